@@ -296,6 +296,12 @@ class Cameras:
         directions = torch.nn.functional.normalize((pose[:, :3, :3] * local[:, None, :]).sum(-1), dim=-1)
         return Rays(pose[:, :3, 3], directions, self.radii(directions, camera) if cones else None)
 
+    def has_ray(self, index: int) -> Tensor | None:
+        """Which pixels of one image its lens gives a ray to, bool [h, w] on the CPU; None for all."""
+        lenses, tables = self.lenses
+        lens, (width, height) = int(lenses[index]), self.size(index)
+        return None if tables is None or lens < 0 else tables.there(lens)[:height, :width]
+
     def _model(self, index: int) -> int:
         return PERSPECTIVE if self.models is None else int(self.models[index])
 

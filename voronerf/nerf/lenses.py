@@ -23,6 +23,8 @@ SETTLED = 1e-9
 TINY = 1e-12
 #: Radians beyond the border of a picture all around that are a matter of rounding.
 ROUNDED = 1e-6
+#: Imaginary part of a root, over its size, that is a matter of rounding.
+FLAT = 1e-9
 #: How far from its position, in pixels, a point may be imaged that counts as its inverse.
 MISSED = 1e-3
 #: Bytes that the tables of one capture may take. A pixel takes 8, an RGB picture 3.
@@ -30,7 +32,7 @@ MOST_BYTES = 4 << 30
 
 
 def distort(u: Tensor, v: Tensor, coefficients: Tensor, model: int = PERSPECTIVE) -> tuple[Tensor, Tensor]:
-    """The lens model: where the lens puts the ideal point (u, v).
+    """The lens model: where the lens puts the ideal point (u, v); NaN from where on the model folds over.
 
     The point of a perspective or an FOV lens lies on the plane at distance 1; that of a fisheye has the length of the
     angle to the optical axis. With r = |(u, v)| the models are
@@ -57,8 +59,42 @@ def distort(u: Tensor, v: Tensor, coefficients: Tensor, model: int = PERSPECTIVE
         omega, radius = float(coefficients[0]), torch.hypot(u, v).clamp_min(TINY)
         share = torch.atan(radius * 2 * math.tan(omega / 2)) / (radius * omega) if omega else torch.ones_like(u)
         return u * share, v * share
-    a, b, *_ = _bend(u, v, coefficients.tolist(), model)
-    return a, b
+    terms = coefficients.tolist()
+    a, b, *_ = _bend(u, v, terms, model)
+    seen = torch.hypot(u, v) < fold(terms, model)
+    return a.where(seen, torch.nan), b.where(seen, torch.nan)
+
+
+def fold(terms: Sequence[float], model: int) -> float:
+    """The length of (u, v) from which on the radial factor brings points back towards the middle, or infinity.
+
+    Fits are good inside the image that they were made of. Beyond it a polynomial may turn, and would show again what
+    lies far outside.
+
+    Args:
+        terms: The coefficients of `distort`, but for those of an FOV lens, which never folds.
+        model: PERSPECTIVE, FISHEYE or EQUIRECTANGULAR.
+    """
+    k1, k2, _, _, k3, k4, k5, k6 = terms
+    above = [1, k1, k2, k3, k4] if model == FISHEYE else [1, k1, k2, k3]  # of r^2
+    below = [1] if model == FISHEYE else [1, k4, k5, k6]
+    slope = [0.0] * (len(above) + len(below) - 1)  # of r above / below, times below^2
+    for i, a in enumerate(above):
+        for j, b in enumerate(below):
+            slope[i + j] += (1 + 2 * i - 2 * j) * a * b
+    inverses = torch.cat((_inverse_roots(slope), _inverse_roots(below)))
+    real = inverses.real[(inverses.real > 0) & (inverses.imag.abs() < FLAT * inverses.abs())]
+    return 1 / math.sqrt(float(real.max())) if len(real) else math.inf
+
+
+def _inverse_roots(factors: Sequence[float]) -> Tensor:
+    """1 / root of a polynomial, complex128, by the factors of its powers; that of 0 is 1.
+
+    The inverses are the eigenvalues of a matrix without a division, which tiny factors do not disturb.
+    """
+    matrix = torch.diag(torch.ones(len(factors) - 1, dtype=torch.float64), -1)[:-1, :-1]
+    matrix[:1] -= torch.tensor(factors[1:], dtype=torch.float64)
+    return torch.linalg.eigvals(matrix)
 
 
 def undistort(u: Tensor, v: Tensor, coefficients: Tensor, model: int = PERSPECTIVE) -> tuple[Tensor, Tensor]:
@@ -138,7 +174,8 @@ def unproject(
 
 
 class LensTables:
-    """The directions of all pixels of l lenses, computed on first use and kept on each device that asks.
+    """The directions of all pixels of l lenses, and which have one, computed on first use and kept on each device that
+    asks.
 
     A direction (x, y, z) in the camera's axes is kept as its stereographic projection (x, -y) / (1 - z), which two
     numbers of float32 hold for every direction but straight back.
@@ -158,6 +195,7 @@ class LensTables:
             )
         self._lenses, self._width, self._height = lenses.double().cpu(), width, height
         self._on: dict[torch.device, Tensor] = {}
+        self._there = torch.empty(0, dtype=torch.bool)
 
     def on(self, device: torch.device) -> Tensor:
         """float32 [l, h, w, 2] on a device."""
@@ -167,11 +205,19 @@ class LensTables:
             self._on[device] = self._on[torch.device("cpu")].to(device)
         return self._on[device]
 
+    def there(self, lens: int) -> Tensor:
+        """The pixels of a lens that have a direction, bool [h, w] on the CPU."""
+        self.on(torch.device("cpu"))
+        return self._there[lens]
+
     def _computed(self) -> Tensor:
         tables = torch.empty(len(self._lenses), self._height, self._width, 2)
+        self._there = torch.empty(tables.shape[:3], dtype=torch.bool)
         y, x = torch.meshgrid(torch.arange(self._height) + 0.5, torch.arange(self._width) + 0.5, indexing="ij")
-        for table, lens in zip(tables, self._lenses):
-            right, up, back = unproject(x, y, lens[:4], lens[4:12], int(lens[12]))[0].unbind(-1)
+        for table, there, lens in zip(tables, self._there, self._lenses):
+            directions, seen = unproject(x, y, lens[:4], lens[4:12], int(lens[12]))
+            there.copy_(seen)
+            right, up, back = directions.unbind(-1)
             # a position without a ray may have no direction either
             table.copy_((torch.stack((right, -up), dim=-1) / (1 - back)[..., None]).nan_to_num(0.0, 0.0, 0.0))
         return tables

@@ -163,6 +163,9 @@ def _places(scene: Scene, width: float, contraction: Contraction | Perspective |
     number = torch.arange(views).repeat_interleave(len(x))
     rays = cameras.rays(number, (sizes[:, :1] * x).reshape(-1), (sizes[:, 1:] * y).reshape(-1))
     near, far, hit = intersect_box(rays.origins, rays.directions, scene.box, scene.near, scene.far)
+    for view, (sees, (width_of, height_of)) in enumerate(zip(hit.view(views, -1), sizes.tolist())):
+        if (mask := scene.train.mask(view)) is not None:  # some pixels may have no ray
+            sees &= mask[(height_of * y).long(), (width_of * x).long()]
     depth = near + torch.minimum((far - near) / 2, torch.full_like(near, width / 2))
     points = torch.addcmul(rays.origins, depth[:, None], rays.directions)
     points = points if contraction is None else contraction.points(points)

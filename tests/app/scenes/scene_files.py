@@ -8,12 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from voronerf.app.scenes.lenses import MODELS
+from voronerf.nerf.cameras import orbit_cameras
 
 Contents = dict[str, Any]
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
+
+#: Cameras around something, the size of their images, and points that they see.
+COUNT, SIZE = 9, (12, 10)
+POSES = orbit_cameras(COUNT, radius=4, elevation=20, width=12, height=10, focal=20, centre=(1, 2, 3)).poses
+POINTS = np.random.default_rng(0).normal(size=(60, 3)) * 0.4 + (1, 2, 3)
 
 
 def needs(name):
@@ -122,3 +129,15 @@ def write_llff(folder, poses, size, focal, bounds):
     matrix = np.stack((-poses[:, :3, 1], poses[:, :3, 0], poses[:, :3, 2], poses[:, :3, 3], lens), axis=-1)
     rows = np.concatenate((matrix.reshape(len(poses), 15), np.broadcast_to(bounds, (len(poses), 2))), axis=1)
     np.save(folder / "poses_bounds.npy", rows)
+
+
+def write_both(folder, sizes=(SIZE,) * COUNT, *, binary=True, **save):
+    write_images(folder, sizes, **save)
+    write_colmap(folder, POSES, sizes, POINTS, binary=binary)
+    write_llff(folder, POSES, SIZE, 20.0, (2.5, 5.5))
+
+
+def every(scene):
+    """Names and poses of all views, in the order of the names."""
+    rows = [*zip(scene.train.names, scene.train.cameras.poses), *zip(scene.test.names, scene.test.cameras.poses)]
+    return [name for name, _ in sorted(rows)], torch.stack([pose for _, pose in sorted(rows)])

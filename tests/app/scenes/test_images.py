@@ -9,7 +9,7 @@ from helpers import python, refuses
 from PIL import Image
 
 from voronerf.app.scenes import SceneError, images
-from voronerf.app.scenes.images import area_average, read_image, read_images
+from voronerf.app.scenes.images import area_average, read_header, read_image, read_images
 
 
 def test_area_average_is_that_of_the_composited_image():
@@ -54,6 +54,23 @@ def test_jpeg_reduction_is_the_area_average(tmp_path, factor, size):
     expected = area_average(smooth, factor)
     assert found.shape == expected.shape == (height // factor, width // factor, 3)
     assert np.abs(found.astype(int) - expected.astype(int)).mean() < 2
+
+
+@pytest.mark.parametrize("tag", [1, 3, 6, 8])
+@pytest.mark.parametrize("mode", ["RGB", "L"])
+def test_a_jpeg_with_a_second_picture_is_read_like_one_without(tmp_path, tag, mode):
+    """Phones and Sony's cameras add a preview, or a map of brightness, by an index of pictures (MPF)."""
+    pixels = np.random.default_rng(tag).integers(0, 256, (48, 64, 3), np.uint8)
+    picture, exif = Image.fromarray(pixels).convert(mode), Image.Exif()
+    exif[0x0112] = tag
+    one, two = tmp_path / "one.jpg", tmp_path / "two.jpg"
+    picture.save(one, quality=90, exif=exif)
+    picture.save(two, "MPO", save_all=True, append_images=[picture.resize((16, 12))], quality=90, exif=exif)
+    with Image.open(two) as file:
+        assert file.format == "MPO"
+    assert read_header(one) == read_header(two) and read_header(two).turns == {1: 0, 3: 2, 6: 3, 8: 1}[tag]
+    for factor in (1, 2, 3, 8):  # by 8, an area average of all pixels differs
+        assert np.array_equal(read_image(one, factor), read_image(two, factor))
 
 
 @pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("RGBA", 4), ("L", 3), ("LA", 4), ("P", 3), ("1", 3)])

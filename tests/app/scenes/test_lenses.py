@@ -5,17 +5,20 @@ THIN_PRISM_FISHEYE, which it has not.
 """
 
 import json
+import math
 from pathlib import Path
 
 import pytest
 import torch
 from helpers import refuses
+from PIL import Image
 from scene_files import write_colmap, write_images
 
-from voronerf.app.scenes import load_scene
-from voronerf.app.scenes.lenses import MODELS, colmap_lens
+from voronerf.app.scenes import SceneError, load_scene
+from voronerf.app.scenes.lenses import COEFFICIENTS, MODELS, OTHER_MODELS, colmap_lens
 from voronerf.app.scenes.record import read_scene, write_scene
 from voronerf.nerf import Cameras, orbit_cameras
+from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, distort, fold
 
 TABLE = json.loads((Path(__file__).parent / "lenses.json").read_text())
 
@@ -76,6 +79,60 @@ def test_pictures_all_around(tmp_path):
         torch.testing.assert_close(rays.directions, Cameras.all_around(cameras.poses, 16).image_rays(0).directions)
 
 
+@pytest.mark.parametrize("height", [32, 40])
+@pytest.mark.parametrize("binary", [True, False])
+def test_pictures_all_around_of_a_model(tmp_path, binary, height):
+    """Its two parameters are the size; depths are distances, since points lie on all sides."""
+    poses = orbit_cameras(9, radius=4, elevation=20, width=1, height=1, focal=1).poses
+    points = torch.nn.functional.normalize(torch.randn(60, 3, generator=torch.Generator().manual_seed(0)), dim=-1) * 20
+    lens = ("EQUIRECTANGULAR", (64.0, float(height)))
+    write_images(tmp_path, [(64, height)] * 9)
+    write_colmap(tmp_path, poses, [(64, height)] * 9, points.numpy(), binary=binary, lenses=[lens] * 9)
+    scene = load_scene(tmp_path, normalise=False)
+    assert scene.kind == "inside-out" and scene.near == pytest.approx(0.75 * 16, rel=0.05)
+    x, y, z = ((points - poses[1, :3, 3]) @ poses[1, :3, :3]).unbind(-1)
+    right, down = torch.atan2(x, -z), torch.atan2(-y, torch.hypot(x, z))
+    expected = torch.stack(((right / math.tau + 0.5) * 64, (down / math.pi + 0.5) * height), dim=-1)
+    pixels, _ = scene.train.cameras.project(points, scene.train.names.index("01"))
+    torch.testing.assert_close(pixels, expected, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("tag", [1, 3, 6])
+def test_a_picture_all_around_stands_upright_or_on_its_head(tmp_path, tag):
+    poses = orbit_cameras(3, radius=4, elevation=20, width=1, height=1, focal=1).poses
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    write_images(tmp_path, [(64, 32)] * 3, exif=exif)
+    write_colmap(tmp_path, poses, [(64, 32)] * 3, [], lenses=[("EQUIRECTANGULAR", (64, 32))] * 3)
+    if tag == 6:
+        refuses("must have no orientation tag of a quarter turn", load_scene, tmp_path, error=SceneError)
+        return
+    rays = load_scene(tmp_path, normalise=False).test.cameras.image_rays(0).directions.view(32, 64, 3)
+    expected = Cameras.all_around(poses[:1], 32).image_rays(0).directions.view(32, 64, 3)
+    torch.testing.assert_close(rays, expected.rot90(2) if tag == 3 else expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("terms", "model", "radius"),
+    [
+        ({"k1": -0.25}, PERSPECTIVE, 2 / 3**0.5),
+        ({"k1": -0.25, "k2": 1e-20, "k3": -1e-18}, PERSPECTIVE, 2 / 3**0.5),
+        ({"k1": 0.1, "k2": 0.2}, PERSPECTIVE, math.inf),
+        ({"k4": -0.25}, PERSPECTIVE, 2.0),  # a pole
+        ({"k1": -0.1}, FISHEYE, (10 / 3) ** 0.5),
+        ({"k4": -1e-4}, FISHEYE, (1e4 / 9) ** 0.125),
+        ({}, EQUIRECTANGULAR, math.inf),
+    ],
+)
+def test_where_a_lens_folds_over(terms, model, radius):
+    terms = [terms.get(name, 0.0) for name in COEFFICIENTS[FISHEYE if model == FISHEYE else PERSPECTIVE]]
+    assert fold(terms, model) == pytest.approx(radius)
+    if radius < 100:
+        u = torch.tensor([0.99, 1.01], dtype=torch.float64) * radius
+        assert distort(u, 0 * u, torch.tensor(terms), model)[0].isnan().tolist() == [False, True]
+
+
 def test_refuses_unknown_models():
-    refuses("camera model DIVISION is not supported, only SIMPLE_PINHOLE, PINHOLE", colmap_lens, "DIVISION", [1.0])
+    for name in OTHER_MODELS.values():
+        refuses(f"camera model {name} is not supported (colmap image_undistorter makes", colmap_lens, name, [1.0])
     refuses("RADIAL must have 5 parameters, got 4", colmap_lens, "RADIAL", [1.0] * 4)

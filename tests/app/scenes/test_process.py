@@ -7,9 +7,11 @@ import os
 import re
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
+import zlib
 
 import numpy as np
 import pytest
@@ -19,8 +21,7 @@ from PIL import Image
 from scene_files import write_images
 
 from voronerf.app.cli import main
-from voronerf.app.render.video import write_video
-from voronerf.app.scenes import SceneError, load_scene, process
+from voronerf.app.scenes import SceneError, gather, load_scene, process
 from voronerf.app.scenes.colmap import read_model
 from voronerf.app.scenes.lenses import colmap_lens
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
@@ -77,7 +78,7 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         process.process(pictures, out, max_features=300, progress=stop)
-    assert not (out / "sparse").exists() and set(seen) == {"features", "pairs", "matches"}
+    assert not (out / "sparse").exists() and set(seen) == {"images", "features", "pairs", "matches"}
     refuses(
         "was begun with --max-features 300, not 500",
         process.process,
@@ -318,14 +319,6 @@ def test_a_lost_camera_does_not_give_a_scene_its_scale(tmp_path):
     assert kept.train.cameras.origins.norm(dim=-1).median() < 1e-3
 
 
-def test_a_video_is_taken_apart(tmp_path, monkeypatch):
-    shades = torch.arange(20, dtype=torch.uint8).mul(10)[:, None, None, None].expand(20, 10, 12, 3)
-    write_video(tmp_path / "a.mp4", shades.repeat(1, 4, 4, 1), 10)
-    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
-    refuses("no model", process.process, tmp_path / "a.mp4", tmp_path / "out", frames=5, error=SceneError)
-    assert len(list((tmp_path / "out/images").iterdir())) == 5
-
-
 def test_the_largest_features_are_kept(tmp_path):
     few = tmp_path / "few.db"
     process._keep_largest(pycolmap, write_database(tmp_path / "database.db", [2, 5, 1, 4]), few, 2)
@@ -345,8 +338,8 @@ def test_half_transparent_pixels_have_features(tmp_path):
     pixels = np.zeros((1, 3, 4), np.uint8)
     pixels[..., 3] = 127, 128, 255
     Image.fromarray(pixels).save(path := tmp_path / "a.png")
-    process._write_masks([path], tmp_path / "masks")
-    assert np.array(Image.open(tmp_path / "masks/a.png.png")).tolist() == [[False, True, True]]
+    process._write_masks([path], tmp_path / "masks", tmp_path / "features")
+    assert np.array(Image.open(tmp_path / "features/a.png.png")).tolist() == [[False, True, True]]
 
 
 def test_reduced_images_keep_the_orientation_tag(tmp_path, monkeypatch):
@@ -383,7 +376,8 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
         ("text.mp4", "text.mp4: is no video in a container that is read"),
         ("list.mp4", "list.mp4: is no video in a container that is read"),
         ("images", "must have at least 3 images, got 2"),
-        ("", "must have at least 3 images, got 0; " + str(tmp_path / "images has 2")),
+        ("", f"{tmp_path}/images: must have at least 3 images, got 2"),
+        ("full", f"{tmp_path}/full: must have at least 3 images, got 0"),
     ):
         refuses(reason, process.process, tmp_path / source, tmp_path / "out", error=SceneError)
     refuses("full: must not exist yet", process.process, tmp_path / "images", tmp_path / "full", error=SceneError)
@@ -487,20 +481,296 @@ def test_images_of_phones_are_named_where_they_cannot_be_read(tmp_path, monkeypa
     assert len(list((tmp_path / "out/images").iterdir())) == 3
 
 
+def picture(number, size=(32, 20), mode="RGB"):
+    return Image.new("RGB", size, (20 * number % 256, 90, 30)).convert(mode)
+
+
+def gathered(tmp_path, monkeypatch, files):
+    """Processes files: the number of a picture, an image or bytes each. Returns names of copies, and lines on them."""
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    folder, out, said = tmp_path / "in", tmp_path / "out", []
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(content, bytes):
+            (folder / name).write_bytes(content)
+        else:
+            (picture(content) if isinstance(content, int) else content).save(folder / name)
+    refuses("no model", process.process, folder, out, say=said.append, error=SceneError)
+    before = itertools.takewhile(lambda line: "with one camera" not in line, said)
+    return sorted(path.name for path in (out / "images").iterdir()), list(before)
+
+
+def numbered(*patterns, first=0, count=3):
+    """Names by patterns, each of another picture."""
+    names = [pattern.format(number) for pattern in patterns for number in range(count)]
+    return {name: number for number, name in enumerate(names, first)}
+
+
+@pytest.mark.parametrize(
+    ("files", "names", "lines"),
+    [
+        (
+            {**numbered("camA/{}.jpg", "cam B/{}.jpg"), **numbered("Mask/{}.png", "camA/depth/{}.png", first=9)},
+            [f"cam{c}_{i}.jpg" for c in ("A", "_B") for i in range(3)],
+            ["the images are those of cam B (3), camA (3)"],
+        ),
+        (numbered("a/b/{}.png"), ["a_b_0.png", "a_b_1.png", "a_b_2.png"], []),
+        (numbered("images/{}.jpg", "images_2/{}.jpg", "depth/{}.png"), ["0.jpg", "1.jpg", "2.jpg"], []),
+        (
+            numbered("Images/{}.jpg", "more/{}.jpg"),
+            ["0.jpg", "1.jpg", "2.jpg"],
+            ["3 images in other folders than Images are left out"],
+        ),
+        (numbered("{}.JPG", "more/{}.jpg"), ["0.JPG", "1.JPG", "2.JPG"], ["3 images in its folders are left out"]),
+        (
+            numbered("{}.jpg", "{}.png", "{}.webp", "b{}.webp", "b{}.tif"),
+            ["0.jpg", "1.jpg", "2.jpg", "b0.png", "b1.png", "b2.png"],
+            ["9 images are left out that are there in another format, too: 0.png, 1.png, 2.png, 0.webp"],
+        ),
+        (numbered("{}.webp"), ["0.jpg", "1.jpg", "2.jpg"], []),
+        (numbered("{}.tif", "b{}.TIFF", "c{}.bmp"), [f"{c}{i}.png" for c in ("", "b", "c") for i in range(3)], []),
+        (
+            {**numbered("{}.jpg"), "0 (1).jpg": 0, "copy of 1.jpg": 1, "b/2.jpg": 2},
+            ["0.jpg", "1.jpg", "2.jpg"],
+            ["1 images in its", "2 images are left out that repeat others to the byte: 0_(1).jpg, copy_of_1.jpg"],
+        ),
+        (
+            {**numbered("{}.jpg"), "1.dng": b"raw", "2.dng": b"raw", "0.mov": b"live", "LICENSE": b"words"},
+            ["0.jpg", "1.jpg", "2.jpg"],
+            ["other files than PNG, JPEG, WebP, TIFF, BMP and HEIC are left out: 2 .dng, 1 .mov, 1 LICENSE"],
+        ),
+        (
+            {
+                **numbered("a/{}.jpg"),
+                **dict.fromkeys(("a/._0.jpg", "a/.DS_Store", "a/Thumbs.db", "a/desktop.ini"), b"system"),
+                **dict.fromkeys(("__MACOSX/a/._0.jpg", "a/@eaDir/0.jpg/SYNO_XL.jpg", ".trash/0.jpg"), b"system"),
+                **numbered("old/images/{}.jpg", first=9),
+                "old/colmap/settings.json": b"{}",
+            },
+            ["a_0.jpg", "a_1.jpg", "a_2.jpg"],
+            [],
+        ),
+    ],
+)
+def test_the_images_of_a_folder_are_taken_once_and_what_is_left_out_is_said(tmp_path, monkeypatch, files, names, lines):
+    taken, said = gathered(tmp_path, monkeypatch, files)
+    assert taken == names
+    assert len(said) == len(lines) and all(part in line for part, line in zip(lines, said)), said
+
+
+def test_images_of_two_folders_must_not_get_one_name(tmp_path):
+    for name in ("a/b_0.jpg", "a_b/0.jpg"):
+        (tmp_path / "in" / name).parent.mkdir(parents=True)
+        picture(1).save(tmp_path / "in" / name)
+    line = f"a_b/0.jpg: {tmp_path}/in/a/b_0.jpg has this name, too"
+    refuses(line, process.process, tmp_path / "in", tmp_path / "out", error=SceneError)
+
+
+def quarters():
+    """Red, black, blue and green quarters, so that turns show."""
+    image = Image.new("RGB", (32, 20))
+    for place, colour in (((0, 0, 16, 10), "red"), ((0, 10, 16, 20), "blue"), ((16, 10, 32, 20), "lime")):
+        image.paste(colour, place)
+    return image
+
+
+def turned():
+    """The tag of a camera that is held upright."""
+    exif = Image.Exif()
+    exif[0x0110], exif[0x0112], exif[0x8769] = "a camera", 6, {0xA405: 26}
+    return exif
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "kept"),
+    [
+        ("a.webp", {"exif": turned()}, "a.jpg"),
+        ("a.webp", {"exif": turned(), "lossless": True}, "a.png"),
+        ("a.tif", {"compression": "tiff_lzw", "tiffinfo": {0x0110: "a camera", 0x0112: 6}}, "a.png"),
+        ("a.tif", {"compression": "jpeg", "quality": 95, "tiffinfo": {0x0110: "a camera", 0x0112: 6}}, "a.png"),
+        ("a.jpg", {"format": "WebP", "exif": turned()}, "a.jpg"),  # by its content
+    ],
+)
+def test_converted_images_are_upright_and_keep_their_lens(tmp_path, name, options, kept):
+    (tmp_path / "out").mkdir()
+    quarters().save(tmp_path / name, **options)
+    copy, reduced = gather._copy_image(tmp_path / name, tmp_path / "out" / name)
+    assert copy == tmp_path / "out" / kept and not reduced
+    with Image.open(copy) as image:
+        shown, exif = np.asarray(image).astype(int), image.getexif()
+        assert image.format == ("JPEG" if kept.endswith("jpg") else "PNG")
+        assert exif[0x0110] == "a camera" and 0x0112 not in exif
+    upright = np.asarray(quarters().transpose(Image.Transpose.ROTATE_270)).astype(int)
+    inside = np.s_[[8, 24], [[5], [15]]]  # of each quarter
+    assert shown.shape == (32, 20, 3) and np.abs(shown[inside] - upright[inside]).max() < 12
+    camera = pycolmap.infer_camera_from_image(copy)
+    assert camera.has_prior_focal_length == ("exif" in options)
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.webp"])
+def test_transparent_images_stay_transparent(tmp_path, name):
+    image = picture(3, mode="RGBA")
+    image.putalpha(77)
+    image.save(tmp_path / name)
+    copy, _ = gather._copy_image(tmp_path / name, tmp_path / f"copy_{name}")
+    with Image.open(copy) as kept:
+        assert copy.suffix == ".png" and kept.mode == "RGBA" and kept.getpixel((4, 4))[3] == 77
+
+
+def write_deep(path, values):
+    """Writes colours of 16 bits [h, w, 3], as PNG or as TIFF."""
+    height, width, _ = values.shape
+    if path.suffix == ".png":
+        rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+        header = struct.pack(">2I5B", width, height, 16, 2, 0, 0, 0)
+        parts = ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+        chunks = [struct.pack(">I", len(part)) + kind + part for kind, part in parts]
+        checked = [chunk + struct.pack(">I", zlib.crc32(chunk[4:])) for chunk in chunks]
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(checked))
+    else:
+        tags = {256: width, 257: height, 258: 122, 259: 1, 262: 2, 273: 128, 277: 3, 278: height, 279: values.size * 2}
+        counts = [(tag, 3, 3 if tag == 258 else 1, value) for tag, value in tags.items()]
+        entries = b"".join(struct.pack("<2H2I", *each) for each in counts)
+        start = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + b"\0" * 4
+        path.write_bytes(start.ljust(122, b"\0") + struct.pack("<3H", 16, 16, 16) + values.astype("<u2").tobytes())
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_of_16_bits_a_channel_8_are_kept(tmp_path, monkeypatch, suffix):
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    (folder := tmp_path / "in").mkdir()
+    values = np.random.default_rng(0).integers(0, 2**16, (3, 9, 16, 3))
+    for number in range(3):
+        write_deep(folder / f"{number}{suffix}", values[number])
+    said = []
+    refuses("no model", process.process, folder, tmp_path / "out", say=said.append, error=SceneError)
+    assert said[0] == f"{folder}: of 3 images with 16 bits a channel the upper 8 are kept: " + ", ".join(
+        f"{number}{suffix}" for number in range(3)
+    )
+    made = [np.asarray(Image.open(tmp_path / f"out/images/{number}.png")) for number in range(3)]
+    assert (np.stack(made) == values >> 8).all()
+
+
+@pytest.mark.parametrize(("name", "dtype"), [("a.png", "u2"), ("a.tif", "u2"), ("a.tif", "i4"), ("a.tif", "f4")])
+def test_grey_values_of_unknown_range_are_refused(tmp_path, name, dtype):
+    Image.fromarray(np.ones((9, 9), dtype)).save(tmp_path / name)
+    line = f"{tmp_path}/{name}: has grey values of more than 8 bits; write it with 8 bits a channel"
+    refuses(line, gather._copy_image, tmp_path / name, tmp_path / "copy.png", error=SceneError)
+
+
+def half(size=(32, 20)):
+    """A mask whose right half is black."""
+    mask = Image.new("L", size)
+    mask.paste(255, (0, 0, size[0] // 2, size[1]))
+    return mask
+
+
+def clear(mask):
+    """A white picture that is transparent where a mask is black."""
+    picture = Image.new("RGBA", mask.size, "white")
+    picture.putalpha(mask)
+    return picture
+
+
+@pytest.mark.parametrize(
+    ("files", "names", "line"),
+    [
+        ({**numbered("{}.jpg"), "masks/0.jpg.png": half(), "masks/2.png": half()}, ["0.jpg", "2.jpg"], "2 of 3"),
+        ({**numbered("images/{}.jpg"), "masks/1.png": half()}, ["1.jpg"], "1 of 3 images have a mask"),
+        ({**numbered("a b/{}.webp"), "masks/a b/1.webp.png": half()}, ["a_b_1.jpg"], "1 of 3 images have a mask"),
+        ({**numbered("camA/{}.jpg"), "camA/masks/1.png": half()}, ["camA_1.jpg"], "1 of 3 images have a mask"),
+        ({**numbered("{}.jpg"), "masks/1.png": clear(half())}, ["1.jpg"], "1 of 3 images have a mask"),
+        ({**numbered("{}.tif"), "masks/1.png": half().convert("P")}, ["1.png"], "1 of 3 images have a mask"),
+        ({**numbered("{}.jpg"), "../masks/1.png": half().convert("RGBA")}, ["1.jpg"], "1 of 3 images have a mask"),
+        (
+            {**numbered("{}.jpg"), "0 2.jpg": 0, **dict.fromkeys(("masks/0.png", "masks/0 2.png"), half())},
+            ["0.jpg"],
+            "1 of 3",
+        ),
+        ({**numbered("{}.jpg"), "masks/mask_1.png": half()}, [], "masks: has no mask of an image; that of 0.jpg is"),
+        (numbered("{}.jpg"), [], ""),
+    ],
+)
+def test_masks_go_along(tmp_path, monkeypatch, files, names, line):
+    made, said = gathered(tmp_path, monkeypatch, files)
+    assert len(made) == 3 and line in "".join(said[-1:])
+    masks = tmp_path / "out/masks"
+    assert masks.is_dir() == bool(names)
+    assert sorted(path.name for path in masks.glob("*")) == [f"{name}.png" for name in names]
+    for folder in (masks, tmp_path / "out/colmap/masks"):
+        for name in names:
+            assert (np.asarray(Image.open(folder / f"{name}.png").convert("L")) == np.asarray(half())).all()
+
+
+@pytest.mark.parametrize(
+    ("mask", "reason"),
+    [
+        (half((20, 32)), "masks/1.png: is 20 x 32 pixels, 1.jpg is 32 x 20"),
+        (half((16, 10)), "masks/1.png: is 16 x 10 pixels, 1.jpg is 32 x 20"),
+        (b"no image", "masks/1.png: cannot be read: "),
+    ],
+)
+def test_a_mask_that_does_not_fit_leaves_nothing(tmp_path, mask, reason):
+    (tmp_path / "in/masks").mkdir(parents=True)
+    for number in range(3):
+        picture(number).save(tmp_path / f"in/{number}.jpg")
+    half().save(tmp_path / "in/masks/0.png")
+    if isinstance(mask, bytes):
+        (tmp_path / "in/masks/1.png").write_bytes(mask)
+    else:
+        mask.save(tmp_path / "in/masks/1.png")
+    refuses(reason, process.process, tmp_path / "in", tmp_path / "out", error=SceneError)
+    assert not (tmp_path / "out").exists()
+
+
+def test_masked_parts_have_no_features_and_do_not_train(tmp_path, pictures):
+    (tmp_path / "in/masks/b").mkdir(parents=True)
+    for number, path in enumerate(sorted(pictures.iterdir())):
+        (tmp_path / f"in/{'ab'[number // 4]}").mkdir(exist_ok=True)
+        shutil.copy(path, tmp_path / f"in/{'ab'[number // 4]}/{number}.png")
+    mask = Image.new("1", (WIDTH, HEIGHT), 1)
+    mask.paste(0, (0, 0, WIDTH // 4, HEIGHT))
+    mask.save(tmp_path / "in/masks/b/5.png")
+    out = tmp_path / "out"
+    process.process(tmp_path / "in", out, max_features=300)
+    with pycolmap.Database.open(out / "colmap/database.db") as opened:
+        images = sorted(opened.read_all_images(), key=lambda image: image.name)
+        left = [opened.read_keypoints(image.image_id)[:, 0].min() for image in images]
+    assert [x > WIDTH // 4 - 1 for x in left] == [number == 5 for number in range(COUNT)]
+    scene = load_scene(out, format="transforms")
+    names = [f"{'ab'[number // 4]}_{number}" for number in range(COUNT)]
+    assert sorted([*scene.train.names, *scene.test.names]) == names
+    masks = {name: split.mask(i) for split in (scene.train, scene.test) for i, name in enumerate(split.names)}
+    assert [bool(masks[name].all()) for name in names] == [number != 5 for number in range(COUNT)]
+    assert not masks["b_5"][:, : WIDTH // 4].any() and masks["b_5"][:, WIDTH // 4 :].all()
+
+
+def test_pycolmap_is_needed_once_the_images_were_looked_at(tmp_path, monkeypatch):
+    write_images(tmp_path, [(12, 10)] * 2)
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pycolmap", None)
+        refuses("images, got 2", process.process, tmp_path / "images", tmp_path / "out", error=SceneError)
+        picture(1).save(tmp_path / "images/more.png")
+        refuses("pip install 'voronerf[colmap]'", process.process, tmp_path, tmp_path / "out", error=ImportError)
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    refuses("finds no model", process.process, tmp_path, tmp_path / "out", error=SceneError)
+
+
 def test_images_of_one_size_share_a_camera(tmp_path, pictures, monkeypatch):
     (tmp_path / "mixed").mkdir()
     for number, path in enumerate(sorted(pictures.iterdir())[:6]):
-        with Image.open(path) as image:  # every other one held upright
-            image.rotate(90 * (number % 2), expand=True).save(tmp_path / f"mixed/{number}.png")
+        with Image.open(path) as image:  # every third one held upright
+            image.rotate(90 * (number % 3 == 0), expand=True).save(tmp_path / f"mixed/{number}.png")
     monkeypatch.setattr(process, "_map", lambda *_: None)
     said = []
     with pytest.raises(SceneError, match="finds no model"):
         process.process(tmp_path / "mixed", tmp_path / "out", max_features=100, say=said.append)
-    assert said[0].startswith("6 images with 2 cameras, one for each size; ")
+    sizes = f"4 of {WIDTH} x {HEIGHT}, 2 of {HEIGHT} x {WIDTH}"
+    assert said[0].startswith(f"6 images with 2 cameras, one for each size: {sizes}; ")
     with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
         cameras = {each.camera_id: (each.width, each.height) for each in opened.read_all_cameras()}
         taken = [cameras[opened.read_image_with_name(f"{number}.png").camera_id] for number in range(6)]
-    assert len(cameras) == 2 and taken == 3 * [(WIDTH, HEIGHT), (HEIGHT, WIDTH)]
+    assert len(cameras) == 2 and taken == 2 * [(HEIGHT, WIDTH), (WIDTH, HEIGHT), (WIDTH, HEIGHT)]
 
 
 def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch):
@@ -548,6 +818,9 @@ def test_a_training_of_photographs_without_cameras_points_to_process(tmp_path):
     write_images(tmp_path / "walk", [(12, 10)] * 2)
     for folder in (tmp_path / "walk", tmp_path / "walk/images"):
         refuses(f"voronerf process {tmp_path}/walk/images DIR finds the cameras", load_scene, folder, error=SceneError)
+    (tmp_path / "web").mkdir()
+    picture(1).save(tmp_path / "web/0.webp")
+    refuses(f"voronerf process {tmp_path}/web DIR finds the cameras", load_scene, tmp_path / "web", error=SceneError)
     (tmp_path / "walk.MOV").touch()
     refuses(f"voronerf process {tmp_path}/walk.MOV DIR makes one", load_scene, tmp_path / "walk.MOV", error=SceneError)
     (tmp_path / "empty").mkdir()
@@ -563,10 +836,9 @@ def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, p
         (
             (jpeg[: len(jpeg) // 2], "cannot be read: image file is truncated"),
             (png[: len(png) // 2], "cannot be read: image file is truncated"),
-            (b"no image" * 9, "is not an image in PNG or JPEG format"),
-            (b"", "is not an image in PNG or JPEG format"),
-            (png[:24] + b"\x10" + png[25:], "has more than 8 bits a channel"),
-            (png[:16] + b"\x7f" + png[17:], "is not an image in PNG or JPEG format"),
+            (b"no image" * 9, "is not an image in PNG, JPEG, WebP, TIFF, BMP format"),
+            (b"", "is not an image in PNG, JPEG, WebP, TIFF, BMP format"),
+            (png[:16] + b"\x7f" + png[17:], "is not an image in PNG, JPEG, WebP, TIFF, BMP format"),
         )
     ):
         folder = tmp_path / str(number)

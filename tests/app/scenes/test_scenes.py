@@ -3,14 +3,16 @@
 import json
 import logging
 import math
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import refuses
 from PIL import Image
 from scene_files import needs, rewrite, write_blender, write_capture
 
-from voronerf.app.scenes import builtin_scene, load_scene
+from voronerf.app.scenes import SceneError, builtin_scene, load_scene
 from voronerf.app.scenes.photographs import find_frame
 from voronerf.nerf import Space, Stratified, render_rays
 from voronerf.nerf.cameras import Cameras, focus_point, orbit_cameras
@@ -90,6 +92,60 @@ def test_val_stands_in_for_test(tmp_path):
     write_blender(tmp_path, builtin_scene(8, train_views=4, test_views=3), 0.69)
     (tmp_path / "transforms_test.json").rename(tmp_path / "transforms_val.json")
     assert len(load_scene(tmp_path).test) == 3
+
+
+def blender_nerf(folder, test, lens):
+    """A scene as BlenderNeRF exports it: test views, if any, are listed and not rendered."""
+    write_blender(folder, builtin_scene(8, train_views=9, test_views=2), 0.69)
+    if lens:
+        for name in ("train", "test"):
+            rewrite(
+                folder, lambda contents: contents.update(fl_x=11.1, cx=4.0, k1=0.0, aabb_scale=4), f"transforms_{name}"
+            )
+    if test == "none":
+        (folder / "transforms_test.json").unlink()
+    elif test == "those for training":
+        shutil.copyfile(folder / "transforms_train.json", folder / "transforms_test.json")
+    elif test == "val":
+        shutil.copytree(folder / "test", folder / "val")
+        contents = (folder / "transforms_test.json").read_text()
+        (folder / "transforms_val.json").write_text(contents.replace("./test", "./val"))
+    if test != "those for training":
+        shutil.rmtree(folder / "test")
+
+
+@pytest.mark.parametrize("lens", [True, False])
+@pytest.mark.parametrize("test", ["not rendered", "none", "those for training", "val"])
+def test_without_pictures_for_testing_every_eighth_is_held_out(tmp_path, test, lens):
+    blender_nerf(tmp_path, test, lens)
+    scene = load_scene(tmp_path)
+    held = any("every 8th is held out" in note for note in scene.notes)
+    assert (scene.background, scene.box is None, held) == ("white", False, test != "val")
+    assert scene.test.names == (("r_0", "r_8") if held else ("val_r_0", "val_r_1") if lens else ("r_0", "r_1"))
+    assert len(scene.train) == (7 if held else 9)
+
+
+def test_flags_that_are_off_make_no_capture(tmp_path):
+    write_blender(tmp_path, builtin_scene(8, train_views=4, test_views=2), 0.69)
+    for name in ("transforms_train", "transforms_test"):
+        rewrite(tmp_path, lambda contents: contents.update(latlong=False, from_mitsuba=False, ftheta_p1=0), name)
+    assert load_scene(tmp_path).far == 6
+    rewrite(tmp_path, lambda contents: contents.update(from_mitsuba=True), "transforms_train")
+    refuses("from_mitsuba is not supported", load_scene, tmp_path, error=SceneError)
+
+
+def test_a_picture_of_blender_that_is_listed_twice_is_not_also_held_out(tmp_path):
+    blender_nerf(tmp_path, "none", lens=False)
+    rewrite(tmp_path, lambda contents: contents["frames"].insert(0, contents["frames"][3]), "transforms_train")
+    scene = load_scene(tmp_path)
+    assert sorted(scene.train.names + scene.test.names) == [f"r_{index}" for index in range(9)]
+    assert scene.test.names == ("r_0", "r_8")
+
+
+def test_a_single_picture_of_blender_is_too_few(tmp_path):
+    write_blender(tmp_path, builtin_scene(8, train_views=1, test_views=1), 0.69)
+    (tmp_path / "transforms_test.json").unlink()
+    refuses("transforms_train.json: one image is too few", load_scene, tmp_path, error=SceneError)
 
 
 def test_capture(tmp_path, caplog):
@@ -174,7 +230,8 @@ def test_names_of_a_capture_are_all_different(tmp_path):
     assert names() == [name.removesuffix(".png").replace("/", "_") for name in left_right]
     contents["frames"][1]["file_path"] = "./left/../left/00.png"  # the first one's image again
     path.write_text(json.dumps(contents))
-    assert len(set(names())) == 8
+    assert len(set(names())) == 7
+    assert "of images that are listed twice the first counts: 00.png" in load_scene(tmp_path).notes
     for frame, name in zip(contents["frames"], ("a", "b", "c", "d", "e", "f", "g", "h")):
         (tmp_path / frame["file_path"]).with_name(f"{name}.png").write_bytes((tmp_path / "left/00.png").read_bytes())
         frame["file_path"] = str(Path(frame["file_path"]).with_name(f"{name}.png"))

@@ -34,9 +34,11 @@ def process(
     """Make a scene of a video or of images: COLMAP finds the cameras. A stopped one goes on with the same command.
 
     Args:
-        source: A video, or a folder of PNG, JPEG or, with pillow-heif, HEIC images.
-        out: The folder to make; it gets images, sparse/0, transforms.json and colmap, which keeps every stage.
-        frames: Frames taken of a video, evenly spread.
+        source: A video, or a folder of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC images, or of folders of
+            these. Its folder masks may have a mask of each, whose black pixels do not count.
+        out: The folder to make; it gets images, masks if there are any, sparse/0, transforms.json and colmap, which
+            keeps every stage.
+        frames: Frames taken of a video, evenly spread; of a shorter one all.
         matching: Which images are compared: all with all, each with those next to it by name, or those that share
             their largest features (auto).
         camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.

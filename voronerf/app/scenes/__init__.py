@@ -11,13 +11,14 @@ from typing import NamedTuple
 from voronerf.app.scenes.blender import load_blender
 from voronerf.app.scenes.builtin import builtin_scene, city_scene
 from voronerf.app.scenes.builtin.city import city_of
-from voronerf.app.scenes.colmap import find_model, load_colmap
+from voronerf.app.scenes.colmap import find_models, load_colmap
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.folders import HEIF, SUFFIXES
+from voronerf.app.scenes.folders import CONVERTED, SUFFIXES
 from voronerf.app.scenes.llff import FILE, load_llff
 from voronerf.app.scenes.photographs import Reading
 from voronerf.app.scenes.scene import KINDS, Scene, Split
 from voronerf.app.scenes.transforms import load_transforms
+from voronerf.app.wording import similar_path
 
 __all__ = ["Scene", "SceneError", "Split", "builtin_scene", "city_scene", "load_scene"]
 
@@ -36,7 +37,7 @@ class Format(NamedTuple):
 
     sign: str
     load: Callable[[Path, Reading], Scene]
-    find: Callable[[Path], Path | None] | None = None
+    find: Callable[[Path], object] | None = None
 
     def held(self, folder: Path) -> bool:
         """Whether a folder has this format."""
@@ -46,7 +47,7 @@ class Format(NamedTuple):
 #: In the order in which a folder is tried.
 FORMATS = {
     "blender": Format("transforms_train.json", load_blender),
-    "colmap": Format("a COLMAP model in sparse/0", load_colmap, find_model),
+    "colmap": Format("a COLMAP model in sparse/0", load_colmap, find_models),
     "transforms": Format("transforms.json", load_transforms),
     "llff": Format(FILE, load_llff),
 }
@@ -69,7 +70,7 @@ def is_builtin(source: str | Path | None) -> bool:
 
 def has_images(folder: Path) -> bool:
     """Whether a folder has images, with or without cameras."""
-    return any(path.suffix.lower() in (*SUFFIXES, *HEIF) for path in folder.iterdir())
+    return any(path.suffix.lower() in (*SUFFIXES, *CONVERTED) for path in folder.iterdir())
 
 
 def load_scene(
@@ -88,7 +89,8 @@ def load_scene(
     Args:
         source: "builtin", or "builtin:400" of 400 pixels; "builtin-city" of one block or "builtin-city:4x4" of 16; or a
             folder with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a
-            COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`; such a file stands for its folder.
+            COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`; such a file stands for its folder, and the folder
+            of a model for that of its scene.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels, or the size that is named,
             divided by it. None is 1, and for photographs the least factor that leaves at most 512 pixels a side.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
@@ -139,13 +141,15 @@ def load_scene(
     if folder.is_file() and folder.name in (signs := {each.sign: name for name, each in FORMATS.items()}):
         folder, format = folder.parent, signs[folder.name] if format == "auto" else format
     if not folder.exists():
-        raise SceneError(f"{folder}: there is no such folder")
+        beside = (path for path in folder.parent.glob("*") if path.is_dir())
+        raise SceneError(f"{folder}: there is no such folder{similar_path(folder, (Path(BUILTIN), *beside))}")
     if not folder.is_dir():
         hint = f"; of a video, voronerf process {folder} DIR makes one" if folder.suffix.lower() in VIDEOS else ""
         raise SceneError(f"{folder}: is not a folder{hint}")
     held = [name for name, each in FORMATS.items() if each.held(folder)]
-    if "transforms" in held and find_model(folder) == folder / "colmap/sparse/0":
-        held.remove("colmap")  # nerfstudio's, whose transforms.json was made of it and says more
+    models = find_models(folder)
+    if "transforms" in held and models and models.paths[0].relative_to(models.folder).parts[1:2] == ("sparse",):
+        held.remove("colmap")  # as colmap/sparse/0 of nerfstudio, whose transforms.json was made of it and says more
         held.append("colmap")
     if not held:
         none = f"{folder}: is not a scene, it has none of {', '.join(each.sign for each in FORMATS.values())}"

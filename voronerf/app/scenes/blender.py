@@ -14,7 +14,7 @@ import torch
 from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_images
-from voronerf.app.scenes.photographs import Reading, distinct_names
+from voronerf.app.scenes.photographs import HOLD_OUT, Reading, distinct_names
 from voronerf.app.scenes.scene import Scene, Split
 from voronerf.app.scenes.transforms import ListedImage, capture_scene, focal_length, has_lens, number, read_transforms
 from voronerf.nerf.cameras import Cameras
@@ -27,29 +27,33 @@ NEAR, FAR = 2.0, 6.0
 def load_blender(folder: Path, reading: Reading) -> Scene:
     """Loads a Blender synthetic scene.
 
-    The test views are those of `transforms_test.json`, or of `transforms_val.json` if the former is missing. Entries
-    such as `fl_x`, `cx` or `k1`, which Blender's files do not have, mark a capture that was split before. It is loaded
-    like `load_transforms` does, with that split.
+    The test views are those of `transforms_test.json`, or of `transforms_val.json` if the former is missing or has no
+    image; without either, as BlenderNeRF exports scenes, every 8th training view is held out. Entries such as `fl_x`,
+    `cx` or `k1`, which Blender's files do not have, mark a capture that was split before. It is loaded like
+    `load_transforms` does, with that split.
 
     Returns:
         The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
         the training views; without alpha the box is None. For a capture see `load_transforms`.
     """
     train_file = folder / "transforms_train.json"
-    choices = [folder / "transforms_test.json", folder / "transforms_val.json"]
-    test_file = next((path for path in choices if path.is_file()), None)
-    if test_file is None:
-        raise SceneError(
-            f"{folder}: has transforms_train.json but neither transforms_test.json nor transforms_val.json"
-        )
     entries, train_frames = read_transforms(train_file, reading.allow_outside)
-    _, test_frames = read_transforms(test_file, reading.allow_outside)
+    train_frames = list({frame.path.resolve(): frame for frame in train_frames}.values())
+    test_frames = _test_frames(folder, train_frames, reading)
+    note: tuple[str, ...] = ()
+    if not test_frames:
+        note = ("no other images for testing, as BlenderNeRF exports scenes: every 8th is held out",)
+        train_frames.sort(key=lambda frame: frame.path.as_posix())
+        test_frames = train_frames[::HOLD_OUT]
+        train_frames = [frame for number, frame in enumerate(train_frames) if number % HOLD_OUT]
+        if not train_frames:
+            raise SceneError(f"{train_file}: one image is too few, one is held out for testing")
 
     if has_lens((*train_frames, *test_frames)):
         if "near" in entries or "far" in entries:
             log.warning("%s: near and far are not used, since the scene of a capture is moved and scaled", train_file)
         frames = [*train_frames, *test_frames]
-        return capture_scene(folder, entries, frames, torch.arange(len(frames)) >= len(train_frames), reading)
+        return capture_scene(folder, entries, frames, torch.arange(len(frames)) >= len(train_frames), reading, note)
 
     if reading.kind not in ("auto", "object"):
         raise SceneError(f"{train_file}: --kind must be auto or object for a Blender scene, got {reading.kind}")
@@ -65,8 +69,22 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     train = _split(train_frames, images[:count], sizes[:count], downscale, on_disk)
     test = _split(test_frames, images[count:], sizes[count:], downscale, on_disk)
     box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
-    name, notes = folder.resolve().name, ("Blender scene, an object on white",)
+    name, notes = folder.resolve().name, ("Blender scene, an object on white", *note)
     return Scene(name=name, train=train, test=test, near=near, far=far, box=box, background="white", notes=notes)
+
+
+def _test_frames(folder: Path, train_frames: Sequence[ListedImage], reading: Reading) -> list[ListedImage]:
+    """The images for testing of the first file that has some; images for training are left out, with a warning."""
+    training = {frame.path.resolve() for frame in train_frames}
+    for name in ("transforms_test.json", "transforms_val.json"):
+        if (folder / name).is_file():
+            frames = read_transforms(folder / name, reading.allow_outside, all_may_miss=True)[1]
+            others = [frame for frame in frames if frame.path.resolve() not in training]
+            if both := len(frames) - len(others):
+                log.warning("%s: %d of its images are for training, and are not tested", folder / name, both)
+            if others:
+                return others
+    return []
 
 
 def _split(

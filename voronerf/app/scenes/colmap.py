@@ -10,6 +10,7 @@ Source: COLMAP, "Output Format". Models of rigs keep the pose of each image in `
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,9 +20,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from voronerf.app.files import leads_outside
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.folders import choose_images, named_images, stay_inside
-from voronerf.app.scenes.lenses import MODELS, Lens, colmap_lens
+from voronerf.app.scenes.folders import (
+    ImageFolder,
+    choose_images,
+    image_folders,
+    named_files,
+    named_images,
+    stay_inside,
+)
+from voronerf.app.scenes.images import read_header
+from voronerf.app.scenes.lenses import EQUIRECTANGULAR, MODELS, OTHER_MODELS, Lens, colmap_lens
 from voronerf.app.scenes.photographs import Reading, View, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.transforms import LARGEST, LONGEST
@@ -29,6 +39,16 @@ from voronerf.app.scenes.transforms import LARGEST, LONGEST
 Array = NDArray[Any]
 
 FILES = ("cameras", "images", "points3D")
+#: The places of models in the folder of a scene, each a model or a folder of models 0, 1, ..., in the order in which
+#: they are tried, and of their images: COLMAP's, nerfstudio's, gaussian-splatting's before the images are undistorted,
+#: and image_undistorter's.
+PLACES = {
+    "sparse": "images",
+    "colmap/sparse": "images",
+    "distorted/sparse": "input",
+    "dense/sparse": "dense/images",
+    ".": "images",
+}
 #: Bytes of a file.
 MOST_BYTES = 2**31
 #: Points that fewer images than this have seen are too uncertain to tell where the scene is.
@@ -67,24 +87,71 @@ class ColmapModel(NamedTuple):
     points: Array  # float64 [n, 3]
 
 
-def find_model(folder: Path) -> Path | None:
-    """The folder of a COLMAP model in that of a scene, or None."""
-    for inside in ("sparse/0", "sparse", "colmap/sparse/0", "."):
-        for suffix in (".bin", ".txt"):
-            if all((folder / inside / f"{name}{suffix}").is_file() for name in FILES[:2]):
-                return folder / inside
+class Models(NamedTuple):
+    """The sparse models of a scene, in the order of their numbers: its folder, the path of its images in it, and the
+    folders of the models."""
+
+    folder: Path
+    images: str
+    paths: list[Path]
+
+
+def find_models(folder: Path) -> Models | None:
+    """The COLMAP models of a scene, or None; the folder of one or of all of them stands for that of the scene."""
+    for place, images in PLACES.items():
+        folder = Path(os.path.abspath(folder)) if place == "." else folder
+        inside = folder / place
+        numbered = sorted(
+            (path for path in inside.glob("[0-9]*") if path.name.isdecimal()), key=lambda path: int(path.name)
+        )
+        if paths := [path for path in (*numbered, inside) if _suffix(path)]:
+            return Models(*(_scene_around(folder) if place == "." else (folder, images)), paths)
     return None
+
+
+def _scene_around(folder: Path) -> tuple[Path, str]:
+    """The folder of a scene and the path of its images in it; the folder may be that of models in the scene."""
+    models = folder.parent if folder.name.isdecimal() else folder
+    if not image_folders(folder):
+        for place, images in PLACES.items():
+            around = Path(*models.parts[: len(models.parts) - len(Path(place).parts)])
+            if around / place == models and image_folders(around, images):
+                return around, images
+    return folder, PLACES["."]
+
+
+def _suffix(folder: Path) -> str | None:
+    """The suffix of the files of a model, binary ones before text; None for a folder that has none."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{name}{suffix}").is_file() for name in FILES[:2]):
+            return suffix
+    return None
+
+
+def _count_images(folder: Path) -> int:
+    """The number of images of a model; that of a binary one is in its first bytes. A broken model has none."""
+    path = folder / f"images{_suffix(folder)}"
+    try:
+        if path.suffix == ".txt":
+            return sum(1 for _ in _text_images(path))
+        with open(path, "rb") as file:
+            count = int.from_bytes(file.read(8), "little")
+        return count if count * LEAST_IMAGE <= path.stat().st_size else 0
+    except (OSError, SceneError):
+        return 0
 
 
 def read_model(folder: Path) -> ColmapModel:
     """Reads a model; binary files come first where there are both. Without `points3D` it has no points."""
-    suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
+    suffix = _suffix(folder) or ".bin"
     cameras_path, images_path, points_path = (folder / f"{name}{suffix}" for name in FILES)
     binary = suffix == ".bin"
     try:
         cameras = dict((_cameras if binary else _text_cameras)(cameras_path))
         images = []
         for name, camera, values, points in (_images if binary else _text_images)(images_path):
+            if "\0" in name:
+                raise SceneError(f"{images_path}: the name of an image must have no zero byte, got {name!r:.60}")
             if camera not in cameras:
                 raise SceneError(f"{images_path}: image {name} has camera {camera}, which {cameras_path.name} has not")
             images.append(ColmapImage(name, cameras[camera], _pose(values, f"{images_path}: image {name}"), points))
@@ -149,21 +216,22 @@ class _Reader:
 
 def _cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     reader = _Reader(path)
-    for _ in range(reader.count(24 + 3 * 8, "cameras")):
+    for _ in range(reader.count(24 + 2 * 8, "cameras")):
         number, model, width, height = reader.values("<IiQQ")
-        if model not in MODELS:
-            raise SceneError(f"{path}: camera {number} has model number {model}, which is not known")
-        name, parameters = MODELS[model]
+        unknown = OTHER_MODELS.get(model, f"number {model}, newer than COLMAP 4.2,")
+        name, parameters = MODELS.get(model, (unknown, ""))
         yield number, _camera(path, number, name, width, height, reader.values(f"<{len(parameters.split())}d"))
 
 
+#: Bytes of an image without observations, whose name is empty.
+LEAST_IMAGE = 64 + 1 + 8
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 RawImage = tuple[str, int, tuple[float, ...], Array]
 
 
 def _images(path: Path) -> Iterator[RawImage]:
     reader = _Reader(path)
-    for _ in range(reader.count(64 + 1 + 8, "images")):
+    for _ in range(reader.count(LEAST_IMAGE, "images")):
         _, *values, camera = reader.values("<I7dI")
         name = reader.name()
         seen = reader.records(reader.count(OBSERVATION.itemsize, "observations"), OBSERVATION)["point"]
@@ -183,7 +251,7 @@ def _points(path: Path) -> Iterator[tuple[int, float, float, float, int]]:
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """The words of each line that is no comment, empty ones too, with its number."""
     _check_size(path)
-    with open(path, encoding="utf-8", errors="replace") as file:
+    with open(path, encoding="utf-8-sig", errors="replace") as file:  # Windows may begin it with a mark of its order
         for number, line in enumerate(file, 1):
             if not line.startswith("#"):
                 yield number, line.split()
@@ -267,29 +335,60 @@ def _pose(values: tuple[float, ...], where: str) -> Array:
 def load_colmap(folder: Path, reading: Reading) -> Scene:
     """Loads a capture with a COLMAP model; every 8th image in the order of their names is held out for testing.
 
-    The bounds of a view are the depths between which 98 % of its points lie.
+    Of several models the one with the most images is read. Black pixels of `masks` beside the images do not count. The
+    bounds of a view are the depths between which 98 % of its points lie.
     """
-    place = find_model(folder)
-    if place is None:
+    models = find_models(folder)
+    if models is None:
         raise SceneError(f"{folder}: has no COLMAP model, cameras and images as .bin or .txt, in sparse/0 or sparse")
+    folder = models.folder
+    inside = [path for path in models.paths if reading.allow_outside or not leads_outside(path / "images.bin", folder)]
+    counts = {path: _count_images(path) for path in inside} if len(inside) > 1 else {}
+    place = max(counts, key=lambda path: counts[path], default=(inside or models.paths)[0])
     for part in place.iterdir():
         stay_inside(part, folder, reading.allow_outside)
     model = read_model(place)
-    longest = max(max(image.camera.width, image.camera.height) for image in model.images)
-    chosen = choose_images(folder, reading.downscale, longest)
+    chosen = choose_images(folder, reading.downscale, models.images)
     names = [image.name for image in model.images]
-    views = []
-    for file, image in zip(named_images(model.path, chosen.path, names, reading.allow_outside), model.images):
-        if file is not None:
-            size = (float(image.camera.width), float(image.camera.height))
-            points = points_seen(image, model)
-            bounds, pose = depth_bounds(image, points), torch.from_numpy(image.pose)
-            views.append(View(file, pose, image.camera.lens, size, None, bounds, torch.from_numpy(points)))
-    models = sorted({image.camera.model for image in model.images})
-    about = [f"COLMAP model {place.relative_to(folder)} of {len(views)} images, {' and '.join(models)}", *chosen.notes]
-    if (folder / "sparse" / "1").is_dir():
-        about.append("other models in sparse are not read")
-    return photograph_scene(model.path, folder, views, None, reading, factor=chosen.factor, notes=about)
+    files, notes = named_images(model.path, chosen, names, reading.allow_outside)
+    images = [(file, image) for file, image in zip(files, model.images) if file is not None]
+    masks, mask_notes = _find_masks(model.path, chosen, images, reading.allow_outside)
+    headers, views = [read_header(file) for file, _ in images], []
+    for (file, image), mask, header in zip(images, masks, headers):
+        size = (float(image.camera.width), float(image.camera.height))
+        points = points_seen(image, model)
+        pose, bounds, seen = torch.from_numpy(image.pose), depth_bounds(image, points), torch.from_numpy(points)
+        views.append(View(file, pose, image.camera.lens, size, mask, bounds, seen, header))
+    kinds = sorted({image.camera.model for image in model.images})
+    about = [f"COLMAP model {place.relative_to(folder)} of {len(views)} images, {' and '.join(kinds)}"]
+    if counts:
+        sizes = ", ".join(f"{path.relative_to(folder)} of {count}" for path, count in counts.items())
+        other = next(path for path in counts if path != place)
+        about.append(f"the largest of the models is read: {sizes} images (--data {other} reads another one)")
+    about += [*chosen.notes, *notes, *mask_notes]
+    factor = chosen.reduction(headers)
+    return photograph_scene(model.path, folder, views, None, reading, factor=factor, notes=about)
+
+
+def _find_masks(
+    source: Path, folder: ImageFolder, images: list[tuple[Path, ColmapImage]], allow_outside: bool
+) -> tuple[list[Path | None], list[str]]:
+    """The masks of images: of 0.jpg 0.jpg.png, COLMAP's name, or 0.png; and a line about them."""
+    masks = folder.masks
+    if masks is None:
+        return [None] * len(images), []
+    names = [_name_inside(folder.path / image.name.replace("\\", "/"), folder.path) for _, image in images]
+    files = [_name_inside(file, folder.path) for file, _ in images]
+    by_name, by_file = (named_files(source, masks, each, allow_outside) for each in (names, files))
+    found = [one or other for one, other in zip(by_name, by_file)]
+    count = len(found) - found.count(None)
+    return found, [f"{count} of {len(found)} images have a mask in {masks.name}, whose black pixels do not count"]
+
+
+def _name_inside(path: Path, folder: Path) -> str:
+    """The name of a path in a folder, or its last part if it leads elsewhere."""
+    name = os.path.relpath(path, folder)
+    return path.name if name.startswith("..") else name
 
 
 def points_seen(image: ColmapImage, model: ColmapModel) -> Array:
@@ -301,7 +400,9 @@ def points_seen(image: ColmapImage, model: ColmapModel) -> Array:
 
 def depth_bounds(image: ColmapImage, points: Array) -> tuple[float, float] | None:
     """The depths between which the points [s, 3] of an image lie, but for outliers; None if they are too few."""
-    depth = -(points - image.pose[:3, 3]) @ image.pose[:3, 2]
+    apart = points - image.pose[:3, 3]
+    around = image.camera.lens.model == EQUIRECTANGULAR  # which has no axis along which depths are measured
+    depth = np.linalg.norm(apart, axis=1) if around else -apart @ image.pose[:3, 2]
     depth = depth[depth > 0]
     if len(depth) < LEAST_POINTS:
         return None

@@ -3,53 +3,81 @@
 from __future__ import annotations
 
 import logging
+import os
+import posixpath
 import re
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from voronerf.app.files import leads_outside
 from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.images import Header
 from voronerf.app.scenes.photographs import least_factor
 
 log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
-#: Images of phones, of which `voronerf process` makes JPEG.
+#: Images of phones, and all images of which `voronerf process` makes JPEG or PNG.
 HEIF = (".heic", ".heif")
+CONVERTED = (".tif", ".tiff", ".bmp", ".webp", *HEIF)
 
 
 class ImageFolder(NamedTuple):
-    """A folder of images, by how much they are still to be reduced, and lines about it."""
+    """A folder of images.
+
+    Attributes:
+        path: the folder.
+        full: the folder of the same images in full size, if that is another one.
+        masks: the folder of their masks.
+        factor: by how much the images are still to be reduced; None leaves it to their size.
+        notes: lines for the user.
+    """
 
     path: Path
-    factor: int
+    full: Path | None
+    masks: Path | None
+    factor: int | None
     notes: tuple[str, ...]
 
+    def reduction(self, headers: Sequence[Header]) -> int:
+        """By how much images with these headers are to be reduced."""
+        return self.factor or least_factor(max(max(header.size) for header in headers))
 
-def choose_images(folder: Path, downscale: int | None, longest: float) -> ImageFolder:
+
+def image_folders(folder: Path, images: str = "images") -> dict[int, Path]:
+    """The folders `images` and `images_N` of a scene, in any case, by N; `images` is a path in the scene's folder."""
+    around, name = (folder / images).parent, Path(images).name
+    matches = [
+        (re.fullmatch(rf"{name}(?:_([1-9]\d{{0,3}}))?", path.name, re.IGNORECASE), path)
+        for path in sorted(around.iterdir() if around.is_dir() else ())
+    ]
+    return {int(match[1] or 1): path for match, path in matches if match and path.is_dir()}
+
+
+def choose_images(folder: Path, downscale: int | None, images: str = "images") -> ImageFolder:
     """The folder of images that needs the least reduction.
 
-    With `downscale` N, `images_N` is read as it is, else `images`. Where there is no `images`, the largest `images_N`
-    is read, which a `downscale` of 1 takes as it is. None reduces the images as far as `least_factor` says; `longest`
-    is the longest side of those in `images`.
+    With `downscale` N, `images_N` is read as it is, else `images`, whose files are reduced by N, whatever size the
+    cameras are for. Where there is no `images`, the largest `images_N` is read, which a `downscale` of 1 takes as it
+    is. None reduces the images as far as `least_factor` says. `images` is a path in the scene's folder.
     """
-    sizes = {1: folder / "images"} if (folder / "images").is_dir() else {}
-    for path in folder.glob("images_*"):
-        match = re.fullmatch(r"images_([1-9]\d{0,3})", path.name)
-        if match and path.is_dir():
-            sizes[int(match[1])] = path
+    sizes = image_folders(folder, images)
     if not sizes:
-        raise SceneError(f"{folder}: has neither a folder images nor images_2, images_4, ...")
+        name = Path(images).name
+        raise SceneError(f"{folder}: has neither a folder {images} nor {name}_2, {name}_4, ...")
     chosen = downscale if downscale in sizes else min(sizes)
     if downscale is None:
-        factor = least_factor(longest / chosen)
+        factor = None
     elif downscale == 1 or downscale % chosen == 0:
         factor = max(downscale // chosen, 1)
     else:
         raise SceneError(f"{sizes[chosen]}: --downscale must be 1 or a multiple of {chosen}, got {downscale}")
-    notes = () if sizes[chosen].name == "images" else (f"{sizes[chosen].name} is read, and not images",)
-    return ImageFolder(sizes[chosen], factor, notes)
+    notes = () if chosen == 1 else (f"{sizes[chosen].name} is read, and not {images}",)
+    masks = image_folders(folder, posixpath.join(posixpath.dirname(images), "masks"))
+    full = sizes.get(1) if chosen > 1 else None
+    return ImageFolder(sizes[chosen], full, masks.get(chosen, masks.get(1)), factor, notes)
 
 
 def stay_inside(path: Path, folder: Path, allow_outside: bool, name: str = "") -> None:
@@ -61,21 +89,108 @@ def stay_inside(path: Path, folder: Path, allow_outside: bool, name: str = "") -
         raise SceneError(f"{name or path}: must lie in the folder of the scene; --allow-outside reads others")
 
 
-def named_images(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
-    """The files of names in a folder, None for those that are missing; with a warning that says how many."""
-    files: list[Path | None] = []
-    for name in names:
-        path = folder / name.replace("\\", "/")
-        stay_inside(path, folder.parent, allow_outside)
-        files.append(path if path.is_file() else None)
+def named_images(
+    source: Path, images: ImageFolder, names: Sequence[str], allow_outside: bool
+) -> tuple[list[Path | None], tuple[str, ...]]:
+    """Finds the files of names in a folder of images, as `named_files` does; else by their order if all are there.
+
+    Returns:
+        (the file of each name, None for those that are missing, with a warning that says how many; lines for the user).
+    """
+    files = named_files(source, images.path, names, allow_outside)
+    notes: tuple[str, ...] = ()
+    if not any(files):
+        files = _files_in_order(source, images, names, allow_outside)
+        notes = (f"the names in {images.path.name} are not those of the model: its images are taken in their order",)
     missing = files.count(None)
     if missing == len(files):
-        raise SceneError(f"{source}: none of its {len(files)} images exists, the first is {folder / names[0]}")
+        raise SceneError(f"{source}: none of its {len(files)} images exists, the first is {images.path / names[0]}")
     if missing:
         log.warning("%s: %d of %d listed images are missing and are skipped", source, missing, len(files))
-    return files
+    return files, notes
+
+
+def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
+    """Finds the files of names in a folder and the folders in it; None for those that are missing.
+
+    A name is that of a file as it is; else without the suffix of either, else in another case. Where no name is found
+    so, and the last parts of the names differ from each other, the last parts are compared in the same way.
+    """
+    names = [posixpath.normpath(name.replace("\\", "/")) for name in names]
+    found = {
+        name: folder / name
+        for name in names
+        if os.path.isfile(folder / name) and (allow_outside or not leads_outside(folder / name, folder.parent))
+    }
+    if len(found) < len(set(names)):
+        files = image_files(folder)
+        _compare(source, folder, set(names), files, found, str)
+        if not found and len(set(map(posixpath.basename, names))) == len(set(names)):
+            _compare(source, folder, set(names), files, found, posixpath.basename)
+    for name in names:
+        if name in found or not posixpath.isabs(name):  # of another machine
+            stay_inside(found.get(name, folder / name), folder.parent, allow_outside)
+    return [found.get(name) for name in names]
+
+
+def _compare(
+    source: Path, folder: Path, names: set[str], files: list[Path], found: dict[str, Path], part: Callable[[str], str]
+) -> None:
+    """Adds what is found of names by comparing a part of the paths; nothing that two names or two files share."""
+    for fold in (str, str.casefold):
+        for cut, cut_file in ((str, str), (str, _without_suffix), (_without_suffix, _without_suffix)):
+            fitting = defaultdict(list)
+            for path in files:
+                fitting[fold(cut_file(part(path.relative_to(folder).as_posix())))].append(path)
+            keys = {name: fold(cut(part(name))) for name in names}
+            counts, taken = Counter(keys.values()), set(found.values())
+            for name in sorted(names - found.keys()):
+                paths = fitting.get(keys[name], [])
+                if len(paths) > 1 and part is str:
+                    both = " or ".join(path.relative_to(folder).as_posix() for path in paths[:2])
+                    raise SceneError(f"{source}: {name} may be {both} in {folder}: leave one of them there")
+                if len(paths) == counts[keys[name]] == 1 and paths[0] not in taken:
+                    found[name] = paths[0]
+
+
+def _without_suffix(name: str) -> str:
+    return posixpath.splitext(name)[0]
+
+
+def _files_in_order(source: Path, images: ImageFolder, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
+    """The files of names by the order of the names; or, of reduced images, by that of the images in full size.
+
+    None are found where the order of the characters is not that of the numbers in names, as of 10.jpg and 9.jpg: others
+    may have counted on.
+    """
+    files = image_files(images.path)
+    ordered: list[Any] = sorted(set(names)) if images.full is None else image_files(images.full)
+    if len(ordered) != len(files) or not (_counts_on(ordered) and _counts_on(files)):
+        return [None] * len(names)
+    places = dict(zip(ordered, files))
+    if images.full is None:
+        return [places.get(name) for name in names]
+    return [path and places.get(path) for path in named_files(source, images.full, names, allow_outside)]
+
+
+def _counts_on(paths: Sequence[Path | str]) -> bool:
+    """Whether the numbers in sorted paths are in order, too."""
+    parts = [re.split(r"(\d+)", str(path)) for path in paths]
+    keys = [[int(part) if part.isdecimal() else part for part in each] for each in parts]
+    return keys == sorted(keys)
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The image files of a folder and the folders in it, in the order of their paths."""
+    files = (path for path in folder.rglob("*") if _is_image(path))
+    return sorted(files, key=lambda path: path.relative_to(folder).as_posix())
 
 
 def listed_images(folder: Path) -> list[Path]:
     """The image files of a folder in the order of their names."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    return sorted(path for path in folder.iterdir() if _is_image(path))
+
+
+def _is_image(path: Path) -> bool:
+    """Whether a path is that of an image file; macOS puts others beside them, as ._a.jpg."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()

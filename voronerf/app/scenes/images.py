@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
+from PIL.JpegImagePlugin import JpegImageFile
 from torch import Tensor
 
 from voronerf.app.scenes.errors import SceneError
@@ -29,6 +30,8 @@ UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.err
 TURNS = {3: 2, 6: 3, 8: 1}
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_DEPTH = 24  # offset of the bits a channel
+#: Alpha from which a pixel counts where alpha is a mask; less is a border, and what lies behind shows.
+OPAQUE = 250
 #: Share of the free memory that a scene may need; the rest is for the networks.
 SHARE = 0.75
 #: Bytes for each pixel while a view is rendered and scored, most of them for SSIM.
@@ -83,7 +86,7 @@ def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 def read_header(path: Path) -> Header:
     """Reads the header of an image file, without its pixels."""
     with _opened(path) as file:
-        jpeg, turns = file.format == "JPEG", 0
+        jpeg, turns = isinstance(file, JpegImageFile), 0
         if jpeg:  # of PNG, Pillow would decode the pixels
             with contextlib.suppress(*UNREADABLE):  # a broken tag is none
                 turns = TURNS.get(file.getexif().get(ExifTags.Base.Orientation, 1), 0)
@@ -208,21 +211,23 @@ def read_masks(
     factor: int,
     *,
     name: str = "images",
+    alpha: bool = False,
 ) -> Tensor | None:
     """Decodes the masks of images: black pixels do not count, nor does a block that has one.
 
     Args:
         masks: the mask file of each image, or None if the whole image counts.
         paths: of the images.
-        images: which have the sizes of their masks, and are turned as these will be; where they are on disk, so are
-            these.
+        images: of the sizes of their masks or reduced from these, and turned as the masks will be; where they are on
+            disk, so are the masks.
         factor: of the reduction.
         name: of the scene.
+        alpha: transparent pixels do not count either.
 
     Returns:
-        bool [c, h, w], False around smaller images; None if no image has a mask.
+        bool [c, h, w], False around smaller images; None if no image has a mask and ``alpha`` is False.
     """
-    if not any(masks):
+    if not any(masks) and not alpha:
         return None
     turns, shape = images.turns, (len(masks), *images.images.shape[1:3])
 
@@ -232,23 +237,51 @@ def read_masks(
         kept: Any = np.ones((height, width), dtype=bool)
         if mask is not None:
             with _opened(mask) as file:
-                if list(file.size) != size:
-                    raise SceneError(
-                        f"{mask}: is {file.size[0]} x {file.size[1]} pixels, {path.name} is {size[0]} x {size[1]}"
-                    )
-                kept = np.asarray(file.convert("L"))[: height * factor, : width * factor] > 0
+                kept = drawn(file, size, turns[index])
+            high, wide = kept.shape
+            scale = wide / size[0]  # above 1 the mask is that of the image before it was reduced
+            if scale < 1 or abs(high - scale * size[1]) >= scale:
+                raise SceneError(f"{mask}: is {wide} x {high} pixels, {path.name} is {size[0]} x {size[1]}")
+            if scale > 1:
+                whole = Image.fromarray(kept.astype(np.uint8) * 255)
+                kept = np.asarray(whole.resize(size, Image.Resampling.BOX)) == 255
+            kept = kept[: height * factor, : width * factor]
             kept = kept.reshape(height, factor, width, factor).all(axis=(1, 3))
-        if not kept.any():
-            raise SceneError(f"{mask}: must leave a pixel, or with --downscale a block of pixels, of {path.name}")
         kept = np.rot90(kept, turns[index])
+        if alpha:
+            kept = kept & (images.images[index, : kept.shape[0], : kept.shape[1], 3].numpy() >= OPAQUE)
+        if not kept.any():
+            what = f"{mask}: must" if mask else f"{path}: its alpha must"
+            raise SceneError(
+                f"{what} leave a pixel that counts, or with --downscale a block of pixels; else take the image away"
+            )
         place = np.zeros(shape[1:], dtype=np.uint8)
         place[: kept.shape[0], : kept.shape[1]] = kept
         return place
 
     if images.on_disk:
-        sources = [None if mask is None else str(mask.absolute()) for mask in masks]
-        return stored(f"{name}-masks", [sources, factor, turns], _times(masks), shape, make, 1).view(torch.bool)
+        files = [*masks, *(paths if alpha else ())]
+        sources = [None if file is None else str(file.absolute()) for file in files]
+        return stored(f"{name}-masks", [sources, factor, turns], _times(files), shape, make, 1).view(torch.bool)
     return torch.from_numpy(np.stack([make(index) for index in range(len(masks))])).view(torch.bool)
+
+
+def drawn(mask: Image.Image, size: Sequence[int], turns: int) -> NDArray[np.bool_]:
+    """The pixels of a mask that count, bool [h, w] of the image as it is stored: neither black nor transparent.
+
+    A mask may have been drawn on the upright image, which a tag makes of the stored one by quarter turns. Of a JPEG,
+    which blurs borders, what is darker than grey is black.
+
+    Args:
+        mask: its file, opened.
+        size: (width, height) of the image as it is stored, or in proportion.
+        turns: quarters anticlockwise, of the image's tag.
+    """
+    kept = np.asarray(mask.convert("L")) > (127 if isinstance(mask, JpegImageFile) else 0)
+    if mask.has_transparency_data:
+        kept = kept & (np.asarray(mask.convert("RGBA"))[..., 3] > 0)
+    upright = turns % 2 == 1 and (mask.width > mask.height) != (size[0] > size[1])
+    return np.rot90(kept, -turns) if upright else kept
 
 
 @contextlib.contextmanager
@@ -276,8 +309,11 @@ def _has_alpha(file: Image.Image) -> bool:
 
 
 def _reduce_while_decoding(file: Image.Image, factor: int) -> int:
-    """Lets a JPEG file be decoded in a part of its size; returns the factor that is left."""
-    size, step = file.size, _reduction(file.format == "JPEG", factor)
+    """Lets a JPEG file be decoded in a part of its size; returns the factor that is left.
+
+    Files with a second picture, which Pillow calls MPO, are JPEG, too.
+    """
+    size, step = file.size, _reduction(isinstance(file, JpegImageFile), factor)
     if step > 1:
         file.draft("RGB", (size[0] // step, size[1] // step))
     return factor if file.size == size else factor // step

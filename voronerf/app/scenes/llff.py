@@ -13,6 +13,7 @@ import torch
 
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import choose_images, listed_images, stay_inside
+from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import PERSPECTIVE, Lens
 from voronerf.app.scenes.photographs import Reading, View, photograph_scene
 from voronerf.app.scenes.scene import Scene
@@ -29,15 +30,15 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
     path = folder / FILE
     stay_inside(path, folder, reading.allow_outside)
     rows = _read(path)
-    chosen = choose_images(folder, reading.downscale, float(rows[:, [4, 9]].max()))
+    chosen = choose_images(folder, reading.downscale)
     stay_inside(chosen.path, folder, reading.allow_outside)
     files = listed_images(chosen.path)
     if len(files) != len(rows):
         raise SceneError(f"{path}: has poses of {len(rows)} images, {chosen.path} has {len(files)} images")
-    views = []
+    headers, views = [], []
     for number, (file, row) in enumerate(zip(files, rows)):
         stay_inside(file, folder, reading.allow_outside)
-        matrix, (near, far) = row[:15].reshape(3, 5), row[15:]
+        matrix, (near, far) = row[:15].reshape(3, 5), row[15:].tolist()
         height, width, focal = matrix[:, 4].tolist()
         pose = np.eye(4)
         pose[:3] = np.stack((matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]), axis=1)
@@ -48,9 +49,11 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
             came = ", ".join(f"{value:g}" for value in row[[4, 9, 14, 15, 16]])
             raise SceneError(f"{path}: row {number} must have a size, a focal length and 0 < near < far, got {came}")
         lens = Lens((focal, focal, width / 2, height / 2), (0.0,) * 8, PERSPECTIVE)
-        views.append(View(file, torch.from_numpy(pose), lens, (width, height), bounds=(float(near), float(far))))
+        headers.append(read_header(file))
+        views.append(View(file, torch.from_numpy(pose), lens, (width, height), bounds=(near, far), header=headers[-1]))
     about = (f"LLFF's {FILE} of {len(views)} images", *chosen.notes)
-    return photograph_scene(path, folder, views, None, reading, factor=chosen.factor, notes=about)
+    factor = chosen.reduction(headers)
+    return photograph_scene(path, folder, views, None, reading, factor=factor, notes=about)
 
 
 def _read(path: Path) -> np.ndarray:

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.images import Decoded, Header, read_images, read_masks
-from voronerf.app.scenes.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
+from voronerf.app.scenes.images import OPAQUE, Decoded, Header, read_images, read_masks
+from voronerf.app.scenes.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Lens, have_rays
 from voronerf.app.scenes.scene import Scene, SparseDepth, Split
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
 from voronerf.nerf.cameras import Cameras, focus_point
@@ -42,6 +42,16 @@ LEAST_NEAR = 0.02
 NEARER, FARTHER = 0.75, 1.5
 # Mean of the viewing directions, a unit vector each, from which on they count as one direction.
 PARALLEL = 0.95
+# A picture of an object on white: so much of it is transparent, and so much of its border. Masks of people, edges after
+# straightening and single pixels are less of one of both.
+CLEAR, CLEAR_BORDER = 0.25, 0.5
+# Positions along each side of an image whose rays say how far it sees, where its corners have none.
+ACROSS = 65
+# Share of the pixels of an image to which its lens must give a ray.
+LEAST_RAYS = 0.25
+# By how many pixels a reduced image may have another shape than the one before: sizes are whole numbers, and exporters
+# that scale images may write fractions.
+ROUNDED = 2
 KIND_LINES = {
     "object": "an object on white, from the images' alpha",
     "forward": "forward facing, the cameras look the same way",
@@ -52,8 +62,8 @@ KIND_LINES = {
 
 class View(NamedTuple):
     """A photograph: its file, its pose float64 [4, 4], camera to world, its lens and the (width, height) that this is
-    for; and where known its mask, the depths between which its points lie, these points float64 [s, 3], and the
-    header of the file."""
+    for; and where known its mask, the depths between which its points lie, these points float64 [s, 3], the header of
+    the file, and the radius of the circle around its middle outside of which nothing counts, in pixels of ``size``."""
 
     path: Path
     pose: Tensor
@@ -63,6 +73,7 @@ class View(NamedTuple):
     bounds: tuple[float, float] | None = None
     points: Tensor | None = None
     header: Header | None = None
+    circle: float | None = None
 
 
 @dataclass(frozen=True)
@@ -86,7 +97,7 @@ def distinct_names(paths: list[Path], folder: Path) -> list[str]:
     """A unique name for each image, under which pictures of it are stored.
 
     The names are the stems of the files if these differ; otherwise the paths inside the folder of the scene, such as
-    a_00 for a/00.png; and if a file is listed twice, the paths behind the number of the image.
+    a_00 for a/00.png; and if some of these are the same, the paths behind the number of the image.
     """
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
@@ -120,16 +131,17 @@ def photograph_scene(
         notes: what the loader has to say.
         transform: float64 [4, 4], from the original coordinates to those of the poses.
     """
+    views, held_out, repeats = _listed_once(views, held_out)
     places = torch.stack([view.pose[:3, 3] for view in views])
     lost = lost_cameras(places)
-    notes = [*notes, *_far_notes(views, lost, reading.keep_far)]
+    notes = [*notes, *repeats, *_far_notes(views, lost, reading.keep_far)]
     if not reading.keep_far:
         views = [view for view, left_out in zip(views, lost.tolist()) if not left_out]
         held_out = None if held_out is None else held_out[~lost]
     views, count = _training_first(views, held_out, source)
     name = folder.resolve().name
     poses = torch.stack([view.pose for view in views])
-    pictures, masks, kind = _read_pictures(views, poses, factor, reading, source, name)
+    pictures, masks, kind, masked = _read_pictures(views, poses, factor, reading, source, name)
     bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
     upright = _turned(Cameras(poses, torch.ones(len(poses), 4), 1, 1), pictures.turns).poses
     frame = find_frame(upright, kind, bounds if len(bounds) else None, normalise=reading.normalise)
@@ -141,7 +153,7 @@ def photograph_scene(
         _ = cameras.lenses
     except ValueError as error:
         raise SceneError(f"{source}: {error}") from None
-    masks = _without_dark_corners(cameras, masks, source, views)
+    masks, shown = _masked_by_lenses(cameras, masks, source, views, factor, pictures.turns)
     box = None
     if kind == "object":
         box = carve_box(cameras[:count], pictures.images[:count, ..., 3], frame.near, frame.far)
@@ -155,7 +167,7 @@ def photograph_scene(
         for part in (slice(count), slice(count, None))
     )
     faults = camera_faults(places, bounds, ((view.lens, view.size[0]) for view in views))
-    notes = [*notes, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
+    notes = [*notes, *masked, *shown, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
     if reading.downscale is None and factor > 1:
         size = f"{cameras.width} x {cameras.height}"
         notes.append(f"images are reduced by {factor}, to {size} (--downscale 1 keeps their size)")
@@ -174,6 +186,21 @@ def photograph_scene(
     )
 
 
+def _listed_once(
+    views: Sequence[View], held_out: Tensor | None
+) -> tuple[Sequence[View], Tensor | None, tuple[str, ...]]:
+    """Views of different files, and which are held out: one file could be trained and tested. A line names repeats."""
+    first: dict[Path, int] = {}
+    for index, view in enumerate(views):
+        first.setdefault(view.path.resolve(), index)
+    if len(first) == len(views):
+        return views, held_out, ()
+    kept = list(first.values())
+    names = [views[index].path.name for index in sorted(set(range(len(views))) - set(kept))]
+    note = f"of images that are listed twice the first counts: {some_of(names)}"
+    return [views[index] for index in kept], None if held_out is None else held_out[kept], (note,)
+
+
 def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path) -> tuple[list[View], int]:
     """The training views and then the others, so that the images of both are slices and no copies; how many train."""
     if held_out is None:
@@ -187,21 +214,51 @@ def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path
 
 def _read_pictures(
     views: Sequence[View], poses: Tensor, factor: int, reading: Reading, source: Path, name: str
-) -> tuple[Decoded, Tensor | None, str]:
-    """Reads images and masks of views, and tells the kind of scene; only an object keeps its alpha."""
+) -> tuple[Decoded, Tensor | None, str, tuple[str, ...]]:
+    """Reads images and masks of views, and tells the kind of scene and whether alpha was a mask.
+
+    An object keeps its alpha. Elsewhere transparent pixels are masked: people who walk through, and what straightening
+    has left without colour.
+    """
     paths, headers = [view.path for view in views], [view.header for view in views]
     read = functools.partial(read_images, paths, factor, headers=headers, name=name, upright=True)
-    pictures = read(keep=reading.images)
-    masks = read_masks([view.mask for view in views], paths, pictures, factor, name=name)
+    pictures, notes = read(keep=reading.images), tuple[str, ...]()
+    for view, turns in zip(views, pictures.turns):
+        if view.lens.model == EQUIRECTANGULAR and turns % 2:
+            raise SceneError(f"{view.path}: a picture all around must have no orientation tag of a quarter turn")
     has_alpha = pictures.images.shape[-1] == 4
-    transparent = has_alpha and any(bool((image[..., 3] < 255).any()) for image in pictures.images)
-    around = any(view.lens.model == EQUIRECTANGULAR for view in views)
-    kind = _kind(poses, transparent, around, reading, source)
+    alphas = _alphas(pictures, factor) if has_alpha else []
+    models = {view.lens.model for view in views}
+    with_alpha = sum(bool((alpha < OPAQUE).any()) for alpha in alphas)
+    # Of a fisheye, what surrounds its circle may be transparent.
+    cut_out = not models & {EQUIRECTANGULAR, FISHEYE} and sum(map(_is_cut_out, alphas)) > len(alphas) / 2
+    kind = _kind(poses, with_alpha > 0, cut_out, EQUIRECTANGULAR in models, reading, source)
+    as_mask = with_alpha > 0 and kind != "object"
+    masks = read_masks([view.mask for view in views], paths, pictures, factor, name=name, alpha=as_mask)
+    if as_mask:
+        some = f"{with_alpha} of {len(views)} images"
+        notes = (f"transparent pixels, in {some}, are masked (--kind object puts them on white)",)
     if kind != "object" and has_alpha:
         # On disk they are stored again: a part of each pixel cannot be drawn from a mapped file without a copy.
         again = read(keep="disk", most_channels=3) if pictures.on_disk else None
         pictures = again or pictures._replace(images=pictures.images[..., :3].contiguous())
-    return pictures, masks, kind
+    return pictures, masks, kind, notes
+
+
+def _alphas(pictures: Decoded, factor: int) -> list[Tensor]:
+    """The alpha [h, w] of each image, without what lies around smaller ones."""
+    alphas = []
+    for image, size, turns in zip(pictures.images, pictures.sizes, pictures.turns):
+        width, height = ((size.flip(0) if turns % 2 else size) // factor).tolist()
+        alphas.append(image[:height, :width, 3])
+    return alphas
+
+
+def _is_cut_out(alpha: Tensor) -> bool:
+    """Whether an image with this alpha [h, w] shows an object before nothing."""
+    clear = alpha < 128
+    border = torch.cat((clear[0], clear[-1], clear[:, 0], clear[:, -1]))
+    return float(clear.float().mean()) >= CLEAR and float(border.float().mean()) >= CLEAR_BORDER
 
 
 def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
@@ -318,7 +375,11 @@ def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Per
     axes = frame.axes.float()
     for index in range(len(cameras)):
         width, height = cameras.size(index)
-        rays = cameras.rays(index, torch.tensor([0.0, width, 0.0, width]), torch.tensor([0.0, 0.0, height, height]))
+        x, y = torch.cartesian_prod(torch.tensor([0.0, width]), torch.tensor([0.0, height])).T
+        if not (there := have_rays(cameras, index, x, y)).all():  # corners of a wide lens
+            x, y = torch.cartesian_prod(torch.linspace(0, width, ACROSS), torch.linspace(0, height, ACROSS)).T
+            there = have_rays(cameras, index, x, y)
+        rays = cameras.rays(index, x[there], y[there])
         for distance in (frame.near, frame.far):
             local = (rays.origins + distance * rays.directions - centre) @ axes.T
             slopes = torch.maximum(slopes, (local[:, :2].abs() / local[:, 2:].clamp_min(frame.near / 2)).amax(0))
@@ -341,13 +402,16 @@ def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
     return torch.stack((x, torch.linalg.cross(z, x), z))
 
 
-def _kind(poses: Tensor, transparent: bool, around: bool, reading: Reading, source: Path) -> str:
-    """The kind that was asked for, or the one that transparent pixels and cameras show; some may see all around."""
+def _kind(poses: Tensor, transparent: bool, cut_out: bool, around: bool, reading: Reading, source: Path) -> str:
+    """The kind that was asked for, or the one that pictures and cameras show.
+
+    Pixels may be transparent, most pictures cut out, and some cameras may see all around.
+    """
     if reading.kind == "object" and not transparent:
         raise SceneError(f"{source}: --kind object needs images with transparent pixels, these are opaque")
     if reading.kind != "auto":
         return reading.kind
-    if transparent:
+    if cut_out:
         return "object"
     if around:
         return "inside-out"
@@ -363,8 +427,7 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
     intrinsics = []
     for view, (width, height) in zip(views, sizes.tolist()):
         across, down = width / view.size[0], height / view.size[1]
-        # Reduced images have sizes of whole pixels; exporters that scale images may write fractions.
-        if abs(across - down) * max(view.size) > 2:
+        if abs(across - down) * max(view.size) > ROUNDED * max(across, 1):
             raise SceneError(
                 f"{view.path}: is {width} x {height} pixels as stored, but {source} says {view.size[0]:g} x "
                 f"{view.size[1]:g}"
@@ -403,22 +466,48 @@ def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
     return Cameras.of_images(poses, intrinsics, sizes, distortion, cameras.models)
 
 
-def _without_dark_corners(cameras: Cameras, masks: Tensor | None, source: Path, views: Sequence[View]) -> Tensor | None:
-    """The masks without the pixels that no ray of a fisheye or an FOV lens reaches."""
-    inverts = lens_inverts(cameras)
-    if bool(inverts.all()):
-        return masks
-    perspective = torch.tensor([view.lens.model == PERSPECTIVE for view in views])
-    if bool((wrong := perspective & ~inverts).any()):
-        name = views[int(wrong.int().argmax())].path.name
-        raise SceneError(f"{source}: the lens distortion of {name} cannot be inverted inside the image")
+def _masked_by_lenses(
+    cameras: Cameras, masks: Tensor | None, source: Path, views: Sequence[View], factor: int, turns: Sequence[int]
+) -> tuple[Tensor | None, tuple[str, ...]]:
+    """The masks without the pixels that have no ray of a lens or lie outside of a fisheye's circle, and a line."""
+    shown: dict[int, Tensor] = {}
+    for index, view in enumerate(views):
+        there = cameras.has_ray(index)
+        share = 1.0 if there is None else float(there.float().mean())
+        if share < LEAST_RAYS:
+            raise SceneError(
+                f"{source}: the lens of {view.path.name} gives a ray to {share:.0%} of its pixels, at least "
+                f"{LEAST_RAYS:.0%} must have one; check its focal length and distortion"
+            )
+        if view.circle is not None:
+            circle = _circle(view, factor).rot90(turns[index])
+            there = circle if there is None else there & circle
+        if there is not None and not there.all():
+            shown[index] = there
+    if not shown:
+        return masks, ()
     if masks is None:
         masks = torch.ones(len(cameras), cameras.height, cameras.width, dtype=torch.bool)
     masks = masks.clone()  # it may be mapped from a file
-    for index in (~inverts).nonzero()[:, 0].tolist():
-        width, height = cameras.size(index)
-        masks[index, :height, :width] &= pixels_with_rays(cameras, index)
-    return masks
+    for index, there in shown.items():
+        height, width = there.shape
+        masks[index, :height, :width] &= there
+        if not masks[index].any():
+            raise SceneError(f"{views[index].path}: its mask and its lens must leave a pixel")
+    dark = 1 - sum(map(torch.sum, shown.values())) / sum(map(torch.numel, shown.values()))
+    return masks, (f"{dark:.0%} of the pixels of {len(shown)} images are none that their lens shows, and are masked",)
+
+
+def _circle(view: View, factor: int) -> Tensor:
+    """The pixels of a reduced image within the circle of its fisheye, bool [h, w] as it is stored."""
+    assert view.header is not None and view.circle is not None
+    width, height = view.header.size
+    y, x = torch.meshgrid(
+        factor * (torch.arange(height // factor) + 0.5) - height / 2,
+        factor * (torch.arange(width // factor) + 0.5) - width / 2,
+        indexing="ij",
+    )
+    return torch.hypot(x, y) <= view.circle * width / view.size[0]
 
 
 def _note(kind: str, frame: Frame, reading: Reading) -> str:

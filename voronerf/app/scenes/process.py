@@ -2,7 +2,7 @@
 
 Its stages leave what they found in `OUT/colmap`, where a stopped process goes on and COLMAP's own program can look:
 
-    features   `database.db`: the features of each image; `masks`: where images are not transparent
+    features   `database.db`: the features of each image; `masks`: where images are not transparent, nor masked
     pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: those that share some
     matches    `database.db`: matches of those pairs
     cameras    `global` and, if that model has faults or loses cameras, `incremental`. Each is made again, by
@@ -16,15 +16,14 @@ from Motion", section 4; the global mapper is that of Pan et al. 2024, "Global S
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import itertools
 import json
 import os
 import re
 import shutil
 import signal
-import subprocess
 import threading
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,12 +31,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from PIL import ExifTags, Image
+from PIL import Image
 
 from voronerf.app.files import write_text
 from voronerf.app.scenes.colmap import FILES, ColmapImage, ColmapModel, depth_bounds, points_seen, read_model
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.folders import HEIF, listed_images
+from voronerf.app.scenes.folders import listed_images
 from voronerf.app.scenes.folds import (
     STILL,
     Matches,
@@ -50,14 +49,13 @@ from voronerf.app.scenes.folds import (
     trusted_pairs,
     wide_pairs,
 )
-from voronerf.app.scenes.images import UNREADABLE, read_header, read_image
+from voronerf.app.scenes.gather import Progress, emptied, gather
+from voronerf.app.scenes.images import read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
 from voronerf.app.scenes.transforms import Shot, write_transforms
+from voronerf.app.wording import did_you_mean
 
-#: Formats of a video. A playlist would name other files.
-CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
-LEAST_IMAGES = 3
 MATCHINGS = ("auto", "exhaustive", "sequential")
 MAPPERS = ("auto", "global", "incremental")
 #: Of transparent images, the alpha from which features count.
@@ -93,7 +91,6 @@ LEAST_SIDE = 256
 #: The start of the names of COLMAP's logs, and what they say when a stage of the global mapper begins.
 LOG, BEGINS = "log.", re.compile(r"=== Running (?:iterative )?(.+) ===")
 
-Progress = Callable[[str, int, int], None]
 Size = tuple[int, int]
 Item = TypeVar("Item")
 
@@ -147,10 +144,13 @@ def process(
     goes on there. `out/sparse/0` appears when all is done.
 
     Args:
-        source: a video, or a folder of PNG, JPEG or, with pillow-heif, HEIC images. Transparent parts have no features:
-            the surroundings of an object on a turntable, which stand still, must be so.
+        source: a video, or a folder of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC images; if it has none,
+            those of its folder `images`, or of all its folders, are taken. Transparent parts have no features: the
+            surroundings of an object on a turntable, which stand still, must be so. Nor have parts that are black in
+            the mask of an image `0.jpg`: `0.jpg.png` or `0.png` in a folder `masks` in or beside that of the images.
+            Masks go along to `out/masks`.
         out: the folder to make. It must not exist, be empty, or be that of a process that was stopped.
-        frames: of a video, evenly spread.
+        frames: of a video, evenly spread; all of a video that has fewer.
         matching: which images are matched: "exhaustive", all with all; "sequential", with those next to them by name;
             "auto", those whose largest features match, and the next two by name.
         camera_model: COLMAP's name of the model of the lens.
@@ -163,18 +163,25 @@ def process(
         say: takes a line about each step.
         progress: takes the name of a stage, how much of it is done and how much there is; 0 where that is not known.
     """
-    names = [name for name, _ in MODELS.values()]
+    names = [name for name, _ in MODELS.values() if name != "EQUIRECTANGULAR"]
     for argument, value, known in (
         ("matching", matching, MATCHINGS),
         ("mapper", mapper, MAPPERS),
         ("camera_model", camera_model, names),
     ):
         if value not in known:
-            raise ValueError(f"process: {argument} must be one of {', '.join(known)}, got {value!r:.60}")
+            end = did_you_mean(value, known)
+            raise ValueError(f"process: {argument} must be one of {', '.join(known)}, got {value!r:.60}{end}")
     if max_features < 100:
         raise ValueError(f"process: max_features must be at least 100, got {max_features}")
     if size < 64:
         raise ValueError(f"process: size must be at least 64, got {size}")
+    if not source.exists():
+        raise SceneError(f"{source}: there is no such video or folder")
+    settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features, size)
+    work = _begin(out, settings)
+    if not (images := out / "images").is_dir():
+        _begin_images(source, out, frames, say, progress)
     os.environ.setdefault("GLOG_logbuflevel", "-1")  # COLMAP reads it when it is loaded: its log is not held back
     stopping = signal.getsignal(signal.SIGTERM)
     try:
@@ -183,26 +190,20 @@ def process(
         raise ImportError("voronerf process needs pycolmap: pip install 'voronerf[colmap]'") from None
     with contextlib.suppress(ValueError):  # in another thread than the main one
         signal.signal(signal.SIGTERM, stopping)  # importing pycolmap installs glog's handler, which prints a stack
-    if not source.exists():
-        raise SceneError(f"{source}: there is no such video or folder")
-    settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features, size)
-    work = _begin(out, settings)
     log, level = pycolmap.logging, pycolmap.logging.Level
     log.minloglevel, log.logtostderr, log.alsologtostderr = level.INFO.value, False, verbose
     log.stderrthreshold = level.FATAL.value
     log.set_log_destination(level.INFO, work / LOG)
     for other in (level.WARNING, level.ERROR):  # which are in that log, too
         log.set_log_destination(other, "")
-    if not (images := out / "images").is_dir():
-        _gather(source, out, frames, say)
-    files = listed_images(images)
+    files, masks = listed_images(images), out / "masks"
     sizes = {path.name: read_header(path).size for path in files}
-    count = len(set(sizes.values()))
-    shared = "one camera" if count == 1 else f"{count} cameras, one for each size"
+    counts = [f"{count} of {width} x {height}" for (width, height), count in Counter(sizes.values()).most_common()]
+    shared = "one camera" if len(counts) == 1 else f"{len(counts)} cameras, one for each size: {some_of(counts)}"
     say(f"{len(files)} images with {shared}; {work} keeps what COLMAP finds")
     stages = Stages(pycolmap, work, images, progress)
-    if any(read_header(path).alpha for path in files):
-        _write_masks(files, work / "masks")
+    if masks.is_dir() or any(read_header(path).alpha for path in files):
+        _write_masks(files, masks, work / "masks")
     _match(stages, sizes, settings)
     matches = _read_matches(stages)
     still, pairs = still_pairs(matches)
@@ -226,7 +227,12 @@ def process(
         _write_reduced(files, out / f"images_{factor}", factor)
     shown = [
         Shot(
-            f"images/{each.name}", torch.from_numpy(each.pose), each.camera.lens, each.camera.width, each.camera.height
+            f"images/{each.name}",
+            torch.from_numpy(each.pose),
+            each.camera.lens,
+            each.camera.width,
+            each.camera.height,
+            f"masks/{each.name}.png" if (masks / f"{each.name}.png").is_file() else "",
         )
         for each in best.images
     ]
@@ -256,86 +262,25 @@ def _begin(out: Path, settings: Settings) -> Path:
     part = out / BEGUN
     if out.exists() and (not out.is_dir() or any(path != part for path in out.iterdir())):
         raise SceneError(f"{out}: must not exist yet, be an empty folder, or be that of a process that was stopped")
-    write_text(_emptied(part) / noted.name, json.dumps(settings._asdict(), indent=1))
+    write_text(emptied(part) / noted.name, json.dumps(settings._asdict(), indent=1))
     os.replace(part, work)
     return work
 
 
-def _gather(source: Path, out: Path, frames: int, say: Callable[[str], None]) -> None:
-    """Copies the images of a folder, or takes those of a video, to `out/images`.
-
-    COLMAP's lists of pairs separate names by spaces: names have `_` in their place. HEIC images become JPEG.
-    """
-    part = _emptied(out / ".images")
+def _begin_images(source: Path, out: Path, frames: int, say: Callable[[str], None], progress: Progress) -> None:
+    """Makes `out/images` and, where there are masks, `out/masks`; or nothing, as if never begun."""
+    part, masks = emptied(out / ".images"), out / "masks"
     try:
-        if source.is_dir():
-            phone = sorted(path for path in source.iterdir() if path.suffix.lower() in HEIF and path.is_file())
-            for path in [*listed_images(source), *_readable(phone, source, say)]:
-                copy = part / "_".join(path.name.split())
-                copy = copy.with_suffix(".jpg") if path in phone else copy
-                if copy.exists():
-                    raise SceneError(f"{path}: another image has this name with _ in the place of spaces")
-                if path in phone:
-                    _convert_heif(path, copy)
-                else:
-                    read_image(path, min(8, *read_header(path).size))  # COLMAP would take one that is cut off
-                    shutil.copyfile(path, copy)
-        else:
-            _take_frames(source, part, frames)
-        count = len(listed_images(part))
-        if count < LEAST_IMAGES:
-            inside = source / "images"
-            hint = f"; {inside} has {len(listed_images(inside))}" if inside.is_dir() else ""
-            raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {count}{hint}")
+        gather(source, part, masks, frames, say=say, progress=progress)
     except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
+        for begun in (part, masks):
+            shutil.rmtree(begun, ignore_errors=True)
         with contextlib.suppress(OSError):
             os.replace(out / "colmap", out / BEGUN)  # a kill leaves no folder of the stages without settings
             shutil.rmtree(out / BEGUN)
             out.rmdir()
         raise
     os.replace(part, out / "images")
-
-
-def _readable(phone: Sequence[Path], source: Path, say: Callable[[str], None]) -> Sequence[Path]:
-    """HEIC images, or none with a line about it where the package that reads them is missing."""
-    if phone and importlib.util.find_spec("pillow_heif") is None:
-        say(f"{source}: {len(phone)} HEIC images are left out; pip install pillow-heif reads them")
-        return ()
-    return phone
-
-
-def _convert_heif(path: Path, copy: Path) -> None:
-    """Writes a HEIC image as JPEG, upright, with what it says of its lens."""
-    import pillow_heif
-
-    try:
-        image = pillow_heif.open_heif(path).to_pillow()
-        exif = image.getexif()
-        exif[ExifTags.Base.Orientation] = 1  # it is read upright
-        image.convert("RGB").save(copy, quality=95, exif=exif)
-    except (*UNREADABLE, RuntimeError) as error:
-        raise SceneError(f"{path}: cannot be read: {error}") from None
-
-
-def _take_frames(video: Path, folder: Path, count: int) -> None:
-    """Writes frames of a video as JPEG; ffmpeg turns those of a phone upright."""
-    import imageio_ffmpeg
-
-    read = ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS, "-i", f"file:{video}"]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", *read]
-    told = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
-    length = re.search(r"Duration: (\d+):(\d+):(\d+\.\d+)", told)
-    seconds = sum(float(part) * unit for part, unit in zip(length.groups(), (3600, 60, 1))) if length else 0.0
-    if not seconds or " Video: " not in told:
-        raise SceneError(f"{video}: is no video in a container that is read ({CONTAINERS})")
-    options = ["-map", "0:v:0", "-vf", f"fps={count / seconds:.9g}", "-frames:v", str(count), "-q:v", "2"]
-    made = subprocess.run(
-        [*command, *options, str(folder / "%05d.jpg")], capture_output=True, text=True, errors="replace"
-    )
-    if made.returncode:
-        reason = (made.stderr.strip().splitlines() or ["no reason"])[-1]
-        raise SceneError(f"{video}: ffmpeg cannot read it: {reason:.200}")
 
 
 @dataclass(frozen=True)
@@ -547,7 +492,7 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Se
     colmap, folder = stages.colmap, stages.work / name
     mapper, _, again = name.partition("_")
     if not folder.is_dir():
-        part = _emptied(stages.work / f".{name}")
+        part = emptied(stages.work / f".{name}")
         errors: list[Exception] = []
         placed: list[None] = []
 
@@ -628,7 +573,7 @@ def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
     for image in list(reconstruction.images.values()):
         if image.name in model.lost:
             reconstruction.deregister_frame(image.frame_id)
-    part = _emptied(folder.with_name(f".{folder.name}"))
+    part = emptied(folder.with_name(f".{folder.name}"))
     reconstruction.write_binary(part)
     for path in part.iterdir():
         if path.stem not in FILES:  # of rigs: each image has its pose
@@ -636,14 +581,17 @@ def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
     os.replace(part, folder)
 
 
-def _write_masks(files: Sequence[Path], folder: Path) -> None:
-    """Writes masks as COLMAP reads them: black where an image is transparent."""
+def _write_masks(files: Sequence[Path], masks: Path, folder: Path) -> None:
+    """Writes masks as COLMAP reads them: black where an image is transparent, or masked already."""
     if folder.is_dir():
         return
-    part = _emptied(folder.with_name(f".{folder.name}"))
+    part = emptied(folder.with_name(f".{folder.name}"))
     for path in files:
         pixels = read_image(path, 1)
         opaque = pixels[..., 3] >= OPAQUE if pixels.shape[-1] == 4 else np.ones(pixels.shape[:2], dtype=bool)
+        if (mask := masks / f"{path.name}.png").is_file():
+            with Image.open(mask) as drawn:
+                opaque &= np.asarray(drawn)
         Image.fromarray(opaque).save(part / f"{path.name}.png")
     os.replace(part, folder)
 
@@ -652,7 +600,7 @@ def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
     """Writes the images reduced by area, unless they are there or would be too small."""
     if folder.is_dir() or max(max(read_header(path).size) for path in files) // factor < LEAST_SIDE:
         return
-    part = _emptied(folder.with_name(f".{folder.name}"))
+    part = emptied(folder.with_name(f".{folder.name}"))
     for path in files:
         with Image.open(path) as image:
             kept = {} if path.suffix.lower() == ".png" else {"quality": 95, "exif": image.getexif()}
@@ -668,10 +616,3 @@ def _copied(database: Path, part: Path) -> Path:
         left.unlink()
     shutil.copyfile(database, part)
     return part
-
-
-def _emptied(folder: Path) -> Path:
-    """A new folder in the place of what an earlier process left."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    return folder

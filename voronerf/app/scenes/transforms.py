@@ -21,9 +21,9 @@ from torch import Tensor
 from voronerf.app.files import read_json, write_text
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import stay_inside
-from voronerf.app.scenes.images import read_header
+from voronerf.app.scenes.images import Header, read_header
 from voronerf.app.scenes.lenses import COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, Lens
-from voronerf.app.scenes.photographs import Reading, View, least_factor, photograph_scene
+from voronerf.app.scenes.photographs import ROUNDED, Reading, View, least_factor, photograph_scene
 from voronerf.app.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -38,6 +38,8 @@ SPLITS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
 MODELS = (*PERSPECTIVE_MODELS, *FISHEYE_MODELS, "EQUIRECTANGULAR")
+#: Entries of instant-ngp that change rays in ways that cameras here have not.
+OTHER_RAYS = ("orthographic", "from_mitsuba", *(f"ftheta_p{power}" for power in range(5)))
 LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "distortion_params", "camera_model", "is_fisheye")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's distortion_params
 UNSUPPORTED = ("k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
@@ -61,10 +63,13 @@ class ListedImage(NamedTuple):
     mask: Path | None = None
 
 
-def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, Any], list[ListedImage]]:
+def read_transforms(
+    path: Path, allow_outside: bool = False, *, all_may_miss: bool = False
+) -> tuple[dict[str, Any], list[ListedImage]]:
     """Reads a transforms file and finds its images.
 
-    Images that are listed but missing are left out, with a warning that says how many.
+    Images that are listed but missing are left out, with a warning that says how many, and an error if all are missing
+    and may not.
 
     Returns:
         (the file's entries, the frames whose image exists, in the file's order).
@@ -76,7 +81,7 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
     frames = entries.get("frames") if isinstance(entries, dict) else None
-    if not isinstance(frames, list) or not frames:
+    if not isinstance(frames, list) or not (frames or all_may_miss):
         raise SceneError(f"{path}: has no frames")
     shared = _named_distortion(entries, path)
     present = []
@@ -92,11 +97,12 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
         if image is not None:
             mask = _mask(path.parent, frame.get("mask_path"), allow_outside, where)
             present.append(ListedImage(image, pose, path, {**shared, **_named_distortion(frame, path)}, mask))
-    if not present:
+    if not present and not all_may_miss:
         raise SceneError(
             f"{path}: none of its {len(frames)} images exists, the first is {path.parent / frames[0]['file_path']}"
         )
-    if missing := len(frames) - len(present):
+    missing = len(frames) - len(present)
+    if missing and present:
         log.warning("%s: %d of %d listed images are missing and are skipped", path, missing, len(frames))
     return entries, present
 
@@ -119,7 +125,7 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def focal_length(entries: dict[str, Any], key: str, side: int, path: Path) -> float | None:
+def focal_length(entries: dict[str, Any], key: str, side: float, path: Path) -> float | None:
     """A focal length in pixels, from itself or from an angle of view; None if the entry is missing.
 
     Args:
@@ -139,7 +145,7 @@ def focal_length(entries: dict[str, Any], key: str, side: int, path: Path) -> fl
         focal = value
     if not 1 / LONGEST <= focal / side <= LONGEST:
         raise SceneError(
-            f"{path}: {key} must give a focal length of {1 / LONGEST:g} to {LONGEST} times the {side} pixels of the "
+            f"{path}: {key} must give a focal length of {1 / LONGEST:g} to {LONGEST} times the {side:g} pixels of the "
             f"image, got {value:g}"
         )
     return focal
@@ -259,42 +265,57 @@ def _plain(name: str) -> str:
 
 def has_lens(frames: Sequence[ListedImage]) -> bool:
     """Whether a transforms file describes lenses as captures do; Blender's files give the field of view alone."""
-    return any(frame.values.get(key) is not None for frame in frames for key in LENS)
+    flags = ("latlong", "fisheye_crop_radius", *OTHER_RAYS)
+    return any(
+        any(frame.values.get(key) is not None for key in LENS) or any(frame.values.get(key) for key in flags)
+        for frame in frames
+    )
 
 
 def capture_scene(
-    folder: Path, entries: dict[str, Any], frames: Sequence[ListedImage], held_out: Tensor | None, reading: Reading
+    folder: Path,
+    entries: dict[str, Any],
+    frames: Sequence[ListedImage],
+    held_out: Tensor | None,
+    reading: Reading,
+    notes: Sequence[str] = (),
 ) -> Scene:
     """Makes the scene of a capture from its frames, see `load_transforms`."""
     path = frames[0].source
-    notes = [f"{path.name} of {len(frames)} images"]
+    notes = [f"{path.name} of {len(frames)} images", *notes]
     if any(frame.values.get("depth_file_path") is not None for frame in frames):
         notes.append("its depth images are not used")
     applied = entries.get("applied_transform")
-    transform = None if applied is None else pose_of(applied, str(path), "applied_transform")
-    views = [_view(frame) for frame in frames]
-    factor = reading.downscale or least_factor(max(max(view.size) for view in views))
+    transform = (
+        torch.eye(4, dtype=torch.float64) if applied is None else pose_of(applied, str(path), "applied_transform")
+    )
+    transform[:3] *= number(entries, "applied_scale", path, positive=True) or 1.0
+    headers = [read_header(frame.path) for frame in frames]
+    views = [_view(frame, header) for frame, header in zip(frames, headers)]
+    for view, header in zip(views, headers):
+        if view.size != header.size:
+            sizes = "{} x {} pixels, where {} says {:g} x {:g}".format(*header.size, path.name, *view.size)
+            notes.append(f"images have {sizes}: their lenses are scaled")
+            break
+    factor = reading.downscale or least_factor(max(max(header.size) for header in headers))
     return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
 
 
-def _view(frame: ListedImage) -> View:
+def _view(frame: ListedImage, header: Header) -> View:
     """The view of a frame, with its lens; checks that all of its model is used."""
     values, path = frame.values, frame.source
     model = values.get("camera_model", "OPENCV")
     if model not in MODELS:
         raise SceneError(f"{path}: camera model {model!s:.60} is not supported, only {', '.join(MODELS)}")
+    if other := [key for key in OTHER_RAYS if values.get(key)]:
+        raise SceneError(f"{path}: {other[0]} is not supported, only lenses that are {', '.join(MODELS)}")
     kind = FISHEYE if model in FISHEYE_MODELS or bool(values.get("is_fisheye")) else PERSPECTIVE
-    kind = EQUIRECTANGULAR if model == "EQUIRECTANGULAR" else kind
+    kind = EQUIRECTANGULAR if model == "EQUIRECTANGULAR" or values.get("latlong") else kind
     known, whose = KNOWN[kind]
     if used := [key for key in DISTORTION + UNSUPPORTED if key not in known and number(values, key, path)]:
         only = f"only {', '.join(known)}{whose}" if known else f"there is none{whose}"
         raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, {only}")
-    header = read_header(frame.path)
-    width, height = size = header.size
-    for key, actual in (("w", width), ("h", height)):
-        stated = number(values, key, path, positive=True)
-        if stated is not None and abs(stated - actual) >= 1:  # exporters that scale images may write fractions
-            raise SceneError(f"{frame.path}: is {width} x {height} pixels, but {path} says {key} = {stated:g}")
+    width, height = size = _lens_size(frame, header.size)
     if kind == EQUIRECTANGULAR:  # whose fl_x is half of the width in nerfstudio, and says nothing
         if width != 2 * height:
             raise SceneError(f"{frame.path}: an EQUIRECTANGULAR image must be 2 to 1, got {width} x {height} pixels")
@@ -311,7 +332,26 @@ def _view(frame: ListedImage) -> View:
     intrinsics = (fx or fy or 0, fy or fx or 0, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     distortion = {key: number(values, key, path) or 0.0 for key in DISTORTION}
     lens = Lens(intrinsics, tuple(distortion.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
-    return View(frame.path, frame.pose, lens, size, frame.mask, header=header)
+    circle = number(values, "fisheye_crop_radius", path, positive=True)
+    return View(frame.path, frame.pose, lens, size, frame.mask, header=header, circle=circle)
+
+
+def _lens_size(frame: ListedImage, size: tuple[int, int]) -> tuple[float, float]:
+    """The (width, height) of the image that a frame's lens is for, of an image of ``size``.
+
+    It is ``size``, or where the image was scaled afterwards what ``w`` and ``h`` say, of the same shape.
+    """
+    stated = [number(frame.values, key, frame.source, positive=True) for key in ("w", "h")]
+    # Exporters that scale images may write fractions.
+    wrong = [key for key, was, now in zip("wh", stated, size) if was is not None and abs(was - now) >= 1]
+    w, h = stated
+    if not wrong:
+        return size
+    cropped = w is not None and abs(size[0] - w) <= ROUNDED
+    if cropped or w is None or h is None or abs(size[0] / w - size[1] / h) * max(w, h) > ROUNDED:
+        says = " and ".join(f"{key} = {was:g}" for key, was in zip("wh", stated) if was is not None)
+        raise SceneError(f"{frame.path}: is {size[0]} x {size[1]} pixels, but {frame.source} says {says}")
+    return w, h
 
 
 def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -325,13 +365,14 @@ def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 class Shot(NamedTuple):
-    """One image to be written: its file, its pose [4, 4] and its lens."""
+    """One image to be written: its file, its pose [4, 4], its lens, its size, and the file of its mask, if any."""
 
     file: str
     pose: Tensor
     lens: Lens
     width: int
     height: int
+    mask: str = ""
 
 
 def write_transforms(path: Path, shots: Sequence[Shot]) -> None:
@@ -346,7 +387,8 @@ def write_transforms(path: Path, shots: Sequence[Shot]) -> None:
         lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": shot.width, "h": shot.height}
         lens |= {name: values.get(name, 0.0) for name in known}
         kind = {"camera_model": "OPENCV_FISHEYE" if model == FISHEYE else "OPENCV"}
-        frames.append({"file_path": shot.file, "transform_matrix": shot.pose.tolist(), **lens, **kind})
+        mask = {"mask_path": shot.mask} if shot.mask else {}
+        frames.append({"file_path": shot.file, **mask, "transform_matrix": shot.pose.tolist(), **lens, **kind})
     shared = {key: value for key, value in frames[0].items() if all(frame.get(key) == value for frame in frames)}
     rest = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
     write_text(path, json.dumps({**shared, "frames": rest}, indent=1))

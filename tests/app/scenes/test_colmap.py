@@ -1,0 +1,360 @@
+"""COLMAP's folders as people have them: models, names, masks, and broken ones."""
+
+import shutil
+import struct
+
+import numpy as np
+import pytest
+import torch
+from helpers import refuses
+from PIL import Image
+from scene_files import COUNT, POINTS, POSES, SIZE, every, write_both, write_colmap, write_images
+
+from voronerf.app.scenes import SceneError, load_scene
+
+
+def write_models(folder, counts, pictures="images"):
+    """Models of the first so many images each, by their places in the folder."""
+    for place, count in counts.items():
+        write_colmap(folder / "made", POSES[:count], [SIZE] * count, POINTS, binary=place.endswith(("0", "2")))
+        shutil.copytree(folder / "made/sparse/0", folder / place, dirs_exist_ok=True)
+        shutil.rmtree(folder / "made")
+    write_images(folder / "made", [SIZE] * COUNT)
+    shutil.move(folder / "made/images", folder / pictures)
+
+
+@pytest.mark.parametrize(
+    ("counts", "pictures", "data", "largest"),
+    [
+        ({"sparse/0": 3, "sparse/1": 9, "sparse/2": 4}, "images", (".", "sparse"), "sparse/1"),
+        ({"sparse/2": 4, "sparse/10": 9}, "images", (".", "sparse"), "sparse/10"),
+        ({"sparse/0": 9, "sparse/1": 9}, "images", (".", "sparse"), "sparse/0"),
+        ({"sparse/0": 3, "sparse": 9}, "images", (".",), "sparse"),
+        ({"colmap/sparse/0": 3, "colmap/sparse/1": 9}, "images", (".", "colmap/sparse"), "colmap/sparse/1"),
+        ({"distorted/sparse/0": 9, "distorted/sparse/1": 5}, "input", (".", "distorted/sparse"), "distorted/sparse/0"),
+        ({"0": 3, "1": 9}, "Images", (".",), "1"),
+    ],
+)
+def test_of_several_models_the_largest_is_read_or_the_one_that_is_named(tmp_path, counts, pictures, data, largest):
+    write_models(tmp_path, counts, pictures)
+    sizes = ", ".join(f"{place} of {count}" for place, count in counts.items())
+    other = next(place for place in counts if place != largest)
+    for each in data:
+        scene = load_scene(tmp_path / each)
+        assert scene.name == tmp_path.name and len(scene.train) + len(scene.test) == counts[largest]
+        line = f"the largest of the models is read: {sizes} images (--data {tmp_path / other} reads another one)"
+        assert line in scene.notes
+    for place, count in counts.items():
+        if place != "sparse":
+            scene = load_scene(tmp_path / place)
+            assert len(scene.train) + len(scene.test) == count and not any("largest" in note for note in scene.notes)
+
+
+def test_the_folder_of_undistorted_images_is_a_scene(tmp_path):
+    """COLMAP's image_undistorter writes it, and it may lie in the folder of the scene."""
+    write_models(tmp_path, {"dense/sparse": COUNT}, "dense/images")
+    for folder in (tmp_path, tmp_path / "dense", tmp_path / "dense/sparse"):
+        assert len(load_scene(folder).train) == 7
+    (tmp_path / "transforms.json").write_text("{}")
+    refuses("transforms.json: has no frames", load_scene, tmp_path, error=SceneError)  # which says more
+    write_models(tmp_path / "outside", {"sparse/0": 3})
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse/1").symlink_to(tmp_path / "outside/sparse/0")
+    folder = tmp_path / "dense"
+    shutil.move(tmp_path / "sparse/1", folder / "sparse/1")
+    refuses("must lie in the folder of the scene", load_scene, folder, error=SceneError)
+
+
+@pytest.mark.parametrize("missing", ["cameras", "images"])
+def test_a_model_is_read_of_the_files_that_belong_together(tmp_path, missing):
+    write_both(tmp_path)
+    write_both(tmp_path, binary=False)
+    for name in ("cameras", "images", "points3D"):
+        text = tmp_path / f"sparse/0/{name}.txt"
+        text.write_bytes(b"\xef\xbb\xbf# of Windows\r\n" + text.read_bytes())
+    (tmp_path / f"sparse/0/{missing}.bin").unlink()
+    assert every(load_scene(tmp_path, format="colmap"))[0] == [f"{index:02d}" for index in range(COUNT)]
+
+
+def write_named(folder, name, file, pictures="images", size=SIZE):
+    """A model whose images have the names that `name` makes of their numbers, and files with those of `file`."""
+    write_colmap(folder, POSES, [SIZE] * COUNT, POINTS, binary=False)
+    listed = folder / "sparse/0/images.txt"
+    text = listed.read_text()
+    for index in range(COUNT):
+        text = text.replace(f" {index:02d}.jpg", f" {name(index)}")
+        path = folder / pictures / file(index)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", size, 3 * (index,)).save(path)
+    listed.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "order"),
+    [
+        ("IMG_{}.JPG", "IMG_{}.png", False),
+        ("IMG_{}", "IMG_{}.JPG", False),
+        ("frame.{:03d}", "frame.{:03d}.png", False),  # which is no suffix
+        ("{}.jpg", "{}.jpg.png", False),
+        ("img_{}.jpg", "IMG_{}.JPG", False),
+        ("IMG_{}.HEIC", "img_{}.jpeg", False),
+        ("camA\\{}.tif", "camA/{}.png", False),
+        ("images/{}.jpg", "{}.jpg", False),
+        ("/home/someone/a/{}.jpg", "{}.jpg", False),
+        ("C:\\a\\{}.jpg", "b/{}.png", False),
+        ("IMG_{}.JPG", "image{:03d}.png", True),
+        ("/home/someone/gone/{}.jpg", "{:03d}.png", True),
+    ],
+)
+def test_images_are_found_by_their_names_or_else_by_their_order(tmp_path, name, file, order):
+    write_named(tmp_path, name.format, file.format)
+    (tmp_path / "images/._0.png").write_bytes(b"of macOS")
+    scene = load_scene(tmp_path, normalise=False)
+    line = "the names in images are not those of the model: its images are taken in their order"
+    assert (line in scene.notes) == order
+    for split in (scene.train, scene.test):
+        for image, pose in zip(split.images, split.cameras.poses):
+            torch.testing.assert_close(pose, POSES[int(image[0, 0, 0])], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("name", "file"), [("{}.jpg", "image_{:03d}.png"), ("IMG_{:03d}.JPG", "{}.png")])
+def test_an_order_of_which_there_are_two_is_none(tmp_path, name, file):
+    """10 stands before 9 in one of them."""
+    write_named(tmp_path, lambda index: name.format(index + 5), lambda index: file.format(index + 5))
+    refuses("none of its 9 images exists", load_scene, tmp_path, error=SceneError)
+
+
+def test_a_name_may_be_missing_wherever_it_leads(tmp_path):
+    names = ["/home/someone/a/{}.jpg", "/home/someone/a/{}.jpg"]
+    write_named(tmp_path, names[0].format, "{}.jpg".format)
+    (tmp_path / "images/3.jpg").unlink()
+    scene = load_scene(tmp_path)
+    assert len(scene.train) + len(scene.test) == 8
+    listed = tmp_path / "sparse/0/images.txt"
+    text = listed.read_text()
+    listed.write_text(text.replace("/home/someone/a/4", "b" * 300))
+    scene = load_scene(tmp_path)
+    assert len(scene.train) + len(scene.test) == 7
+    listed.write_text(text.replace("/home/someone/a/4", "b\0"))
+    refuses("the name of an image must have no zero byte", load_scene, tmp_path, error=SceneError)
+
+
+@pytest.mark.parametrize("damage", ["count", "text", "link"])
+def test_a_broken_model_beside_a_sound_one_is_not_the_largest(tmp_path, damage):
+    folder = tmp_path / "scene"
+    write_models(folder, {"sparse/0": 4, "sparse/1": 9})
+    if damage == "count":
+        (folder / "sparse/1/cameras.bin").write_bytes(b"")
+        (folder / "sparse/1/images.bin").write_bytes(bytes([255] * 8))
+    elif damage == "text":
+        (folder / "sparse/1/images.txt").write_text("1 2 3\n")
+    else:
+        shutil.move(folder / "sparse/1", tmp_path / "elsewhere")
+        (folder / "sparse/1").symlink_to(tmp_path / "elsewhere")
+    scene = load_scene(folder)
+    assert len(scene.train) + len(scene.test) == 4
+
+
+@pytest.mark.parametrize(("place", "data"), [("sparse/0", "."), ("sparse", "."), ("sparse", "0")])
+def test_the_folder_of_a_model_is_known_from_within(tmp_path, monkeypatch, place, data):
+    write_both(tmp_path)
+    monkeypatch.chdir(tmp_path / place)
+    scene = load_scene(data)
+    assert len(scene.train) + len(scene.test) == 9
+
+
+def test_images_are_reduced_ones_of_the_same_order(tmp_path):
+    """All images of the folder count, whether the model has them or not."""
+    write_named(tmp_path, "IMG_{}.JPG".format, "IMG_{}.JPG".format)
+    write_named(tmp_path, "IMG_{}.JPG".format, "image{:03d}.png".format, "images_2", (6, 5))
+    path = tmp_path / "sparse/0/images.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[5:]) + "\n")  # without the last two, which come first
+    scene = load_scene(tmp_path, downscale=2, normalise=False)
+    assert scene.train.images.shape == (6, 5, 6, 3)
+    for image, pose in zip(scene.train.images, scene.train.cameras.poses):
+        torch.testing.assert_close(pose, POSES[int(image[0, 0, 0])], atol=1e-5, rtol=0)
+    (tmp_path / "images_2/image004.png").unlink()
+    refuses("none of its 7 images exists", load_scene, tmp_path, downscale=2, error=SceneError)
+
+
+def test_images_that_may_be_others_are_not_taken(tmp_path, caplog):
+    write_named(tmp_path / "a", "{}".format, "{}.png".format)
+    Image.new("RGB", SIZE).save(tmp_path / "a/images/3.jpg")
+    refuses("3 may be 3.jpg or 3.png in", load_scene, tmp_path / "a", error=SceneError)
+    write_named(tmp_path / "b", "{}.png".format, "{}.png".format)
+    Image.new("RGB", SIZE).save(tmp_path / "b/images/3.jpg")
+    assert "3" in load_scene(tmp_path / "b").train.names and not caplog.records
+    write_named(
+        tmp_path / "c", lambda index: f"cam{index % 2}/{index}.png", lambda index: f"cam{index % 2}/{index}.png"
+    )
+    (tmp_path / "c/images/cam1/3.png").rename(tmp_path / "c/images/cam0/3.png")
+    assert "3" not in load_scene(tmp_path / "c").train.names and "1 of 9 listed images are missing" in caplog.text
+    write_named(tmp_path / "d", lambda index: f"cam{index % 2}/{index // 2}.png", lambda index: f"{index // 2}.png")
+    refuses("none of its 9 images exists", load_scene, tmp_path / "d", error=SceneError)
+
+
+def test_a_file_is_that_of_one_name_alone(tmp_path, caplog):
+    """3.png is not taken for a missing 3.jpg where the model has 3.png itself, nor where two names fit it."""
+    for lost in ("3.jpg", "3"):
+        write_named(tmp_path / lost, lambda index, lost=lost: lost if index == 4 else f"{index}.png", "{}.png".format)
+        scene = load_scene(tmp_path / lost, normalise=False)
+        torch.testing.assert_close(scene.train.cameras.poses[scene.train.names.index("3")], POSES[3], atol=1e-5, rtol=0)
+        assert "1 of 9 listed images are missing" in caplog.text
+    write_named(
+        tmp_path / "b",
+        lambda index: ("3.jpg", "3.tif")[index - 3] if index in (3, 4) else f"{index}.jpg",
+        "{}.png".format,
+    )
+    scene = load_scene(tmp_path / "b")
+    assert "3" not in (*scene.train.names, *scene.test.names) and "2 of 9 listed images are missing" in caplog.text
+
+
+def test_names_of_files_elsewhere_are_those_in_the_folder(tmp_path):
+    """Unless reading files elsewhere is allowed."""
+    elsewhere = tmp_path / "elsewhere"
+    write_named(tmp_path / "scene", lambda index: f"{elsewhere}/{index}.png", "{}.png".format)
+    elsewhere.mkdir()
+    for index in range(COUNT):
+        Image.new("RGB", SIZE, (99,) * 3).save(elsewhere / f"{index}.png")
+    for allowed, grey in ((False, 1), (True, 99)):
+        scene = load_scene(tmp_path / "scene", allow_outside=allowed)
+        assert int(scene.train.images[scene.train.names.index("1")].max()) == grey
+
+
+@pytest.mark.parametrize("again", ["03.jpg", "./03.jpg", "../images/03.jpg", "link.jpg"])
+def test_an_image_that_is_listed_twice_is_not_also_held_out(tmp_path, again):
+    write_named(tmp_path, lambda index: again if index == 8 else f"{index:02d}.jpg", "{:02d}.jpg".format)
+    (tmp_path / "images/link.jpg").symlink_to(tmp_path / "images/03.jpg")
+    scene = load_scene(tmp_path)
+    assert f"of images that are listed twice the first counts: {again.rpartition('/')[2]}" in scene.notes
+    assert sorted((*scene.train.names, *scene.test.names)) == [f"{index:02d}" for index in range(8)]
+
+
+def half_black(path, size):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.uint8(255) * (np.arange(size[0]) >= size[0] // 2)[None].repeat(size[1], 0)).save(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "mask", "size"),
+    [
+        ("{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.jpg.png", SIZE),  # COLMAP's
+        ("{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.png", SIZE),  # nerfstudio's
+        ("{:02d}.png", "{:02d}.png", "Masks/{:02d}.png", SIZE),
+        ("{:02d}", "{:02d}.JPG", "masks/{:02d}.JPG.png", SIZE),
+        ("a/{:02d}.jpg", "a/{:02d}.jpg", "masks/a/{:02d}.jpg.png", SIZE),
+        ("../images/{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.jpg.png", SIZE),
+        ("/home/someone/{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.jpg.png", SIZE),
+        ("{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.jpg.png", (48, 40)),
+        ("{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.jpg.png", (50, 41)),
+    ],
+)
+def test_masks_beside_the_images_of_a_model(tmp_path, name, file, mask, size):
+    """Some images have one, or all; masks may have the size that the images had before."""
+    write_named(tmp_path, name.format, file.format)
+    for index in (0, 1, 4):
+        half_black(tmp_path / mask.format(index), size)
+    scene = load_scene(tmp_path)
+    folder = mask.partition("/")[0]
+    assert f"3 of 9 images have a mask in {folder}, whose black pixels do not count" in scene.notes
+    for split in (scene.train, scene.test):
+        for view, label in enumerate(split.names):
+            kept = torch.ones(10, 12, dtype=torch.bool)
+            kept[:, :6] = label not in ("00", "01", "04")
+            assert torch.equal(split.mask(view), kept)
+
+
+def test_masks_of_reduced_images(tmp_path):
+    write_images(tmp_path, [(48, 40)] * COUNT)
+    lens = ("SIMPLE_PINHOLE", (80.0, 24.0, 20.0))
+    write_colmap(tmp_path, POSES, [(48, 40)] * COUNT, POINTS, lenses=[lens] * COUNT)
+    (tmp_path / "images_4").mkdir()
+    for index in range(COUNT):
+        Image.new("RGB", (12, 10)).save(tmp_path / f"images_4/{index:02d}.png")
+        half_black(tmp_path / f"masks/{index:02d}.jpg.png", (48, 40))
+    block = np.full((40, 48), 255, np.uint8)
+    block[9, 13] = 0
+    Image.fromarray(block).save(tmp_path / "masks/02.jpg.png")
+    scene = load_scene(tmp_path, downscale=4)
+    assert [int(mask.sum()) for mask in scene.train.masks] == [60, 119, 60, 60, 60, 60, 60]
+    assert not scene.train.masks[1][2, 3]  # a block that has a black pixel
+    half_black(tmp_path / "masks_4/03.png", (12, 10))
+    scene = load_scene(tmp_path, downscale=4)
+    assert "1 of 9 images have a mask in masks_4, whose black pixels do not count" in scene.notes
+    for size, reason in (((40, 48), "03.png: is 40 x 48 pixels"), ((6, 5), "03.png: is 6 x 5 pixels, 03.png is 12 x")):
+        half_black(tmp_path / "masks_4/03.png", size)
+        refuses(reason, load_scene, tmp_path, downscale=4, error=SceneError)
+    (tmp_path / "masks_4/03.png").unlink()
+    (tmp_path / "masks_4/03.png").symlink_to("/etc/passwd")
+    refuses("must lie in the folder of the scene", load_scene, tmp_path, downscale=4, error=SceneError)
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda model: broken(model / "images.bin", 0, "<Q", 2**60), "images.bin: is cut short or broken: 11529215"),
+        (lambda model: broken(model / "images.bin", 8 + 64 + 7, "<Q", 2**40), "observations do not fit into"),
+        (lambda model: broken(model / "points3D.bin", 0, "<Q", 10**6), "points3D.bin: is cut short or broken: 1000000"),
+        (lambda model: broken(model / "images.bin", 12, "<d", np.nan), "image 08.jpg: its pose must be a unit"),
+        (
+            lambda model: broken(model / "cameras.bin", 12, "<i", 77),
+            "camera 1: camera model number 77, newer than COLMAP 4.2, is not supported (colmap image_undistorter makes",
+        ),
+        (lambda model: broken(model / "cameras.bin", 12, "<i", 13), "camera 1: camera model DIVISION is not supported"),
+        (
+            lambda model: (model / "cameras.bin").write_bytes((model / "cameras.bin").read_bytes()[:-1]),
+            "cameras.bin: is cut short",
+        ),
+        (lambda model: broken(model / "cameras.bin", 32, "<d", -1.0), "camera 1 must have a size, finite parameters"),
+        (lambda model: broken(model / "images.bin", 44, "<d", 1e300), "its pose must be a unit quaternion and a"),
+        (lambda model: broken(model / "images.bin", 8 + 60, "<I", 99), "has camera 99, which cameras.bin has not"),
+        (lambda model: broken(model / "images.bin", 8 + 64, "<6s", b"../../"), "must lie in the folder"),
+        (lambda model: (model / "images.bin").write_bytes((model / "images.bin").read_bytes()[:90]), "is cut short"),
+        (lambda model: (model / "images.bin").write_bytes(bytes(8)), "images.bin: has no images"),
+        (lambda model: (model / "more.bin").symlink_to("/etc/passwd"), "more.bin: must lie in the folder of the scene"),
+        (lambda model: (model.parents[1] / "images/03.jpg").write_bytes(b"no"), "03.jpg: is not an image"),
+        (
+            lambda model: Image.new("RGB", (10, 12)).save(model.parents[1] / "images/03.jpg"),
+            "is 10 x 12 pixels as stored",
+        ),
+    ],
+)
+def test_broken_colmap_folders_are_one_line(tmp_path, damage, reason):
+    write_both(tmp_path)
+    damage(tmp_path / "sparse/0")
+    refuses(reason, load_scene, tmp_path, error=SceneError)
+
+
+def broken(path, at, layout, *values):
+    data = bytearray(path.read_bytes())
+    struct.pack_into(layout, data, at, *values)
+    path.write_bytes(bytes(data))
+
+
+def test_numbers_of_points_that_are_none_are_passed_over(tmp_path):
+    """COLMAP writes 2^64 - 1 for a sighting of no point."""
+    write_both(tmp_path, binary=False)
+    model, before = tmp_path / "sparse/0", load_scene(tmp_path)
+    (model / "points3D.txt").write_text((model / "points3D.txt").read_text() + f"{2**63} 1 2 3 0 0 0 1 1 0 2 0 3 0\n")
+    lines = (model / "images.txt").read_text().splitlines()
+    at = next(number for number, line in enumerate(lines) if len(line.split()) >= 30)
+    (model / "images.txt").write_text("\n".join([*lines[:at], f"{lines[at]} 1 2 {2**64 - 1}", *lines[at + 1 :]]) + "\n")
+    after = load_scene(tmp_path)
+    assert torch.equal(before.train.cameras.poses, after.train.cameras.poses)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "reason"),
+    [
+        ("cameras", "1 PINHOLE 12 ten 20 20 6 5", "cameras.txt: line 1 is not that of a camera"),
+        ("cameras", f"1 PINHOLE {10**400} 10 20 20 6 5", "camera 1 must have a size, finite parameters"),
+        ("cameras", "1 PINHOLE 12 10 20 20 6", "camera 1: PINHOLE must have 4 parameters, got 3"),
+        ("images", "1 1 0 0 0 0 0", "images.txt: line 1 is not that of an image"),
+        ("points3D", "7 one 2 3", "points3D.txt: line 1 is not that of a point"),
+    ],
+)
+def test_broken_text_is_one_line(tmp_path, file, text, reason):
+    write_both(tmp_path, binary=False)
+    (tmp_path / f"sparse/0/{file}.txt").write_text(text + "\n")
+    refuses(reason, load_scene, tmp_path, error=SceneError)

@@ -1,0 +1,152 @@
+"""Captures and camera paths that other people's programs have written, which once went wrong: each is read rightly, or
+refused in one line that says what to do."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from helpers import refuses
+from scene_files import DATA
+
+from voronerf.app.render.paths import read_camera_path
+from voronerf.app.scenes import SceneError, load_scene
+from voronerf.app.scenes.colmap import read_model
+from voronerf.app.scenes.folders import listed_images
+from voronerf.app.scenes.gather import emptied, gather
+
+CASES = DATA.parent / "cases"
+
+
+def gathered(source, out):
+    """The images that `process` takes of a source, and the lines about them."""
+    said = []
+    gather(source, emptied(out / "images"), out / "masks", 150, say=said.append, progress=lambda *_: None)
+    return listed_images(out / "images"), " ".join(said)
+
+
+def case(name):
+    """The folder of a case."""
+    if not (CASES / name).is_dir():
+        pytest.skip(f"{CASES / name} is not there; set VORONERF_DATA to a folder beside it")
+    return CASES / name
+
+
+def size_of(scene):
+    return scene.train.cameras.width, scene.train.cameras.height
+
+
+def test_alpha_that_is_not_an_object():
+    scene = load_scene(case("alpha_not_an_object"))
+    assert (scene.kind, scene.background, scene.far) == ("unbounded", None, 4)
+    assert scene.train.images.shape[-1] == 3 and scene.train.masks is None
+
+
+def test_a_scale_that_was_applied():
+    scene = load_scene(case("applied_scale"))
+    original = torch.tensor([2.298, 1.928, 1.260, 1.0], dtype=torch.float64)
+    moved = (scene.transform @ original)[:3].float()
+    torch.testing.assert_close(moved, scene.train.cameras.origins[0], atol=1e-3, rtol=0)
+    torch.testing.assert_close(moved, torch.tensor([-0.706, -0.593, 0.387]), atol=1e-3, rtol=0)
+
+
+def test_the_default_export_of_blendernerf():
+    scene = load_scene(case("blendernerf_default"))
+    assert (len(scene.train), len(scene.test)) == (7, 2)
+    assert any("every 8th is held out" in note for note in scene.notes)
+
+
+def test_flags_of_lenses():
+    folder = case("lens_flags_ignored")
+    assert load_scene(folder / "latlong").train.cameras.models.tolist() == [3] * 7
+    refuses("ftheta_p1 is not supported, only lenses that are", load_scene, folder / "ftheta", error=SceneError)
+    refuses("orthographic is not supported, only", load_scene, folder / "orthographic", error=SceneError)
+    mask = load_scene(folder / "crop").train.mask(0)
+    y, x = torch.meshgrid(torch.arange(60) - 29.5, torch.arange(80) - 39.5, indexing="ij")
+    assert torch.equal(mask, torch.hypot(x, y) <= 28)
+
+
+def test_jpegs_with_a_second_picture():
+    scene = load_scene(case("mpo_orientation"))
+    assert size_of(scene) == (60, 80)
+    assert scene.train.cameras.intrinsics[0].tolist() == pytest.approx([62, 60, 60 - 29.6, 41])
+
+
+def test_a_wide_angle():
+    scene = load_scene(case("wide_angle_perspective"))
+    mask = scene.train.mask(0)
+    assert float(mask.float().mean()) == pytest.approx(0.811, abs=1e-3)
+    y, x = torch.meshgrid(torch.arange(60) - 29.5, torch.arange(80) - 39.5, indexing="ij")
+    assert torch.equal(mask, torch.hypot(x, y) / 48 < 2 / 3 / 0.75**0.5)
+
+
+def test_models_of_another_size_than_their_pictures():
+    folder = case("images_smaller_than_model")
+    small, large = load_scene(folder), load_scene(folder / "big")
+    assert size_of(small) == (504, 378) and size_of(large) == (400, 300)
+    for scene in (small, large):  # the focal length is that of the model, scaled
+        model = read_model(folder / ("big" if scene is large else "") / "sparse/0").images[0].camera
+        across = size_of(scene)[0] / model.width
+        assert float(scene.train.cameras.intrinsics[0, 0]) == pytest.approx(model.lens.intrinsics[0] * across)
+
+
+def test_the_larger_of_two_models():
+    folder = case("sparse_1_larger")
+    for data, count in (("", 44), ("sparse/1", 44), ("sparse/0", 3)):
+        scene = load_scene(folder / data)
+        assert len(scene.train) + len(scene.test) == count
+    assert "sparse/0 of 3, sparse/1 of 44 images" in " ".join(load_scene(folder).notes)
+
+
+@pytest.mark.parametrize(("name", "downscale"), [("a", None), ("b", None), ("b", 4), ("c", None), ("c", 4)])
+def test_names_of_pictures(name, downscale):
+    folder = case("colmap_names") / name
+    scene = load_scene(folder, downscale=downscale)
+    assert len(scene.train) + len(scene.test) == 9
+    if downscale:  # the pictures of images_4 are those of images, in the same order
+        full = load_scene(folder, downscale=1)
+        assert torch.equal(scene.train.cameras.poses, full.train.cameras.poses)
+
+
+def test_models_of_colmap_4():
+    folder = case("colmap4_models")
+    scene = load_scene(folder / "equirectangular")
+    assert scene.train.cameras.models.tolist() == [3] * len(scene.train)
+    refuses(
+        "camera model SIMPLE_DIVISION is not supported (colmap image_undistorter",
+        load_scene,
+        folder / "division",
+        error=SceneError,
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "line"),
+    [
+        ("subs", 5, "repeat others to the byte: camB_0.jpg"),
+        ("webp", 5, ""),
+        ("tif", 5, ""),
+        ("mac", 5, ""),
+        ("mixed", 5, "images in its folders are left out"),
+    ],
+)
+def test_sources_of_process(tmp_path, name, count, line):
+    images, said = gathered(case("process_sources") / name, tmp_path)
+    assert len(images) == count and line in said
+
+
+@pytest.mark.parametrize("name", ["clip.mp4", "recorded_in_browser.webm"])
+def test_short_videos(tmp_path, name):
+    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed")
+    images, said = gathered(case("short_video") / name, tmp_path)
+    assert len(images) == len({path.read_bytes() for path in images}) == 40
+    assert "all of its frames are taken, 40 in place of --frames 150" in said
+
+
+@pytest.mark.parametrize("name", ["legacy", "v1", "nested"])
+def test_camera_paths(name):
+    path = read_camera_path(case("camera_path_nerfstudio") / f"{name}.json")
+    frames = json.loads((case("camera_path_nerfstudio") / f"{name}.json").read_text())["camera_path"]
+    rows = torch.tensor([frame["camera_to_world"] for frame in frames]).view(-1, 4, 4)
+    torch.testing.assert_close(path.frames.poses, rows, atol=1e-5, rtol=0)
