@@ -1,7 +1,9 @@
 """Points, meshes and cells of runs whose field is a formula, loaded again."""
 
 import itertools
+import json
 import re
+import struct
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +15,9 @@ import torch
 from helpers import refuses, renderer_of, seeded
 
 from voronerf import VoronoiDiagram
+from voronerf.app.evaluate.panels import palette
 from voronerf.app.export import cell_meshes, export_cells, export_mesh, export_points
+from voronerf.app.export.space import write_geometry
 from voronerf.app.run import Run
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import ConfigError
@@ -35,6 +39,48 @@ def shell(positions, directions, ray_index):
     return torch.where(positions[:, 2:] > 0, RED, BLUE), 300.0 * (apart | speck)
 
 
+def read_glb(path):
+    """Every mesh of a file by its node's name: arrays by attribute and the material; nodes must have no transform."""
+    data = path.read_bytes()
+    magic, version, length, size = struct.unpack_from("<4s3I", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    tree, buffer = json.loads(data[20 : 20 + size]), data[28 + size :]
+    meshes = {}
+    for node in tree["nodes"]:
+        assert node.keys() <= {"name", "mesh", "children"}
+        if "mesh" not in node:
+            continue
+        (part,) = tree["meshes"][node["mesh"]]["primitives"]
+        arrays = {}
+        for name, index in part["attributes"].items():
+            accessor = tree["accessors"][index]
+            view = tree["bufferViews"][accessor["bufferView"]]
+            kind = {5121: "u1", 5123: "<u2", 5126: "<f4"}[accessor["componentType"]]
+            start, width = view["byteOffset"], {"VEC3": 3, "VEC4": 4}[accessor["type"]]
+            values = np.frombuffer(buffer, kind, accessor["count"] * width, start).reshape(-1, width)
+            assert accessor["min"] == values.min(0).tolist() and accessor["max"] == values.max(0).tolist()
+            assert accessor.get("normalized", False) == (name == "COLOR_0")
+            arrays[name] = values
+        meshes[node["name"]] = arrays, tree["materials"][part["material"]]
+    return meshes
+
+
+def linear(colour):
+    """The linear values of sRGB ones in 0..1."""
+    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+
+
+def loaded(path):
+    """A mesh as trimesh reads it, turned to z up, and the colours of its vertices in sRGB."""
+    mesh = trimesh.load(path, force="mesh", process=False)
+    if path.suffix != ".glb":
+        return mesh, mesh.visual.vertex_colors[:, :3]
+    ((arrays, _),) = read_glb(path).values()
+    mesh.apply_transform([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # as Blender does
+    bytes_of_linear = np.searchsorted(linear(np.arange(256) / 255) * 65535, arrays["COLOR_0"][:, :3] - 0.5)
+    return mesh, bytes_of_linear
+
+
 @pytest.fixture(scope="module")
 def run():
     scene = replace(builtin_scene(24, train_views=20, test_views=1), box=BOX)
@@ -47,15 +93,52 @@ def run():
 def test_a_mesh_is_the_outer_surface_alone(run, tmp_path, suffix):
     path = tmp_path / "deep" / f"ball{suffix}"
     export_mesh(run, path, resolution=48)
-    mesh = trimesh.load(path, force="mesh", process=False)
+    mesh, colours = loaded(path)
     assert mesh.is_watertight and mesh.body_count == 1  # neither the inside of the shell nor the speck
     distance = np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS)
     assert distance.mean() < 0.02 and distance.max() < 0.06
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.08)
     assert (mesh.vertex_normals * mesh.vertices).sum(-1).min() > 0
-    colours = mesh.visual.vertex_colors[:, :3]
     for colour, where in ((RED, mesh.vertices[:, 2] > 0.05), (BLUE, mesh.vertices[:, 2] < -0.05)):
         assert np.abs(np.median(colours[where], axis=0) - colour.numpy() * 255).max() < 12  # pixels of the rim mix
+
+
+@pytest.mark.parametrize("to_files", [False, True])
+def test_a_glb_stands_upright_and_has_linear_colours(run, tmp_path, to_files):
+    transform = torch.eye(4, dtype=torch.float64)
+    transform[:3, :3] = 0.5 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    turned = replace(run, scene=replace(run.scene, transform=transform))
+    returned, _ = (
+        export_mesh(turned, tmp_path / f"ball.{kind}", resolution=32, to_files=to_files) for kind in ("glb", "ply")
+    )
+    ply = trimesh.load(tmp_path / "ball.ply", process=False)
+    ((arrays, material),) = read_glb(tmp_path / "ball.glb").values()
+    assert material == {
+        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+        "doubleSided": True,
+    }
+    x, y, z = np.asarray(ply.vertices, dtype=np.float32).T
+    assert np.array_equal(arrays["POSITION"], np.stack((x, z, -y), 1))
+    assert np.abs(returned.vertices - ply.vertices).max() < 1e-6  # z up
+    radius = RADIUS * (2 if to_files else 1)
+    assert np.abs(np.linalg.norm(arrays["POSITION"], axis=-1) - radius).max() < 0.2
+    assert (arrays["NORMAL"] * arrays["POSITION"]).sum(-1).min() > 0
+    assert arrays["COLOR_0"].dtype == np.uint16 and (arrays["COLOR_0"][:, 3] == 65535).all()
+    colours = np.asarray(ply.visual.vertex_colors[:, :3]) / 255
+    assert np.abs(arrays["COLOR_0"][:, :3] / 65535 - linear(colours)).max() < 1e-5
+    red = colours[:, 0] > 0.8
+    assert red.any() and arrays["POSITION"][red, 1].min() > -0.1 * radius  # which is above
+
+
+def test_dark_colours_of_a_glb_stay_apart(tmp_path):
+    grey = np.arange(256).repeat(3).reshape(256, 3).astype(np.uint8)
+    points = np.random.default_rng(0).random((256, 3))
+    ramp = trimesh.Trimesh(points, np.arange(255).reshape(-1, 3), vertex_colors=grey, process=False)
+    write_geometry(tmp_path / "ramp.GLB", ramp)
+    ((arrays, _),) = read_glb(tmp_path / "ramp.GLB").values()
+    back = linear(np.arange(256) / 255)[:, None] - arrays["COLOR_0"][None, :, 0] / 65535
+    assert np.array_equal(np.abs(back).argmin(0), np.arange(256))
+    assert np.array_equal(ramp.visual.vertex_colors[:, :3], grey) and np.array_equal(ramp.vertices, points)
 
 
 def test_a_mesh_has_as_many_triangles_as_asked_for(run, tmp_path):
@@ -159,12 +242,26 @@ def test_cells_fill_the_box_and_hold_their_points(name):
     assert (name != "far") == (len(meshes) == diagram.num_cells)
 
 
-def test_cells_are_objects_of_their_own_colour(run, tmp_path):
-    export_cells(run, tmp_path / "cells.glb")
+@pytest.mark.parametrize("to_files", [False, True])
+def test_cells_are_objects_of_their_own_colour(run, tmp_path, to_files):
+    transform = torch.eye(4, dtype=torch.float64)
+    transform[:3] = torch.tensor([[0.0, -0.5, 0, 1], [0.5, 0, 0, 2], [0, 0, 0.5, 3]])
+    turned = replace(run, scene=replace(run.scene, transform=transform))
+    export_cells(turned, tmp_path / "cells.glb", to_files=to_files)
     scene = trimesh.load(tmp_path / "cells.glb")
     assert sorted(scene.geometry) == [f"cell_{cell:04}" for cell in range(5)]
-    colours = {tuple(mesh.visual.material.baseColorFactor) for mesh in scene.geometry.values()}
-    assert len(colours) == 5
+    wanted, read = cell_meshes(run.diagram, BOX), read_glb(tmp_path / "cells.glb")
+    for cell, mesh in wanted.items():
+        if to_files:
+            mesh.apply_transform(torch.linalg.inv(transform).numpy())
+        arrays, material = read[f"cell_{cell:04}"]
+        x, y, z = mesh.vertices.T
+        assert np.abs(arrays["POSITION"] - np.stack((x, z, -y), 1)).max() < 1e-5
+        colour = material["pbrMetallicRoughness"]["baseColorFactor"]
+        assert np.abs(colour[:3] - linear(palette(5).numpy()[cell] / 255)).max() < 1e-6 and colour[3] == 1
+        assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
+    volume = float((BOX[1] - BOX[0]).prod()) * (8 if to_files else 1)
+    assert sum(mesh.volume for mesh in scene.geometry.values()) == pytest.approx(volume)
 
 
 def test_what_is_refused(run, tmp_path, monkeypatch):

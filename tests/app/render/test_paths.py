@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -26,6 +27,105 @@ def by_hand(**changes):
     """The least that nerfstudio's own reader asks for."""
     frame = {"camera_to_world": LEVEL, "fov": 90, "aspect": 2}
     return {"render_width": 80, "render_height": 40, "camera_path": [frame, frame], **changes}
+
+
+def columns(matrix):
+    """The numbers of a pose column by column, as three.js and keyframes of nerfstudio's first viewer have them."""
+    return [number for column in range(4) for number in matrix[column::4]]
+
+
+def scaled(matrix, factor):
+    """The pose of a camera beside an object that was scaled by 1 / factor."""
+    return [number * factor if place % 4 < 3 and place < 12 else number for place, number in enumerate(matrix)]
+
+
+def nerfstudio_rays(kind, pose, width, height, fov):
+    """Directions [h, w, 3] in the world by the formulas of nerfstudio's `Cameras` for a frame of a path."""
+    focal = height / 2 / math.tan(math.radians(fov) / 2)
+    fx, fy = (width / 2, height) if kind == "equirectangular" else (focal, focal)
+    y, x = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) + 0.5 for side in (height, width)), indexing="ij")
+    u, v = (x - width / 2) / fx, -(y - height / 2) / fy
+    if kind == "fisheye":
+        angle = torch.hypot(u, v)
+        local = torch.stack((u * angle.sin() / angle, v * angle.sin() / angle, -angle.cos()), -1)
+    elif kind == "equirectangular":
+        theta, phi = -math.pi * u, math.pi * (0.5 - v)
+        local = torch.stack((-theta.sin() * phi.sin(), phi.cos(), -theta.cos() * phi.sin()), -1)
+    else:
+        local = torch.stack((u, v, -torch.ones_like(u)), -1)
+    return torch.nn.functional.normalize(local, dim=-1) @ pose[:3, :3].T, torch.stack((x, y), -1)
+
+
+@pytest.mark.parametrize("kind", ["perspective", "fisheye", "equirectangular", "Equirectangular"])
+@pytest.mark.parametrize("size", [(96, 54), (50, 80)])
+def test_frames_have_the_rays_of_nerfstudio(tmp_path, kind, size):
+    pose = look_at(torch.tensor([[1.0, 2, 0.5]]), torch.tensor([0.1, 0.2, 0.3]), torch.tensor([0.0, 0, 1]))[0].double()
+    frame = {"camera_to_world": pose.tolist(), "fov": 62.5, "aspect": 1}
+    entries = by_hand(camera_type=kind, camera_path=[frame], render_width=float(size[0]), render_height=size[1])
+    (tmp_path / "path.json").write_text(json.dumps(entries))
+    frames = read_camera_path(tmp_path / "path.json").frames
+    directions, pixels = nerfstudio_rays(kind.lower(), pose, *size, 62.5)
+    rays = frames.image_rays(0)
+    torch.testing.assert_close(rays.directions, directions.view(-1, 3).float(), atol=1e-6, rtol=0)
+    seen, _ = frames.project(rays.origins + 3 * directions.view(-1, 3).float(), 0)
+    torch.testing.assert_close(seen, pixels.view(-1, 2).float(), atol=1e-3, rtol=0)
+    write_camera_path(tmp_path / "again.json", CameraPath(frames, fps=5))
+    again = read_camera_path(tmp_path / "again.json").frames.image_rays(0)
+    torch.testing.assert_close(again.directions, rays.directions, atol=1e-6, rtol=0)
+
+
+ROWS = [LEVEL[row : row + 4] for row in (0, 4, 8, 12)]
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        {"camera_to_world": ROWS},
+        {"camera_to_world": ROWS[:3]},
+        {"camera_to_world": LEVEL[:12]},
+        {"camera_to_world": scaled(LEVEL, 0.125)},  # Blender's, beside a mesh eight times as large
+        {"camera_to_world": [*LEVEL[:15], 1.0000001], "render_time": 0.5},
+    ],
+    ids=["4 x 4", "3 x 4", "12", "scaled", "rounded"],
+)
+def test_poses_in_every_form(tmp_path, frame):
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(by_hand(camera_path=[frame], default_fov=90)))
+    read = read_camera_path(file).frames
+    torch.testing.assert_close(read.poses[0], torch.tensor(ROWS, dtype=torch.float32))
+    assert read.intrinsics[0].tolist() == pytest.approx([20, 20, 40, 20])  # of default_fov
+
+
+@pytest.mark.parametrize(
+    ("changes", "fps"),
+    [({"fps": 12.5, "seconds": 9}, 12.5), ({"seconds": 4.0}, 0.5), ({"fps": None, "seconds": 4}, 0.5), ({}, 24)],
+)
+def test_the_rate_of_a_file(tmp_path, changes, fps):
+    (tmp_path / "path.json").write_text(json.dumps(by_hand(**changes)))
+    assert read_camera_path(tmp_path / "path.json").fps == fps
+
+
+@pytest.mark.parametrize(
+    ("matrix", "there"),
+    [
+        (LEVEL, True),
+        (ROWS, True),
+        (json.dumps([float(x) for x in columns(LEVEL)]), True),  # nerfstudio's viewer before 1.0, add-ons
+        (json.dumps(LEVEL), False),
+        ("[1, 2", False),
+        ("7", False),
+        ("[" * 100_000, False),
+        (None, False),
+    ],
+    ids=["numbers", "rows", "columns in a string", "rows in a string", "cut", "number", "deep", "none"],
+)
+def test_keyframes_of_every_viewer(tmp_path, matrix, there):
+    keyframe = {"matrix": matrix, "fov": 90, "aspect": 2, "properties": '[["FOV",90],["NAME","Camera 0"],["TIME",0]]'}
+    (tmp_path / "path.json").write_text(json.dumps(by_hand(keyframes=[keyframe])))
+    path = read_camera_path(tmp_path / "path.json")
+    assert len(path.frames) == 2 and (path.keyframes is not None) == there  # broken ones keep no frame from being shown
+    if there:
+        assert torch.equal(path.keyframes.poses[0], path.frames.poses[0])
 
 
 def test_a_file_of_nerfstudio(tmp_path):
@@ -82,8 +182,14 @@ def test_what_is_written_is_read(tmp_path):
     [
         ({"camera_path": 3}, "is not a camera path: it must have a list camera_path"),
         ({"camera_path": []}, "camera_path must be a list of 1 to 100000 frames, got 0 of them"),
-        ({"camera_path": [7]}, "camera_path[0].camera_to_world must be 16 numbers, got None"),
-        ({"camera_path": [{"camera_to_world": LEVEL[:12], "fov": 50}]}, "camera_to_world must be 16 numbers, got [1"),
+        ({"camera_path": [7]}, "camera_path[0].camera_to_world must be 4 x 4 or 3 x 4 numbers, got None"),
+        ({"camera_path": [{"camera_to_world": LEVEL[:11], "fov": 50}]}, "must be 4 x 4 or 3 x 4 numbers, got [1"),
+        ({"camera_path": [{"camera_to_world": str(LEVEL), "fov": 50}]}, "must be 4 x 4 or 3 x 4 numbers, got '[1"),
+        ({"camera_path": [{"camera_to_world": columns(LEVEL), "fov": 50}]}, "must be a rotation and a position"),
+        (
+            {"camera_path": [{"camera_to_world": LEVEL}]},
+            "camera_path[0].fov must be a number of 0.01 to 179.9, got None",
+        ),
         ({"camera_path": [{"camera_to_world": [math.nan] * 16, "fov": 50}]}, "1e+09, got nan"),
         (
             {"camera_path": [{"camera_to_world": [10**400] * 16, "fov": 50}]},
@@ -98,12 +204,15 @@ def test_what_is_written_is_read(tmp_path):
             {"camera_path": [{"camera_to_world": LEVEL, "fov": 180}]},
             "[0].fov must be a number of 0.01 to 179.9, got 180",
         ),
-        ({"keyframes": {"a": 1}}, "keyframes must be a list of 1 to 100000 frames, got {'a': 1}"),
         ({"render_width": 10**9}, "render_width must be an integer of 1 to 8192, got 1000000000"),
+        ({"render_width": 1920.5}, "render_width must be an integer of 1 to 8192, got 1920.5"),
         ({"render_height": True}, "render_height must be an integer of 1 to 8192, got True"),
         ({"fps": "fast"}, "fps must be a number of 0.01 to 1000, got 'fast'"),
-        ({"camera_type": "fisheye"}, "camera_type must be perspective or equirectangular, got 'fisheye'"),
-        ({"camera_type": "equirectangular", "render_width": 81}, "frames must be 2 to 1, got 81 x 40"),
+        ({"seconds": 0}, "seconds must be a number of 0.001 to 1e+09, got 0"),
+        (
+            {"camera_type": "omnidirectional"},
+            "camera_type must be perspective, fisheye or equirectangular, got 'omnidirectional'",
+        ),
     ],
 )
 def test_files_that_are_no_paths(tmp_path, changes, rule):
@@ -186,6 +295,8 @@ def test_frames_have_the_size_of_most_images_or_another():
     wide = resized(frames, (128, 72))  # what is above and below is cut off
     assert (wide.width, wide.height) == (128, 72) and wide.intrinsics[0].tolist() == [160, 160, 64, 36]
     assert resized(wide, (32, 24)).intrinsics[0].tolist() == pytest.approx([160 / 3, 160 / 3, 16, 12])
+    around = resized(replace(frames, distortion=torch.zeros(5, 8), models=torch.ones(5, dtype=torch.int32)), (128, 72))
+    assert around.models.tolist() == [1] * 5 and torch.equal(around.intrinsics, wide.intrinsics)  # still fisheyes
 
 
 @pytest.mark.parametrize("towards", [0.0, 4.0])  # parallel cameras, and ones that look at a point

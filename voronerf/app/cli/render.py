@@ -8,7 +8,7 @@ from pathlib import Path
 from voronerf.app.cli.display import say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
 from voronerf.app.export.video import FRAMES, check_folder, export_video, video_cameras
-from voronerf.app.render.paths import LONGEST_SIDE, panoramas, read_camera_path, resized
+from voronerf.app.render.paths import LONGEST_SIDE, panoramas, read_camera_path, resized, see_all_around
 from voronerf.app.render.video import check_video
 from voronerf.app.train.config import ConfigError
 
@@ -33,7 +33,8 @@ def render(
         run: The run directory.
         out: The video file, .mp4, or with --images a new folder; default video, or the name of the path, in the run
             directory.
-        path: Camera path in nerfstudio's format, such as the viewer saves; it has the frames and their size.
+        path: Camera path in nerfstudio's format, such as the viewer saves; it has the frames and their size. Positions
+            are those of this run's scene.
         frames: Frames of a video without a path.
         fps: Frames per second; default 24, or those of the path.
         size: Width and height of the frames, such as 1280x720; default those of the training images, or of the path.
@@ -56,7 +57,7 @@ def render(
         cameras, rate = video_cameras(opened.scene, frames), 24.0
     else:
         cameras, rate = flight.frames.downscaled(opening.downscale or 1), flight.fps
-    if panorama or cameras.models is not None:
+    if panorama or (sides is not None and see_all_around(cameras)):
         cameras = panoramas(cameras, sides or (2 * cameras.height, cameras.height))
     elif sides is not None:
         cameras = resized(cameras, sides)

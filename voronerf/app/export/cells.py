@@ -27,7 +27,8 @@ THINNEST = 1e-6
 def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None, to_files: bool = False) -> Any:
     """Writes the cells of a run, clipped to the scene's box, as .glb with an object for each; returns the scene.
 
-    The objects are named `cell_0000` and so on, and have the colours that the cells have in pictures.
+    The objects are named `cell_0000` and so on, and have the colours that the cells have in pictures. The file has y
+    up, as glTF asks for; the scene that is returned has z up.
 
     Args:
         run: The run.
@@ -53,8 +54,8 @@ def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None, to_fi
 
     scene = trimesh.Scene()
     for cell, mesh in cell_meshes(run.diagram, box_of(run, box)).items():
-        scene.add_geometry(mesh, node_name=f"cell_{cell:04}", geom_name=f"cell_{cell:04}")
-    scene = placed(run, scene, to_files)
+        name = f"cell_{cell:04}"
+        scene.add_geometry(placed(run, mesh, to_files), node_name=name, geom_name=name)
     write_geometry(path, scene)
     return scene
 

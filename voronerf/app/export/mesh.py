@@ -69,9 +69,11 @@ def export_mesh(
 ) -> Any:
     """Writes the surface of a run as .ply, .glb or .obj, and returns it as a ``trimesh.Trimesh``.
 
-    Each vertex has the colour that the training views show there. The mesh of a scene with a box is closed: what is
-    behind a surface in every view counts as solid. That of an unbounded scene ends where the box ends, and where no
-    camera looks; what the box leaves out is said. Parts with few triangles beside the largest are left out.
+    Each vertex has the colour that the training views show there. .ply and .obj have z up and sRGB colours, .glb has y
+    up and linear colours, as glTF asks for; the mesh that is returned has z up and sRGB colours. The mesh of a scene
+    with a box is closed: what is behind a surface in every view counts as solid. That of an unbounded scene ends where
+    the box ends, and where no camera looks; what the box leaves out is said. Parts with few triangles beside the
+    largest are left out.
 
     Args:
         run: The run.

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from voronerf.app.evaluate.scores import Track, in_silence
+from voronerf.app.export.gltf import follow_conventions
 from voronerf.app.files import write_bytes
 from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
@@ -49,13 +50,19 @@ def check_export(path: Path, suffixes: tuple[str, ...]) -> None:
 
 
 def write_geometry(path: Path, geometry: Any, **options: Any) -> None:
-    """Writes a mesh, points or a scene of trimesh in the format of the suffix, whole or not at all."""
-    data = geometry.export(file_type=path.suffix[1:].lower(), **options)
+    """Writes a mesh, points or a scene of trimesh in the format of the suffix, whole or not at all.
+
+    Geometry has z up and colours as in pictures, which .ply and .obj keep; .glb has y up and linear colours.
+    """
+    kind = path.suffix[1:].lower()
+    if kind == "glb":
+        options["buffer_postprocessor"] = follow_conventions
+    data = geometry.export(file_type=kind, **options)
     write_bytes(path, data.encode() if isinstance(data, str) else data)
 
 
 def placed(run: Run, geometry: Any, to_files: bool) -> Any:
-    """A geometry of trimesh, in the coordinates of the scene's files if ``to_files``."""
+    """A mesh or points of trimesh, in the coordinates of the scene's files if ``to_files``."""
     if to_files and run.scene.transform is not None:
         geometry.apply_transform(torch.linalg.inv(run.scene.transform).numpy())
     return geometry
@@ -95,6 +102,8 @@ def views_of(run: Run, cameras: Cameras, track: Track = in_silence) -> list[Surf
         image = run.render(cameras, number)
         surface = image.heaviest.cpu() if contraction is None else contraction.inverse(image.heaviest.cpu())
         shown = (image.opacity.cpu() > SOLID) & (surface.abs().amax(-1) < FARTHEST)
+        if (there := cameras.has_ray(number)) is not None:
+            shown &= there
         views.append(
             SurfaceView(cameras[[number]], image.colour.cpu(), torch.where(shown[..., None], surface, torch.nan))
         )

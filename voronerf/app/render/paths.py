@@ -2,15 +2,19 @@
 
 c cameras, f frames. Poses and pixels as in :mod:`voronerf.nerf.cameras`.
 
-The file is JSON: `render_width`, `render_height`, `fps`, and a list `camera_path` with a frame each, whose
-`camera_to_world` has the 16 numbers of a pose row by row and whose `fov` is the vertical angle of view in degrees.
-Viewers keep the keyframes beside them: a list `keyframes` with `matrix` and `fov`, and `is_cycle`.
+The file is JSON: `render_width`, `render_height`, `camera_type`, `fps`, and a list `camera_path` with a frame each,
+whose `camera_to_world` has the numbers of a pose row by row and whose `fov` is the vertical angle of view in degrees.
+Viewers keep the keyframes beside them: a list `keyframes` with `matrix` and `fov`, and `is_cycle`. The matrix of a
+keyframe is a list, row by row, or of nerfstudio's viewer before 1.0, its Blender add-on and its Maya plugin a string of
+JSON, column by column.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +23,17 @@ from torch import Tensor
 
 from voronerf.app.files import json_text, read_json, write_text
 from voronerf.nerf.cameras import Cameras, focus_point, look_at
+from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE
 
+#: The camera models, by the names that paths have for them.
+MODELS = {"perspective": PERSPECTIVE, "fisheye": FISHEYE, "equirectangular": EQUIRECTANGULAR}
 #: Frames of a path; at 24 a second they take more than an hour.
 MOST_FRAMES = 100_000
 #: Pixels along a side of a frame.
 LONGEST_SIDE = 8192
 #: Distance from the origin.
 FARTHEST = 1e9
-#: By which the product of a rotation and its transpose may differ from 1.
+#: By which the product of a rotation and its transpose may differ from 1, and the last row of a pose from 0 0 0 1.
 ORTHONORMAL = 2e-3
 #: Above this length of their mean direction, cameras look one way rather than around or about something.
 ONE_WAY = 0.95
@@ -44,7 +51,7 @@ class CameraPath:
     Attributes:
         frames: a camera for each, of the size of the video.
         fps: frames a second.
-        keyframes: of the same size, or None.
+        keyframes: perspective cameras of the same size, or None.
         closed: whether the last keyframe is followed by the first.
 
     Examples:
@@ -63,13 +70,16 @@ class CameraPath:
 
 
 def read_camera_path(file: Path | str) -> CameraPath:
-    """Reads a path that nerfstudio's viewer or :func:`write_camera_path` has saved.
+    """Reads a path that nerfstudio's viewers, its add-ons or :func:`write_camera_path` have saved.
 
-    Positions are those of the scene that is rendered. Crops, times and transitions of the file have no effect.
+    Positions are those of the scene that is rendered. A pose may be scaled, as that of a camera beside a scaled object
+    is: its scale has no effect, nor have crops, times and transitions of the file. Frames without an angle of view have
+    the file's `default_fov`, and a file without `fps` shows its frames in its `seconds`, else 24 a second. Keyframes
+    that are no cameras are left out.
 
     Raises:
-        ValueError: the file is no such path, of another type of camera than perspective or equirectangular, or too
-            large; it names the file, the frame and the field.
+        ValueError: the file is no such path, of another type of camera than perspective, fisheye or equirectangular,
+            or too large; it names the file, the frame and the field.
         OSError: it cannot be read.
 
     Examples:
@@ -88,36 +98,38 @@ def read_camera_path(file: Path | str) -> CameraPath:
     if not isinstance(entries, dict) or not isinstance(entries.get("camera_path"), list):
         raise ValueError(f"{file}: is not a camera path: it must have a list camera_path")
     kind = entries.get("camera_type", "perspective")
-    if kind not in ("perspective", "equirectangular"):
-        raise ValueError(f"{file}: camera_type must be perspective or equirectangular, got {kind!r:.60}")
-    sizes = {}
-    for name in ("render_width", "render_height"):
-        size = entries.get(name)
-        if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= LONGEST_SIDE:
-            raise ValueError(f"{file}: {name} must be an integer of 1 to {LONGEST_SIDE}, got {size!r:.60}")
-        sizes[name] = size
-    size = sizes["render_width"], sizes["render_height"]
-    fps = _number(entries.get("fps", 24), 0.01, 1000, f"{file}: fps")
-    frames = _read_cameras(entries["camera_path"], "camera_to_world", size, f"{file}: camera_path")
-    if kind == "equirectangular":
-        if size[0] != 2 * size[1]:
-            raise ValueError(f"{file}: equirectangular frames must be 2 to 1, got {size[0]} x {size[1]}")
-        frames = Cameras.all_around(frames.poses, size[1])
-    keyframes = entries.get("keyframes") or None
-    if keyframes is not None:
-        keyframes = _read_cameras(keyframes, "matrix", size, f"{file}: keyframes")
+    model = MODELS.get(str(kind).lower())
+    if model is None:
+        raise ValueError(f"{file}: camera_type must be perspective, fisheye or equirectangular, got {kind!r:.60}")
+    width, height = (
+        int(_number(entries.get(name), 1, LONGEST_SIDE, f"{file}: {name}", whole=True))
+        for name in ("render_width", "render_height")
+    )
+    angle = entries.get("default_fov")
+    frames = _read_cameras(
+        entries["camera_path"], "camera_to_world", angle, width, height, f"{file}: camera_path", model
+    )
+    fps = entries.get("fps")
+    if fps is None and "seconds" in entries:
+        fps = len(frames) / _number(entries["seconds"], 1e-3, 1e9, f"{file}: seconds")
+    fps = _number(24 if fps is None else fps, 0.01, 1000, f"{file}: fps")
+    keyframes = None
+    with contextlib.suppress(RecursionError, TypeError, ValueError):  # the frames are there without them
+        keyframes = _read_cameras(entries.get("keyframes"), "matrix", angle, width, height, f"{file}: keyframes")
     return CameraPath(frames, fps, keyframes, entries.get("is_cycle") is True)
 
 
 def write_camera_path(file: Path | str, path: CameraPath) -> None:
     """Writes a path that nerfstudio and :func:`read_camera_path` read.
 
-    The file keeps poses, size and the vertical angle of view; the principal point becomes the middle of the frame.
+    The file keeps poses, size, the camera model of the first frame and the vertical angle of view; the principal point
+    becomes the middle of the frame.
     """
+    model = PERSPECTIVE if path.frames.models is None else int(path.frames.models[0])
     size = {"render_height": path.frames.height, "render_width": path.frames.width}
     keyframes = [] if path.keyframes is None else _entries(path.keyframes, "matrix")
     entries = {
-        "camera_type": "perspective",
+        "camera_type": next(name for name, number in MODELS.items() if number == model),
         **size,
         "fps": path.fps,
         "seconds": len(path.frames) / path.fps,
@@ -225,12 +237,17 @@ def like_most(cameras: Cameras) -> Cameras:
 
 
 def resized(cameras: Cameras, size: tuple[int, int]) -> Cameras:
-    """Cameras without lenses for pictures of another (width, height), which show no more than theirs at either side."""
+    """Cameras for pictures of another (width, height), which show no more than theirs at either side."""
     scale = max(size[0] / cameras.width, size[1] / cameras.height)
     intrinsics = scale * cameras.intrinsics
     intrinsics[:, 2] += (size[0] - scale * cameras.width) / 2
     intrinsics[:, 3] += (size[1] - scale * cameras.height) / 2
-    return Cameras(cameras.poses, intrinsics, *size)
+    return replace(cameras, intrinsics=intrinsics, width=size[0], height=size[1])
+
+
+def see_all_around(cameras: Cameras) -> bool:
+    """Whether all cameras see all around."""
+    return cameras.models is not None and bool((cameras.models == EQUIRECTANGULAR).all())
 
 
 def panoramas(cameras: Cameras, size: tuple[int, int]) -> Cameras:
@@ -241,7 +258,7 @@ def panoramas(cameras: Cameras, size: tuple[int, int]) -> Cameras:
     """
     if size[0] != 2 * size[1]:
         raise ValueError(f"pictures all around must be 2 to 1, got {size[0]} x {size[1]}")
-    if cameras.models is not None:
+    if see_all_around(cameras):
         return Cameras.all_around(cameras.poses, size[1])
     level = cameras.forward * cameras.forward.new_tensor((1.0, 1.0, 0.0))
     up = cameras.poses.new_tensor((0.0, 0.0, 1.0))
@@ -288,35 +305,61 @@ def _around(cameras: Cameras, count: int, focus: Tensor) -> Tensor:
     return look_at(origins, focus, up)
 
 
-def _read_cameras(entries: Any, key: str, size: tuple[int, int], where: str) -> Cameras:
+def _read_cameras(
+    entries: Any, key: str, angle: Any, width: int, height: int, where: str, model: int = PERSPECTIVE
+) -> Cameras:
+    """The cameras of a list of frames; ``angle`` is the angle of view of those that have none."""
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_FRAMES:
         got = f"{len(entries)} of them" if isinstance(entries, list) else f"{entries!r:.60}"
         raise ValueError(f"{where} must be a list of 1 to {MOST_FRAMES} frames, got {got}")
-    (width, height), matrices, focals = size, [], []
+    matrices, focals = [], []
     for number, entry in enumerate(entries):
         at = f"{where}[{number}]"
         matrix = entry.get(key) if isinstance(entry, dict) else None
-        if not isinstance(matrix, list) or len(matrix) != 16:
-            raise ValueError(f"{at}.{key} must be 16 numbers, got {matrix!r:.60}")
-        matrices.append([_number(value, -FARTHEST, FARTHEST, f"{at}.{key}") for value in matrix])
-        fov = _number(entry.get("fov"), 0.01, 179.9, f"{at}.fov")
-        focals.append(height / 2 / math.tan(math.radians(fov) / 2))
+        if key == "matrix" and isinstance(matrix, str):
+            columns = json.loads(matrix)
+            matrix = [columns[row::4] for row in range(4)]
+        matrices.append(_matrix(matrix, f"{at}.{key}"))
+        if model != EQUIRECTANGULAR:
+            fov = entry.get("fov")
+            fov = _number(angle if fov is None else fov, 0.01, 179.9, f"{at}.fov")
+            focals.append([height / 2 / math.tan(math.radians(fov) / 2)] * 2)
+        else:
+            focals.append([width / 2 / math.pi, height / math.pi])
     poses = torch.tensor(matrices, dtype=torch.float64).view(-1, 4, 4)
+    poses[:, :3, :3] /= torch.linalg.det(poses[:, :3, :3]).clamp_min(1e-18)[:, None, None] ** (1 / 3)
     rotations = poses[:, :3, :3]
     unlike = (rotations @ rotations.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2)) > ORTHONORMAL
-    unlike |= (torch.linalg.det(rotations) < 0) | (poses[:, 3] != poses.new_tensor((0, 0, 0, 1))).any(-1)
+    unlike |= (poses[:, 3] - poses.new_tensor((0, 0, 0, 1))).abs().amax(-1) > ORTHONORMAL
     if unlike.any():
         raise ValueError(f"{where}[{int(unlike.nonzero()[0])}].{key} must be a rotation and a position")
-    focal = torch.tensor(focals)
+    poses[:, 3] = poses.new_tensor((0, 0, 0, 1))
     middle = torch.tensor((width / 2, height / 2)).repeat(len(focals), 1)
-    return Cameras(poses.float(), torch.cat((focal[:, None], focal[:, None], middle), dim=-1), width, height)
+    cameras = Cameras(poses.float(), torch.cat((torch.tensor(focals), middle), dim=-1), width, height)
+    if model == PERSPECTIVE:
+        return cameras
+    models = torch.full((len(poses),), model, dtype=torch.int32)
+    return replace(cameras, distortion=torch.zeros(len(poses), 8), models=models)
 
 
-def _number(value: object, lowest: float, highest: float, where: str) -> float:
+def _matrix(value: Any, where: str) -> list[float]:
+    """The 16 numbers of a pose, given as numbers or as rows; the last row may be left out."""
+    rows = value if isinstance(value, list) else []
+    numbers = [number for row in rows for number in (row if isinstance(row, list) else [row])]
+    if len(numbers) == 12:
+        numbers += [0, 0, 0, 1]
+    if len(numbers) != 16:
+        raise ValueError(f"{where} must be 4 x 4 or 3 x 4 numbers, got {value!r:.60}")
+    return [_number(number, -FARTHEST, FARTHEST, where) for number in numbers]
+
+
+def _number(value: Any, lowest: float, highest: float, where: str, *, whole: bool = False) -> float:
     # The comparison takes integers of any size, and NaN fails it.
-    if isinstance(value, int | float) and not isinstance(value, bool) and lowest <= value <= highest:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and lowest <= value <= highest
+    if is_number and not (whole and value % 1):
         return float(value)
-    raise ValueError(f"{where} must be a number of {lowest:g} to {highest:g}, got {value!r:.60}")
+    kind = "an integer" if whole else "a number"
+    raise ValueError(f"{where} must be {kind} of {lowest:g} to {highest:g}, got {value!r:.60}")
 
 
 def _entries(cameras: Cameras, key: str) -> list[dict[str, Any]]:
