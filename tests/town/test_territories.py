@@ -11,10 +11,11 @@ from voronerf import NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
 from voronerf.app.scenes import builtin_scene, city_scene
 from voronerf.nerf import Adam, Batch, Occupancy, RayLoss, Rays, Renderer, TrainingStep
 from voronerf.nerf.contraction import Contraction
+from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.samplers import SETTLING_PART
 from voronerf.town.group import Group
 from voronerf.town.rays import Territory, meet, step_together
-from voronerf.town.territories import Territories, cut_space, halve
+from voronerf.town.territories import LATTICE, Territories, cut_space, halve
 
 BOX = torch.tensor([[0.0, 0, 0], [4.0, 2, 2]])
 
@@ -195,3 +196,22 @@ def test_a_ray_that_has_ended_goes_no_further():
     fill(own, (100.0,) * 3, torch.full((3, 3), 0.5))
     found = run(own, {0: rays_through(30)})
     assert [each.samples > 0 for each in found.values()] == [True, False, False]
+
+
+def test_pixels_that_do_not_count_place_no_view():
+    """Of one pixel that counts, a view lies where its ray has gone half of its way through the scene."""
+    scene = builtin_scene(LATTICE, train_views=3, test_views=1)
+    masks = torch.zeros(3, LATTICE, LATTICE, dtype=torch.bool)
+    row, column = LATTICE // 2, LATTICE // 2 + 2
+    masks[:, row, column] = True
+    centres = cut_space(replace(scene, train=replace(scene.train, masks=masks)), 3, None).centres
+    places = []
+    for view in range(3):
+        rays = scene.train.cameras.rays(view, torch.tensor([column]), torch.tensor([row]))
+        near, far, hit = intersect_box(rays.origins, rays.directions, scene.box, scene.near, scene.far)
+        width = float((scene.box[1] - scene.box[0]).prod() / 3) ** (1 / 3)
+        depth = near + torch.minimum((far - near) / 2, torch.full_like(near, width / 2))
+        assert hit.all()
+        places.append(rays.origins + depth[:, None] * rays.directions)
+    apart = torch.cdist(torch.cat(places), centres)
+    assert float(apart.amin(1).max()) < 1e-5

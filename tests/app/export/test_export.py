@@ -17,11 +17,11 @@ from helpers import refuses, renderer_of, seeded
 from voronerf import VoronoiDiagram
 from voronerf.app.evaluate.panels import palette
 from voronerf.app.export import cell_meshes, export_cells, export_mesh, export_points
-from voronerf.app.export.space import write_geometry
+from voronerf.app.export.space import views_of, write_geometry
 from voronerf.app.run import Run
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import ConfigError
-from voronerf.nerf import Contraction
+from voronerf.nerf import Contraction, orbit_cameras
 
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
 pytest.importorskip("skimage", reason="scikit-image is not installed")
@@ -37,6 +37,18 @@ def shell(positions, directions, ray_index):
     apart = (positions.norm(dim=-1) - (RADIUS - 0.1)).abs() < 0.1
     speck = (positions - torch.tensor([0.9, 0.9, 0.6])).norm(dim=-1) < 0.04
     return torch.where(positions[:, 2:] > 0, RED, BLUE), 300.0 * (apart | speck)
+
+
+def test_pixels_without_a_ray_show_no_surface():
+    """In the corners of a wide lens a picture may have any colour."""
+    cameras = orbit_cameras(2, radius=2, elevation=5, width=20, height=16, focal=10)
+    cameras = replace(cameras, distortion=torch.tensor([[-0.25] + 7 * [0.0], 8 * [0.0]]))
+    image = SimpleNamespace(colour=torch.ones(16, 20, 3), opacity=torch.ones(16, 20), heaviest=torch.ones(16, 20, 3))
+    run = SimpleNamespace(render=lambda *_: image, renderer=SimpleNamespace(contraction=None))
+    wide, plain = views_of(run, cameras)
+    there = cameras.has_ray(0)
+    assert 0.5 < float(there.float().mean()) < 0.9 and cameras.has_ray(1) is None
+    assert torch.equal(wide.surface.isfinite().all(-1), there) and bool(plain.surface.isfinite().all())
 
 
 def read_glb(path):

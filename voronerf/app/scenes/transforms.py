@@ -292,11 +292,10 @@ def capture_scene(
     transform[:3] *= number(entries, "applied_scale", path, positive=True) or 1.0
     headers = [read_header(frame.path) for frame in frames]
     views = [_view(frame, header) for frame, header in zip(frames, headers)]
-    for view, header in zip(views, headers):
-        if view.size != header.size:
-            sizes = "{} x {} pixels, where {} says {:g} x {:g}".format(*header.size, path.name, *view.size)
-            notes.append(f"images have {sizes}: their lenses are scaled")
-            break
+    scaled = [(*header.size, path.name, *view.size) for view, header in zip(views, headers) if view.size != header.size]
+    if scaled:
+        sizes = "{} x {} pixels, where {} says {:g} x {:g}".format(*scaled[0])
+        notes.append(f"images have {sizes}: their lenses are scaled")
     factor = reading.downscale or least_factor(max(max(header.size) for header in headers))
     return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
 
