@@ -7,7 +7,7 @@ import torch
 from helpers import refuses
 
 from voronerf.nerf import lenses
-from voronerf.nerf.cameras import Cameras, Rays, focus_point, look_at, orbit_cameras, turntable_cameras
+from voronerf.nerf.cameras import Cameras, Rays, axis_misses, focus_point, look_at, orbit_cameras, turntable_cameras
 from voronerf.nerf.lenses import distort, undistort
 
 FOX = (0.0578421, -0.0805099, -0.000980296, 0.00015575, 0, 0, 0, 0)
@@ -209,6 +209,13 @@ def test_orbit_and_turntable():
     torch.testing.assert_close((again.origins - focus).norm(dim=-1), torch.full((4,), 2.5), atol=1e-3, rtol=0)
     options = {"radius": 1, "elevation": 0, "width": 1, "height": 1, "focal": 1}
     refuses("count must be >= 1, got 0", orbit_cameras, 0, **options)
+
+
+def test_how_far_axes_pass_from_a_point():
+    cameras = Cameras(torch.eye(4)[None], torch.ones(1, 4), 1, 1)  # which looks along -z
+    points = torch.tensor([[0.0, 0, -2], [3.0, 0, -4], [0.0, 1, 0], [0.0, 1, 5], [0.0, 0, 0]])
+    found = torch.cat([axis_misses(cameras, point) for point in points])
+    torch.testing.assert_close(found, torch.tensor((0.0, 0.6, 1.0, 1.0, 1.0)))
 
 
 def test_no_focus_of_parallel_or_outward_axes():

@@ -22,7 +22,20 @@ from torch import Tensor
 from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, LensTables, distort, unproject
 from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 
-__all__ = ["Cameras", "Rays", "focus_point", "look_at", "orbit_cameras", "turntable_cameras"]
+__all__ = [
+    "Cameras",
+    "Rays",
+    "axis_misses",
+    "focus_point",
+    "look_at",
+    "orbit_cameras",
+    "shared_focus",
+    "turntable_cameras",
+]
+
+#: Largest median of `axis_misses` of cameras around something: 24 degrees, within the pictures of most lenses. Captures
+#: around something have 0.06 to 0.13, those that are aimed 12 degrees off 0.22; 1 % of random walks have less than 0.4.
+AROUND = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,6 +404,36 @@ def focus_point(cameras: Cameras) -> Tensor | None:
     point = torch.linalg.solve(matrix, (across @ origins[:, :, None]).mean(0)[:, 0])
     ahead = ((point - origins) * forward).sum(-1)
     return point.to(cameras.poses.dtype) if (ahead > 0).double().mean() > 0.5 else None
+
+
+def axis_misses(cameras: Cameras, point: Tensor) -> Tensor:
+    """Returns how far each optical axis passes from a point, as a share of the camera's distance from it, [c].
+
+    A camera that looks at the point has 0, one that looks past it at an angle of 30 degrees 0.5, and one that has it
+    behind itself 1.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import orbit_cameras
+        >>> from voronerf.nerf.cameras import axis_misses
+        >>> cameras = orbit_cameras(2, radius=4.0, elevation=0.0, width=64, height=64, focal=70.0)
+        >>> axis_misses(cameras, torch.tensor([0.0, 3.0, 0.0])).round(decimals=4)
+        tensor([0.6000, 0.6000])
+    """
+    offset = point - cameras.origins
+    distance = offset.norm(dim=-1).clamp_min(1e-12)
+    share = torch.linalg.cross(offset, cameras.forward, dim=-1).norm(dim=-1) / distance
+    return torch.where((offset * cameras.forward).sum(-1) > 0, share, 1)
+
+
+def shared_focus(cameras: Cameras) -> Tensor | None:
+    """Returns the `focus_point` of cameras that stand around something, [3], or None for others.
+
+    The point closest to all optical axes of people who walk and look around lies ahead of most cameras by chance. Only
+    cameras around something look at it.
+    """
+    focus = focus_point(cameras)
+    return focus if focus is not None and float(axis_misses(cameras, focus).median()) < AROUND else None
 
 
 def look_at(origins: Tensor, target: Tensor, up: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from voronerf.app.render.paths import (
     write_camera_path,
 )
 from voronerf.nerf import Cameras, focus_point, orbit_cameras, turntable_cameras
-from voronerf.nerf.cameras import look_at
+from voronerf.nerf.cameras import look_at, shared_focus
 
 LEVEL = [1, 0, 0, 4, 0, 0, -1, -5, 0, 1, 0, 6, 0, 0, 0, 1]  # at (4, -5, 6), looking along +y, z up
 
@@ -282,6 +282,21 @@ def test_a_path_of_cameras_that_look_outwards_goes_through_them_in_order():
     assert torch.cdist(frames.origins, seen.origins).amin(1).max() < 0.3
     torch.testing.assert_close(frames.poses[[0, 47]], seen.poses[[0, 11]], atol=1e-5, rtol=0)
     assert len(capture_path(seen, 1, near=1, far=9)) == 1
+
+
+def test_a_path_of_people_who_walk_and_look_around_is_theirs():
+    """The point closest to all axes lies ahead of most cameras by chance."""
+    torch.manual_seed(0)
+    along = torch.linspace(-2, 2, 12)
+    origins = torch.stack((along, 0.3 * torch.rand(12), torch.full((12,), 1.5)), 1)
+    turn = along + 2 * math.pi * torch.rand(()) + torch.rand(12)
+    targets = origins + torch.stack((turn.cos(), turn.sin(), torch.full((12,), -0.1)), 1)
+    poses = look_at(origins, targets, torch.tensor([0.0, 0, 1]))
+    cameras = Cameras(poses, torch.tensor([[20.0, 20, 16, 12]]).expand(12, 4), 32, 24)
+    assert focus_point(cameras) is not None and shared_focus(cameras) is None
+    path = capture_path(cameras, 60, near=0.5, far=8)
+    apart = torch.cdist(path.origins, origins).amin(1)
+    assert float(apart.max()) < 0.3
 
 
 def test_frames_have_the_size_of_most_images_or_another():

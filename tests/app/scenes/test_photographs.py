@@ -1,6 +1,7 @@
 """Folders of photographs: COLMAP's, LLFF's and nerfstudio's readers, what they share, and what they refuse."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from voronerf.app import open_run
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.scenes import SceneError, builtin_scene, images, load_scene, photographs
 from voronerf.app.scenes.colmap import read_model
+from voronerf.app.scenes.photographs import find_frame
 from voronerf.app.scenes.scene import SparseDepth
 from voronerf.app.train import Callback, ConfigError, TrainConfig, train
 from voronerf.app.train.build import (
@@ -37,7 +39,7 @@ from voronerf.app.train.build import (
     make_routers,
 )
 from voronerf.app.train.defaults import BESIDE, COVERED, resolve
-from voronerf.nerf.cameras import Cameras, orbit_cameras
+from voronerf.nerf.cameras import Cameras, focus_point, look_at, orbit_cameras
 
 
 @pytest.mark.parametrize(("format", "binary"), [("colmap", True), ("colmap", False), ("llff", True)])
@@ -172,6 +174,78 @@ def test_the_kind_is_told_by_the_cameras_and_can_be_set(tmp_path, kind, turn):
         assert scene.near == pytest.approx(0.75)
     assert load_scene(tmp_path, kind="inside-out").kind == "inside-out"
     refuses("--kind object needs images with transparent pixels", load_scene, tmp_path, kind="object", error=SceneError)
+
+
+def looking(origins, targets):
+    poses = look_at(origins, targets, torch.tensor((0.0, 0.0, 1.0)))
+    return Cameras(poses, torch.ones(len(poses), 4), 1, 1)
+
+
+def on_a_sphere(count, turn, climb, generator):
+    """Directions whose azimuth and height are drawn from 0 to these angles, in radians."""
+    azimuth, height = turn * torch.rand(count, generator=generator), climb * torch.rand(count, generator=generator)
+    return torch.stack((azimuth.cos() * height.cos(), azimuth.sin() * height.cos(), height.sin()), dim=1)
+
+
+def test_people_who_walk_and_look_around_are_inside_out():
+    """Whether the point that is closest to their axes lies ahead of most cameras is chance."""
+    generator = torch.Generator().manual_seed(0)
+    ahead = 0
+    for _ in range(200):
+        origins = torch.tensor((2.0, 2.0, 0.3)) * torch.randn(40, 3, generator=generator)
+        cameras = looking(origins, origins + on_a_sphere(40, 2 * math.pi, 0.4, generator))
+        ahead += focus_point(cameras) is not None
+        assert photographs.kind_of(cameras) == "inside-out"
+    assert 60 < ahead < 140
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize("middle", [0.0, 0.6])
+@pytest.mark.parametrize("turn", [2.0, math.pi, 2 * math.pi])
+@pytest.mark.parametrize("climb", [0.2, 1.5])
+def test_cameras_around_something_are_unbounded(turn, climb, middle, noise):
+    """Along an arc or over a dome, around an object or beside it, and not well aimed."""
+    generator = torch.Generator().manual_seed(0)
+    origins = on_a_sphere(60, turn, climb, generator)
+    targets = torch.tensor((-middle, 0.0, 0.0)) + noise * torch.randn(60, 3, generator=generator)
+    assert photographs.kind_of(looking(origins, targets)) == "unbounded"
+
+
+def outward(extent):
+    """Poses of cameras that look outwards from a circle of this radius, float64 [24, 4, 4]."""
+    poses = orbit_cameras(24, radius=extent, elevation=0, width=1, height=1, focal=1).poses.double()
+    poses[:, :3, [0, 2]] *= -1
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("extent", "length"),
+    [(30.0, 20.0), (1.5, 1.5), (1e-6, 0.5)],
+    ids=["far", "a walk", "on the spot"],
+)
+def test_the_sphere_of_a_walk_goes_through_its_farthest_camera(extent, length):
+    """But for cameras that only turn, and for those that see less far than they go; near is before the points."""
+    bounds = torch.tensor((0.5, 20.0), dtype=torch.float64).repeat(24, 1)
+    frame = find_frame(outward(extent), "inside-out", bounds)
+    assert 1 / frame.scale == pytest.approx(length)
+    assert frame.near / frame.scale == pytest.approx(0.75 * 0.5) and frame.far / frame.scale > 29.99
+
+
+@pytest.mark.parametrize("kind", ["inside-out", "unbounded"])
+def test_near_is_before_what_some_views_see_but_not_before_noise(kind):
+    poses = outward(1.0)
+    if kind == "unbounded":
+        poses[:, :3, [0, 2]] *= -1
+    far = torch.full((24,), 1000.0, dtype=torch.float64)
+
+    def near(close):
+        close = torch.tensor(close, dtype=torch.float64)
+        frame = find_frame(poses, kind, torch.stack((close, far), dim=1))
+        return frame.near / frame.scale
+
+    assert near([0.005] * 4 + [0.9] * 20) == pytest.approx(0.75 * 0.005)
+    assert near([1e-7] * 2 + [0.9] * 22) == pytest.approx(photographs.LEAST_NEAR)
+    assert near([0.5] * 24) == pytest.approx(0.75 * 0.5)
 
 
 def test_silhouettes_that_do_not_fit_together_are_said(tmp_path):

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from voronerf.app.files import json_text, read_json, write_text
-from voronerf.nerf.cameras import Cameras, focus_point, look_at
+from voronerf.nerf.cameras import Cameras, focus_point, look_at, shared_focus
 from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE
 
 #: The camera models, by the names that paths have for them.
@@ -213,11 +213,11 @@ def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Ca
     """
     if count < 1:
         raise ValueError(f"capture_path: count must be at least 1, got {count}")
-    focus, forward = focus_point(cameras), cameras.forward.double().mean(0)
+    forward = cameras.forward.double().mean(0)
     alike = like_most(cameras)
     if forward.norm() > ONE_WAY:
-        poses = _spiral(cameras, count, focus, near, far)
-    elif focus is not None:
+        poses = _spiral(cameras, count, focus_point(cameras), near, far)
+    elif (focus := shared_focus(cameras)) is not None:
         poses = _around(cameras, count, focus.double())
     else:
         some = torch.linspace(0, len(cameras) - 1, min(max(count // BETWEEN, 2), len(cameras))).round().long()

@@ -24,7 +24,7 @@ from voronerf.app.scenes.images import OPAQUE, Decoded, Header, read_images, rea
 from voronerf.app.scenes.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Lens, have_rays
 from voronerf.app.scenes.scene import Scene, SparseDepth, Split
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
-from voronerf.nerf.cameras import Cameras, focus_point
+from voronerf.nerf.cameras import Cameras, focus_point, shared_focus
 from voronerf.nerf.contraction import Contraction, Perspective
 
 HOLD_OUT = 8
@@ -36,8 +36,9 @@ NEAR = 0.35
 # Smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
 NEAREST = 0.05
 FAR = 4.0
-# Smallest near bound that points give; half of the samples lie before twice the near bound.
-LEAST_NEAR = 0.02
+# Points nearer than this are taken for noise if only this share of the views has any: half of the samples lie before
+# twice the near bound.
+LEAST_NEAR, NOISY = 0.02, 0.1
 # Of the bounds of the views: things may be a little nearer than the nearest point, and farther than the farthest.
 NEARER, FARTHER = 0.75, 1.5
 # Mean of the viewing directions, a unit vector each, from which on they count as one direction.
@@ -55,7 +56,7 @@ ROUNDED = 2
 KIND_LINES = {
     "object": "an object on white, from the images' alpha",
     "forward": "forward facing, the cameras look the same way",
-    "inside-out": "inside-out, the cameras look away from each other",
+    "inside-out": "inside-out, the cameras look around and not at one place",
     "unbounded": "unbounded, the cameras look at one place with surroundings",
 }
 
@@ -327,7 +328,8 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
 
     The cameras' focus becomes the origin, or their middle where they have none in common; their mean up direction
     becomes z, and for a forward-facing scene their mean direction becomes y. The farthest camera is at distance 1; with
-    bounds, the nearest near bound of a forward-facing scene, and the median far bound of one that is seen from within.
+    bounds, the nearest near bound of a forward-facing scene. In one that is seen from within 1 is no nearer than the
+    median near bound, since cameras may only turn, and no farther than the median far bound.
 
     Args:
         poses: float64 [c, 4, 4].
@@ -344,7 +346,8 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
     distances = (cameras.origins - centre).norm(dim=-1)
     length = float(distances.max())
     if outward and bounds is not None:
-        length = float(bounds[:, 0].min() if kind == "forward" else bounds[:, 1].median())
+        least, most = bounds.median(0).values.tolist()  # cells as far as views reach would be too few for near things
+        length = float(bounds[:, 0].min()) if kind == "forward" else min(max(length, least), most)
     length = length if length > 0 else 1.0
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = turn / length
@@ -355,7 +358,8 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
         near, far = 0.05 * nearest, 2.0
     elif bounds is not None:
         measured = True
-        near = max(NEARER * float(bounds[:, 0].min()) / length, LEAST_NEAR)
+        nearest_points = NEARER * bounds[:, 0] / length
+        near = max(float(nearest_points.min()), min(LEAST_NEAR, float(nearest_points.quantile(NOISY))))
         far = max(FARTHER * float(bounds[:, 1].max()) / length, FAR)
     axes = torch.eye(3, dtype=torch.float64)[[0, 2, 1]]
     if normalise:
@@ -415,11 +419,14 @@ def _kind(poses: Tensor, transparent: bool, cut_out: bool, around: bool, reading
         return "object"
     if around:
         return "inside-out"
-    cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
-    forward = cameras.forward
-    if float(forward.mean(0).norm()) > PARALLEL:
+    return kind_of(Cameras(poses, torch.ones(len(poses), 4), 1, 1))
+
+
+def kind_of(cameras: Cameras) -> str:
+    """Returns the kind of scene that the directions of cameras show, without their images."""
+    if float(cameras.forward.mean(0).norm()) > PARALLEL:
         return "forward"
-    return "unbounded" if focus_point(cameras) is not None else "inside-out"
+    return "inside-out" if shared_focus(cameras) is None else "unbounded"
 
 
 def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) -> Cameras:

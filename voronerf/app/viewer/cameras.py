@@ -15,7 +15,7 @@ from torch import Tensor
 from viser.transforms import SO3
 
 from voronerf.app.scenes import Scene
-from voronerf.nerf.cameras import Cameras, focus_point
+from voronerf.nerf.cameras import Cameras, shared_focus
 
 #: From OpenCV's axes to OpenGL's, and back.
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -87,7 +87,7 @@ def scene_bounds(scene: Scene) -> Tensor:
 
 def look_point(scene: Scene, cameras: Cameras, index: int) -> Tensor:
     """What one of several cameras looks at, as the point [3] to turn around: on its axis, beside the scene's focus."""
-    focus = focus_point(scene.train.cameras)
+    focus = shared_focus(scene.train.cameras)
     centre = scene_bounds(scene).mean(0) if focus is None else focus
     origin, forward = cameras.origins[index], cameras.forward[index]
     return origin + forward * ((centre - origin) @ forward).clamp_min(0.1)

@@ -26,7 +26,7 @@ from torch import Tensor
 from voronerf.app.evaluate.panels import palette
 from voronerf.app.run import Run
 from voronerf.app.web.shader import BLOCK, CannotDraw, Layout, fours, networks_text, shader_text
-from voronerf.nerf.cameras import Cameras, focus_point
+from voronerf.nerf.cameras import Cameras, shared_focus
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.nerf.samplers import FINE_WAVE, OPAQUE, Occupancy
@@ -228,7 +228,7 @@ def _views(run: Run) -> dict[str, Any]:
     chosen = np.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS)).round().astype(int)
     chosen = chosen[_tour(cameras.origins[chosen].numpy())]
     first = scene.test.cameras.perspective() if len(scene.test.cameras) else cameras
-    target = focus_point(cameras)
+    target = shared_focus(cameras)
     contraction = scene.contraction
     if scene.box is not None:
         low, high = scene.box.tolist()
