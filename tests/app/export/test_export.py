@@ -17,11 +17,13 @@ from helpers import refuses, renderer_of, seeded
 from voronerf import VoronoiDiagram
 from voronerf.app.evaluate.panels import palette
 from voronerf.app.export import cell_meshes, export_cells, export_mesh, export_points
-from voronerf.app.export.space import views_of, write_geometry
+from voronerf.app.export.mesh import REACH, _fused
+from voronerf.app.export.space import SurfaceView, views_of, write_geometry
 from voronerf.app.run import Run
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import ConfigError
-from voronerf.nerf import Contraction, orbit_cameras
+from voronerf.nerf import Cameras, Contraction, orbit_cameras
+from voronerf.nerf.cameras import look_at
 
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
 pytest.importorskip("skimage", reason="scikit-image is not installed")
@@ -313,3 +315,21 @@ def test_meshes_in_the_coordinates_of_the_files(run, tmp_path):
     assert export_mesh(run, tmp_path / "scene.ply", resolution=32).extents.max() < 1.3
     extents = export_mesh(moved, tmp_path / "metres.ply", resolution=32, to_files=True).extents
     assert extents.min() > 4.2 and extents.max() < 5.4
+
+
+def test_a_floor_within_a_layer_of_blocks_has_no_hole():
+    """Its own layer is filled, too, and not only those a reach above and below."""
+    pose = look_at(torch.tensor([[0.0, 0.0, 3.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    camera = Cameras(pose, torch.tensor([[60.0, 60, 32, 32]]), 64, 64)
+    y, x = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    rays = camera.rays(0, x.reshape(-1), y.reshape(-1))
+    floor = 0.03
+    points = rays.origins + rays.directions * ((floor - 3) / rays.directions[:, 2:])
+    view = SurfaceView(camera, torch.full((64, 64, 3), 0.5), points.view(64, 64, 3))
+    side, low = 1 / 64, torch.full((3,), -0.5)
+    value, seen = _fused(low, side, torch.full((3,), 8), [view], False, lambda items, name: items)
+    heights = low[2] + side * torch.arange(64)
+    there = (heights - floor).abs() < REACH * side / 2
+    assert bool(seen[8:-8, 8:-8, there].all())
+    expected = ((heights - floor) / (REACH * side))[there].expand(48, 48, -1)
+    torch.testing.assert_close(value[8:-8, 8:-8, there], expected, atol=0.1, rtol=0)

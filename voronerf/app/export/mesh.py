@@ -30,7 +30,7 @@ from voronerf.app.export.space import (
 )
 from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
-from voronerf.nerf.cameras import Cameras, focus_point
+from voronerf.nerf.cameras import Cameras, shared_focus
 from voronerf.ops._core.checks import available_memory
 
 SUFFIXES = (".ply", ".glb", ".obj")
@@ -117,7 +117,7 @@ def looked_at(views: list[SurfaceView]) -> Tensor | None:
     for view in views:
         shared += _in_picture(points, view)[1]
     kept = shared >= SHARED * len(views)
-    focus = focus_point(cameras)
+    focus = shared_focus(cameras)
     if focus is not None:
         kept &= (points - focus).norm(dim=-1) < (cameras.origins - focus).norm(dim=-1).median()
     if not kept.any():
@@ -224,12 +224,12 @@ def _fused(
         value = _distance(middles, views, reach)[0].view(counts)
         greatest, least = (sign * max_pool3d(sign * value[None], 3, 1, 1)[0] for sign in (1, -1))
         near |= greatest != least
-    corners = torch.cartesian_prod(*[torch.tensor((-1.0, 1.0))] * 3)
+    shown = torch.zeros(counts)
     for view in views:
         points = view.surface[((view.surface > low) & (view.surface < low + BLOCK * side * blocks)).all(-1)]
-        for corner in corners:
-            place = ((points + reach * corner - low) / (BLOCK * side)).long()
-            near[torch.minimum(place.clamp_min(0), blocks - 1).unbind(-1)] = True
+        place = ((points - low) / (BLOCK * side)).long()
+        shown[torch.minimum(place, blocks - 1).unbind(-1)] = 1
+    near |= max_pool3d(shown[None], 3, 1, 1)[0] > 0  # a block is a reach wide
     for axis in range(3):
         value = value.repeat_interleave(BLOCK, axis)
     inside = torch.cartesian_prod(*[torch.arange(BLOCK)] * 3)
