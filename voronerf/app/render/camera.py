@@ -4,17 +4,25 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
 from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.renderer import RenderedImage, Renderer
 
 
 def render_camera(
-    renderer: Renderer, scene: Scene, cameras: Cameras, index: int, *, heaviest: bool = True
+    renderer: Renderer, scene: Scene, cameras: Cameras, index: int, *, heaviest: bool = True, fill: bool = True
 ) -> RenderedImage:
-    """Renders one of several cameras on the background of a scene, without randomness; on the renderer's device."""
+    """Renders one of several cameras on the background of a scene, without randomness; on the renderer's device.
+
+    Where a scene has none, as photographs, holes of a picture have the colour of what lies beside them; without
+    ``fill`` they are black. So are pixels that have no ray.
+    """
     device = renderer.device
-    return renderer.train(False).image(
+    image = renderer.train(False).image(
         cameras.to(device),
         index,
         near=scene.near,
@@ -23,6 +31,32 @@ def render_camera(
         background=scene.background_colour(device),
         heaviest=heaviest,
     )
+    if not fill or scene.background is not None or scene.box is not None:
+        return image
+    filled, there = fill_holes(image.colour, image.opacity), cameras.has_ray(index)
+    return image._replace(colour=filled if there is None else filled * there[..., None].to(device))
+
+
+def fill_holes(colour: Tensor, opacity: Tensor) -> Tensor:
+    """A picture [h, w, 3] whose transparent parts have the colour of what lies beside them.
+
+    Every coarser picture of a pyramid fills the finer one where that is transparent (Gortler et al. 1996, "The
+    Lumigraph", section 3.4).
+
+    Args:
+        colour: [h, w, 3], multiplied by the opacity.
+        opacity: [h, w], 0..1.
+    """
+    levels = [torch.cat((colour, opacity[..., None]), -1).permute(2, 0, 1)[None]]
+    while max(levels[-1].shape[2:]) > 1:
+        summed = avg_pool2d(levels[-1], 2, ceil_mode=True, count_include_pad=False, divisor_override=1)
+        levels.append(summed / summed[:, 3:].clamp_min(1))
+    filled = levels.pop()
+    while levels:
+        finer = levels.pop()
+        behind = interpolate(filled[:, :3], finer.shape[2:], mode="bilinear", align_corners=False)
+        filled = finer[:, :3] + (1 - finer[:, 3:]).clamp_min(0) * behind
+    return filled[0, :3].permute(1, 2, 0)
 
 
 def crop_camera(camera: Cameras, left: int, top: int, width: int, height: int) -> Cameras:

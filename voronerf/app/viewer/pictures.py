@@ -129,7 +129,8 @@ def render_bands(subject: Subject, camera: Cameras, look: Look, rows: int) -> It
     for top in range(0, camera.height, rows):
         band = crop_camera(camera, 0, top, camera.width, min(rows, camera.height - top))
         with subject.weights():
-            yield render_camera(renderer, scene, band, 0, heaviest=look.pane == "cells" or look.picked is not None)
+            heaviest = look.pane == "cells" or look.picked is not None
+            yield render_camera(renderer, scene, band, 0, heaviest=heaviest, fill=False)
 
 
 def stack_bands(bands: list[RenderedImage]) -> RenderedImage:

@@ -1,0 +1,69 @@
+"""Pictures of photographs: their holes have the colour of what lies beside them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from unittest import mock
+
+import pytest
+import torch
+
+from voronerf.app.render.camera import fill_holes, render_camera
+from voronerf.app.scenes import builtin_scene
+from voronerf.nerf import Cameras, Renderer, Stratified, orbit_cameras
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 12), (33, 5)])
+def test_what_is_opaque_stays_as_it_is(size):
+    colour = torch.rand(*size, 3)
+    assert torch.equal(fill_holes(colour, torch.ones(size)), colour)
+
+
+def test_a_hole_has_the_colour_of_what_lies_beside_it():
+    colour = torch.tensor([0.2, 0.4, 0.8]).expand(20, 30, 3).clone()
+    colour[:, 15:] = torch.tensor([0.9, 0.1, 0.1])
+    opacity = torch.ones(20, 30)
+    opacity[5:9, 3:7], opacity[5:9, 20:28] = 0, 0.25
+    filled = fill_holes(colour * opacity[..., None], opacity)
+    torch.testing.assert_close(filled[:, :10], colour[:, :10])
+    torch.testing.assert_close(filled[:, 20:], colour[:, 20:])
+
+
+def test_a_gradient_goes_on_through_a_hole():
+    colour = torch.linspace(0, 1, 32)[None, :, None].expand(32, 32, 3)
+    opacity = torch.ones(32, 32)
+    opacity[12:18, 12:18] = 0
+    filled = fill_holes(colour * opacity[..., None], opacity)
+    assert float((filled - colour).abs().max()) < 0.1
+
+
+def test_a_picture_of_nothing_is_black():
+    assert not fill_holes(torch.zeros(4, 6, 3), torch.zeros(4, 6)).any()
+
+
+def test_photographs_alone_are_filled():
+    """A wall with a hole: of the background's colour where there is one, black in the viewer and in a box."""
+
+    def wall(positions, directions, ray_index):
+        there = (positions[:, 2] < 0) & (positions[:, :2].norm(dim=-1) > 0.3)
+        return torch.full_like(positions, 0.75), torch.where(there, 1e4, 0.0)
+
+    cameras = orbit_cameras(1, radius=2.0, elevation=90.0, width=24, height=24, focal=24.0)
+    scene = replace(builtin_scene(8, train_views=2, test_views=1), background=None, box=None, near=0.5, far=4.0)
+    renderer = Renderer({"field": wall}, Stratified(64))
+    filled = render_camera(renderer, scene, cameras, 0).colour
+    torch.testing.assert_close(filled, torch.full_like(filled, 0.75))
+    boxed = replace(scene, box=torch.tensor([[-2.0, -2, -2], [2, 2, 2]]))
+    for other, options, hole in (
+        (replace(scene, background="white"), {}, 1),
+        (boxed, {}, 0),
+        (scene, {"fill": False}, 0),
+    ):
+        seen = render_camera(renderer, other, cameras, 0, **options).colour[12, 12]
+        assert seen.tolist() == [hole] * 3
+
+    there = torch.ones(24, 24, dtype=torch.bool)
+    there[:4] = False
+    with mock.patch.object(Cameras, "has_ray", return_value=there):
+        seen = render_camera(renderer, scene, cameras, 0).colour
+    assert torch.equal(seen, filled * there[..., None])
