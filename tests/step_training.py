@@ -12,6 +12,7 @@ from voronerf.nerf import (
     Renderer,
     SmoothDepth,
     SparseDepth,
+    Surface,
     TrainingStep,
     orbit_cameras,
 )
@@ -54,7 +55,7 @@ class Training:
         grid.density[:6] = grid.occupied[:6] = 0
         self.sampler = sampler(grid, 32)
         shown = self.router if own is None else DirectionPerSample(self.router)
-        terms = [SparseDepth(0.3), SmoothDepth(0.1)]
+        terms = [SparseDepth(0.3), SmoothDepth(0.1), Surface(distortion=0.1, orientation=0.2)]
         self.loss = RayLoss(Renderer({"field": shown}, self.sampler), terms=terms)
         self.optimizer = Adam.of({"field": self.router}, lr=0.01, sparse=["features"])
         for group in self.optimizer.param_groups:

@@ -12,7 +12,7 @@ from helpers import renderer_of, seeded
 from torch import nn
 
 from voronerf import MLP, HashGridField, Layer, NeRF, OccupancyGrid, VoronoiRouter
-from voronerf.nerf import Adam, Batch, DirectionPerSample, RayLoss, Rays, SmoothDepth, SparseDepth
+from voronerf.nerf import Adam, Batch, DirectionPerSample, RayLoss, Rays, SmoothDepth, SparseDepth, Surface
 from voronerf.nerf.fields.nerf import MipNeRF
 from voronerf.nerf.fields.radiance import RadianceField
 from voronerf.nerf.occupancy import density_of
@@ -20,6 +20,7 @@ from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.ops.render_loss.reference import robust_error
 from voronerf.ops.smooth_depth_gradient.reference import smooth_depth_loss
 from voronerf.ops.sparse_depth_gradient.reference import sparse_depth_loss
+from voronerf.ops.surface_gradient.reference import surface_losses
 
 pytestmark = pytest.mark.native
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -168,7 +169,7 @@ def test_with_a_term_in_torch(name, monkeypatch):
 def test_equals_a_rendering_that_torch_differentiates(name, monkeypatch):
     """The error of the colours and all kinds of terms, each by the formula of its reference."""
     router, field = make(name)
-    terms = [SparseDepth(0.3), term_of_all, SmoothDepth(0.2)]
+    terms = [SparseDepth(0.3), term_of_all, SmoothDepth(0.2), Surface(distortion=0.4, orientation=0.3)]
     fast, separate = losses(field, monkeypatch, terms=terms, robust=0.05)
     batch, found = batch_of(sparse=20, unseen=12), []
     for loss in (fast, separate):
@@ -183,6 +184,10 @@ def test_equals_a_rendering_that_torch_differentiates(name, monkeypatch):
     disparity = torch.zeros(64).index_add(0, samples.ray_index.long(), seen.weights / samples.depths)
     expected = robust_error(error, 0.05).sum() / 192 + 0.3 * sparse_depth_loss(*along, batch.sparse_depths).mean()
     expected = expected + 0.2 * smooth_depth_loss(disparity, seen.opacity, batch.far, 12) + term_of_all(seen, batch)
+    lengths = samples.depths, samples.deltas, samples.ray_offsets, batch.near, batch.far
+    opacities, lit = -torch.expm1(-seen.density * samples.deltas), torch.ones_like(seen.density, dtype=torch.bool)
+    spread, fallen = surface_losses(seen.weights, opacities, *lengths, lit)
+    expected = expected + 0.4 * spread.mean() + 0.3 * fallen.mean()
     expected.backward()
     for own in found:
         for part, other in zip(own, [expected.detach(), *(p.grad for p in router.parameters())], strict=True):

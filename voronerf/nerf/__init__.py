@@ -14,7 +14,7 @@ from voronerf.nerf.sampling import stratified_depths
 from voronerf.nerf.segment import replayed
 from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
-from voronerf.nerf.terms import LossAlongRays, Seen, SmoothDepth, SparseDepth, Term
+from voronerf.nerf.terms import LossAlongRays, Seen, SmoothDepth, SparseDepth, Surface, Term
 from voronerf.nerf.volume import Batch, RayColours, Rendered, RenderOutput, Samples, Space
 
 __all__ = [
@@ -51,6 +51,7 @@ __all__ = [
     "StepOutput",
     "Strategy",
     "Stratified",
+    "Surface",
     "Term",
     "TrainingStep",
     "focus_point",

@@ -31,7 +31,7 @@ class RayLoss:
     Args:
         renderer: Networks and sampler.
         terms: Further terms, beside the error of the colours: a :class:`Term`, such as :class:`SparseDepth` and
-            :class:`SmoothDepth`, or a function of :class:`Seen` rays and their :class:`Batch` that gives a scalar, and
+            :class:`Surface`, or a function of :class:`Seen` rays and their :class:`Batch` that gives a scalar, and
             that torch differentiates. The networks alone learn from it. It is given all rays: of the last
             ``3 * batch.unseen``, no picture shows the colour.
         robust: Scale of the errors beyond which the loss of a ray is not squared: see `voronerf.ops.render_loss`. What

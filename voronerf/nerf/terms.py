@@ -18,6 +18,7 @@ from voronerf.ops.formulas import activate
 from voronerf.ops.rendered_gradient import rendered_gradient
 from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
+from voronerf.ops.surface_gradient import surface_gradient
 
 
 class LossAlongRays(NamedTuple):
@@ -152,6 +153,33 @@ class SmoothDepth:
             given = along.loss, along.gradient, *lengths, batch.far
             options: dict[str, Any] = {"hidden": along.hidden, **along.rule, "backend": along.backend}
             smooth_depth_gradient(*given, triples=batch.unseen, factor=self.factor, **options)
+
+
+@replayed
+class Surface:
+    """Light along a ray that does not come from one surface: see `voronerf.ops.surface_gradient`.
+
+    Args:
+        distortion: Factor on the mean over the rays of the distortion loss of mip-NeRF 360.
+        orientation: The same on an orientation loss after Ref-NeRF.
+
+    Examples:
+        >>> from voronerf import NeRF
+        >>> from voronerf.nerf import RayLoss, Renderer, Stratified, Surface
+        >>> terms = [Surface(distortion=0.005, orientation=0.02)]
+        >>> loss = RayLoss(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8)), terms=terms)
+    """
+
+    def __init__(self, *, distortion: float = 0.0, orientation: float = 0.0) -> None:
+        self.distortion, self.orientation = distortion, orientation
+
+    def add(self, along: LossAlongRays, batch: Batch) -> None:
+        """See :class:`Term`."""
+        samples = along.samples
+        lengths = along.density, samples.depths, samples.deltas, along.weights, samples.ray_offsets
+        given = along.loss, along.gradient, *lengths, batch.near, batch.far
+        options: dict[str, Any] = {"hidden": along.hidden, **along.rule, "backend": along.backend}
+        surface_gradient(*given, distortion=self.distortion, orientation=self.orientation, **options)
 
 
 class Seen:

@@ -44,6 +44,7 @@ from voronerf.ops.routed_program import routed_program
 from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.spherical_harmonics import spherical_harmonics
+from voronerf.ops.surface_gradient import surface_gradient
 from voronerf.ops.unseen_rays import unseen_rays
 
 __all__ = [
@@ -96,6 +97,7 @@ __all__ = [
     "smooth_depth_gradient",
     "sparse_depth_gradient",
     "spherical_harmonics",
+    "surface_gradient",
     "unseen_rays",
 ]
 
