@@ -199,7 +199,7 @@ def test_a_ray_that_has_ended_goes_no_further():
 
 
 def test_pixels_that_do_not_count_place_no_view():
-    """Of one pixel that counts, a view lies where its ray has gone half of its way through the scene."""
+    """If one pixel of a view counts, the view lies where the ray of that pixel is half way through the scene."""
     scene = builtin_scene(LATTICE, train_views=3, test_views=1)
     masks = torch.zeros(3, LATTICE, LATTICE, dtype=torch.bool)
     row, column = LATTICE // 2, LATTICE // 2 + 2
