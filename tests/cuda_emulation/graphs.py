@@ -66,8 +66,9 @@ class Graph(TorchDispatchMode):
 
     def replay(self) -> None:
         self._seen.calls.append("replay")
-        for each in self._work:
-            each()
+        with torch.no_grad():  # what autograd adds was captured, too
+            for each in self._work:
+                each()
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
         kwargs = kwargs or {}

@@ -13,7 +13,8 @@ from step_training import Scaled, Training
 
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
-from voronerf.nerf import SplitStrategy, replayed
+from voronerf.nerf import SplitStrategy, replayed, terms
+from voronerf.ops import surface_gradient
 from voronerf.ops.keep_heaviest import reference
 
 pytestmark = pytest.mark.native
@@ -26,6 +27,11 @@ def on_device(monkeypatch):
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
     monkeypatch.setattr(State, "read_output", lambda state, output: None)
     monkeypatch.setattr(reference, "check_range", lambda *_: None)  # which reads on a CPU alone
+
+    def in_torch(*given, **options):
+        surface_gradient(*given, **{**options, "backend": "reference"})  # which has no kernel on CUDA
+
+    monkeypatch.setattr(terms, "surface_gradient", in_torch)
 
 
 def built(**options):
@@ -141,6 +147,14 @@ def test_what_keeps_a_step_from_it():
         step.batches.place = torch.device("meta")
         assert step._standing_obstacle() == "its pictures are on meta"
     assert "capture" not in seen.calls
+
+
+def test_no_step_is_left_out_for_what_is_behind_the_last_sample():
+    """A captured step has room for more samples than there are: terms in torch see what lies there, too."""
+    with emulated(), graphs() as seen:
+        training = Training(cells=2)
+        training.train(4)
+        assert "capture" in seen.calls and float(training.guard.skipped) == 0
 
 
 def test_precision_of_a_traced_field():

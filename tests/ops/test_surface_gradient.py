@@ -77,6 +77,20 @@ def test_equals_autograd_through_a_slow_loop(device, backend, counts, skipped, s
     assert bool((gradient[skipped:, 3] != 1).any())
 
 
+@pytest.mark.parametrize("anything", [0.0, float("nan")])
+def test_samples_of_no_ray_hold_anything(device, backend, anything):
+    """Steps on a GPU have room for more samples than there are."""
+    need("surface_gradient", backend, device, torch.float32)
+    *samples, offsets, near, far = case((4, 9, 30, 3), skipped=5)
+    offsets, near, far = offsets[:-1], near[:-1], far[:-1]
+    rule = {"distortion": 0.25, "orientation": 0.5, "density_scale": 1.0, "backend": backend}
+    expected = learnt((*samples, offsets, near, far), device, **rule)
+    for tensor in samples:
+        tensor[:5] = tensor[-3:] = anything
+    loss, gradient = learnt((*samples, offsets, near, far), device, **rule)
+    assert torch.equal(loss, expected[0]) and torch.equal(gradient[5:-3], expected[1][5:-3])
+
+
 @pytest.mark.parametrize("backend", ["reference", "native"])
 @pytest.mark.parametrize("counts", [(), (0, 0)])
 def test_without_samples_nothing_changes(backend, counts):

@@ -24,6 +24,7 @@ def surface_losses(
     """The distortion and the orientation loss [r] of rays, differentiable in the weights and opacities [m] of samples.
 
     Formulas and arguments are those of ``voronerf.ops.surface_gradient``; only samples that are ``lit`` [m] count.
+    Samples that belong to no ray are finite.
     """
     r, m = len(near), len(weights)
     # Samples before and behind those of the rays have a place of their own: no host reads where they begin.
@@ -53,9 +54,13 @@ def surface_gradient(loss: Tensor, gradient: Tensor, *given: Any) -> None:
     *tensors, distortion, orientation, hidden, density_scale, activated = given
     density, depths, deltas, _, ray_offsets, near, far = (kept(tensor.detach()) for tensor in tensors)
     check_ray_offsets("surface_gradient", ray_offsets, len(density))
+    light, ray = packed_light(optical_depth(density, deltas), ray_offsets)
+    # Samples that belong to no ray hold anything, as those do that a captured step has room for.
+    known = (ray > 0) & (ray <= len(near))
+    density, deltas = (torch.where(known, tensor, 0) for tensor in (density, deltas))
+    depths = torch.where(known, depths, 1)
     density.requires_grad_()
     optical = optical_depth(density, deltas)
-    light, _ = packed_light(optical.detach(), ray_offsets)
     weights = composite(density, density.detach()[:, None], depths, deltas, ray_offsets).weights
     ends = ray_offsets, near, far, ~(light <= hidden)
     spread, fallen = surface_losses(weights, -torch.expm1(-optical), depths, deltas, *ends)
