@@ -132,3 +132,7 @@ def test_the_claims_of_the_first_page() -> None:
     assert f"{kinds} repositories, {ways}" in " ".join((ROOT / "docs" / "foreign-fields.md").read_text().split())
     *_, bonsai = (r for r in results("photographs_strata.json")["results"] if r["scene"] == "bonsai" and "psnr" in r)
     assert f"three minutes on two cores {bonsai['scene']} is at {bonsai['psnr']:.1f} dB" in page
+    for minutes, place in ((3, "after three minutes"), (10, "after ten")):
+        rows = [row for row in results("photographs_splats.json")["results"] if row["minutes"] == minutes]
+        leads = [row["voronerf"][0]["psnr"] - max(of["psnr"] for of in row["opensplat"]) for row in rows]
+        assert f"{min(leads):.1f} to {max(leads):.1f} dB {place}" in " ".join(page.split())
