@@ -175,8 +175,7 @@ __device__ __forceinline__ void load_matrices(uint32_t (&words)[4], const uint32
     const auto at = static_cast<uint32_t>(__cvta_generic_to_shared(from + lane % 16 * stride + lane / 16 * 4));
     asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
                  : "=r"(words[0]), "=r"(words[1]), "=r"(words[2]), "=r"(words[3])
-                 : "r"(at)
-                 : "memory");
+                 : "r"(at));
   } else
 #endif
   {
@@ -194,8 +193,7 @@ __device__ __forceinline__ void load_turned(uint32_t (&words)[4], const uint32_t
     const auto at = static_cast<uint32_t>(__cvta_generic_to_shared(from + (lane % 8 + 8 * down) * stride + 4 * across));
     asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
                  : "=r"(words[0]), "=r"(words[1]), "=r"(words[2]), "=r"(words[3])
-                 : "r"(at)
-                 : "memory");
+                 : "r"(at));
   } else
 #endif
   {

@@ -12,8 +12,7 @@
 // every time. Gradients of tables alone are added up by atomic operations, in any order.
 //
 // Budget: 256 threads of 128 registers, so that two blocks are resident; or of 80 for three, in float32 and in bfloat16
-// with tiles of 64 rows, at the price of 4 to 12 registers that are spilled from step to step. What is not a product is
-// not inlined.
+// with tiles of 64 rows, at the price of some that are spilled from step to step. What is not a product is not inlined.
 #include <algorithm>
 #include <cstring>
 #include <stdexcept>
@@ -222,7 +221,7 @@ __global__ void __launch_bounds__(kThreads, Steps::kResident)
           call,    slots,    call.partials + task * partial, weights, cell, row, kHeight, left, done == 0,
           kHalves, kBfloat16};
       for (int i = 0; i < call.code.step_count; ++i) {
-        const CudaStep& step = call.steps[i];
+        const CudaStep step = load_step(call.steps + i);
         if (step.op == ProgramOp::linear) {
           Steps::linear(tile, step);
         } else if (step.op == ProgramOp::outer) {

@@ -101,21 +101,21 @@ struct HalfNumbers {
 
   // For sums over rows: columns from i on as the rows of a left operand, over the 16 rows from `row` on.
   static constexpr int kRows = 16;
-  template <bool kShared>
+  template <bool kShared, bool kWords>
   static __device__ __forceinline__ void turned_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
                                                      int rows, int lane) {
-    if (a.has_words) {
+    if (kWords || a.has_words) {
       load_turned<kShared, true>(words, a.words + row * a.stride + i / 2, a.stride, lane);
-      return;
-    }
+    } else {
 #pragma unroll
-    for (int j = 0; j < 4; ++j) words[j] = turned_pair(a, row + 8 * (j / 2), i + 8 * (j % 2), rows, lane);
+      for (int j = 0; j < 4; ++j) words[j] = turned_pair(a, row + 8 * (j / 2), i + 8 * (j % 2), rows, lane);
+    }
   }
   // Columns from j on, two tiles of 8, as right operands.
-  template <bool kShared>
+  template <bool kShared, bool kWords>
   static __device__ __forceinline__ void turned_right(uint32_t (&words)[2][2], const ProductValue& b, int j, int row,
                                                       int rows, bool cut, int lane) {
-    if (b.has_words) {
+    if (kWords || b.has_words) {
       uint32_t four[4];
       load_turned<kShared, false>(four, b.words + row * b.stride + j / 2, b.stride, lane);
 #pragma unroll
@@ -181,13 +181,13 @@ struct Tf32Numbers {
 
   // A lane takes rows 2 m and 2 m + 1, not m and m + 4: its 32 lanes are then in different banks.
   static constexpr int kRows = 8;
-  template <bool kShared>
+  template <bool kShared, bool>
   static __device__ __forceinline__ void turned_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
                                                      int rows, int lane) {
 #pragma unroll
     for (int j = 0; j < 4; ++j) words[j] = turned(a, row + j / 2, i + 8 * (j % 2), rows, lane);
   }
-  template <bool kShared>
+  template <bool kShared, bool>
   static __device__ __forceinline__ void turned_right(uint32_t (&words)[2][2], const ProductValue& b, int j, int row,
                                                       int rows, bool, int lane) {
 #pragma unroll
@@ -265,11 +265,15 @@ struct TensorSteps {
     const bool swapped = step.swapped;
     const ProductValue a = product_value(tile, step.x, step.x_words), b = product_value(tile, step.y, step.y_words);
     const int warp = static_cast<int>(thread_again() / 32), lane = static_cast<int>(thread_again() % 32);
-    const int down = ceil_div(a.columns, 16), units = down * ceil_div(b.columns, 32);
+    const bool words = Numbers::kHalves && a.has_words && b.has_words;
     float* const partial = tile.partial + step.partial;
+    // By steps of 8 warps, without a division.
+    const int down = 16 * ceil_div(a.columns, 16);
+    int i0 = 16 * warp, j0 = 0;
 #pragma unroll 1
-    for (int unit = warp; unit < units; unit += kProgramThreads / 32) {
-      const int i0 = 16 * (unit % down), j0 = 32 * (unit / down), tiles = ceil_div(b.columns - j0, 8);
+    for (;; i0 += kProgramThreads / 2) {
+      for (; i0 >= down; j0 += 32) i0 -= down;
+      if (j0 >= b.columns) break;
       float sums[4][4] = {};
       float2 before[8];  // on their way meanwhile
       const bool pairs = j0 + 32 <= b.columns && i0 + 16 <= a.columns && !tile.fill;
@@ -279,21 +283,10 @@ struct TensorSteps {
         before[t] = pairs ? *reinterpret_cast<const float2*>(corner + t % 2 * 8 * step.stride + t / 2 * 8)
                           : make_float2(0.0f, 0.0f);
       }
-#pragma unroll 2
-      for (int row = 0; row < tile.rows; row += Numbers::kRows) {
-        uint32_t left[4];
-        Numbers::template turned_left<kShared>(left, a, i0, row, tile.rows, lane);
-        if constexpr (Numbers::kCuts) {
-          for (uint32_t& word : left) word = swapped ? clamp_halves(word) : word;
-        }
-#pragma unroll
-        for (int pair = 0; pair < 2; ++pair) {
-          if (2 * pair >= tiles) continue;
-          uint32_t right[2][2];
-          Numbers::template turned_right<kShared>(right, b, j0 + 16 * pair, row, tile.rows, !swapped, lane);
-          Numbers::multiply_turned(sums[2 * pair], left, right[0]);
-          Numbers::multiply_turned(sums[2 * pair + 1], left, right[1]);
-        }
+      if (words) {
+        multiply_turned<true>(sums, a, b, i0, j0, tile.rows, swapped, lane);
+      } else {
+        multiply_turned<false>(sums, a, b, i0, j0, tile.rows, swapped, lane);
       }
       if (j0 + 32 <= b.columns && i0 + 16 <= a.columns) {
 #pragma unroll
@@ -325,7 +318,7 @@ struct TensorSteps {
       float sums[2][4] = {};
       for (int row = 0; row < tile.rows; row += Numbers::kRows) {
         uint32_t right[2][2];
-        Numbers::template turned_right<kShared>(right, b, j0, row, tile.rows, false, lane);
+        Numbers::template turned_right<kShared, true>(right, b, j0, row, tile.rows, false, lane);
         Numbers::multiply_turned(sums[0], ones, right[0]);
         Numbers::multiply_turned(sums[1], ones, right[1]);
       }
@@ -364,6 +357,31 @@ struct TensorSteps {
         const auto left = Numbers::template left<kShared, kWords>(x, row + 16 * r, Numbers::kChunk * c, cut, lane);
 #pragma unroll
         for (int t = 0; t < kDown; ++t) Numbers::multiply(sums[r][t], left, right[t]);
+      }
+    }
+  }
+
+  // sums += over rows a's 16 columns from i0 on by b's 32 from j0 on. kWords: both lie in words, which are 0 up to
+  // there and in rows without a sample.
+  template <bool kWords>
+  static __device__ __forceinline__ void multiply_turned(float (&sums)[4][4], const ProductValue& a,
+                                                         const ProductValue& b, int i0, int j0, int rows, bool swapped,
+                                                         int lane) {
+    const int tiles = ceil_div(b.columns - j0, 8);
+#pragma unroll kWords ? 4 : 1
+    for (int row = 0; row < rows; row += Numbers::kRows) {
+      uint32_t left[4];
+      Numbers::template turned_left<kShared, kWords>(left, a, i0, row, rows, lane);
+      if constexpr (Numbers::kCuts) {
+        for (uint32_t& word : left) word = swapped ? clamp_halves(word) : word;
+      }
+#pragma unroll
+      for (int pair = 0; pair < 2; ++pair) {
+        if (!kWords && 2 * pair >= tiles) continue;
+        uint32_t right[2][2];
+        Numbers::template turned_right<kShared, kWords>(right, b, j0 + 16 * pair, row, rows, !swapped, lane);
+        Numbers::multiply_turned(sums[2 * pair], left, right[0]);
+        Numbers::multiply_turned(sums[2 * pair + 1], left, right[1]);
       }
     }
   }

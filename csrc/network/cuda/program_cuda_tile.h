@@ -42,6 +42,16 @@ struct alignas(16) CudaStep {
 };
 static_assert(sizeof(CudaStep) == 80, "five loads");
 
+// All of it at once: a thread waits for none of its numbers by itself.
+__device__ __forceinline__ CudaStep load_step(const CudaStep* from) {
+  CudaStep step;
+  uint4 parts[5];
+#pragma unroll
+  for (int i = 0; i < 5; ++i) parts[i] = load_constant(reinterpret_cast<const uint4*>(from) + i);
+  memcpy(&step, parts, sizeof step);
+  return step;
+}
+
 // Pointers of a call, on the device; `code` too.
 struct CudaProgram {
   ProgramCode code;
