@@ -13,8 +13,7 @@ from step_training import Scaled, Training
 
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
-from voronerf.nerf import SplitStrategy, replayed, terms
-from voronerf.ops import surface_gradient
+from voronerf.nerf import SplitStrategy, batches, replayed, terms
 from voronerf.ops.keep_heaviest import reference
 
 pytestmark = pytest.mark.native
@@ -27,11 +26,18 @@ def on_device(monkeypatch):
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
     monkeypatch.setattr(State, "read_output", lambda state, output: None)
     monkeypatch.setattr(reference, "check_range", lambda *_: None)  # which reads on a CPU alone
+    for place, op in (
+        (batches, "unseen_rays"),
+        (terms, "sparse_depth_gradient"),
+        (terms, "smooth_depth_gradient"),
+        (terms, "surface_gradient"),
+    ):  # which have no kernels on CUDA
+        monkeypatch.setattr(place, op, in_torch(getattr(place, op)))
 
-    def in_torch(*given, **options):
-        surface_gradient(*given, **{**options, "backend": "reference"})  # which has no kernel on CUDA
 
-    monkeypatch.setattr(terms, "surface_gradient", in_torch)
+def in_torch(op):
+    """An op by its reference, whatever its caller says."""
+    return lambda *given, **options: op(*given, **{**options, "backend": "reference"})
 
 
 def built(**options):
@@ -149,10 +155,11 @@ def test_what_keeps_a_step_from_it():
     assert "capture" not in seen.calls
 
 
-def test_no_step_is_left_out_for_what_is_behind_the_last_sample():
+@pytest.mark.parametrize("photograph", [False, True])
+def test_no_step_is_left_out_for_what_is_behind_the_last_sample(photograph):
     """A captured step has room for more samples than there are: terms in torch see what lies there, too."""
     with emulated(), graphs() as seen:
-        training = Training(cells=2)
+        training = Training(cells=2, photograph=photograph)
         training.train(4)
         assert "capture" in seen.calls and float(training.guard.skipped) == 0
 
