@@ -5,7 +5,8 @@ objects as they are.
 
 Registers, spills, shared memory, and the warps that registers let a multiprocessor hold, are printed for every kernel
 and compared with the table that is kept, .ci/cuda_resources.json: a spill that is not in it is a failure, and with the
-nvcc that it was made by so are registers or shared memory above it, or fewer warps. sm_80 is an A100, sm_89 an RTX
+nvcc that it was made by so are registers or shared memory above it, fewer warps, or more instructions of a layer of a
+network (machine_code.py), which are counted where cuobjdump is found. sm_80 is an A100, sm_89 an RTX
 4090, sm_90 an H200. ``--update`` notes the given architectures in it, and forgets kernels that are no more. The last
 architecture is compiled to PTX as well. Kernels of the toolkit's own (CUB) are counted and not judged: their names
 change with its version, and this project cannot change them. It is a failure if the resources of a kernel are not
@@ -26,12 +27,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = runpy.run_path(str(ROOT / "setup.py"), run_name="voronerf_setup")
+CODE = runpy.run_path(str(Path(__file__).with_name("machine_code.py")))
 OUT: Path = BUILD["build_folder"]()
 TABLE = ROOT / ".ci" / "cuda_resources.json"
 REGISTERS = 65536
 """Of a multiprocessor."""
 MOST_WARPS = {"sm_75": 32, "sm_86": 48, "sm_89": 48, "sm_120": 48}
 """Of a multiprocessor; 64 elsewhere."""
+NETWORKS = "network/cuda/program_cuda.cu.o"
+"""Whose kernels make layers."""
 FLAGS = "-Werror all-warnings -Xcompiler -Wall,-Wextra,-Werror -Xptxas -v"
 OBJECT = re.compile(r"^\[\d+/\d+\] (?=\S+\.cu\.o$)", re.MULTILINE)
 """Of ninja, before what a compilation says."""
@@ -78,9 +82,21 @@ def main(architectures: list[str]) -> int:
                 "shared_bytes": int(shared[1]) if shared else 0,
                 "warps": warps(int(match["registers"]), match["arch"]),
             }
+    path, counted = CODE["tools"](), (OUT / NETWORKS).is_file() and NETWORKS not in failed
+    if path is None:
+        print("cuda-check: no instructions of layers were counted, for want of cuobjdump and nvdisasm.")
+    for architecture in architectures if path is not None and counted else ():
+        for name, found in CODE["layers"](OUT / NETWORKS, architecture, path).items():
+            kernel = f"{Path(NETWORKS).stem}: {demangled(name)}"
+            row = kernels.get(kernel, {}).get(f"sm_{architecture}")
+            if row is None or "program_kernel" not in kernel:
+                continue
+            row["layer"] = sum(found.values())
+            said = ", ".join(f"{count} {kind}" for kind, count in found.most_common(6))
+            print(f"{kernel} (sm_{architecture}): {row['layer']} instructions a layer, {said}")
     for kernel, by_architecture in sorted(kernels.items()):
-        columns = {key: [row[key] for row in by_architecture.values()] for key in next(iter(by_architecture.values()))}
-        print(f"{kernel}: " + ", ".join(f"{key} {span(values)}" for key, values in columns.items()))
+        columns = {key: [row[key] for row in by_architecture.values() if key in row] for key in COLUMNS}
+        print(f"{kernel}: " + ", ".join(f"{key} {span(values)}" for key, values in columns.items() if values))
     version = nvcc_version(nvcc)
     spilling = sum(row["spilled_bytes"] > 0 for rows in kernels.values() for row in rows.values())
     targets = f"{', '.join(f'sm_{arch}' for arch in architectures)} and PTX of {architectures[-1]}"
@@ -119,13 +135,13 @@ Kernels = dict[str, dict[str, dict[str, int]]]
 def regressions(version: str, kernels: Kernels) -> list[str]:
     """What is worse than in the table, a line each; kernels and architectures that are not in it may not spill."""
     kept = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": "", "kernels": {}}
-    compared = ("spilled_bytes", "registers", "shared_bytes") if kept["nvcc"] == version else ("spilled_bytes",)
+    compared = ("spilled_bytes", *(("registers", "shared_bytes", "layer") if kept["nvcc"] == version else ()))
     worse = []
     for kernel, by_architecture in sorted(kernels.items()):
         for architecture, row in by_architecture.items():
             known = unpack(kept["kernels"].get(kernel, {})).get(architecture, {"spilled_bytes": 0})
             for key in compared:
-                if row[key] > known.get(key, row[key]):
+                if key in row and row[key] > known.get(key, row[key]):
                     worse.append(f"{kernel} ({architecture}): {key} {row[key]}, above {known[key]}")
             if "registers" in compared and row["warps"] < known.get("warps", 0):
                 worse.append(f"{kernel} ({architecture}): warps {row['warps']}, below {known['warps']}")
@@ -147,13 +163,15 @@ def number(architecture: str) -> int:
     return int(architecture.removeprefix("sm_"))
 
 
-COLUMNS = ("registers", "spilled_bytes", "shared_bytes", "warps")
+COLUMNS = ("registers", "spilled_bytes", "shared_bytes", "warps", "layer")
 
 
 def as_text(version: str, kernels: Kernels) -> str:
     """The table as JSON, a line for each kernel."""
     rows = {
-        kernel: {architecture: [row[key] for key in COLUMNS] for architecture, row in by_architecture.items()}
+        kernel: {
+            architecture: [row[key] for key in COLUMNS if key in row] for architecture, row in by_architecture.items()
+        }
         for kernel, by_architecture in sorted(kernels.items())
     }
     lines = ",\n".join(f"  {json.dumps(kernel)}: {json.dumps(row)}" for kernel, row in rows.items())

@@ -320,3 +320,54 @@ def test_the_wheel_does_the_main_job_in_a_new_environment(installed):
         assert "built with" in said or not command.endswith("info")  # with CUDA or without
     assert "Building" not in installed("pip", "install", "--no-index", "voronerf[viewer]")
     installed("python", "-c", "import voronerf.app.viewer, sys; assert '.venv' not in voronerf.__file__")
+
+
+SASS = """\
+\t\tFunction : kernel
+        /*0000*/                   MOV R1, c[0x0][0x28] ;    /* 0x00000a0000017a02 */
+        /*0010*/              @!P0 BRA 0x70 ;
+        /*0020*/                   LDG.E.128 R4, desc[UR4][R2.64] ;
+{products}
+        /*0030*/              @!P1 BRA P0, 0x60 ;
+        /*0040*/                   STS [R3], R4 ;
+        /*0050*/                   F2FP.RELU.BF16.F32.PACK_AB R4, R5, R4 ;
+        /*0060*/               @P2 BRA 0x10 ;
+        /*0070*/                   EXIT ;
+        /*0080*/                   HMMA.16816.F32.BF16 R8, R4, R6, R8 ;
+        /*0090*/                   BRA 0x90 ;
+"""
+
+
+@pytest.fixture
+def code():
+    path = ROOT / ".ci" / "machine_code.py"
+    if not path.is_file():
+        pytest.skip(".ci/machine_code.py is not there: the tests are not in the source tree")
+    return runpy.run_path(str(path))
+
+
+def test_instructions_of_a_layer_are_those_of_the_shortest_way_around(code, tmp_path):
+    products = "\n".join(f"        /*2{i:02x}1*/ HMMA.16816.F32.BF16 R8, R4, R6, R8 ;" for i in range(32))
+    (tmp_path / "sass").write_text(SASS.format(products=products))
+    program(tmp_path / "cuobjdump", f'test "$1 $2" = "-arch sm_90" && cat "{tmp_path}/sass"')
+    found = code["layers"](tmp_path / "program.o", "90", f"{tmp_path}:/bin:/usr/bin")
+    # Neither what is skipped on the way, nor what is behind its end.
+    assert found == {"kernel": {"BRA": 3, "LDG": 1, "HMMA": 32}}
+
+
+def test_a_block_that_is_a_loop_is_counted_once(code):
+    loop = [(16 * i, "FFMA R0, R1, R2, R0") for i in range(130)] + [(4000, "@P0 BRA 0x0")]
+    assert code["layer"]([*loop, (4016, "EXIT")]) == {"FFMA": 130, "BRA": 1}
+    assert code["layer"]([*loop, (4016, "@P0 BRA 0x0"), (4032, "EXIT")]) == {"FFMA": 130, "BRA": 2}
+    assert not code["layer"]([(0, "FFMA R0, R1, R2, R0"), (16, "EXIT")])
+
+
+def test_cuda_check_tells_of_more_instructions_of_a_layer(check, monkeypatch, tmp_path):
+    monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
+    row = {"registers": 40, "spilled_bytes": 0, "shared_bytes": 0, "warps": 48}
+    kept = {"kernel": {"sm_80": {**row, "layer": 200}}, "other": {"sm_80": row}}
+    check.TABLE.write_text(check.as_text("V13", kept))
+    assert check.regressions("V13", {"kernel": {"sm_80": row}, "other": {"sm_80": {**row, "layer": 9}}}) == []
+    assert check.regressions("V13", {"kernel": {"sm_80": {**row, "layer": 201}}}) == [
+        "kernel (sm_80): layer 201, above 200"
+    ]
