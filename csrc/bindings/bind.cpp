@@ -255,6 +255,7 @@ constexpr const char* kStub =
     "cuda_architectures: str\n"
     "cuda_major: int\n"
     "most_sources: int\n"
+    "most_held: int\n"
     "\n"
     "class Unchanged:\n"
     "    def contents(self, container: Any, free: Sequence[str] = ...) -> None: ...\n"

@@ -14,5 +14,6 @@ PYBIND11_MODULE(_C, module) {
   module.attr("cuda_architectures") = VN_CUDA_ARCHITECTURES;
   module.attr("cuda_major") = VN_CUDA_MAJOR;
   module.attr("most_sources") = voronerf::kMostSources;
+  module.attr("most_held") = voronerf::kMostHeld;
   voronerf::bind_all(module.ptr());
 }

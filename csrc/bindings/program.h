@@ -9,6 +9,7 @@ namespace voronerf {
 VN_NAMES(ProgramOp, "input", "output", "linear", "function", "binary", "total", "move", "encode", "outer", "columns");
 VN_NAMES(ProgramBinary, "add", "sub", "mul", "div", "gate");
 VN_NAMES(ProgramFinish, "none", "relu", "relu_slope");
+VN_NAMES(ProgramHands, "nothing", "words", "sums");
 #define VN_NAME(NAME, ...) #NAME,
 VN_NAMES(ProgramEncoding, VN_ENCODINGS(VN_NAME) "hash");
 VN_NAMES(ProgramFunction, VN_FUNCTIONS(VN_NAME));
@@ -19,8 +20,8 @@ VN_NAMES(ProgramLayout, "floats", "pairs", "tiles", "parts");
 VN_NAMES(ProgramPrecision, "float32", "tf32", "bfloat16", "float16");
 VN_STRUCT(ProgramPack, kind, parameter, o, i, start, width, at);
 VN_STRUCT(ProgramOperand, parameter, spread, slot, stride, memory, input, pairs, start, width, place);
-VN_STRUCT(ProgramStep, op, function, binary, encoding, finish, order, width, slot, stride, memory, number, depth,
-          sources, parameter, pairs, floats, points, in_place, a, b, first, taken);
+VN_STRUCT(ProgramStep, op, function, binary, encoding, finish, hands, order, width, slot, stride, memory, number, depth,
+          sources, parameter, pairs, floats, from_registers, points, in_place, a, b, first, taken);
 VN_STRUCT(ProgramSum, sum, kind, adds, partial, o, i, start, width, stride, size);
 VN_STRUCT(ProgramInput, width, ray);
 VN_STRUCT(ProgramOutput, width, ray, memory);

@@ -100,34 +100,43 @@ __device__ __forceinline__ uint32_t clamp_halves(uint32_t word) {
 #endif
 }
 
-// Two 16-bit numbers in a word, those below 0 as 0; NaN stays.
+// The same with 0 for what is below; NaN stays. From sm_80 on one instruction.
 template <bool kBfloat16>
-__device__ __forceinline__ uint32_t relu_halves(uint32_t word) {
-#ifdef VN_EMULATE
-  const uint32_t infinity = kBfloat16 ? 0x7f80u : 0x7c00u;
-  for (int shift = 0; shift < 32; shift += 16) {
-    const uint32_t bits = word >> shift & 0xffffu;
-    if ((bits & 0x8000u) != 0 && (bits & 0x7fffu) <= infinity) word &= ~(0xffffu << shift);
+__device__ __forceinline__ uint32_t pack_relu(float x, float y) {
+#if !defined(VN_EMULATE) && __CUDA_ARCH__ >= 800
+  uint32_t bits;
+  if constexpr (kBfloat16) {
+    asm("cvt.rn.relu.bf16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
+  } else {
+    asm("cvt.rn.relu.f16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
   }
-  return word;
+  return bits;
+#else
+  return pack_halves<kBfloat16>(x < 0.0f ? 0.0f : x, y < 0.0f ? 0.0f : y);  // comparisons keep NaN
+#endif
+}
+
+// All bits of each half of a word where its number is above 0, or NaN; else none.
+template <bool kBfloat16>
+__device__ __forceinline__ uint32_t above_zero_halves(uint32_t word) {
+#ifdef VN_EMULATE
+  uint32_t mask = 0;
+  for (int shift = 0; shift < 32; shift += 16) {
+    if (!(half_value(word >> shift & 0xffffu, kBfloat16) <= 0.0f)) mask |= 0xffffu << shift;
+  }
+  return mask;
 #else
   if constexpr (kBfloat16) {
     __nv_bfloat162 pair;
     memcpy(&pair, &word, sizeof pair);
-    pair = __hmax2_nan(pair, __nv_bfloat162(__ushort_as_bfloat16(0), __ushort_as_bfloat16(0)));
-    memcpy(&word, &pair, sizeof word);
+    return __hgtu2_mask(pair, __nv_bfloat162(__ushort_as_bfloat16(0), __ushort_as_bfloat16(0)));
   } else {
     __half2 pair;
     memcpy(&pair, &word, sizeof pair);
-    pair = __hmax2_nan(pair, __half2half2(__ushort_as_half(0)));
-    memcpy(&word, &pair, sizeof word);
+    return __hgtu2_mask(pair, __half2half2(__ushort_as_half(0)));
   }
-  return word;
 #endif
 }
-
-// Whether the 16-bit number in the low half of a word is above 0.
-__device__ __forceinline__ bool positive_half(uint32_t word) { return (word & 0xffffu) - 1u < 0x7fffu; }
 
 // Adds to one, two or four numbers of global memory, by an operation that nobody waits for.
 template <int kCount>

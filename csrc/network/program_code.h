@@ -17,10 +17,13 @@ namespace voronerf {
 
 constexpr int kGranule = 16;     // columns of every slot are padded to a multiple of this
 constexpr int kMostSources = 8;  // of a linear step; Python reads it
+constexpr int kMostHeld = 64;    // of a linear step's columns that it hands to the next in registers; Python reads it
 
 enum class ProgramOp : int { input, output, linear, function, binary, total, move, encode, outer, columns };
 enum class ProgramBinary : int { add, sub, mul, div, gate };
 enum class ProgramFinish : int { none, relu, relu_slope };
+// What a linear step has in registers for the next one on CUDA: its value as pairs, or its sums, which that adds to.
+enum class ProgramHands : int { nothing, words, sums };
 #define VN_NUMBER(NAME, ...) NAME,
 enum class ProgramEncoding : int { VN_ENCODINGS(VN_NUMBER) hash };
 enum class ProgramFunction : int { VN_FUNCTIONS(VN_NUMBER) };
@@ -57,6 +60,7 @@ struct ProgramStep {
   ProgramBinary binary;
   ProgramEncoding encoding;
   ProgramFinish finish;  // of linear
+  ProgramHands hands;
   // function: of the derivative. linear: 1 or 4 outputs by few_outputs_tile.h, else 0. move: 1 if every column has one
   // part. encode: 0, or 1 for the gradient to x of <g, e(x)>, with operands x, g, e(x). outer: 1 where the inputs are
   // next to each other in the partial.
@@ -69,7 +73,8 @@ struct ProgramStep {
   int32_t sources;       // linear: operands that are multiplied, next to each other in the matrix; on CUDA one
   int32_t parameter;     // encode of a hash grid: the table
   int32_t pairs;         // with 16-bit products: where its value is stored as pairs too; -1: nowhere
-  bool floats;           // where there are pairs: whether anything reads its value as floats
+  bool floats;           // where there are pairs, or it hands something on: whether anything reads its value as floats
+  bool from_registers;   // linear on CUDA: what is multiplied is what a step before has handed on
   bool points;           // input: hash grids alone read it, and nothing does once they are looked up
   bool in_place;         // input: nothing is copied where it may be read in place
   float a, b;            // of a function

@@ -31,8 +31,9 @@ void members(voronerf::ProgramOperand& o) {
   read(o.parameter, o.spread, o.slot, o.stride, o.memory, o.input, o.pairs, o.start, o.width, o.place);
 }
 void members(voronerf::ProgramStep& s) {
-  read(s.op, s.function, s.binary, s.encoding, s.finish, s.order, s.width, s.slot, s.stride, s.memory, s.number);
-  read(s.depth, s.sources, s.parameter, s.pairs, s.floats, s.points, s.in_place, s.a, s.b, s.first, s.taken);
+  read(s.op, s.function, s.binary, s.encoding, s.finish, s.hands, s.order, s.width, s.slot, s.stride, s.memory);
+  read(s.number, s.depth, s.sources, s.parameter, s.pairs, s.floats, s.from_registers, s.points, s.in_place, s.a, s.b);
+  read(s.first, s.taken);
 }
 void members(voronerf::ProgramSum& s) {
   read(s.sum, s.kind, s.adds, s.partial, s.o, s.i, s.start, s.width, s.stride, s.size);

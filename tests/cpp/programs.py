@@ -172,7 +172,12 @@ def table_of(program: Program, layout: str) -> Any:
 
 
 ENUMERATORS = {"op": "ProgramOp", "function": "ProgramFunction", "binary": "ProgramBinary"}
-ENUMERATORS |= {"encoding": "ProgramEncoding", "finish": "ProgramFinish", "layout": "ProgramLayout"}
+ENUMERATORS |= {
+    "encoding": "ProgramEncoding",
+    "finish": "ProgramFinish",
+    "hands": "ProgramHands",
+    "layout": "ProgramLayout",
+}
 
 
 def numbers(record: Any) -> Iterator[str]:

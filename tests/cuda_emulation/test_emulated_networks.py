@@ -114,16 +114,32 @@ def test_rows_are_gathered_and_scattered_and_every_order_of_threads_gives_the_sa
     assert (results[0][0].double() - exact[0]).norm() <= 1.2e-2 * exact[0].norm()
 
 
+WHOLE = {
+    "two parts": MLP((Layer((POSITIONS,), 40, "relu"), Layer((0,), 70, "relu"), Layer((1, 0), 5)), (2,)),
+    # From layer to layer in registers: one chunk and two, to one and to two; a sum of two and of three products; and
+    # what is read by the next layer, and by another one too.
+    "in registers": MLP(
+        (
+            *(Layer((POSITIONS,), 64, "relu"), Layer((0,), 64, "relu"), Layer((1,), 32, "relu")),
+            *(Layer((2,), 20, "relu"), Layer((3,), 48, "relu"), Layer((POSITIONS, 4), 33, "relu")),
+            *(Layer((5,), 9), Layer((POSITIONS, 3, 6), 17, "relu"), Layer((7, 5), 5)),
+        ),
+        (8,),
+    ),
+}
+
+
 @pytest.mark.parametrize("kib", TILES)
 @pytest.mark.parametrize("precision", ["bfloat16", "float16", "tf32"])
-def test_gradients_of_relu_are_exact_in_whole_numbers(precision: str, kib: int) -> None:
+@pytest.mark.parametrize("name", WHOLE)
+def test_gradients_of_relu_are_exact_in_whole_numbers(name: str, precision: str, kib: int) -> None:
     """Small whole numbers and weights of which few are not 0: no rounding moves a sample across a kink."""
-    layers = MLP((Layer((POSITIONS,), 40, "relu"), Layer((0,), 70, "relu"), Layer((1, 0), 5)), (2,))
+    layers, most, likely = WHOLE[name], *((2, 2) if name == "two parts" else (1, 4))
     dtype, draw = torch.float32 if precision == "tf32" else getattr(torch, precision), torch.Generator().manual_seed(1)
 
     def whole(*shape: int, few: bool = False) -> torch.Tensor:
-        numbers = torch.randint(-2, 3, shape, generator=draw).double()
-        return numbers * (torch.rand(shape, generator=draw) < 2 / shape[-1]) if few else numbers
+        numbers = torch.randint(-most, most + 1, shape, generator=draw).double()
+        return numbers * (torch.rand(shape, generator=draw) < likely / shape[-1]) if few else numbers
 
     counts = [150, 0, 70]
     given = case(layers, counts, 3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -122,13 +123,62 @@ def test_products_before_ampere(products: str, exactly: bool, capability: int, c
 
 
 @pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 63, 64, 65, 127, 128, 129, 257])
-def test_sizes_around_tiles_and_tasks(n: int) -> None:
+@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+def test_sizes_around_tiles_and_tasks(products: str, n: int) -> None:
     program, offsets = smooth(), offsets_of([n])
     tensors = tensors_of(program, [n])
     for shared_bytes in TILES[:2]:
         with emulated(shared_bytes=shared_bytes):
-            found = outcome(program, tensors, offsets, "float32")
-        close(found, outcome(program, tensors, offsets), ALLOWED["float32"])
+            found = outcome(program, tensors, offsets, products)
+        close(found, outcome(program, tensors, offsets), ALLOWED[products])
+
+
+def learning_a_table() -> Program:
+    """The gradient of a table is that of a value that the next product reads, and nothing else is between them."""
+    b = Builder()
+    x, d = b.input(3), b.input(8)
+    e = b.encode("hash", x, b.grid(GRID.text), b.parameter(*GRID.table_shape))
+    h = b.apply("relu", b.linear(d, b.parameter(e.width, 8), e.width))
+    z = b.linear(h, b.parameter(e.width, e.width), e.width, add=e)
+    program = b.program([b.linear(z, b.parameter(4, e.width), 4)])
+    return gradient(program, (False, False), (True, True, False, False), (True,), ())
+
+
+def reading_a_part() -> Program:
+    """A value that is read whole, and in the next product in part."""
+    b = Builder()
+    h = b.apply("relu", b.linear(b.input(32), b.parameter(32, 32), 32))
+    whole = b.linear(h, b.parameter(48, 32), 48)
+    return b.program([b.apply("relu", b.linear(h.part(16, 16), b.parameter(48, 16), 48, add=whole))])
+
+
+def cut_by_its_input() -> Program:
+    """A product that is cut by the ReLU that it multiplies."""
+    b = Builder()
+    h = b.apply("relu", b.linear(b.input(128), b.parameter(128, 128), 128))
+    return b.program([b.linear(b.binary("gate", b.linear(h, b.parameter(128, 128), 128), h), b.parameter(4, 128), 4)])
+
+
+def learning_nothing() -> Program:
+    """Without a step."""
+    b = Builder()
+    program = b.program([b.apply("step", b.linear(b.input(4), b.parameter(3, 4), 3))])
+    return gradient(program, (False,), (True,), (True,), ())
+
+
+@pytest.mark.parametrize("products", ["bfloat16", "float16", "float32"])
+@pytest.mark.parametrize("make", [learning_a_table, reading_a_part, cut_by_its_input, learning_nothing])
+def test_what_must_not_stay_in_registers(make: Callable[[], Program], products: str) -> None:
+    program, sizes = make(), [70, 0, 33]
+    offsets, tensors, count = offsets_of(sizes), tensors_of(program, sizes), len(program.inputs)
+    exact = [tensor.double() for tensor in tensors]
+    right = grouped_program(exact[:count], exact[count:], offsets, program=program, backend="reference")
+    assert any(part.any() for part in right) == (make is not learning_nothing)
+    for shared_bytes in TILES:
+        rows = plans.Rows(tensors[:count], tensors[count:], offsets, None, None)
+        with emulated(shared_bytes=shared_bytes):
+            found = plans.run(rows, plans.How(program.text, products=products))
+            close(found, right, 2 * ALLOWED[products])  # rounding moves a few samples across a kink
 
 
 @pytest.mark.parametrize("products", ["float32", "bfloat16"])

@@ -54,7 +54,7 @@ def test_the_first_call_on_the_emulated_device(tmp_path):
     assert len(rows) == 28 and all(row["seconds"] > 0 and row["floor"] > 0 for row in rows)
     assert any(row.get("graph", "").endswith("calls") for row in rows)
     counted = {row["name"]: row["most"] for row in rows if row["most"]}
-    assert 0.30 < counted["nearest_centre k=512 n=128"] < 0.33 and 0.15 < counted["w64d4 bfloat16 k=16 n=128"] < 0.18
+    assert 0.30 < counted["nearest_centre k=512 n=128"] < 0.33 and 0.41 < counted["w64d4 bfloat16 k=16 n=128"] < 0.45
     counts = Counter(part for part, _ in names)
     assert counts.pop("small") > 90
     assert counts == {"large": 6, "captured": 10, "rows": 29, "training": 2, "profile": 2}

@@ -74,3 +74,33 @@ def test_a_product_takes_as_many_sources_as_the_compiled_module_has_room_for(mon
     table = MLP((Layer(("positions",) * (2 * most + 3), 5),), (0,))
     lowering.lower.__wrapped__(table.program(3, 0, (5,), (True,), False).text)
     assert [step.sources for step in made[0].steps if step.op == "linear"] == [most, most, 3]
+
+
+def test_layers_hand_words_and_sums_to_the_next_on_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In registers, where the next product alone needs them; a value that others read has a slot, too."""
+    made, most = list[Any](), native.compiled.most_held
+    monkeypatch.setattr(native.compiled, "make_program", made.append)
+
+    def linear(*layers: Layer, layout: str = "tiles") -> list[tuple[str, bool, bool]]:
+        table = MLP(layers, (len(layers) - 1,))
+        text = table.program(3, 0, tuple(layer.width for layer in layers), (True,) * len(layers), False).text
+        lowering.lower.__wrapped__(text, layout, True)
+        return [(s.hands, s.from_registers, s.pairs >= 0 or s.floats) for s in made[-1].steps if s.op == "linear"]
+
+    first, positions = Layer(("positions",), most, "relu"), Layer(("positions",), 5)
+    assert linear(first, Layer((0,), most, "relu"), Layer((1,), 4)) == [
+        ("words", False, False),
+        ("words", True, False),
+        ("nothing", True, True),
+    ]
+    # The sum of two products goes on in registers, and what is held waits meanwhile.
+    assert linear(first, Layer(("positions", 0), 5)) == [
+        ("words", False, False),
+        ("sums", False, False),
+        ("nothing", True, True),
+    ]
+    assert linear(first, Layer((0,), 7, "relu"), Layer((1, 0), 5))[0] == ("words", False, True)
+    wide = Layer((0,), most + 1, "relu")
+    assert [hands for hands, _, _ in linear(first, wide, Layer((1,), 4))] == ["nothing"] * 3
+    assert [hands for hands, _, _ in linear(first, Layer((0,), 4), layout="floats")] == ["nothing"] * 2
+    assert linear(positions) == [("nothing", False, True)]

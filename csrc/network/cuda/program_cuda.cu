@@ -1,18 +1,20 @@
-// Programs on CUDA: an interpreter. A block takes tasks, rows of one cell, and all of its threads do one step after
-// another for a tile of rows.
+// Programs on CUDA: an interpreter. A block takes tasks, rows of one cell, a tile of them after the other. Of a tile
+// each of its warps has 16 or 32 rows of its own, and does one step after another for them without waiting for the
+// others; but for sums over rows, which all warps make together for all rows. Where the values of few rows fit, four
+// warps are a team that has 16 rows and shares the columns.
 //
-// Values lie in shared memory, [rows][stride] each at its slot: as float32, and with products of 16 bits as words of
-// two such numbers wherever only products read them. A tile has 128 rows with 16 bits, else 64, and fewer where two
-// blocks would not fit into a multiprocessor; what does not fit with 32 lies in the workspace instead, a part for each
-// of two blocks a multiprocessor.
+// Values lie in shared memory, for each team [rows][stride] at their slot: as float32, and with products of 16 bits as
+// words of two such numbers wherever only products read them. What one product makes and the next one reads stays in
+// registers. Where less than two teams fit, values lie in the workspace instead, a part for each block that is
+// resident.
 //
 // Layers: weights are packed once for a call, in the order and the type that products take them in
 // (program_cuda_product.h). Sums over rows: a thread has the same entries in every tile and adds to them in the task's
 // partial in global memory; a second kernel adds up the partials of a cell in their order, so results are the same
 // every time. Gradients of tables alone are added up by atomic operations, in any order.
 //
-// Budget: 256 threads of 128 registers, so that two blocks are resident; or of 80 for three, in float32 and in bfloat16
-// with tiles of 64 rows, at the price of some that are spilled from step to step. What is not a product is not inlined.
+// Budget: registers for two blocks of 8 warps with 16 rows each, or three of 4 warps with 32 rows. What is not a
+// product is not inlined.
 #include <algorithm>
 #include <cstring>
 #include <stdexcept>
@@ -27,11 +29,10 @@ namespace voronerf {
 
 namespace {
 
-constexpr int kThreads = kProgramThreads;
-constexpr int64_t kTaskRows = 128, kPartialBytes = int64_t{1} << 28;
+constexpr int kThreads = 256;
+constexpr int64_t kPartialBytes = int64_t{1} << 28;
 constexpr int64_t kBlocksPerMultiprocessor = 8;  // of kernels other than the interpreter
 constexpr int kPackPart = 1024;                  // words of what is packed that a block takes at a time
-constexpr int kResident = 2, kMostResident = 3;  // blocks of the interpreter on a multiprocessor, at least and at most
 constexpr int64_t kReservedBytes = 1024;         // of shared memory, for each block
 // The memory of a step, in the device's records: the number of a look-up, none, or below that the number of a scatter.
 constexpr int kNoMemory = -1;
@@ -58,11 +59,11 @@ __device__ __noinline__ void function_step(const Tile& tile, const ProgramStep& 
   const float a = step.a, b = step.b;
   const int order = step.order;
   const bool alone = step.taken == 1;
-  const Target to = tile.target(step);
+  const auto to = tile.target(step);
   switch (step.function) {
 #define VN_CASE(NAME, ...)                                                                           \
   case ProgramFunction::NAME:                                                                        \
-    return for_each_entry(tile.rows, step.width, [&](int row, int column) {                          \
+    return for_each_entry<Tile>(tile.rows, step.width, [&](int row, int column) {                    \
       const float by = alone ? 1.0f : times.at(row, column);                                         \
       to.put(row, column, by * derivative<device::NAME##_function>(order, x.at(row, column), a, b)); \
     });
@@ -88,17 +89,17 @@ __device__ __forceinline__ float binary(ProgramBinary name, float a, float b) {
 
 template <typename Tile>
 __device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
-  const Target to = tile.target(step);
+  const auto to = tile.target(step);
   if (step.order == 1) {  // every column has one part
     for (int i = 0; i < step.taken; ++i) {
       const Rows x = tile.operand(operands[i]);
       const int place = operands[i].place;
-      for_each_entry(tile.rows, operands[i].width,
-                     [&](int row, int column) { to.put(row, place + column, x.at(row, column)); });
+      for_each_entry<Tile>(tile.rows, operands[i].width,
+                           [&](int row, int column) { to.put(row, place + column, x.at(row, column)); });
     }
     return;
   }
-  for_each_entry(tile.rows, step.width, [&](int row, int column) {
+  for_each_entry<Tile>(tile.rows, step.width, [&](int row, int column) {
     float sum = 0.0f;
     for (int i = 0; i < step.taken; ++i) {
       const int within = column - operands[i].place;
@@ -108,52 +109,26 @@ __device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& s
   });
 }
 
+// What neither multiplies nor is in memory of the caller's.
 template <typename Tile>
-__device__ __forceinline__ void input_step(const Tile& tile, const ProgramStep& step) {
-  const CudaProgram& call = tile.call;
-  const Target to = tile.target(step);
-  const int input = step.number, width = step.width;
-  const bool turned = call.turned[input];  // neighbouring lanes read neighbouring rows, else columns
-  for_each_entry(turned ? width : tile.rows, turned ? tile.rows : width, [&](int i, int j) {
-    const int row = turned ? j : i, column = turned ? i : j;
-    to.put(row, column, load_input(call, input, width, source_row(call.rows, tile.begin + row), column));
-  });
-}
-
-template <typename Tile>
-__device__ __forceinline__ void output_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
-  const CudaProgram& call = tile.call;
-  const Rows x = tile.operand(operands[0]);
-  const int output = step.number, type = call.output_types[output];
-  for_each_entry(tile.rows, step.width, [&](int row, int column) {
-    const int64_t at = source_row(call.rows, tile.begin + row) * call.output_widths[output] + step.depth + column;
-    store_number(call.outputs[output], type, at, x.at(row, column));
-  });
-}
-
-// Steps that multiply nothing.
-template <typename Tile>
-__device__ __noinline__ void plain_step(const Tile& tile, const ProgramStep& given) {
-  const ProgramStep step = given;
+__device__ __noinline__ void plain_step(const Tile& tile, const ProgramStep& step) {
   const ProgramOperand* operands = tile.call.code.operands + step.first;
-  const Target to = tile.target(step);
-  if (step.op != ProgramOp::output) clear_rest(tile, step);
+  const bool there = step.op == ProgramOp::encode && tile.call.ready && step.memory >= 0;
+  if (step.op == ProgramOp::encode && !(there && tile.call.kept[step.memory] != nullptr)) {
+    return encode_step(tile, step, operands);
+  }
+  if (step.op == ProgramOp::function) return function_step(tile, step, operands);
+  const auto to = tile.target(step);
   switch (step.op) {
-    case ProgramOp::input:
-      return input_step(tile, step);
-    case ProgramOp::output:
-      return output_step(tile, step, operands);
-    case ProgramOp::function:
-      return function_step(tile, given, operands);
     case ProgramOp::binary: {
       const Rows x = tile.operand(operands[0]), y = tile.operand(operands[1]);
-      return for_each_entry(tile.rows, step.width, [&](int row, int column) {
+      return for_each_entry<Tile>(tile.rows, step.width, [&](int row, int column) {
         to.put(row, column, binary(step.binary, x.at(row, column), y.at(row, column)));
       });
     }
     case ProgramOp::total: {
       const Rows x = tile.operand(operands[0]);
-      return for_each_entry(tile.rows, step.width, [&](int row, int column) {
+      return for_each_entry<Tile>(tile.rows, step.width, [&](int row, int column) {
         float sum = 0.0f;
         for (int i = 0; i < step.number; ++i) sum += x.at(row, column * step.number + i);
         to.put(row, column, sum);
@@ -161,13 +136,11 @@ __device__ __noinline__ void plain_step(const Tile& tile, const ProgramStep& giv
     }
     case ProgramOp::move:
       return move_step(tile, step, operands);
-    default: {  // encode
-      const bool there = tile.call.ready && step.memory >= 0 && tile.call.kept[step.memory] != nullptr;
-      if (!there) return encode_step(tile, given, operands);
+    default: {  // what is looked up already
       const int64_t stride = tile.call.kept_strides[step.memory];
       const float* from = tile.call.kept[step.memory] + tile.begin * stride;
-      return for_each_entry(tile.rows, step.width,
-                            [&](int row, int column) { to.put(row, column, from[row * stride + column]); });
+      return for_each_entry<Tile>(tile.rows, step.width,
+                                  [&](int row, int column) { to.put(row, column, from[row * stride + column]); });
     }
   }
 }
@@ -182,7 +155,7 @@ __device__ __noinline__ void keep(const Tile& tile, const ProgramStep& step) {
   const int64_t stride = call.kept_strides[step.memory];
   float* const to = call.kept[step.memory] + tile.begin * stride;
   const float* from = tile.slot(step.slot);
-  for_each_entry(tile.rows, static_cast<int>(stride), [&](int row, int column) {
+  for_each_entry<Tile>(tile.rows, static_cast<int>(stride), [&](int row, int column) {
     to[row * stride + column] = column < step.width ? from[row * step.stride + column] : 0.0f;
   });
 }
@@ -201,12 +174,68 @@ __device__ __forceinline__ int cell_of_task(const CudaRows& rows, int task) {
   return static_cast<int>(cells.first);
 }
 
-// kHalves and kBfloat16: as of a tile.
-template <typename Steps, bool kHalves, bool kBfloat16>
-__global__ void __launch_bounds__(kThreads, Steps::kResident)
+// Steps from `i` on that a team does by itself; returns the number of the next one that it does not.
+template <typename Steps, typename Tile>
+__device__ __forceinline__ int own_steps(const CudaProgram& call, const Tile& tile, int i) {
+  for (; i < call.code.step_count; ++i) {
+    CudaStep step = load_step(call.steps + i);
+    if (step.sums()) break;
+    if (Tile::kHalves && step.pairs >= 0 && (step.op == CudaOp::plain || step.op == CudaOp::input)) {
+      clear_rest(tile, step);
+    }
+    if (step.op == CudaOp::plain) {
+      plain_step(tile, call.code.steps[i]);
+    } else if (step.op == CudaOp::input) {
+      input_step(tile, step);
+    } else if (step.op == CudaOp::output) {
+      output_step(tile, step);
+    } else {
+      typename Steps::Held held;
+      for (;;) {
+        if (step.op == CudaOp::chain) {
+          Steps::chained(tile, step, held);
+        } else {
+          Steps::linear(tile, step, i, held);
+        }
+        if (!step.holds) break;
+        Tile::sync();
+        step = load_step(call.steps + ++i);
+      }
+    }
+    Tile::sync();
+    if (step.keeps) {
+      keep(tile, call.code.steps[i]);
+      Tile::sync();
+    }
+  }
+  return i;
+}
+// The same for a warp that has no rows.
+__device__ __forceinline__ int next_sum(const CudaProgram& call, int i) {
+  while (i < call.code.step_count && !load_step(call.steps + i).sums()) ++i;
+  return i;
+}
+template <typename Steps, typename Tile>
+__device__ __forceinline__ int sums(const CudaProgram& call, const Tile& tile, int i) {
+  for (; i < call.code.step_count; ++i) {
+    const CudaStep step = load_step(call.steps + i);
+    if (step.op == CudaOp::outer) {
+      Steps::outer(tile, step);
+    } else if (step.op == CudaOp::columns) {
+      Steps::columns(tile, step);
+    } else {
+      break;
+    }
+  }
+  return i;
+}
+
+template <typename Steps>
+__global__ void __launch_bounds__(32 * program_warps(Steps::Tile::kRows), program_blocks(Steps::Tile::kRows))
     program_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t partial) {
-  constexpr int kHeight = Steps::kHeight;
-  float* const slots = call.spilled + int64_t{blockIdx.x} * call.code.columns * kHeight;
+  using Tile = typename Steps::Tile;
+  const int height = static_cast<int>(blockDim.x / Tile::kWorkers) * Tile::kRows;
+  float* const slots = call.spilled + int64_t{blockIdx.x} * call.code.columns * height;
   const CudaRows& rows = call.rows;
   const int tasks = rows.first_task[rows.k];
   for (int task = blockIdx.x; task < tasks; task += gridDim.x) {
@@ -215,27 +244,26 @@ __global__ void __launch_bounds__(kThreads, Steps::kResident)
     const int64_t begin = first + (task - rows.first_task[cell]) * call.task_rows;
     const int count = static_cast<int>(last - begin < call.task_rows ? last - begin : call.task_rows);
     const float* const weights = call.packed + cell * call.packed_stride;
-    for (int done = 0; done < count; done += kHeight) {
-      const int left = count - done < kHeight ? count - done : kHeight, row = static_cast<int>(begin) + done;
-      const ProgramTile<Steps::kInShared> tile{
-          call,    slots,    call.partials + task * partial, weights, cell, row, kHeight, left, done == 0,
-          kHalves, kBfloat16};
-      for (int i = 0; i < call.code.step_count; ++i) {
-        const CudaStep step = load_step(call.steps + i);
-        if (step.op == ProgramOp::linear) {
-          Steps::linear(tile, step);
-        } else if (step.op == ProgramOp::outer) {
-          Steps::outer(tile, step);
-        } else if (step.op == ProgramOp::columns) {
-          Steps::columns(tile, step);
-        } else {
-          plain_step(tile, call.code.steps[i]);
-        }
+    for (int done = 0; done < count; done += height) {
+      const int all = count - done < height ? count - done : height;
+      const int before = static_cast<int>(threadIdx.x / Tile::kWorkers) * Tile::kRows, left = all - before;
+      const int own = left < 0 ? 0 : left < Tile::kRows ? left : Tile::kRows;
+      const Tile tile{call,
+                      slots,
+                      call.partials + task * partial,
+                      weights,
+                      call.code.columns * Tile::kRows,
+                      cell,
+                      static_cast<int>(begin) + done + before,
+                      own,
+                      all,
+                      done == 0};
+      for (int i = 0;;) {
+        i = Tile::kTeam == 1 && own == 0 ? next_sum(call, i) : own_steps<Steps>(call, tile, i);
+        if (i == call.code.step_count) break;
         __syncthreads();
-        if (step.keeps) {
-          keep(tile, call.code.steps[i]);
-          __syncthreads();
-        }
+        i = sums<Steps>(call, tile, i);
+        __syncthreads();
       }
     }
   }
@@ -292,6 +320,7 @@ __device__ __forceinline__ uint32_t any_packed_word(const PackedMatrix& matrix, 
 // Of each cell's matrices and biases, as products take them. A block takes a part of one at a time.
 __device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision) {
   const bool halves = precision == ProgramPrecision::bfloat16 || precision == ProgramPrecision::float16;
+  const bool tensors = precision != ProgramPrecision::float32;
   const int deep = halves ? HalfNumbers<true>::kChunk : Tf32Numbers::kChunk, packs = call.code.pack_count;
   for (int64_t unit = blockIdx.x; unit < call.rows.k * packs * call.pack_parts; unit += gridDim.x) {
     const int part = static_cast<int>(unit % call.pack_parts);
@@ -305,11 +334,13 @@ __device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision
                         turned ? pack.width : pack.o};
     if (vector) matrix = {from, 0, 1, 1, pack.width};
     const int outputs = padded(matrix.outputs, kProgramOutputs);
-    const int words = vector ? outputs : padded(matrix.depth, deep) * outputs / (halves ? 2 : 1);
+    // Of a bias for tensor cores the two columns of a lane come twice, as it has them in two rows.
+    const int words = vector ? (tensors ? 2 : 1) * outputs : padded(matrix.depth, deep) * outputs / (halves ? 2 : 1);
     auto* const to = reinterpret_cast<uint32_t*>(call.packed) + cell * call.packed_stride + pack.at;
     const int last = words < (part + 1) * kPackPart ? words : (part + 1) * kPackPart;
     for (int word = part * kPackPart + static_cast<int>(threadIdx.x); word < last; word += kThreads) {
-      to[word] = any_packed_word(matrix, vector ? ProgramPrecision::float32 : precision, outputs, word);
+      const int column = vector && tensors ? word / 4 * 2 + word % 2 : word;
+      to[word] = any_packed_word(matrix, vector ? ProgramPrecision::float32 : precision, outputs, column);
     }
   }
 }
@@ -470,59 +501,67 @@ int32_t largest_pack(const ProgramTable& table) {
   return largest;
 }
 
-// A step for the interpreter, of records whose slots are those of the device.
-CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, const std::vector<ProgramPack>& packs) {
+// A step for the interpreter, of records whose slots are those of the device. goes_on: with the sums of the one before.
+CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, const std::vector<ProgramPack>& packs,
+                   bool goes_on) {
   CudaStep made{};
-  const auto value = [](const ProgramOperand& o, bool& words) -> CudaValue {
-    words = o.pairs >= 0;
-    if (words) return {o.pairs, 0, pair_stride(o.width), o.width};
+  const auto value = [](const ProgramOperand& o) -> CudaValue {
+    if (o.pairs >= 0) return {o.pairs, 0, pair_stride(o.width), o.width};
     return {o.slot, o.start, o.stride, o.width};
   };
-  made.op = step.op;
   made.keeps = step.memory != kNoMemory;
   made.slot = step.floats ? step.slot : -1, made.stride = step.stride, made.pairs = step.pairs;
   made.width = step.width, made.depth = step.depth;
   made.bias = made.added = -1;
-  made.partial = step.number;
+  made.number = step.number;
+  const ProgramOperand *x = operands, *y = operands;
   if (step.op == ProgramOp::linear) {
     const ProgramPack& pack = packs[static_cast<size_t>(step.number)];
     made.weights = pack.at;
     made.turned = pack.kind == ProgramPackKind::turned;
     made.relu = step.finish == ProgramFinish::relu;
     made.sloped = step.finish == ProgramFinish::relu_slope;
-    made.x = value(operands[0], made.x_words);
-    if (made.sloped) made.y = value(operands[step.taken - 1], made.y_words);
-    if (step.taken > 1 + made.sloped) {
+    made.x_held = step.from_registers;
+    made.holds = step.hands == ProgramHands::words;
+    made.carries = step.hands == ProgramHands::sums;
+    if (made.sloped) y = operands + step.taken - 1;
+    if (step.taken > 1 + static_cast<int>(made.sloped) && !goes_on) {
       const ProgramOperand& added = operands[1];
       const bool bias = added.parameter && !added.spread;
       if (bias) made.bias = packs[static_cast<size_t>(added.slot)].at;
       if (!bias) made.added = step.first + 1;
     }
+    const bool words = (made.x_held || x->pairs >= 0) && (!made.sloped || y->pairs >= 0) && !step.floats;
+    made.op = words && made.added < 0 && !made.carries ? CudaOp::chain : CudaOp::linear;
   } else if (step.op == ProgramOp::outer) {
+    made.op = CudaOp::outer;
     made.swapped = step.order != 1;
-    made.x = value(operands[made.swapped ? 1 : 0], made.x_words);
-    made.y = value(operands[made.swapped ? 0 : 1], made.y_words);
+    (made.swapped ? x : y) = operands + 1;
   } else if (step.op == ProgramOp::columns) {
-    made.x = value(operands[0], made.x_words);
+    made.op = CudaOp::columns;
+  } else {
+    made.op = step.op == ProgramOp::input    ? CudaOp::input
+              : step.op == ProgramOp::output ? CudaOp::output
+                                             : CudaOp::plain;
+    made.added = step.first;
+    return made;
   }
+  made.x = value(*x), made.x_words = x->pairs >= 0;
+  made.y = value(*y), made.y_words = y->pairs >= 0;
   return made;
 }
 
-// Whether three blocks of the interpreter are resident where a tile has fewer than 128 rows.
-bool three_resident(ProgramPrecision precision) {
-  return precision == ProgramPrecision::float32 || precision == ProgramPrecision::bfloat16;
-}
-
-// How a call is cut: rows of a tile and of a task, blocks, at most so many tasks, and where what is in the workspace.
+// How a call is cut: rows and warps of a tile, rows of a task, blocks, at most so many tasks, and where what is in the
+// workspace.
 struct Cut {
-  int height;
+  int own_rows, team, warps;
   bool spilled;
   int shared;
   int64_t task_rows, tasks, blocks;
   int64_t packed, partials, slots, bytes;
 };
 
-Cut cut(const Program& program, int64_t n, int64_t k, bool three_resident) {
+Cut cut(const Program& program, int64_t n, int64_t k) {
   const ProgramTable& table = program.table;
   const Device& device = current_device();
   const size_t most = std::max({table.inputs.size(), static_cast<size_t>(table.parameters), table.outputs.size(),
@@ -538,65 +577,71 @@ Cut cut(const Program& program, int64_t n, int64_t k, bool three_resident) {
                                 "; use backend='reference'");
   }
   Cut found{};
-  const int64_t columns = Slots(table).columns();
-  const auto shared = [&](int rows) { return 4 * rows * columns; };
-  found.height = table.layout == ProgramLayout::tiles ? 128 : 64;
-  while (found.height > 32 && kResident * (shared(found.height) + kReservedBytes) > device.multiprocessor_bytes) {
-    found.height /= 2;
-  }
-  found.spilled = shared(found.height) > device.shared_bytes;
-  if (found.spilled) found.height = 64;
-  found.shared = static_cast<int>(found.spilled ? 0 : shared(found.height));
-  found.task_rows = kTaskRows;
+  const int64_t columns = std::max(1, Slots(table).columns());  // of sums that nothing is added to there are none
+  // Teams that fit into a multiprocessor, of so many rows each, with the blocks that they make at least.
+  const auto fitting = [&](int rows) {
+    return (device.multiprocessor_bytes - program_blocks(rows) * kReservedBytes) / (4 * rows * columns);
+  };
+  // Warps of 32 rows read each weight once for all of them, if cells have so many and as many warps fit as there are
+  // registers for; of 16 rows, if half as many do.
+  const int64_t resident_tall = program_blocks(32) * program_warps(32);
+  const bool tall = table.layout == ProgramLayout::tiles && fitting(32) >= resident_tall && n >= 32 * k;
+  found.own_rows = tall ? 32 : 16;
+  found.team = fitting(16) >= program_warps(16) ? 1 : kProgramTeam;
+  found.spilled = fitting(16) < 2;
+  // No more teams than there are rows for, in each cell and on every multiprocessor.
+  const int resident = program_blocks(found.own_rows);
+  const int64_t useful = n / (found.own_rows * std::max<int64_t>(1, std::max<int64_t>(k, device.multiprocessors)));
+  int64_t teams = program_warps(found.own_rows) / found.team;
+  const int64_t room = found.spilled ? teams : fitting(found.own_rows) / resident;
+  while (teams > 1 && teams > std::min(room, useful)) teams /= 2;
+  const int64_t height = found.own_rows * teams;
+  found.warps = static_cast<int>(found.team * teams);
+  found.shared = static_cast<int>(found.spilled ? 0 : 4 * height * columns);
+  // More than one tile where a multiprocessor has many.
+  found.task_rows = height * std::clamp<int64_t>(n / (32 * height * device.multiprocessors), 1, 8);
   if (table.partial > 0) {
     // As many tasks as there are blocks at a time, of which each cell's last one is smaller, and few enough partials.
-    const int64_t fitting = device.multiprocessor_bytes / (found.shared + kReservedBytes);
-    const int most = three_resident && !found.spilled && found.height < 128 ? kMostResident : kResident;
-    const int64_t wave = std::clamp<int64_t>(fitting, 1, most) * device.multiprocessors;
-    found.task_rows = std::max<int64_t>(found.height, ceil_div<int64_t>(n, wave > 2 * k ? wave - k : wave));
+    const int64_t most_blocks = resident * program_warps(found.own_rows) / found.warps;
+    const int64_t blocks = device.multiprocessor_bytes / (found.shared + kReservedBytes);
+    const int64_t wave = std::clamp<int64_t>(blocks, 1, most_blocks) * device.multiprocessors;
+    found.task_rows = std::max(height, ceil_div<int64_t>(n, wave > 2 * k ? wave - k : wave));
     found.task_rows = std::max(found.task_rows, ceil_div<int64_t>(n * table.partial, kPartialBytes / 4));
   }
-  found.task_rows = ceil_div<int64_t>(found.task_rows, found.height) * found.height;
+  found.task_rows = ceil_div<int64_t>(found.task_rows, height) * height;
   found.tasks = n / found.task_rows + k;
-  found.blocks = found.spilled ? std::min<int64_t>(found.tasks, kResident * device.multiprocessors) : found.tasks;
+  found.blocks =
+      found.spilled ? std::min<int64_t>(found.tasks, int64_t{resident} * device.multiprocessors) : found.tasks;
   found.packed = aligned(4 * (k + 1));
   found.partials = found.packed + aligned(4 * k * table.packed);
   found.slots = found.partials + aligned(4 * found.tasks * table.partial);
-  found.bytes = found.slots + (found.spilled ? aligned(4 * found.blocks * found.height * columns) : 0);
+  found.bytes = found.slots + (found.spilled ? aligned(4 * found.blocks * height * columns) : 0);
   return found;
 }
 
-template <typename Steps, bool kHalves = false, bool kBfloat16 = false>
+template <typename Steps>
 void launch(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
-  const auto kernel = program_kernel<Steps, kHalves, kBfloat16>;
+  const auto kernel = program_kernel<Steps>;
   // Always the same, since what one host thread sets must do for the launch of another.
   VN_CUDA_CHECK(
       cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, current_device().shared_bytes));
-  VN_LAUNCH(kernel, static_cast<unsigned>(found.blocks), kThreads, found.shared, stream, call, partial);
+  VN_LAUNCH(kernel, static_cast<unsigned>(found.blocks), static_cast<unsigned>(32 * found.warps), found.shared, stream,
+            call, partial);
 }
 
 void launch_floats(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
-  if (found.spilled) return launch<FloatSteps<4, false>>(call, found, partial, stream);
-  if (found.height == 64) return launch<FloatSteps<4, true>>(call, found, partial, stream);
-  launch<FloatSteps<2, true>>(call, found, partial, stream);
+  if (found.spilled) return launch<FloatSteps<kProgramTeam, false>>(call, found, partial, stream);
+  if (found.team > 1) return launch<FloatSteps<kProgramTeam, true>>(call, found, partial, stream);
+  launch<FloatSteps<1, true>>(call, found, partial, stream);
 }
-void launch_tf32(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
-  if (found.spilled) return launch<TensorSteps<Tf32Numbers, 4, 1, false>>(call, found, partial, stream);
-  if (found.height == 64) return launch<TensorSteps<Tf32Numbers, 4, 1, true>>(call, found, partial, stream);
-  launch<TensorSteps<Tf32Numbers, 2, 1, true>>(call, found, partial, stream);
-}
-template <bool kBfloat16>
-void launch_halves(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
-  using Numbers = HalfNumbers<kBfloat16>;
-  if (found.spilled) return launch<TensorSteps<Numbers, 4, 1, false>, true, kBfloat16>(call, found, partial, stream);
-  switch (found.height) {
-    case 128:
-      return launch<TensorSteps<Numbers, 4, 2, true>, true, kBfloat16>(call, found, partial, stream);
-    case 64:
-      return launch<TensorSteps<Numbers, 4, 1, true>, true, kBfloat16>(call, found, partial, stream);
-    default:
-      return launch<TensorSteps<Numbers, 2, 1, true>, true, kBfloat16>(call, found, partial, stream);
+template <typename Numbers>
+void launch_tensors(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
+  if (found.spilled) return launch<TensorSteps<Numbers, 1, kProgramTeam, false>>(call, found, partial, stream);
+  if (found.team > 1) return launch<TensorSteps<Numbers, 1, kProgramTeam, true>>(call, found, partial, stream);
+  if constexpr (Numbers::kHalves) {
+    if (found.own_rows == 32) return launch<TensorSteps<Numbers, 2, 1, true>>(call, found, partial, stream);
   }
+  launch<TensorSteps<Numbers, 1, 1, true>>(call, found, partial, stream);
 }
 
 // Blocks that fill the device, if there is as much to do.
@@ -646,7 +691,10 @@ void program_code_cuda(const Program& program, unsigned char* code) {
     operand.stride += kProgramSkew;
   }
   std::vector<CudaStep> own_steps;
-  for (const ProgramStep& step : steps) own_steps.push_back(cuda_step(step, operands.data() + step.first, table.packs));
+  for (const ProgramStep& step : steps) {
+    const bool goes_on = !own_steps.empty() && own_steps.back().carries;
+    own_steps.push_back(cuda_step(step, operands.data() + step.first, table.packs, goes_on));
+  }
   std::vector<HashEncoding> grids;
   for (const HashGrid& grid : table.grids) grids.push_back(hash_encoding(HashInputs{}, grid));
   const auto write = [code](int64_t place, const auto& records) {
@@ -662,7 +710,7 @@ void program_code_cuda(const Program& program, unsigned char* code) {
 }
 
 int64_t grouped_program_workspace_cuda(const Program& program, int64_t n, int64_t, int64_t k) {
-  return std::max(cut(program, n, k, false).bytes, cut(program, n, k, true).bytes);
+  return cut(program, n, k).bytes;
 }
 
 void grouped_program_cuda(const Program& program, const unsigned char* code, const ProgramInputs& in,
@@ -672,7 +720,7 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
   if (current_device().capability < 80 && precision == ProgramPrecision::tf32) {
     precision = ProgramPrecision::float32;  // there are no such products
   }
-  const Cut found = cut(program, in.n, in.k, three_resident(precision));
+  const Cut found = cut(program, in.n, in.k);
   const CodePlaces at = code_places(table);
   CudaProgram call{};
   call.code.packs = reinterpret_cast<const ProgramPack*>(code + at.packs);
@@ -735,13 +783,13 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
         launch_floats(call, found, table.partial, stream);
         break;
       case ProgramPrecision::tf32:
-        launch_tf32(call, found, table.partial, stream);
+        launch_tensors<Tf32Numbers>(call, found, table.partial, stream);
         break;
       case ProgramPrecision::bfloat16:
-        launch_halves<true>(call, found, table.partial, stream);
+        launch_tensors<HalfNumbers<true>>(call, found, table.partial, stream);
         break;
       case ProgramPrecision::float16:
-        launch_halves<false>(call, found, table.partial, stream);
+        launch_tensors<HalfNumbers<false>>(call, found, table.partial, stream);
         break;
     }
   }

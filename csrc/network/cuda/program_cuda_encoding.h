@@ -1,4 +1,4 @@
-// Encodings of a tile's rows on CUDA, and the gradients to what was encoded. A thread has an entry, of a hash grid a
+// Encodings of a warp's rows on CUDA, and the gradients to what was encoded. A lane has an entry, of a hash grid a
 // level of a row, neighbouring lanes neighbouring rows of one level, whose entries often share sectors.
 #pragma once
 
@@ -67,16 +67,15 @@ __device__ __forceinline__ const typename HashElement<kType>::Type* hash_table(c
 template <typename Tile>
 __device__ __noinline__ void look_up(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
   const Rows x = tile.value(operands[0]);
-  const Target to = tile.target(step);
+  const auto to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
-  const int shift = 31 - __clz(tile.height);
   hash_with_table(grid.features, tile.call.parameter_types[step.parameter], [&](auto features, auto type) {
     constexpr int kFeatures = decltype(features)::value;
     constexpr TableType kType = decltype(type)::value;
     const auto* table = hash_table<kType>(tile, step.parameter);
 #pragma unroll 1
-    for (int i = threadIdx.x; i < tile.height * grid.count; i += kProgramThreads) {
-      const int number = i >> shift, row = i & (tile.height - 1);
+    for (int i = Tile::worker(); i < Tile::kRows * grid.count; i += Tile::kWorkers) {
+      const int number = i / Tile::kRows, row = i % Tile::kRows;
       if (row >= tile.rows) continue;
       const GridLevel& level = grid.levels[number];
       const HashAxes at = hash_axes(grid, level, [&](int axis) { return x.at(row, axis); });
@@ -100,17 +99,16 @@ __device__ __noinline__ void scatter_rows(const Tile& tile, const ProgramStep& s
   const CudaProgram& call = tile.call;
   const HashEncoding& grid = call.grids[scatter.grid];
   float* const to = call.sums[scatter.sum] + tile.cell * call.strides[scatter.parameter];
-  const int shift = 31 - __clz(tile.height);
   hash_with_features(grid.features, [&](auto features) {
     constexpr int kFeatures = decltype(features)::value;
 #pragma unroll 1
-    for (int i = threadIdx.x; i < tile.height * grid.count; i += kProgramThreads) {
-      const int number = i >> shift, row = i & (tile.height - 1);
+    for (int i = Tile::worker(); i < Tile::kRows * grid.count; i += Tile::kWorkers) {
+      const int number = i / Tile::kRows, row = i % Tile::kRows;
       if (row >= tile.rows) continue;
       const int64_t source = source_row(call.rows, tile.begin + row);
       const GridLevel& level = grid.levels[number];
-      const HashAxes at =
-          hash_axes(grid, level, [&](int axis) { return load_input(call, scatter.input, 3, source, axis); });
+      const InputRow from = input_row(call, scatter.input, 3, source);
+      const HashAxes at = hash_axes(grid, level, [&](int axis) { return from.column(axis); });
       const float* given = tile.slot(step.slot) + row * step.stride + number * kFeatures;
       hash_corners<kFeatures>(at.axes, level, level.offset * kFeatures, [&](int64_t entry, int x, int y, int z) {
         const float weight = hash_weight(at.axes, false, nullptr, x, y, z);
@@ -128,16 +126,16 @@ template <typename Tile>
 __device__ __noinline__ void look_up_gradient(const Tile& tile, const ProgramStep& step,
                                               const ProgramOperand* operands) {
   const Rows x = tile.value(operands[0]), g = tile.value(operands[1]);
-  const Target to = tile.target(step);
+  const auto to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
-  const int part = threadIdx.x % 8;
+  const int worker = Tile::worker(), part = worker % 8;
   hash_with_table(grid.features, tile.call.parameter_types[step.parameter], [&](auto features, auto type) {
     constexpr int kFeatures = decltype(features)::value;
     constexpr TableType kType = decltype(type)::value;
     const auto* table = hash_table<kType>(tile, step.parameter);
 #pragma unroll 1
-    for (int first = 0; first < tile.rows; first += kProgramThreads / 8) {
-      const int row = first + threadIdx.x / 8;
+    for (int first = 0; first < tile.rows; first += Tile::kWorkers / 8) {
+      const int row = first + worker / 8;
       float sums[3] = {};
 #pragma unroll 1
       for (int number = part; row < tile.rows && number < grid.count; number += 8) {
@@ -173,8 +171,8 @@ struct ByRow {
   template <typename Tile>
   static __device__ __noinline__ void run(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
     const Rows x = tile.value(operands[0]);
-    const Target to = tile.target(step);
-    const int row = threadIdx.x, raw = operands[0].width;
+    const auto to = tile.target(step);
+    const int row = Tile::worker(), raw = operands[0].width;
     if (row >= tile.rows) return;
     const auto of = [&](int column) { return x.at(row, column); };
     const auto put = [&](int column, float value) { to.put(row, column, value); };
@@ -184,58 +182,92 @@ struct ByRow {
   }
 };
 
-// By the hardware's own functions, whose error is 2^-21 near 0.
-__device__ __forceinline__ void fast_sine_and_cosine(float angle, float& sine, float& cosine) {
-#ifndef VN_EMULATE
-  if (fabsf(angle) <= kLargestDeviceAngle) {
-    const float turns = rintf(angle * 0.159154943f);
-    const float r = fmaf(turns, 1.74845553e-7f, fmaf(turns, -6.28318548f, angle));
-    sine = __sinf(r), cosine = __cosf(r);
-    return;
-  }
+// By the hardware's own functions, whose error is 2^-21 near 0; of angles that are not large.
+__device__ __forceinline__ float2 fast_sine_and_cosine(float angle) {
+#ifdef VN_EMULATE
+  return make_float2(sine_of_octave(angle, 0.0f), sine_of_octave(angle, 0.5f));
+#else
+  const float turns = rintf(angle * 0.159154943f);
+  const float r = fmaf(turns, 1.74845553e-7f, fmaf(turns, -6.28318548f, angle));
+  return make_float2(__sinf(r), __cosf(r));
 #endif
-  sine = sine_of_octave(angle, 0.0f), cosine = sine_of_octave(angle, 0.5f);
+}
+// Of a whole octave. Called where angles are large alone, which others need not have registers for.
+__device__ __noinline__ float2 exact_sine_and_cosine(float value, int octave) {
+  const float angle = value * octave_scale(octave);
+  return make_float2(sine_of_octave(angle, 0.0f), sine_of_octave(angle, 0.5f));
 }
 
 // Sines and cosines of `features` columns of x in octaves; after x itself, or blurred by the variances beside it. A
-// thread has a sine and its cosine. For 16-bit products the hardware's do.
-template <bool kFast, typename Tile>
-__device__ __forceinline__ void octave_pairs(const Tile& tile, int octaves, int features, Rows x, Target to,
-                                             bool blurred) {
-  const int before = blurred ? 0 : features;
+// thread has a sine and its cosine.
+template <bool kBlurred, typename Tile>
+__device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int features, const Rows& x,
+                                              const Target<Tile::kBfloat16>& to) {
+  if (!kBlurred) {
+    for_each_entry<Tile>(tile.rows, features, [&](int row, int column) { to.put(row, column, x.at(row, column)); });
+  }
   // A product in place of a division, which is right for what is below 2^32 / features.
   const uint32_t inverse = 0xffffffffu / static_cast<uint32_t>(features) + 1u;
-  for_each_entry(tile.rows, features * octaves, [&](int row, int i) {
+  for_each_entry<Tile>(tile.rows, features * octaves, [&](int row, int i) {
     const int octave = features == 1 ? i : static_cast<int>(uint64_t{static_cast<uint32_t>(i)} * inverse >> 32);
-    const int feature = i - octave * features, column = before + i + octave * features;
+    const int feature = i - octave * features, column = (kBlurred ? 0 : features) + i + octave * features;
     const float scale = octave_scale(octave), angle = x.at(row, feature) * scale;
-    float sine, cosine;
-    if constexpr (kFast) {
-      fast_sine_and_cosine(angle, sine, cosine);
-    } else {
-      sine = sine_of_octave(angle, 0.0f), cosine = sine_of_octave(angle, 0.5f);
-    }
-    if (blurred) {
-      const float blur = octave_blur(scale, x.at(row, features + feature));
-      sine *= blur, cosine *= blur;
-    }
-    to.put(row, column, sine);
-    to.put(row, column + features, cosine);
+    const float blur = kBlurred ? octave_blur(scale, x.at(row, features + feature)) : 1.0f;
+    to.put(row, column, sine_of_octave(angle, 0.0f) * blur);
+    to.put(row, column + features, sine_of_octave(angle, 0.5f) * blur);
   });
 }
-template <typename Tile>
+// The same as 16-bit numbers, and as floats if kFloats. A thread has a column of a row in all octaves: every fourth by
+// the hardware, those behind it by the double angle, which doubles the error.
+template <bool kBlurred, bool kFloats, typename Tile>
+__device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int features, const Rows& x,
+                                             const Target<Tile::kBfloat16>& to) {
+  constexpr int kDoubled = 4;
+  const float largest = kLargestDeviceAngle / octave_scale(octaves > 0 ? octaves - 1 : 0);
+  for (int i = Tile::worker(); i < Tile::kRows * features; i += Tile::kWorkers) {
+    const int feature = i / Tile::kRows, row = i % Tile::kRows, column = (kBlurred ? 0 : features) + feature;
+    if (row >= tile.rows) continue;
+    const float value = x.at(row, feature), variance = kBlurred ? x.at(row, features + feature) : 0.0f;
+    if (!kBlurred) to.put(row, feature, value);
+    uint16_t* half = to.halves + row * to.halves_stride + column;
+    float* wide = to.floats + row * to.stride + column;
+    const auto put = [&](int octave, float2 pair) {
+      const float blur = kBlurred ? octave_blur(octave_scale(octave), variance) : 1.0f;
+      const uint32_t word = pack_halves<Tile::kBfloat16>(pair.x * blur, pair.y * blur);
+      half[0] = static_cast<uint16_t>(word), half[features] = static_cast<uint16_t>(word >> 16);
+      half += 2 * features;
+      if (kFloats) {
+        wide[0] = pair.x * blur, wide[features] = pair.y * blur;
+        wide += 2 * features;
+      }
+    };
+    if (!(fabsf(value) <= largest)) {  // or NaN
+#pragma unroll 1
+      for (int octave = 0; octave < octaves; ++octave) put(octave, exact_sine_and_cosine(value, octave));
+      continue;
+    }
+    for (int first = 0; first < octaves; first += kDoubled) {
+      float2 pair = fast_sine_and_cosine(value * octave_scale(first));
+#pragma unroll
+      for (int octave = first; octave < first + kDoubled; ++octave) {
+        if (octave >= octaves) break;
+        put(octave, pair);
+        const float twice = pair.x + pair.x;
+        pair = make_float2(twice * pair.y, fmaf(-twice, pair.x, 1.0f));
+      }
+    }
+  }
+}
+template <bool kBlurred, typename Tile>
 __device__ __noinline__ void octaves(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands,
-                                     int features, bool blurred) {
+                                     int features) {
   const Rows x = tile.value(operands[0]);
-  const Target to = tile.target(step);
-  if (!blurred) {
-    for_each_entry(tile.rows, features, [&](int row, int column) { to.put(row, column, x.at(row, column)); });
+  const auto to = tile.target(step);
+  if constexpr (Tile::kHalves) {
+    if (to.has_halves && to.has_floats) return fast_octaves<kBlurred, true>(tile, step.depth, features, x, to);
+    if (to.has_halves) return fast_octaves<kBlurred, false>(tile, step.depth, features, x, to);
   }
-  if (tile.halves) {
-    octave_pairs<true>(tile, step.depth, features, x, to, blurred);
-  } else {
-    octave_pairs<false>(tile, step.depth, features, x, to, blurred);
-  }
+  exact_octaves<kBlurred>(tile, step.depth, features, x, to);
 }
 
 // The gradient to them from g, with what was encoded: the derivative of a sine is the cosine beside it.
@@ -243,10 +275,10 @@ template <typename Tile>
 __device__ __noinline__ void octaves_gradient(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands,
                                               int features, bool blurred) {
   const Rows g = tile.value(operands[1]), encoded = tile.value(operands[2]);
-  const Target to = tile.target(step);
+  const auto to = tile.target(step);
   const int octaves = step.depth;
   const int before = blurred ? 0 : features;
-  for_each_entry(tile.rows, features, [&](int row, int feature) {
+  for_each_entry<Tile>(tile.rows, features, [&](int row, int feature) {
     float sum = blurred ? 0.0f : g.at(row, feature), of_variance = 0.0f;
     for (int octave = 0; octave < octaves; ++octave) {
       const int sine = before + 2 * octave * features + feature, cosine = sine + features;
@@ -266,7 +298,7 @@ struct Octaves {
   static __device__ __forceinline__ void run(const Tile& tile, const ProgramStep& step,
                                              const ProgramOperand* operands) {
     const int features = operands[0].width / (kBlurred ? 2 : 1);
-    if (step.order == 0) return octaves(tile, step, operands, features, kBlurred);
+    if (step.order == 0) return octaves<kBlurred>(tile, step, operands, features);
     octaves_gradient(tile, step, operands, features, kBlurred);
   }
 };

@@ -1,13 +1,13 @@
-// Products of a block on CUDA. TensorSteps and FloatSteps make the steps of a program that multiply, with values of a
-// tile as they lie in its slots and weights as program_prepare_kernel has packed them: nothing passes through shared
-// memory but values, and no thread waits for another.
+// Products on CUDA. TensorSteps and FloatSteps make the steps of a program that multiply, with values as they lie in
+// slots and weights as program_prepare_kernel has packed them. Linear steps are a warp's, of its own rows by all
+// columns, 64 at a time; sums over rows are the block's.
 //
-// Tensor cores: 8 warps, kDown by rows and 8 / kDown by columns; a warp has kTall times 16 rows and kDown tiles of 8
-// columns. Weights lie in the order of fragments: for each chunk of the depth and each tile of 8 columns the 16 bytes
-// of a lane, so that a warp reads 512 bytes in a row. 16-bit values lie in words of two columns, whose rows are 4 words
-// longer than a multiple of 16: the 8 rows of a matrix that ldmatrix reads are in different banks.
+// Tensor cores: weights lie in the order of fragments: for each chunk of the depth and each tile of 8 columns the 16
+// bytes of a lane, so that a warp reads 512 bytes in a row. 16-bit values lie in words of two columns, whose rows are 4
+// words longer than a multiple of 16: the 8 rows of a matrix that ldmatrix reads are in different banks. What the next
+// step multiplies stays in registers, since sums of one product lie as a left operand of another does.
 //
-// float32: a thread has kDown rows by four columns; weights lie as [depth][columns].
+// float32: a thread has up to 8 rows by four columns; weights lie as [depth][columns].
 #pragma once
 
 #include "common/cuda_wrappers.h"
@@ -35,6 +35,9 @@ __device__ __forceinline__ uint32_t packed_word(const PackedMatrix& matrix, int 
   return Numbers::right(matrix, Numbers::kChunk * chunk, part, lane % 4, 8 * tile + lane / 4);
 }
 
+// Of a step without one: as those that are packed, each column twice.
+alignas(16) static __device__ const float kNoBias[2 * kProgramWide] = {};
+
 // Operands --------------------------------------------------------------------------------------------------------
 
 // A value in its slot: words of two 16-bit numbers where there are such, else floats.
@@ -48,9 +51,10 @@ struct ProductValue {
     return column < columns ? floats[row * stride + column] : 0.0f;
   }
 };
-template <typename Tile>
+// kFirst: of the block's first warp, else of the warp.
+template <bool kFirst, typename Tile>
 __device__ __forceinline__ ProductValue product_value(const Tile& tile, const CudaValue& value, bool words) {
-  const float* at = tile.slot(value.slot) + value.start;
+  const float* at = (kFirst ? tile.first_slot(value.slot) : tile.slot(value.slot)) + value.start;
   return {at, reinterpret_cast<const uint32_t*>(at), words, value.stride, value.columns};
 }
 
@@ -63,10 +67,11 @@ template <bool kBfloat16>
 struct HalfNumbers {
   static constexpr int kChunk = 32;
   static constexpr bool kHalves = true, kCuts = !kBfloat16;  // numbers beyond the largest
-  static constexpr int kResident = kCuts ? 2 : 3;            // blocks for whose threads there are registers enough
+  static constexpr auto kKind = kBfloat16 ? ProgramNumbers::bfloat16 : ProgramNumbers::float16;
 
   static __device__ __forceinline__ uint32_t pair(float x, float y) { return pack_halves<kBfloat16>(x, y); }
-  static __device__ __forceinline__ uint32_t relu(uint32_t word) { return relu_halves<kBfloat16>(word); }
+  static __device__ __forceinline__ uint32_t relu_pair(float x, float y) { return pack_relu<kBfloat16>(x, y); }
+  static __device__ __forceinline__ uint32_t above_zero(uint32_t word) { return above_zero_halves<kBfloat16>(word); }
   static __device__ __forceinline__ uint32_t right(const PackedMatrix& matrix, int k, int part, int member, int n) {
     const int at = k + 8 * part + 2 * member;
     // Weights beyond the largest float16 are cut off.
@@ -92,6 +97,10 @@ struct HalfNumbers {
     }
     if (kCuts && cut) clamp(found);
     return found;
+  }
+  static __device__ __forceinline__ void clamp(LeftFragments& found) {
+#pragma unroll
+    for (int i = 0; i < 8; ++i) found.words[i / 4][i % 4] = clamp_halves(found.words[i / 4][i % 4]);
   }
   static __device__ __forceinline__ void multiply(float (&sums)[4], const LeftFragments& left, const uint4& right) {
     const uint32_t first[2] = {right.x, right.y}, second[2] = {right.z, right.w};
@@ -135,10 +144,6 @@ struct HalfNumbers {
   }
 
  private:
-  static __device__ __forceinline__ void clamp(LeftFragments& found) {
-#pragma unroll
-    for (int i = 0; i < 8; ++i) found.words[i / 4][i % 4] = clamp_halves(found.words[i / 4][i % 4]);
-  }
   // Two rows of a lane's column.
   static __device__ __forceinline__ uint32_t turned_pair(const ProductValue& a, int row, int column, int rows,
                                                          int lane) {
@@ -150,7 +155,7 @@ struct HalfNumbers {
 struct Tf32Numbers {
   static constexpr int kChunk = 16;
   static constexpr bool kHalves = false, kCuts = false;
-  static constexpr int kResident = 2;
+  static constexpr auto kKind = ProgramNumbers::floats;
 
   static __device__ __forceinline__ uint32_t word(float x) {
     const float rounded = round_to_tf32(x);
@@ -159,7 +164,8 @@ struct Tf32Numbers {
     return bits;
   }
   static __device__ __forceinline__ uint32_t pair(float, float) { return 0; }  // values are floats
-  static __device__ __forceinline__ uint32_t relu(uint32_t word) { return word; }
+  static __device__ __forceinline__ uint32_t relu_pair(float, float) { return 0; }
+  static __device__ __forceinline__ uint32_t above_zero(uint32_t) { return 0; }
   static __device__ __forceinline__ uint32_t right(const PackedMatrix& matrix, int k, int part, int member, int n) {
     return word(matrix.at(k + 4 * part + member, n));
   }
@@ -173,6 +179,7 @@ struct Tf32Numbers {
     }
     return found;
   }
+  static __device__ __forceinline__ void clamp(LeftFragments&) {}
   static __device__ __forceinline__ void multiply(float (&sums)[4], const LeftFragments& left, const uint4& right) {
     const uint32_t first[2] = {right.x, right.y}, second[2] = {right.z, right.w};
     multiply_tf32(sums, left.words[0], first);
@@ -207,71 +214,100 @@ struct Tf32Numbers {
 
 // Steps -----------------------------------------------------------------------------------------------------------
 
-// kShared: slots are in shared memory. kResident: blocks of a multiprocessor that registers are left for, 128 of a
-// thread with two and 80 with three.
-template <typename Numbers, int kDown, int kTall, bool kShared>
-struct TensorSteps {
-  static constexpr int kHeight = 16 * kDown * kTall;
-  static constexpr int kResident = kShared && kTall == 1 ? Numbers::kResident : 2;
-  static constexpr bool kInShared = kShared;
-  using Tile = ProgramTile<kShared>;
+// What a warp holds from one step to the next, a value of up to 64 columns: words as they leave a product, which are
+// fragments of the next one. Of each tile of 8 columns those of a lane in rows g and g + 8.
+template <int kTall>
+struct HeldWords {
+  uint32_t words[kTall][kProgramWide / 8][2];
+  // Columns from 32 c on.
+  __device__ __forceinline__ LeftFragments left(int r, int c) const {
+    LeftFragments found;
+#pragma unroll
+    for (int i = 0; i < 8; ++i) found.words[i / 4][i % 4] = words[r][4 * c + i / 2][i % 2];
+    return found;
+  }
+};
 
-  // What enters a product of float16 is cut off at its largest number, since infinities in a network soon become NaN,
-  // except for gradients: whoever scales a loss looks for the infinite ones. What a turned matrix multiplies is taken
-  // for one.
-  static __device__ __forceinline__ void linear(const Tile& tile, const CudaStep& step) {
-    const ProductValue x = product_value(tile, step.x, step.x_words);
-    const int chunks = ceil_div(step.depth, Numbers::kChunk), across = 4 * padded(step.width, kProgramOutputs);
-    const int warp = static_cast<int>(thread_again() / 32), lane = static_cast<int>(thread_again() % 32);
-    const uint4* weights = reinterpret_cast<const uint4*>(tile.packed(step.weights)) + lane;
-    const int row = 16 * kTall * (warp % kDown);
-    const int wide = Numbers::kHalves && step.pairs >= 0 ? 2 * pair_words(step.width) : step.width;
+// kTall: times 16 rows of a team. kTeam: its warps. kShared: slots are in shared memory.
+//
+// What enters a product of float16 is cut off at its largest number, since infinities in a network soon become NaN,
+// except for gradients: whoever scales a loss looks for the infinite ones. What a turned matrix multiplies is taken for
+// one.
+template <typename Numbers, int kTall, int kTeam, bool kShared>
+struct TensorSteps {
+  using Tile = ProgramTile<16 * kTall, kTeam, kShared, Numbers::kKind>;
+  using Held = HeldWords<kTall>;
+
+  // Of any kind. Goes on to the last of those steps whose sums go on in the next one. In teams a warp has 16 of 64
+  // columns, but for what stays in registers, which the first one has.
+  static __device__ __forceinline__ void linear(const Tile& tile, CudaStep& step, int& number, Held& held) {
+    const bool words = Numbers::kHalves && (step.pairs >= 0 || step.holds || step.carries);
+    const int wide = words ? 2 * pair_words(step.width) : step.width;
+    if (kTeam > 1 && !in_registers(step)) {
 #pragma unroll 1
-    for (int first = 8 * kDown * (warp / kDown); first < wide; first += kProgramWide) {
-      Sums sums = {};
-      if (step.bias >= 0) {
-        const float2* from = reinterpret_cast<const float2*>(tile.packed(step.bias) + first) + lane % 4;
-#pragma unroll
-        for (int t = 0; t < kDown; ++t) {
-          const float2 two = load_constant(from + 4 * t);
-#pragma unroll
-          for (int r = 0; r < 2 * kTall; ++r) {
-            sums[r / 2][t][r % 2 * 2] = two.x, sums[r / 2][t][r % 2 * 2 + 1] = two.y;
-          }
+      for (int first = 16 * Tile::warp(); first < wide; first += 16 * kTeam) part<2>(tile, step, number, first, held);
+      return;
+    }
+    if (kTeam > 1 && Tile::warp() > 0) {
+      while (step.carries) step = load_step(tile.call.steps + ++number);
+      return;
+    }
+    if (wide <= 8) return part<1>(tile, step, number, 0, held);
+#pragma unroll 1
+    for (int first = 0; first < wide; first += kProgramWide) {
+      if (wide - first > kProgramWide / 2) {
+        part<8>(tile, step, number, first, held);
+      } else {
+        part<4>(tile, step, number, first, held);
+      }
+    }
+  }
+
+  // What chains of layers consist of, words to words, has its own code for each way to read them: where such ways meet,
+  // the compiler moves sums from register to register.
+  static __device__ __forceinline__ void chained(const Tile& tile, const CudaStep& step, Held& held) {
+    if constexpr (Numbers::kHalves) {
+      const int width = step.width, half = kProgramWide / 2;
+      if (kTeam > 1 && !in_registers(step)) {
+#pragma unroll 1
+        for (int first = 16 * Tile::warp(); first < 2 * pair_words(width); first += 16 * kTeam) {
+          chained_part<2, 0>(tile, step, first, held);
         }
-      } else if (step.added >= 0) {
-        add(sums, step, tile, row, first, lane);
+        return;
       }
-      const uint4* from = weights + first / 8 * 32;
-      if (Numbers::kHalves && x.has_words) {
-        multiply<true>(sums, x, !step.turned, from, row, chunks, across, lane);
-      } else {
-        multiply<false>(sums, x, !step.turned, from, row, chunks, across, lane);
+      if (kTeam > 1 && Tile::warp() > 0) return;
+      if (step.x_held && width > half) {
+        if (step.depth > half) return chained_part<8, 2>(tile, step, 0, held);
+        return chained_part<8, 1>(tile, step, 0, held);
       }
-      if (step.relu && step.slot >= 0) {
-        for_each_sum([&](int r, int t, int i) { sums[r][t][i] = sums[r][t][i] < 0.0f ? 0.0f : sums[r][t][i]; });
+      if (step.x_held) {
+        if (step.depth > half) return chained_part<4, 2>(tile, step, 0, held);
+        return chained_part<4, 1>(tile, step, 0, held);
       }
-      if (step.sloped) cut_slopes(sums, product_value(tile, step.y, step.y_words), row, first, lane);
-      if (tile.rows == kHeight && first + 8 * kDown <= step.width) {
-        store<true>(sums, tile, step, row, first, lane);
-      } else {
-        store<false>(sums, tile, step, row, first, lane);
+#pragma unroll 1
+      for (int first = 0; first < width; first += kProgramWide) {
+        if (width - first > half) {
+          chained_part<8, 0>(tile, step, first, held);
+        } else {
+          chained_part<4, 0>(tile, step, first, held);
+        }
       }
     }
   }
 
   // partial[i][j] += sum over rows of a[row][i] b[row][j]. A warp has 16 by 32 of them at a time.
   static __device__ __forceinline__ void outer(const Tile& tile, const CudaStep& step) {
-    const bool swapped = step.swapped;
-    const ProductValue a = product_value(tile, step.x, step.x_words), b = product_value(tile, step.y, step.y_words);
-    const int warp = static_cast<int>(thread_again() / 32), lane = static_cast<int>(thread_again() % 32);
+    const bool swapped = step.swapped != 0;
+    const ProductValue a = product_value<true>(tile, step.x, step.x_words);
+    const ProductValue b = product_value<true>(tile, step.y, step.y_words);
+    const int warp = static_cast<int>(thread_again() / 32), lane = lane_again();
     const bool words = Numbers::kHalves && a.has_words && b.has_words;
-    float* const partial = tile.partial + step.partial;
-    // By steps of 8 warps, without a division.
+    float* const partial = tile.partial + step.number;
+    // Without a division.
     const int down = 16 * ceil_div(a.columns, 16);
     int i0 = 16 * warp, j0 = 0;
 #pragma unroll 1
-    for (;; i0 += kProgramThreads / 2) {
+    for (;; i0 += static_cast<int>(blockDim.x / 2)) {
       for (; i0 >= down; j0 += 32) i0 -= down;
       if (j0 >= b.columns) break;
       float sums[4][4] = {};
@@ -284,9 +320,9 @@ struct TensorSteps {
                           : make_float2(0.0f, 0.0f);
       }
       if (words) {
-        multiply_turned<true>(sums, a, b, i0, j0, tile.rows, swapped, lane);
+        multiply_turned<true>(sums, tile, a, b, i0, j0, swapped, lane);
       } else {
-        multiply_turned<false>(sums, a, b, i0, j0, tile.rows, swapped, lane);
+        multiply_turned<false>(sums, tile, a, b, i0, j0, swapped, lane);
       }
       if (j0 + 32 <= b.columns && i0 + 16 <= a.columns) {
 #pragma unroll
@@ -309,19 +345,19 @@ struct TensorSteps {
 
   // partial[j] += sum over rows of b[row][j], by a product with ones.
   static __device__ __forceinline__ void columns(const Tile& tile, const CudaStep& step) {
-    const ProductValue b = product_value(tile, step.x, step.x_words);
-    const int lane = static_cast<int>(thread_again() % 32);
-    float* const partial = tile.partial + step.partial;
+    const ProductValue b = product_value<true>(tile, step.x, step.x_words);
+    const int lane = lane_again();
+    float* const partial = tile.partial + step.number;
     if (!b.has_words) return sum_columns(tile, step);
     const uint32_t one = Numbers::pair(1.0f, 1.0f), ones[4] = {one, one, one, one};
-    for (int j0 = 16 * static_cast<int>(thread_again() / 32); j0 < step.width; j0 += kProgramThreads / 2) {
+    for (int j0 = 16 * static_cast<int>(thread_again() / 32); j0 < step.width; j0 += static_cast<int>(blockDim.x / 2)) {
       float sums[2][4] = {};
-      for (int row = 0; row < tile.rows; row += Numbers::kRows) {
+      for_each_depth<true>(tile, b, b, [&](const ProductValue&, const ProductValue& own, int row, int rows) {
         uint32_t right[2][2];
-        Numbers::template turned_right<kShared, true>(right, b, j0, row, tile.rows, false, lane);
+        Numbers::template turned_right<kShared, true>(right, own, j0, row, rows, false, lane);
         Numbers::multiply_turned(sums[0], ones, right[0]);
         Numbers::multiply_turned(sums[1], ones, right[1]);
-      }
+      });
 #pragma unroll
       for (int i = 0; i < 4; ++i) {
         const int j = j0 + 8 * (i / 2) + 2 * lane + i % 2;
@@ -331,47 +367,171 @@ struct TensorSteps {
   }
 
  private:
-  using Sums = float[kTall][kDown][4];
+  template <int kTiles>
+  using Sums = float[kTall][kTiles][4];
 
-  template <typename Visit>
+  static __device__ __forceinline__ bool in_registers(const CudaStep& step) {
+    return step.x_held || step.holds || step.carries;
+  }
+
+  // 8 kTiles columns from `first` on. kHeld: chunks of what is held.
+  template <int kTiles, int kHeld>
+  static __device__ __forceinline__ void chained_part(const Tile& tile, const CudaStep& step, int first, Held& held) {
+    const int lane = lane_again();
+    Sums<kTiles> sums;
+    const Product product{tile, step, first, lane};
+    product.start(sums);
+    if constexpr (kHeld > 0) {
+#pragma unroll
+      for (int c = 0; c < kHeld; ++c) product.chunk(sums, c, [&](int r) { return product.held(held, r, c); });
+    } else {
+      const int chunks = ceil_div(step.depth, Numbers::kChunk);
+#pragma unroll 1
+      for (int c = 0; c < chunks; ++c) product.chunk(sums, c, [&](int r) { return product.template left<true>(r, c); });
+    }
+    put_words<kTiles>(held, sums, tile, step, first, lane);
+  }
+  // 8 kTiles columns from `first` on, by the kind of step that has them all.
+  template <int kTiles>
+  static __device__ __forceinline__ void part(const Tile& tile, CudaStep& step, int& number, int first, Held& held) {
+    const int lane = lane_again();
+    Sums<kTiles> sums;
+    Product{tile, step, first, lane}.start(sums);
+#pragma unroll 1
+    for (;;) {
+      multiply<kTiles>(sums, tile, step, first, held, lane);
+      if (step.added >= 0) add<kTiles>(sums, step, tile, first, lane);
+      if (!Numbers::kHalves || kTiles == 1 || !step.carries) break;
+      step = load_step(tile.call.steps + ++number);
+    }
+    const bool floats = step.slot >= 0, by_words = Numbers::kHalves && step.y_words;
+    if (step.relu && floats) {
+      for_each_sum<kTiles>([&](int r, int t, int i) { sums[r][t][i] = sums[r][t][i] < 0.0f ? 0.0f : sums[r][t][i]; });
+    }
+    if (step.sloped && (floats || !by_words)) cut_slopes<kTiles>(sums, tile, step, first, lane);
+    if constexpr (kTiles > 1 && Numbers::kHalves) {
+      if (step.pairs >= 0 || step.holds) put_words<kTiles>(held, sums, tile, step, first, lane);
+    }
+    if (!floats) return;
+    if (tile.rows == Tile::kRows && first + 8 * kTiles <= step.width) {
+      store<kTiles, true>(sums, tile, step, first, lane);
+    } else {
+      store<kTiles, false>(sums, tile, step, first, lane);
+    }
+  }
+
+  template <int kTiles, typename Visit>
   static __device__ __forceinline__ void for_each_sum(const Visit& visit) {
 #pragma unroll
-    for (int i = 0; i < 4 * kTall * kDown; ++i) visit(i / (4 * kDown), i / 4 % kDown, i % 4);
+    for (int i = 0; i < 4 * kTall * kTiles; ++i) visit(i / (4 * kTiles), i / 4 % kTiles, i % 4);
   }
-  // Row and column of a sum, within the rows and columns of its warp.
+  template <int kTiles, typename Visit>
+  static __device__ __forceinline__ void for_each_word(const Visit& visit) {
+#pragma unroll
+    for (int i = 0; i < 2 * kTall * kTiles; ++i) visit(i / (2 * kTiles), i / 2 % kTiles, i % 2);
+  }
+  // Row and column of a sum, within the rows of its warp and the columns of its part.
   static __device__ __forceinline__ MapPlace place(int r, int t, int i, int lane) {
     const MapPlace own = accumulator_place(static_cast<unsigned>(lane), i);
     return {16 * r + own.row, 8 * t + own.column};
   }
 
-  template <bool kWords>
-  static __device__ __forceinline__ void multiply(Sums& sums, const ProductValue& x, bool cut, const uint4* from,
-                                                  int row, int chunks, int across, int lane) {
-#pragma unroll kWords ? 2 : 1
-    for (int c = 0; c < chunks; ++c, from += across) {
-      uint4 right[kDown];
+  // Columns from a first one on of x w^T + bias, for a lane.
+  struct Product {
+    ProductValue x;
+    const uint4* weights;
+    const float4* bias;
+    int across, lane;
+    bool cut;
+    __device__ __forceinline__ Product(const Tile& tile, const CudaStep& step, int first, int lane)
+        : x(product_value<false>(tile, step.x, step.x_words)),
+          weights(reinterpret_cast<const uint4*>(tile.packed(step.weights)) + first / 8 * 32 + lane),
+          bias(reinterpret_cast<const float4*>(step.bias < 0 ? kNoBias : tile.packed(step.bias) + 2 * first) +
+               lane % 4),
+          across(4 * padded(step.width, kProgramOutputs)),
+          lane(lane),
+          cut(!step.turned) {}
+    // sums = bias.
+    template <int kTiles>
+    __device__ __forceinline__ void start(float (&sums)[kTall][kTiles][4]) const {
 #pragma unroll
-      for (int t = 0; t < kDown; ++t) right[t] = load_constant(from + 32 * t);
+      for (int t = 0; t < kTiles; ++t) {
+        const float4 four = load_constant(bias + 4 * t);
 #pragma unroll
-      for (int r = 0; r < kTall; ++r) {
-        const auto left = Numbers::template left<kShared, kWords>(x, row + 16 * r, Numbers::kChunk * c, cut, lane);
-#pragma unroll
-        for (int t = 0; t < kDown; ++t) Numbers::multiply(sums[r][t], left, right[t]);
+        for (int r = 0; r < kTall; ++r) {
+          sums[r][t][0] = four.x, sums[r][t][1] = four.y, sums[r][t][2] = four.z, sums[r][t][3] = four.w;
+        }
       }
+    }
+    // A left operand of 16 rows: what is held, or what is in its slot.
+    __device__ __forceinline__ LeftFragments held(const Held& held, int r, int c) const {
+      LeftFragments left = held.left(r, c);
+      if (Numbers::kCuts && cut) Numbers::clamp(left);
+      return left;
+    }
+    template <bool kWords>
+    __device__ __forceinline__ LeftFragments left(int r, int c) const {
+      return Numbers::template left<kShared, kWords>(x, 16 * r, Numbers::kChunk * c, cut, lane);
+    }
+    // sums += the product at a chunk of the depth. left(r): of 16 rows.
+    template <int kTiles, typename Left>
+    __device__ __forceinline__ void chunk(float (&sums)[kTall][kTiles][4], int c, const Left& left) const {
+      const uint4* const from = weights + c * across;
+      LeftFragments own[kTall];
+#pragma unroll
+      for (int r = 0; r < kTall; ++r) own[r] = left(r);
+#pragma unroll
+      for (int t = 0; t < kTiles; ++t) {
+        const uint4 right = load_constant(from + 32 * t);
+#pragma unroll
+        for (int r = 0; r < kTall; ++r) Numbers::multiply(sums[r][t], own[r], right);
+      }
+    }
+  };
+  // sums += x w^T.
+  template <int kTiles>
+  static __device__ __forceinline__ void multiply(Sums<kTiles>& sums, const Tile& tile, const CudaStep& step, int first,
+                                                  const Held& held, int lane) {
+    const Product product{tile, step, first, lane};
+    const int chunks = ceil_div(step.depth, Numbers::kChunk);
+    if (Numbers::kHalves && step.x_held) {
+      product.chunk(sums, 0, [&](int r) { return product.held(held, r, 0); });
+      if (chunks > 1) product.chunk(sums, 1, [&](int r) { return product.held(held, r, 1); });
+      return;
+    }
+    const bool words = Numbers::kHalves && step.x_words;
+#pragma unroll 1
+    for (int c = 0; c < chunks; ++c) {
+      product.chunk(sums, c, [&](int r) {
+        return words ? product.template left<Numbers::kHalves>(r, c) : product.template left<false>(r, c);
+      });
+    }
+  }
+
+  // visit(a, b, row, rows) for the depth of a sum over the block's rows: operands that lie from a warp's first row on,
+  // and which of its rows come next, of those that have a sample.
+  template <bool kWords, typename Visit>
+  static __device__ __forceinline__ void for_each_depth(const Tile& tile, ProductValue a, ProductValue b,
+                                                        const Visit& visit) {
+#pragma unroll kWords ? 4 / kTall : 1
+    for (int left = tile.all; left > 0; left -= Tile::kRows) {
+#pragma unroll
+      for (int row = 0; row < Tile::kRows; row += Numbers::kRows) visit(a, b, row, left);
+      a.floats += tile.pitch, a.words += tile.pitch;
+      b.floats += tile.pitch, b.words += tile.pitch;
     }
   }
 
   // sums += over rows a's 16 columns from i0 on by b's 32 from j0 on. kWords: both lie in words, which are 0 up to
   // there and in rows without a sample.
   template <bool kWords>
-  static __device__ __forceinline__ void multiply_turned(float (&sums)[4][4], const ProductValue& a,
-                                                         const ProductValue& b, int i0, int j0, int rows, bool swapped,
+  static __device__ __forceinline__ void multiply_turned(float (&sums)[4][4], const Tile& tile, const ProductValue& a,
+                                                         const ProductValue& b, int i0, int j0, bool swapped,
                                                          int lane) {
     const int tiles = ceil_div(b.columns - j0, 8);
-#pragma unroll kWords ? 4 : 1
-    for (int row = 0; row < rows; row += Numbers::kRows) {
+    for_each_depth<kWords>(tile, a, b, [&](const ProductValue& x, const ProductValue& y, int row, int rows) {
       uint32_t left[4];
-      Numbers::template turned_left<kShared, kWords>(left, a, i0, row, rows, lane);
+      Numbers::template turned_left<kShared, kWords>(left, x, i0, row, rows, lane);
       if constexpr (Numbers::kCuts) {
         for (uint32_t& word : left) word = swapped ? clamp_halves(word) : word;
       }
@@ -379,73 +539,94 @@ struct TensorSteps {
       for (int pair = 0; pair < 2; ++pair) {
         if (!kWords && 2 * pair >= tiles) continue;
         uint32_t right[2][2];
-        Numbers::template turned_right<kShared, kWords>(right, b, j0 + 16 * pair, row, rows, !swapped, lane);
+        Numbers::template turned_right<kShared, kWords>(right, y, j0 + 16 * pair, row, rows, !swapped, lane);
         Numbers::multiply_turned(sums[2 * pair], left, right[0]);
         Numbers::multiply_turned(sums[2 * pair + 1], left, right[1]);
       }
-    }
+    });
   }
 
   // What is added to the product, where that is a value.
-  static __device__ __forceinline__ void add(Sums& sums, const CudaStep& step, const Tile& tile, int row, int first,
+  template <int kTiles>
+  static __device__ __forceinline__ void add(Sums<kTiles>& sums, const CudaStep& step, const Tile& tile, int first,
                                              int lane) {
     const Rows added = tile.operand(tile.call.code.operands[step.added]);
-    for_each_sum([&](int r, int t, int i) {
+    for_each_sum<kTiles>([&](int r, int t, int i) {
       const MapPlace at = place(r, t, i, lane);
-      const bool there = row + at.row < tile.rows && first + at.column < step.width;
-      if (there) sums[r][t][i] = added.at(row + at.row, first + at.column);
+      const bool there = at.row < tile.rows && first + at.column < step.width;
+      if (there) sums[r][t][i] += added.at(at.row, first + at.column);
     });
   }
 
   // 0 where a value of ReLU is.
-  static __device__ __forceinline__ void cut_slopes(Sums& sums, const ProductValue& slope, int row, int first,
-                                                    int lane) {
+  template <int kTiles>
+  static __device__ __forceinline__ void cut_slopes(Sums<kTiles>& sums, const Tile& tile, const CudaStep& step,
+                                                    int first, int lane) {
+    const ProductValue slope = product_value<false>(tile, step.y, step.y_words);
     if (Numbers::kHalves && slope.has_words) {
-      const uint32_t* corner = slope.words + (row + lane / 4) * slope.stride + first / 2 + lane % 4;
-      for_each_sum([&](int r, int t, int i) {
-        const uint32_t word = corner[(16 * r + i / 2 * 8) * slope.stride + 4 * t];
-        sums[r][t][i] = positive_half(i % 2 == 0 ? word : word >> 16) ? sums[r][t][i] : 0.0f;
+      const uint32_t* corner = slope.words + lane / 4 * slope.stride + first / 2 + lane % 4;
+      for_each_sum<kTiles>([&](int r, int t, int i) {
+        const uint32_t above = Numbers::above_zero(corner[(16 * r + i / 2 * 8) * slope.stride + 4 * t]);
+        sums[r][t][i] = (i % 2 == 0 ? above & 1u : above >> 31) != 0 ? sums[r][t][i] : 0.0f;
       });
       return;
     }
-    for_each_sum([&](int r, int t, int i) {
+    for_each_sum<kTiles>([&](int r, int t, int i) {
       const MapPlace at = place(r, t, i, lane);
-      const bool cut = slope.at(row + at.row, first + at.column) <= 0.0f;  // NaN is not
+      const bool cut = slope.at(at.row, first + at.column) <= 0.0f;  // NaN is not
       sums[r][t][i] = cut ? 0.0f : sums[r][t][i];
     });
   }
 
-  // kWhole: there is a sample in every row, and each sum has a column.
-  template <bool kWhole>
-  static __device__ __forceinline__ void store(const Sums& sums, const Tile& tile, const CudaStep& step, int row,
-                                               int first, int lane) {
-    const int width = step.width;
-    if (Numbers::kHalves && step.pairs >= 0) {
-      // Words are 0 where there is no sample and no column, since products take whole sixteens of both.
-      const int wide = 2 * pair_words(width), stride = pair_stride(width);
-      uint32_t* const corner =
-          reinterpret_cast<uint32_t*>(tile.slot(step.pairs)) + (row + lane / 4) * stride + first / 2 + lane % 4;
-      for_each_sum([&](int r, int t, int i) {
-        if (i % 2 == 1) return;
-        const MapPlace at = place(r, t, i, lane);
-        const int column = first + at.column;
-        float x = sums[r][t][i], y = sums[r][t][i + 1];
-        if (!kWhole && column >= wide) return;
-        if (!kWhole && (row + at.row >= tile.rows || column >= width)) x = 0.0f;
-        if (!kWhole && (row + at.row >= tile.rows || column + 1 >= width)) y = 0.0f;
-        const uint32_t word = Numbers::pair(x, y);
-        corner[(16 * r + 4 * i) * stride + 4 * t] = step.relu ? Numbers::relu(word) : word;
+  // The value as words: to its slot, and held.
+  template <int kTiles>
+  static __device__ __forceinline__ void put_words(Held& held, const Sums<kTiles>& sums, const Tile& tile,
+                                                   const CudaStep& step, int first, int lane) {
+    if (step.relu) {
+      for_each_word<kTiles>([&](int r, int t, int h) {
+        held.words[r][t][h] = Numbers::relu_pair(sums[r][t][2 * h], sums[r][t][2 * h + 1]);
+      });
+    } else {
+      for_each_word<kTiles>(
+          [&](int r, int t, int h) { held.words[r][t][h] = Numbers::pair(sums[r][t][2 * h], sums[r][t][2 * h + 1]); });
+    }
+    if (step.sloped && step.y_words) {
+      const uint32_t* const corner =
+          product_value<false>(tile, step.y, true).words + lane / 4 * step.y.stride + first / 2 + lane % 4;
+      for_each_word<kTiles>([&](int r, int t, int h) {
+        held.words[r][t][h] &= Numbers::above_zero(corner[(16 * r + 8 * h) * step.y.stride + 4 * t]);
       });
     }
-    if (step.slot < 0) return;
+    if (tile.rows < Tile::kRows || first + 8 * kTiles > step.width) {
+      clear_outside<kTiles>(held, tile, step.width - first, lane);
+    }
+    if (step.pairs < 0) return;
+    const int stride = pair_stride(step.width);
+    uint32_t* const to = reinterpret_cast<uint32_t*>(tile.slot(step.pairs)) + lane / 4 * stride + first / 2 + lane % 4;
+    for_each_word<kTiles>([&](int r, int t, int h) { to[(16 * r + 8 * h) * stride + 4 * t] = held.words[r][t][h]; });
+  }
+  // Words are 0 where there is no sample or no column, since products take whole sixteens of both.
+  template <int kTiles>
+  static __device__ __forceinline__ void clear_outside(Held& held, const Tile& tile, int columns, int lane) {
+    for_each_word<kTiles>([&](int r, int t, int h) {
+      const MapPlace at = place(r, t, 2 * h, lane);
+      const int left = at.row < tile.rows ? columns - at.column : 0;
+      held.words[r][t][h] &= left > 1 ? 0xffffffffu : left > 0 ? 0xffffu : 0u;
+    });
+  }
+
+  // kWhole: there is a sample in every row, and each sum has a column.
+  template <int kTiles, bool kWhole>
+  static __device__ __forceinline__ void store(const Sums<kTiles>& sums, const Tile& tile, const CudaStep& step,
+                                               int first, int lane) {
     float* const floats = tile.slot(step.slot);
-    const int stride = step.stride;
-    for_each_sum([&](int r, int t, int i) {
+    const int stride = step.stride, width = step.width;
+    for_each_sum<kTiles>([&](int r, int t, int i) {
       if (i % 2 == 1) return;
       const MapPlace at = place(r, t, i, lane);
       const int column = first + at.column;
-      float* const to = floats + (row + at.row) * stride + column;
-      if (!kWhole && (row + at.row >= tile.rows || column >= width)) return;
+      float* const to = floats + at.row * stride + column;
+      if (!kWhole && (at.row >= tile.rows || column >= width)) return;
       if (kWhole || column + 1 < width) {
         *reinterpret_cast<float2*>(to) = make_float2(sums[r][t][i], sums[r][t][i + 1]);
       } else {
@@ -455,59 +636,64 @@ struct TensorSteps {
   }
 };
 
-// In float32.
-template <int kDown, bool kShared>
+// In float32. A team has 16 rows.
+template <int kTeam, bool kShared>
 struct FloatSteps {
-  static constexpr int kHeight = 16 * kDown;
-  static constexpr int kResident = kShared ? 3 : 2;
-  static constexpr bool kInShared = kShared;
-  using Tile = ProgramTile<kShared>;
+  using Tile = ProgramTile<16, kTeam, kShared, ProgramNumbers::floats>;
+  struct Held {};
 
-  static __device__ __forceinline__ void linear(const Tile& tile, const CudaStep& step) {
-    const int thread = static_cast<int>(thread_again());
+  static __device__ __forceinline__ void chained(const Tile&, const CudaStep&, Held&) {}
+  static __device__ __forceinline__ void linear(const Tile& tile, const CudaStep& step, int&, Held&) {
+    const int worker = Tile::worker();
     if (step.width > 16) {
 #pragma unroll 1
-      for (int first = 4 * (thread % 16); first < step.width; first += kProgramWide) {
-        block<kDown>(tile, step, thread / 16, first);
+      for (int first = 4 * (worker % 16); first < step.width; first += kProgramWide) {
+        block<8 / kTeam>(tile, step, worker / 16, first);
       }
-      return;
+    } else if (step.width > 4) {
+      const int first = 4 * (worker % 4), row = worker / 4;
+      if (first < step.width && row < Tile::kRows) block<kTeam == 1 ? 2 : 1>(tile, step, row, first);
+    } else if (worker < Tile::kRows) {
+      block<1>(tile, step, worker, 0);
     }
-    // Few outputs: a row a thread.
-    const int shift = step.width > 4 ? 2 : 0, row = thread >> shift, first = 4 * (thread & ((1 << shift) - 1));
-    if (row < kHeight && first < step.width) block<1>(tile, step, row, first);
   }
 
   // As of TensorSteps; a thread has 4 by 4 at a time.
   static __device__ __forceinline__ void outer(const Tile& tile, const CudaStep& step) {
-    const ProductValue a = product_value(tile, step.x, false), b = product_value(tile, step.y, false);
+    const ProductValue a = product_value<true>(tile, step.x, false), b = product_value<true>(tile, step.y, false);
     const bool whole = (step.x.start | step.x.stride | step.y.start | step.y.stride) % 4 == 0;
     const int across = ceil_div(b.columns, 4), units = ceil_div(a.columns, 4) * across;
 #pragma unroll 1
-    for (int unit = static_cast<int>(thread_again()); unit < units; unit += kProgramThreads) {
+    for (int unit = static_cast<int>(thread_again()); unit < units; unit += static_cast<int>(blockDim.x)) {
       const int i0 = 4 * (unit / across), j0 = 4 * (unit % across);
       float4 sums[4] = {};
-      if (whole) {
-#pragma unroll 4
-        for (int row = 0; row < tile.rows; ++row) {
-          const float4 x = *reinterpret_cast<const float4*>(a.floats + row * a.stride + i0);
-          const float4 y = *reinterpret_cast<const float4*>(b.floats + row * b.stride + j0);
-          accumulate(sums[0], x.x, y);
-          accumulate(sums[1], x.y, y);
-          accumulate(sums[2], x.z, y);
-          accumulate(sums[3], x.w, y);
-        }
-      } else {
+      ProductValue x = a, y = b;
 #pragma unroll 1
-        for (int row = 0; row < tile.rows; ++row) {
-          const float4 y = make_float4(b.at(row, j0), b.at(row, j0 + 1), b.at(row, j0 + 2), b.at(row, j0 + 3));
+      for (int left = tile.all; left > 0; left -= Tile::kRows, x.floats += tile.pitch, y.floats += tile.pitch) {
+        const int rows = left < Tile::kRows ? left : Tile::kRows;
+        if (whole) {
+#pragma unroll 4
+          for (int row = 0; row < rows; ++row) {
+            const float4 four = *reinterpret_cast<const float4*>(x.floats + row * x.stride + i0);
+            const float4 by = *reinterpret_cast<const float4*>(y.floats + row * y.stride + j0);
+            accumulate(sums[0], four.x, by);
+            accumulate(sums[1], four.y, by);
+            accumulate(sums[2], four.z, by);
+            accumulate(sums[3], four.w, by);
+          }
+        } else {
+#pragma unroll 1
+          for (int row = 0; row < rows; ++row) {
+            const float4 by = make_float4(y.at(row, j0), y.at(row, j0 + 1), y.at(row, j0 + 2), y.at(row, j0 + 3));
 #pragma unroll
-          for (int i = 0; i < 4; ++i) accumulate(sums[i], a.at(row, i0 + i), y);
+            for (int i = 0; i < 4; ++i) accumulate(sums[i], x.at(row, i0 + i), by);
+          }
         }
       }
 #pragma unroll
       for (int i = 0; i < 4; ++i) {
         if (i0 + i >= a.columns) continue;
-        float* const at = tile.partial + step.partial + (i0 + i) * step.stride + j0;
+        float* const at = tile.partial + step.number + (i0 + i) * step.stride + j0;
         if (j0 + 4 <= b.columns) {
           float4 entry = tile.fill ? make_float4(0.0f, 0.0f, 0.0f, 0.0f) : *reinterpret_cast<float4*>(at);
           entry.x += sums[i].x, entry.y += sums[i].y, entry.z += sums[i].z, entry.w += sums[i].w;
@@ -526,11 +712,12 @@ struct FloatSteps {
   static __device__ __forceinline__ void columns(const Tile& tile, const CudaStep& step) { sum_columns(tile, step); }
 
  private:
-  // Rows row, row + 16 and so on, by four columns.
+  // Rows from `row` on, kRows of them, by four columns.
   template <int kRows>
   static __device__ __forceinline__ void block(const Tile& tile, const CudaStep& step, int row, int first) {
-    const ProductValue value = product_value(tile, step.x, false);
-    const int stride = padded(step.width, kProgramOutputs), down = 16 * value.stride, depth = step.depth;
+    constexpr int kApart = Tile::kRows / kRows;
+    const ProductValue value = product_value<false>(tile, step.x, false);
+    const int stride = padded(step.width, kProgramOutputs), down = kApart * value.stride, depth = step.depth;
     const float* const x = value.floats + row * value.stride;
     float4 sums[kRows] = {};
     if (step.bias >= 0) {
@@ -541,7 +728,7 @@ struct FloatSteps {
       const Rows rows = tile.operand(tile.call.code.operands[step.added]);
 #pragma unroll
       for (int r = 0; r < kRows; ++r) {
-        const int at = row + 16 * r;
+        const int at = row + kApart * r;
         const auto added = [&](int i) {
           return at < tile.rows && first + i < step.width ? rows.at(at, first + i) : 0.0f;
         };
@@ -572,11 +759,11 @@ struct FloatSteps {
 #pragma unroll
       for (int r = 0; r < kRows; ++r) accumulate(sums[r], x[r * down + k], y);
     }
-    const ProductValue slope = product_value(tile, step.y, false);
+    const ProductValue slope = product_value<false>(tile, step.y, false);
     float* const to = tile.slot(step.slot) + first;
 #pragma unroll
     for (int r = 0; r < kRows; ++r) {
-      const int at = row + 16 * r;
+      const int at = row + kApart * r;
       if (at >= tile.rows) continue;
       float four[4] = {sums[r].x, sums[r].y, sums[r].z, sums[r].w};
 #pragma unroll

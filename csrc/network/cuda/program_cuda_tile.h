@@ -11,11 +11,14 @@
 
 namespace voronerf {
 
-constexpr int kProgramThreads = 256;
-constexpr int kProgramWide = 64;     // columns of a product that a block has at a time
-constexpr int kProgramSkew = 4;      // floats that rows of slots are longer than a multiple of 16
-constexpr int kProgramOutputs = 32;  // packed weights and biases are 0 up to a multiple of this
-constexpr int kProgramMost = 64;     // tensors of a kind: kernel arguments hold 4 KiB
+// Warps of a block and blocks of a multiprocessor, by rows of a team: 16 warps with 128 registers, or 12 with 168.
+constexpr int program_warps(int rows) { return rows == 32 ? 4 : 8; }
+constexpr int program_blocks(int rows) { return rows == 32 ? 3 : 2; }
+constexpr int kProgramTeam = 4;          // warps that share their rows, where the values of few rows fit
+constexpr int kProgramWide = kMostHeld;  // columns of a product that a warp has at a time
+constexpr int kProgramSkew = 4;          // floats that rows of slots are longer than a multiple of 16
+constexpr int kProgramOutputs = 32;      // packed weights and biases are 0 up to a multiple of this
+constexpr int kProgramMost = 64;         // tensors of a kind: kernel arguments hold 4 KiB
 constexpr int kProgramLookups = 16;
 
 struct CudaRows {
@@ -28,17 +31,27 @@ struct CudaRows {
 struct CudaValue {
   int32_t slot, start, stride, columns;
 };
+// chain: a linear step from words to words.
+enum class CudaOp : int32_t { plain, input, output, linear, chain, outer, columns };
 // A step as the interpreter reads it, in a few loads: what the step and its operands and packs say, put together. Plain
 // steps have `op` and `keeps` alone.
 struct alignas(16) CudaStep {
-  CudaValue x, y;               // linear: y is where ReLU was. outer: x by y. columns: x
-  int32_t slot, stride, pairs;  // of what it makes: as floats, or -1; and where it is as 16-bit words, or -1
-  int32_t width, depth;
-  int32_t weights, bias, added;  // places in what is packed, and an operand; -1: none
-  int32_t partial;               // outer, columns: the place; outer: its rows are `stride` floats
-  ProgramOp op;
-  bool keeps, relu, sloped, turned;
-  bool x_words, y_words, swapped, unused;  // swapped: x is not the gradient
+  CudaValue x;
+  int32_t weights, bias;  // places in what is packed; -1: none
+  int32_t depth, width;   // output: `depth` is the first column where it goes
+  CudaValue y;            // linear: where ReLU was. outer: x by y
+  int32_t slot, stride;   // of what it makes as floats, or -1; outer: `stride` floats are a row of the sum
+  int32_t pairs;          // where what it makes is as 16-bit words, or -1
+  int32_t added;          // an operand, or -1; output: what is written
+  int32_t number;         // input, output: which. outer, columns: the place in the partial
+  CudaOp op;
+  uint32_t keeps : 1;  // in memory of the call
+  uint32_t relu : 1, sloped : 1, turned : 1;
+  uint32_t x_words : 1, y_words : 1;
+  uint32_t swapped : 1;            // x is not the gradient
+  uint32_t x_held : 1, holds : 1;  // x is in registers; what it makes stays there for the next step
+  uint32_t carries : 1;            // the next step goes on with its sums
+  __device__ __forceinline__ bool sums() const { return op == CudaOp::outer || op == CudaOp::columns; }
 };
 static_assert(sizeof(CudaStep) == 80, "five loads");
 
@@ -116,16 +129,25 @@ __device__ __forceinline__ void store_number(void* to, int type, int64_t at, flo
   }
 }
 
-// Column of an input, for a row of the caller's.
-__device__ __forceinline__ float load_input(const CudaProgram& call, int input, int width, int64_t source, int column) {
+// Of an input, what a row of the caller's has.
+struct InputRow {
+  const void* data;
+  int64_t at, apart;  // the first column, and from one to the next
+  int type;
+  __device__ __forceinline__ float column(int i) const {
+    return data == nullptr ? 0.0f : load_number(data, type, at + i * apart);
+  }
+};
+__device__ __forceinline__ InputRow input_row(const CudaProgram& call, int input, int width, int64_t source) {
   int64_t row = source, rows = call.rows.n;
+  const void* data = call.inputs[input];
   if (call.rays[input]) {
     rows = call.rows.r;
-    if (rows == 0) return 0.0f;
+    if (rows == 0) return {nullptr, 0, 0, 0};
     row = index_within(call.rows.ray_index[source], rows);
   }
-  return load_number(call.inputs[input], call.input_types[input],
-                     call.turned[input] ? column * rows + row : row * width + column);
+  const bool turned = call.turned[input];
+  return {data, turned ? row : row * width, turned ? rows : 1, call.input_types[input]};
 }
 
 // Of a value as 16-bit numbers: words of a row that are 0 behind its columns, and from row to row.
@@ -142,37 +164,61 @@ struct Rows {
 };
 
 // What a step makes: floats in a slot, 16-bit numbers in another one, or both.
+template <bool kBfloat16>
 struct Target {
   float* floats;
   uint16_t* halves;
   int stride, halves_stride;
-  bool has_floats, has_halves, bfloat16;
+  bool has_floats, has_halves;
   __device__ __forceinline__ void put(int row, int column, float x) const {
     if (has_floats) floats[row * stride + column] = x;
-    if (!has_halves) return;
-    const uint32_t word = bfloat16 ? pack_halves<true>(x, 0.0f) : pack_halves<false>(x, 0.0f);
-    halves[row * halves_stride + column] = static_cast<uint16_t>(word);
+    if (has_halves) put_half(row, column, x);
+  }
+  __device__ __forceinline__ void put_half(int row, int column, float x) const {
+    halves[row * halves_stride + column] = static_cast<uint16_t>(pack_halves<kBfloat16>(x, 0.0f));
   }
 };
 
-// Rows of a cell that a block has in hand. A value is [rows][stride] at its slot, rows without a sample included, which
-// hold anything; as 16-bit numbers they are 0. kShared: the slots are the block's shared memory.
-template <bool kShared>
+// What products of a kernel multiply.
+enum class ProgramNumbers { floats, bfloat16, float16 };
+
+// Rows of a cell that a block has in hand, and those of them that are the own ones of a team of kTeam warps. A value is
+// [kRows][stride] at its slot for each team, rows without a sample included, which hold anything; as 16-bit numbers
+// they are 0. kShared: the slots are the block's shared memory.
+template <int kOwnRows, int kWarps, bool kShared, ProgramNumbers kNumbers>
 struct ProgramTile {
+  static constexpr int kRows = kOwnRows, kTeam = kWarps, kWorkers = 32 * kTeam;
+  static constexpr bool kHalves = kNumbers != ProgramNumbers::floats, kBfloat16 = kNumbers == ProgramNumbers::bfloat16;
   const CudaProgram& call;
   float *slots, *partial;  // slots: where they are not in shared memory
   const float* weights;    // what is packed for the cell
-  int cell, begin;
-  int height, rows;       // there are, and have a sample
-  bool fill;              // the first tile of a task
-  bool halves, bfloat16;  // products are of 16 bits, and which
+  int pitch;               // floats from the values of a team to those of the next one
+  int cell, begin;         // begin: the team's first row
+  int rows, all;           // that have a sample, of the team and of the block
+  bool fill;               // the first tile of a task
 
+  // A thread's number in its team, and a warp's.
+  static __device__ __forceinline__ int worker() { return static_cast<int>(thread_again() % kWorkers); }
+  static __device__ __forceinline__ int warp() { return worker() / 32; }
+  // What the team has written is there for all of it.
+  static __device__ __forceinline__ void sync() {
+    if constexpr (kTeam == 1) {
+      __syncwarp();
+    } else {
+      __syncthreads();  // teams keep in step
+    }
+  }
+
+  // Of the team; of the block's first one.
   __device__ __forceinline__ float* slot(int32_t columns) const {
+    return first_slot(columns) + static_cast<int>(thread_again() / kWorkers) * pitch;
+  }
+  __device__ __forceinline__ float* first_slot(int32_t columns) const {
     if constexpr (kShared) {
       VN_DYN_SHARED(float, shared);
-      return shared + columns * height;
+      return shared + columns * kRows;
     } else {
-      return slots + columns * height;
+      return slots + columns * kRows;
     }
   }
   // Parameters but tables are float32.
@@ -181,10 +227,11 @@ struct ProgramTile {
            pack.start;
   }
   __device__ __forceinline__ const float* packed(int32_t at) const { return weights + at; }
-  __device__ __forceinline__ Target target(const ProgramStep& step) const {
-    const bool has_halves = step.pairs >= 0;
-    auto* halves = reinterpret_cast<uint16_t*>(slot(has_halves ? step.pairs : 0));
-    return {slot(step.slot), halves, step.stride, 2 * pair_stride(step.width), step.floats, has_halves, bfloat16};
+  __device__ __forceinline__ Target<kBfloat16> target(const ProgramStep& step) const {
+    return target(step.slot, step.stride, step.pairs, step.width, step.floats);
+  }
+  __device__ __forceinline__ Target<kBfloat16> target(const CudaStep& step) const {
+    return target(step.slot, step.stride, step.pairs, step.width, step.slot >= 0);
   }
   __device__ __forceinline__ Rows value(const ProgramOperand& o) const {
     return {slot(o.slot) + o.start, o.stride, o.spread};
@@ -193,49 +240,106 @@ struct ProgramTile {
     if (o.parameter) return {parameter(call.code.packs[o.slot]), 0, o.spread};
     return value(o);
   }
+
+ private:
+  __device__ __forceinline__ Target<kBfloat16> target(int at, int stride, int pairs, int width, bool floats) const {
+    const bool has_halves = kHalves && pairs >= 0;
+    auto* halves = reinterpret_cast<uint16_t*>(slot(has_halves ? pairs : 0));
+    return {slot(floats ? at : 0), halves, stride, 2 * pair_stride(width), floats, has_halves};
+  }
 };
 
-// visit(row, column) for all entries, by all threads: lanes go along a row as far as it is long, and a thread down a
-// column, so that what depends on the column alone is computed once.
-template <typename Visit>
+__device__ __forceinline__ int lane_again() { return static_cast<int>(thread_again() % 32); }
+
+// visit(row, column) for all entries, by a team: neighbours go along a row as far as it is long, and a thread goes down
+// a column, so that what depends on the column alone is computed once.
+template <typename Tile, typename Visit>
 __device__ __forceinline__ void for_each_entry(int rows, int width, const Visit& visit) {
   const int shift = width > 16 ? 5 : width > 1 ? 32 - __clz(width - 1) : 0;
-  const int thread = static_cast<int>(thread_again()), across = 1 << shift;
-  for (int column = thread & (across - 1); column < width; column += across) {
-    for (int row = thread >> shift; row < rows; row += kProgramThreads >> shift) visit(row, column);
+  const int worker = Tile::worker(), across = 1 << shift;
+  for (int column = worker & (across - 1); column < width; column += across) {
+    for (int row = worker >> shift; row < rows; row += Tile::kWorkers >> shift) visit(row, column);
   }
 }
 
-// partial[j] += sum over rows of a value's column. Four lanes share a column, two neighbouring rows at a time.
+// partial[j] += sum over the block's rows of a value's column. Four lanes share a column, two neighbouring rows at a
+// time.
 template <typename Tile>
 __device__ __forceinline__ void sum_columns(const Tile& tile, const CudaStep& step) {
-  const Rows x{tile.slot(step.x.slot) + step.x.start, step.x.stride, false};
-  const int lane = static_cast<int>(thread_again() % 32);
-  for (int first = 8 * static_cast<int>(thread_again() / 32); first < step.width; first += kProgramThreads / 4) {
+  const float* const values = tile.first_slot(step.x.slot) + step.x.start;
+  const int lane = lane_again(), warps = static_cast<int>(blockDim.x / 32);
+  for (int first = 8 * static_cast<int>(thread_again() / 32); first < step.width; first += 8 * warps) {
     const int column = first + lane % 8;
+    const float* x = values;
     float sum = 0.0f;
-    for (int row = 2 * (lane / 8); row < tile.rows && column < step.width; row += 8) {
-      sum += x.at(row, column);
-      if (row + 1 < tile.rows) sum += x.at(row + 1, column);
+    for (int left = tile.all; left > 0 && column < step.width; left -= Tile::kRows, x += tile.pitch) {
+      const int rows = left < Tile::kRows ? left : Tile::kRows;
+      for (int row = 2 * (lane / 8); row < rows; row += 8) {
+        sum += x[row * step.x.stride + column];
+        if (row + 1 < rows) sum += x[(row + 1) * step.x.stride + column];
+      }
     }
     sum += __shfl_xor_sync(kAllLanes, sum, 8);
     sum += __shfl_xor_sync(kAllLanes, sum, 16);
     if (lane >= 8 || column >= step.width) continue;
-    float& entry = tile.partial[step.partial + column];
+    float& entry = tile.partial[step.number + column];
     entry = (tile.fill ? 0.0f : entry) + sum;
   }
 }
 
 // Of 16-bit numbers what no sample has: rows and columns behind the last.
 template <typename Tile>
-__device__ __forceinline__ void clear_rest(const Tile& tile, const ProgramStep& step) {
-  if (step.pairs < 0) return;
-  const Target to = tile.target(step);
-  const int wide = 2 * pair_words(step.width);
-  for_each_entry(tile.height, wide - step.width,
-                 [&](int row, int column) { to.halves[row * to.halves_stride + step.width + column] = 0; });
-  for_each_entry(tile.height - tile.rows, step.width,
-                 [&](int row, int column) { to.halves[(tile.rows + row) * to.halves_stride + column] = 0; });
+__device__ __forceinline__ void clear_rest(const Tile& tile, const CudaStep& step) {
+  const auto to = tile.target(step);
+  auto* const words = reinterpret_cast<uint32_t*>(to.halves);
+  const int width = step.width, stride = to.halves_stride / 2, behind = (width + 1) / 2, last = pair_words(width);
+  const int row = Tile::worker();
+  if (width % 2 != 0 && row < tile.rows) to.put_half(row, width, 0.0f);
+  if (behind < last) {
+    for_each_entry<Tile>(tile.rows, last - behind, [&](int row, int word) { words[row * stride + behind + word] = 0; });
+  }
+  if (tile.rows < Tile::kRows) {
+    for_each_entry<Tile>(Tile::kRows - tile.rows, last,
+                         [&](int row, int word) { words[(tile.rows + row) * stride + word] = 0; });
+  }
+}
+
+// Inputs and outputs. The rows of a tile are looked for once, by a thread each, if there are few columns.
+constexpr int kFewColumns = 8;
+
+template <typename Tile>
+__device__ __forceinline__ void input_step(const Tile& tile, const CudaStep& step) {
+  const CudaProgram& call = tile.call;
+  const int width = step.width, input = step.number;
+  const auto to = tile.target(step);
+  if (width > kFewColumns && !call.turned[input]) {  // neighbouring lanes read neighbouring columns
+    return for_each_entry<Tile>(tile.rows, width, [&](int row, int column) {
+      to.put(row, column, input_row(call, input, width, source_row(call.rows, tile.begin + row)).column(column));
+    });
+  }
+  const int row = Tile::worker();
+  if (row >= tile.rows) return;
+  const InputRow from = input_row(call, input, width, source_row(call.rows, tile.begin + row));
+  for (int column = 0; column < width; ++column) to.put(row, column, from.column(column));
+}
+
+template <typename Tile>
+__device__ __forceinline__ void output_step(const Tile& tile, const CudaStep& step) {
+  const CudaProgram& call = tile.call;
+  const int output = step.number, width = step.width, type = call.output_types[output];
+  const int64_t wide = call.output_widths[output];
+  const Rows x = tile.operand(call.code.operands[step.added]);
+  const auto put = [&](int64_t source, int row, int column) {
+    store_number(call.outputs[output], type, source * wide + step.depth + column, x.at(row, column));
+  };
+  if (width > kFewColumns) {
+    return for_each_entry<Tile>(
+        tile.rows, width, [&](int row, int column) { put(source_row(call.rows, tile.begin + row), row, column); });
+  }
+  const int row = Tile::worker();
+  if (row >= tile.rows) return;
+  const int64_t source = source_row(call.rows, tile.begin + row);
+  for (int column = 0; column < width; ++column) put(source, row, column);
 }
 
 }  // namespace voronerf

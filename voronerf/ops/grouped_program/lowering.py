@@ -135,6 +135,7 @@ class _Lowering:
         self.slots, self.values = _Slots(), dict[int, _Value]()
         self.packs: dict[tuple[Any, ...], tuple[int, int]] = {}  # their number, and where they are
         self.packed, self.partial = 0, 0
+        self.at, self.in_registers = 0, _NONE  # the step in hand, and the value that a warp on CUDA holds
         self.steps: list[Any] = []
         self.operands: list[Any] = []
         self.sums: list[tuple[int, str, int, int, int, int, int, int, int]] = []
@@ -142,7 +143,11 @@ class _Lowering:
         self.lookups: list[tuple[Lookup, int]] = []
         self.scatters: list[tuple[Lookup, int, int]] = []
         self.own: dict[int, int] = {}  # the memory of outputs that values may be made in
-        self.work = self._in_order() if self.half or cuda else _joined(self._in_order())
+        self.work = self._in_order()
+        if cuda and self.half:
+            self.work = _delayed(self.work)
+        elif not cuda and not self.half:
+            self.work = _joined(self.work)
         self.readers: dict[int, list[tuple[Step, int]]] = {}
         for step in self.work:
             for place, c in enumerate(step.operands):
@@ -230,7 +235,8 @@ class _Lowering:
         given |= {"start": c.start, "width": c.width, "place": place, "spread": c.spread}
         if c.of == PARAMETER:
             width = 1 if c.spread else c.width
-            number = self.pack("vector", c.index, c.start, width, self.padded_outputs(width), self.shape(c.index))
+            floats = self.padded_outputs(width) * (2 if self.cuda else 1)
+            number = self.pack("vector", c.index, c.start, width, floats, self.shape(c.index))
             return self.compiled.ProgramOperand(parameter=True, slot=number, stride=0, **(given | {"start": 0}))
         value = self.values[c.index]
         given |= {"memory": value.memory, "input": value.input}
@@ -242,6 +248,7 @@ class _Lowering:
         """One step's record."""
         operands = list(operands)
         fields: dict[str, Any] = {"function": "copy", "binary": "add", "encoding": "frequency", "finish": "none"}
+        fields |= {"hands": "nothing", "from_registers": False}
         fields |= {
             "order": 0,
             "width": 0,
@@ -272,7 +279,9 @@ class _Lowering:
         """All records."""
         last = {c.index: at for at, step in enumerate(self.work) for c in step.operands if c.of == VALUE}
         for at, step in enumerate(self.work):
-            dying = {c.index for c in step.operands if c.of == VALUE and last[c.index] == at}
+            self.at, dying = at, {c.index for c in step.operands if c.of == VALUE and last[c.index] == at}
+            if step.op != "linear":
+                self.in_registers = _NONE
             lower: Callable[[Step, set[int]], None] = getattr(self, f"_{step.op}")
             lower(step, dying)
             for value in dying:
@@ -301,8 +310,11 @@ class _Lowering:
             value.memory = self.memory(value.stride)
         if self.cuda and self.half and any(as_pairs := self._as_pairs(step)):  # which any step makes there
             looked_up = step.op == "encode" and step.name == HASH  # and may be kept
-            value.pairs = self.slots.take(self.pairs_of(step.width))
+            if len(self._multipliers(step)) < len(as_pairs):
+                place = self._slope_of(step, dying)
+                value.pairs = self.slots.take(self.pairs_of(step.width)) if place is None else place
             value.floats = value.memory != _NONE or looked_up or not all(as_pairs)
+        value.floats = value.floats and not self._carries(self.at)
         if scattered or not value.floats:
             return value
         for c in entrywise:
@@ -316,6 +328,40 @@ class _Lowering:
                 return value
         value.slot = self.slots.take(value.stride)
         return value
+
+    def _carries(self, at: int) -> bool:
+        """Whether a step on CUDA leaves its sums in registers: the next one alone reads them, and adds to them."""
+        if not (self.half and self.cuda) or at + 1 == len(self.work):
+            return False
+        step = self.work[at]
+        alone = _adds(self.work[at + 1], step) and len(self.readers[step.out]) == 1
+        return alone and step.width <= self.compiled.most_held
+
+    def _multipliers(self, step: Step) -> list[Step]:
+        """The steps right behind a linear one on CUDA that may read its words in registers."""
+        found = list[Step]()
+        scattered = any(reader.op == "scatter" for reader, _ in self.readers.get(step.out, []))  # by the warp meanwhile
+        if not (self.half and self.cuda) or step.op != "linear" or scattered or self._carries(self.at):
+            return found
+        for at in range(self.at + 1, len(self.work)):
+            after = self.work[at]
+            if after.op != "linear" or max(step.width, after.width) > self.compiled.most_held:
+                break
+            if after.operands[0][:2] == (VALUE, step.out) and _all_of(after.operands[0], step.width):
+                found.append(after)
+            if not self._carries(at):
+                break
+        return found
+
+    def _slope_of(self, step: Step, dying: set[int]) -> int | None:
+        """The place of the pairs of ReLU that a gradient is cut by, if nothing needs them any more."""
+        if step.name != "relu_slope" or step.operands[0][:2] == step.operands[-1][:2]:
+            return None
+        known = self.values[step.operands[-1].index]
+        if known.floats or step.operands[-1].index not in dying:
+            return None
+        place, known.pairs = known.pairs, _NONE
+        return place
 
     def _own_output(self, step: Step) -> int:
         """The memory of an output that is a whole value and whose rows end with whole vectors: it can be made there."""
@@ -379,8 +425,13 @@ class _Lowering:
         if narrow and filled:
             floats = value.memory != _NONE or not all(as_pairs)
             value.pairs, value.floats = self.slots.take(self.pairs_of(step.width)), floats
-        finish = step.name or "none"
-        self.emit("linear", records, value, order=order, number=number, depth=depth, sources=count, finish=finish)
+        given = {"order": order, "number": number, "depth": depth, "sources": count, "finish": step.name or "none"}
+        held = sources[0][:2] == (VALUE, self.in_registers)
+        given["from_registers"] = held and _all_of(sources[0], self.values[self.in_registers].width)
+        given["hands"] = "sums" if self._carries(self.at) else "words" if self._multipliers(step) else "nothing"
+        if given["hands"] != "sums":
+            self.in_registers = step.out if given["hands"] == "words" else _NONE
+        self.emit("linear", records, value, **given)
 
     def _as_pairs(self, step: Step) -> list[bool]:
         """Of each reader of a value, whether it takes pairs."""
@@ -565,6 +616,24 @@ def _by_octaves(step: Step) -> int:
 def _sources(step: Step) -> int:
     """How many operands of a linear step are multiplied, one behind the other."""
     return int(step.numbers[3]) if len(step.numbers) > 3 else 1
+
+
+def _adds(step: Step, to: Step) -> bool:
+    """Whether a linear step adds its product to what another one has made, a product itself."""
+    added = step.operands[1 : len(step.operands) - (step.name == "relu_slope")] if step.op == "linear" else ()
+    plain = to.op == "linear" and not to.name
+    return plain and any(c.of == VALUE and c.index == to.out and _all_of(c, to.width) for c in added)
+
+
+def _delayed(steps: list[Step]) -> list[Step]:
+    """The steps with those products right before the one that adds to them, which nothing else reads."""
+    uses = [c.index for step in steps for c in step.operands if c.of == VALUE]
+    found = list(steps)
+    for step in reversed(steps):
+        for to in [to for to in steps if _adds(step, to) and uses.count(to.out) == 1]:
+            found.remove(to)
+            found.insert(found.index(step), to)
+    return found
 
 
 def _joined(steps: list[Step]) -> list[Step]:
