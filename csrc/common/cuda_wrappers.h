@@ -48,6 +48,16 @@ __device__ __forceinline__ unsigned thread_again() {
   return thread;
 #endif
 }
+// blockDim.x, likewise.
+__device__ __forceinline__ unsigned threads_again() {
+#ifdef VN_EMULATE
+  return blockDim.x;
+#else
+  unsigned threads;
+  asm volatile("mov.u32 %0, %%ntid.x;" : "=r"(threads));
+  return threads;
+#endif
+}
 
 // Largest number of float16.
 constexpr float kLargestHalf = 65504.0f;

@@ -54,7 +54,7 @@ __device__ __forceinline__ float derivative(int order, float x, float a, float b
 }
 
 template <typename Tile>
-__device__ __noinline__ void function_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
+__device__ __noinline__ void function_step(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
   const Rows x = tile.operand(operands[0]), times = tile.operand(operands[step.taken - 1]);
   const float a = step.a, b = step.b;
   const int order = step.order;
@@ -63,7 +63,7 @@ __device__ __noinline__ void function_step(const Tile& tile, const ProgramStep& 
   switch (step.function) {
 #define VN_CASE(NAME, ...)                                                                           \
   case ProgramFunction::NAME:                                                                        \
-    return for_each_entry<Tile>(tile.rows, step.width, [&](int row, int column) {                    \
+    return for_each_entry<Tile>(tile.rows(), step.width, [&](int row, int column) {                  \
       const float by = alone ? 1.0f : times.at(row, column);                                         \
       to.put(row, column, by * derivative<device::NAME##_function>(order, x.at(row, column), a, b)); \
     });
@@ -94,12 +94,12 @@ __device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& s
     for (int i = 0; i < step.taken; ++i) {
       const Rows x = tile.operand(operands[i]);
       const int place = operands[i].place;
-      for_each_entry<Tile>(tile.rows, operands[i].width,
+      for_each_entry<Tile>(tile.rows(), operands[i].width,
                            [&](int row, int column) { to.put(row, place + column, x.at(row, column)); });
     }
     return;
   }
-  for_each_entry<Tile>(tile.rows, step.width, [&](int row, int column) {
+  for_each_entry<Tile>(tile.rows(), step.width, [&](int row, int column) {
     float sum = 0.0f;
     for (int i = 0; i < step.taken; ++i) {
       const int within = column - operands[i].place;
@@ -111,7 +111,7 @@ __device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& s
 
 // What neither multiplies nor is in memory of the caller's.
 template <typename Tile>
-__device__ __noinline__ void plain_step(const Tile& tile, const ProgramStep& step) {
+__device__ __noinline__ void plain_step(Tile tile, const ProgramStep& step) {
   const ProgramOperand* operands = tile.call.code.operands + step.first;
   const bool there = step.op == ProgramOp::encode && tile.call.ready && step.memory >= 0;
   if (step.op == ProgramOp::encode && !(there && tile.call.kept[step.memory] != nullptr)) {
@@ -122,13 +122,13 @@ __device__ __noinline__ void plain_step(const Tile& tile, const ProgramStep& ste
   switch (step.op) {
     case ProgramOp::binary: {
       const Rows x = tile.operand(operands[0]), y = tile.operand(operands[1]);
-      return for_each_entry<Tile>(tile.rows, step.width, [&](int row, int column) {
+      return for_each_entry<Tile>(tile.rows(), step.width, [&](int row, int column) {
         to.put(row, column, binary(step.binary, x.at(row, column), y.at(row, column)));
       });
     }
     case ProgramOp::total: {
       const Rows x = tile.operand(operands[0]);
-      return for_each_entry<Tile>(tile.rows, step.width, [&](int row, int column) {
+      return for_each_entry<Tile>(tile.rows(), step.width, [&](int row, int column) {
         float sum = 0.0f;
         for (int i = 0; i < step.number; ++i) sum += x.at(row, column * step.number + i);
         to.put(row, column, sum);
@@ -138,8 +138,8 @@ __device__ __noinline__ void plain_step(const Tile& tile, const ProgramStep& ste
       return move_step(tile, step, operands);
     default: {  // what is looked up already
       const int64_t stride = tile.call.kept_strides[step.memory];
-      const float* from = tile.call.kept[step.memory] + tile.begin * stride;
-      return for_each_entry<Tile>(tile.rows, step.width,
+      const float* from = tile.call.kept[step.memory] + tile.begin() * stride;
+      return for_each_entry<Tile>(tile.rows(), step.width,
                                   [&](int row, int column) { to.put(row, column, from[row * stride + column]); });
     }
   }
@@ -148,14 +148,14 @@ __device__ __noinline__ void plain_step(const Tile& tile, const ProgramStep& ste
 // What becomes of a value beside its slot: what was looked up is kept, and the gradient of that is added to that of the
 // table.
 template <typename Tile>
-__device__ __noinline__ void keep(const Tile& tile, const ProgramStep& step) {
+__device__ __noinline__ void keep(Tile tile, const ProgramStep& step) {
   const CudaProgram& call = tile.call;
   if (step.memory < kNoMemory) return scatter_rows(tile, step, call.scatters[kNoMemory - 1 - step.memory]);
   if (call.kept[step.memory] == nullptr || call.ready) return;
   const int64_t stride = call.kept_strides[step.memory];
-  float* const to = call.kept[step.memory] + tile.begin * stride;
+  float* const to = call.kept[step.memory] + tile.begin() * stride;
   const float* from = tile.slot(step.slot);
-  for_each_entry<Tile>(tile.rows, static_cast<int>(stride), [&](int row, int column) {
+  for_each_entry<Tile>(tile.rows(), static_cast<int>(stride), [&](int row, int column) {
     to[row * stride + column] = column < step.width ? from[row * step.stride + column] : 0.0f;
   });
 }
@@ -230,42 +230,68 @@ __device__ __forceinline__ int sums(const CudaProgram& call, const Tile& tile, i
   return i;
 }
 
+// Rows of a block's tile.
+template <typename Tile>
+__device__ __forceinline__ int tile_height() {
+  return static_cast<int>(threads_again() / Tile::kWorkers) * Tile::kRows;
+}
+// The rows of a tile, from `left` of the task on.
+template <typename Tile>
+__device__ __forceinline__ void cut_rows(TileState& state, int left) {
+  const int height = tile_height<Tile>(), all = left < height ? left : height;
+  const int own = all - static_cast<int>(threadIdx.x / Tile::kWorkers) * Tile::kRows;
+  state.left = left, state.all = all;
+  state.rows = own < 0 ? 0 : own < Tile::kRows ? own : Tile::kRows;
+}
+template <typename Tile>
+__device__ __forceinline__ void begin_task(const CudaProgram& call, int task, int64_t partial) {
+  const CudaRows& rows = call.rows;
+  const int cell = cell_of_task(rows, task);
+  const int64_t first = cell_begin(rows, cell), last = first + cell_rows(rows, cell);
+  const int64_t begin = first + (task - rows.first_task[cell]) * call.task_rows;
+  if (threadIdx.x % 32 == 0) {
+    TileState& state = Tile::state();
+    state.partial = task * partial;
+    state.weights = call.packed + cell * call.packed_stride;
+    state.cell = cell;
+    state.begin = static_cast<int>(begin) + static_cast<int>(threadIdx.x / Tile::kWorkers) * Tile::kRows;
+    state.fill = 1;
+    cut_rows<Tile>(state, static_cast<int>(last - begin < call.task_rows ? last - begin : call.task_rows));
+  }
+  __syncwarp();
+}
+// Returns whether the task has another tile.
+template <typename Tile>
+__device__ __forceinline__ bool next_tile() {
+  TileState& state = Tile::state();
+  const int height = tile_height<Tile>(), left = state.left - height;
+  __syncwarp();
+  if (threadIdx.x % 32 == 0) {
+    state.begin += height;
+    state.fill = 0;
+    cut_rows<Tile>(state, left);
+  }
+  __syncwarp();
+  return left > 0;
+}
+
 template <typename Steps>
 __global__ void __launch_bounds__(32 * program_warps(Steps::Tile::kRows), program_blocks(Steps::Tile::kRows))
     program_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t partial) {
   using Tile = typename Steps::Tile;
-  const int height = static_cast<int>(blockDim.x / Tile::kWorkers) * Tile::kRows;
-  float* const slots = call.spilled + int64_t{blockIdx.x} * call.code.columns * height;
+  const Tile tile{call};
   const CudaRows& rows = call.rows;
-  const int tasks = rows.first_task[rows.k];
-  for (int task = blockIdx.x; task < tasks; task += gridDim.x) {
-    const int cell = cell_of_task(rows, task);
-    const int64_t first = cell_begin(rows, cell), last = first + cell_rows(rows, cell);
-    const int64_t begin = first + (task - rows.first_task[cell]) * call.task_rows;
-    const int count = static_cast<int>(last - begin < call.task_rows ? last - begin : call.task_rows);
-    const float* const weights = call.packed + cell * call.packed_stride;
-    for (int done = 0; done < count; done += height) {
-      const int all = count - done < height ? count - done : height;
-      const int before = static_cast<int>(threadIdx.x / Tile::kWorkers) * Tile::kRows, left = all - before;
-      const int own = left < 0 ? 0 : left < Tile::kRows ? left : Tile::kRows;
-      const Tile tile{call,
-                      slots,
-                      call.partials + task * partial,
-                      weights,
-                      call.code.columns * Tile::kRows,
-                      cell,
-                      static_cast<int>(begin) + done + before,
-                      own,
-                      all,
-                      done == 0};
+  for (int task = blockIdx.x; task < rows.first_task[rows.k]; task += gridDim.x) {
+    begin_task<Tile>(call, task, partial);
+    do {
       for (int i = 0;;) {
-        i = Tile::kTeam == 1 && own == 0 ? next_sum(call, i) : own_steps<Steps>(call, tile, i);
+        i = Tile::kTeam == 1 && tile.rows() == 0 ? next_sum(call, i) : own_steps<Steps>(call, tile, i);
         if (i == call.code.step_count) break;
         __syncthreads();
         i = sums<Steps>(call, tile, i);
         __syncthreads();
       }
-    }
+    } while (next_tile<Tile>());
   }
 }
 
@@ -551,6 +577,23 @@ CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, cons
   return made;
 }
 
+// A step that adds up the columns of a gradient becomes a part of the outer product beside it, if that reads the same
+// words on its right side.
+void join_columns(std::vector<CudaStep>& steps) {
+  for (size_t i = 0; i < steps.size(); ++i) {
+    CudaStep& sum = steps[i];
+    for (const size_t j : {i - 1, i + 1}) {
+      if (sum.op != CudaOp::columns || sum.width == 0 || !sum.x_words || j >= steps.size()) continue;
+      CudaStep& outer = steps[j];
+      const bool same = std::memcmp(&outer.y, &sum.x, sizeof(CudaValue)) == 0;
+      if (outer.op != CudaOp::outer || outer.bias >= 0 || !outer.swapped || !outer.x_words || !outer.y_words || !same)
+        continue;
+      outer.bias = sum.number;
+      sum.width = 0;
+    }
+  }
+}
+
 // How a call is cut: rows and warps of a tile, rows of a task, blocks, at most so many tasks, and where what is in the
 // workspace.
 struct Cut {
@@ -578,9 +621,10 @@ Cut cut(const Program& program, int64_t n, int64_t k) {
   }
   Cut found{};
   const int64_t columns = std::max(1, Slots(table).columns());  // of sums that nothing is added to there are none
-  // Teams that fit into a multiprocessor, of so many rows each, with the blocks that they make at least.
+  // Teams of so many rows each that fit into a multiprocessor beside what as many blocks as are resident need.
   const auto fitting = [&](int rows) {
-    return (device.multiprocessor_bytes - program_blocks(rows) * kReservedBytes) / (4 * rows * columns);
+    return (device.multiprocessor_bytes - program_blocks(rows) * (kReservedBytes + kProgramStates)) /
+           (4 * rows * columns);
   };
   // Warps of 32 rows read each weight once for all of them, if cells have so many and as many warps fit as there are
   // registers for; of 16 rows, if half as many do.
@@ -593,11 +637,12 @@ Cut cut(const Program& program, int64_t n, int64_t k) {
   const int resident = program_blocks(found.own_rows);
   const int64_t useful = n / (found.own_rows * std::max<int64_t>(1, std::max<int64_t>(k, device.multiprocessors)));
   int64_t teams = program_warps(found.own_rows) / found.team;
-  const int64_t room = found.spilled ? teams : fitting(found.own_rows) / resident;
+  // A tile reads and writes the partial sums once. So one block takes a multiprocessor where two would be smaller.
+  const int64_t room = found.spilled ? teams : fitting(found.own_rows) / (table.partial > 0 ? 1 : resident);
   while (teams > 1 && teams > std::min(room, useful)) teams /= 2;
   const int64_t height = found.own_rows * teams;
   found.warps = static_cast<int>(found.team * teams);
-  found.shared = static_cast<int>(found.spilled ? 0 : 4 * height * columns);
+  found.shared = static_cast<int>(kProgramStates + (found.spilled ? 0 : 4 * height * columns));
   // More than one tile where a multiprocessor has many.
   found.task_rows = height * std::clamp<int64_t>(n / (32 * height * device.multiprocessors), 1, 8);
   if (table.partial > 0) {
@@ -695,6 +740,7 @@ void program_code_cuda(const Program& program, unsigned char* code) {
     const bool goes_on = !own_steps.empty() && own_steps.back().carries;
     own_steps.push_back(cuda_step(step, operands.data() + step.first, table.packs, goes_on));
   }
+  join_columns(own_steps);
   std::vector<HashEncoding> grids;
   for (const HashGrid& grid : table.grids) grids.push_back(hash_encoding(HashInputs{}, grid));
   const auto write = [code](int64_t place, const auto& records) {

@@ -61,14 +61,15 @@ __device__ __forceinline__ HashAxes hash_axes(const HashEncoding& grid, const Gr
 template <TableType kType, typename Tile>
 __device__ __forceinline__ const typename HashElement<kType>::Type* hash_table(const Tile& tile, int parameter) {
   return static_cast<const typename HashElement<kType>::Type*>(tile.call.parameters[parameter]) +
-         tile.cell * tile.call.strides[parameter];
+         tile.cell() * tile.call.strides[parameter];
 }
 
 template <typename Tile>
-__device__ __noinline__ void look_up(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
+__device__ __noinline__ void look_up(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
   const Rows x = tile.value(operands[0]);
   const auto to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
+  const int rows = tile.rows();
   hash_with_table(grid.features, tile.call.parameter_types[step.parameter], [&](auto features, auto type) {
     constexpr int kFeatures = decltype(features)::value;
     constexpr TableType kType = decltype(type)::value;
@@ -76,7 +77,7 @@ __device__ __noinline__ void look_up(const Tile& tile, const ProgramStep& step, 
 #pragma unroll 1
     for (int i = Tile::worker(); i < Tile::kRows * grid.count; i += Tile::kWorkers) {
       const int number = i / Tile::kRows, row = i % Tile::kRows;
-      if (row >= tile.rows) continue;
+      if (row >= rows) continue;
       const GridLevel& level = grid.levels[number];
       const HashAxes at = hash_axes(grid, level, [&](int axis) { return x.at(row, axis); });
       float sums[kFeatures] = {};
@@ -95,17 +96,18 @@ __device__ __noinline__ void look_up(const Tile& tile, const ProgramStep& step, 
 
 // Adds to the gradient of a table that of what was looked up, a value of a step, by atomic operations.
 template <typename Tile>
-__device__ __noinline__ void scatter_rows(const Tile& tile, const ProgramStep& step, const ProgramScatter& scatter) {
+__device__ __noinline__ void scatter_rows(Tile tile, const ProgramStep& step, const ProgramScatter& scatter) {
   const CudaProgram& call = tile.call;
   const HashEncoding& grid = call.grids[scatter.grid];
-  float* const to = call.sums[scatter.sum] + tile.cell * call.strides[scatter.parameter];
+  const int rows = tile.rows(), begin = tile.begin();
+  float* const to = call.sums[scatter.sum] + tile.cell() * call.strides[scatter.parameter];
   hash_with_features(grid.features, [&](auto features) {
     constexpr int kFeatures = decltype(features)::value;
 #pragma unroll 1
     for (int i = Tile::worker(); i < Tile::kRows * grid.count; i += Tile::kWorkers) {
       const int number = i / Tile::kRows, row = i % Tile::kRows;
-      if (row >= tile.rows) continue;
-      const int64_t source = source_row(call.rows, tile.begin + row);
+      if (row >= rows) continue;
+      const int64_t source = source_row(call.rows, begin + row);
       const GridLevel& level = grid.levels[number];
       const InputRow from = input_row(call, scatter.input, 3, source);
       const HashAxes at = hash_axes(grid, level, [&](int axis) { return from.column(axis); });
@@ -123,22 +125,21 @@ __device__ __noinline__ void scatter_rows(const Tile& tile, const ProgramStep& s
 
 // Eight lanes share a row and its levels.
 template <typename Tile>
-__device__ __noinline__ void look_up_gradient(const Tile& tile, const ProgramStep& step,
-                                              const ProgramOperand* operands) {
+__device__ __noinline__ void look_up_gradient(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
   const Rows x = tile.value(operands[0]), g = tile.value(operands[1]);
   const auto to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
-  const int worker = Tile::worker(), part = worker % 8;
+  const int worker = Tile::worker(), part = worker % 8, rows = tile.rows();
   hash_with_table(grid.features, tile.call.parameter_types[step.parameter], [&](auto features, auto type) {
     constexpr int kFeatures = decltype(features)::value;
     constexpr TableType kType = decltype(type)::value;
     const auto* table = hash_table<kType>(tile, step.parameter);
 #pragma unroll 1
-    for (int first = 0; first < tile.rows; first += Tile::kWorkers / 8) {
+    for (int first = 0; first < rows; first += Tile::kWorkers / 8) {
       const int row = first + worker / 8;
       float sums[3] = {};
 #pragma unroll 1
-      for (int number = part; row < tile.rows && number < grid.count; number += 8) {
+      for (int number = part; row < rows && number < grid.count; number += 8) {
         const GridLevel& level = grid.levels[number];
         const HashAxes at = hash_axes(grid, level, [&](int axis) { return x.at(row, axis); });
         hash_corners<kFeatures>(at.axes, level, level.offset * kFeatures, [&](int64_t entry, int a, int b, int c) {
@@ -157,7 +158,7 @@ __device__ __noinline__ void look_up_gradient(const Tile& tile, const ProgramSte
       for (int axis = 0; axis < 3; ++axis) {
 #pragma unroll
         for (int other = 4; other > 0; other /= 2) sums[axis] += __shfl_xor_sync(kAllLanes, sums[axis], other);
-        if (part != axis || row >= tile.rows) continue;
+        if (part != axis || row >= rows) continue;
         const float slope = hash_place(x.at(row, axis), grid.low[axis], grid.inverse[axis]).slope;
         to.put(row, axis, slope == 0.0f ? 0.0f : slope * sums[axis]);
       }
@@ -169,11 +170,11 @@ __device__ __noinline__ void look_up_gradient(const Tile& tile, const ProgramSte
 template <typename Formula>
 struct ByRow {
   template <typename Tile>
-  static __device__ __noinline__ void run(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
+  static __device__ __noinline__ void run(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
     const Rows x = tile.value(operands[0]);
     const auto to = tile.target(step);
     const int row = Tile::worker(), raw = operands[0].width;
-    if (row >= tile.rows) return;
+    if (row >= tile.rows()) return;
     const auto of = [&](int column) { return x.at(row, column); };
     const auto put = [&](int column, float value) { to.put(row, column, value); };
     if (step.order == 0) return Formula::values(of, raw, step.depth, put);
@@ -204,11 +205,11 @@ template <bool kBlurred, typename Tile>
 __device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int features, const Rows& x,
                                               const Target<Tile::kBfloat16>& to) {
   if (!kBlurred) {
-    for_each_entry<Tile>(tile.rows, features, [&](int row, int column) { to.put(row, column, x.at(row, column)); });
+    for_each_entry<Tile>(tile.rows(), features, [&](int row, int column) { to.put(row, column, x.at(row, column)); });
   }
   // A product in place of a division, which is right for what is below 2^32 / features.
   const uint32_t inverse = 0xffffffffu / static_cast<uint32_t>(features) + 1u;
-  for_each_entry<Tile>(tile.rows, features * octaves, [&](int row, int i) {
+  for_each_entry<Tile>(tile.rows(), features * octaves, [&](int row, int i) {
     const int octave = features == 1 ? i : static_cast<int>(uint64_t{static_cast<uint32_t>(i)} * inverse >> 32);
     const int feature = i - octave * features, column = (kBlurred ? 0 : features) + i + octave * features;
     const float scale = octave_scale(octave), angle = x.at(row, feature) * scale;
@@ -223,10 +224,11 @@ template <bool kBlurred, bool kFloats, typename Tile>
 __device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int features, const Rows& x,
                                              const Target<Tile::kBfloat16>& to) {
   constexpr int kDoubled = 4;
+  const int rows = tile.rows();
   const float largest = kLargestDeviceAngle / octave_scale(octaves > 0 ? octaves - 1 : 0);
   for (int i = Tile::worker(); i < Tile::kRows * features; i += Tile::kWorkers) {
     const int feature = i / Tile::kRows, row = i % Tile::kRows, column = (kBlurred ? 0 : features) + feature;
-    if (row >= tile.rows) continue;
+    if (row >= rows) continue;
     const float value = x.at(row, feature), variance = kBlurred ? x.at(row, features + feature) : 0.0f;
     if (!kBlurred) to.put(row, feature, value);
     uint16_t* half = to.halves + row * to.halves_stride + column;
@@ -259,8 +261,7 @@ __device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int 
   }
 }
 template <bool kBlurred, typename Tile>
-__device__ __noinline__ void octaves(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands,
-                                     int features) {
+__device__ __noinline__ void octaves(Tile tile, const ProgramStep& step, const ProgramOperand* operands, int features) {
   const Rows x = tile.value(operands[0]);
   const auto to = tile.target(step);
   if constexpr (Tile::kHalves) {
@@ -272,13 +273,13 @@ __device__ __noinline__ void octaves(const Tile& tile, const ProgramStep& step, 
 
 // The gradient to them from g, with what was encoded: the derivative of a sine is the cosine beside it.
 template <typename Tile>
-__device__ __noinline__ void octaves_gradient(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands,
+__device__ __noinline__ void octaves_gradient(Tile tile, const ProgramStep& step, const ProgramOperand* operands,
                                               int features, bool blurred) {
   const Rows g = tile.value(operands[1]), encoded = tile.value(operands[2]);
   const auto to = tile.target(step);
   const int octaves = step.depth;
   const int before = blurred ? 0 : features;
-  for_each_entry<Tile>(tile.rows, features, [&](int row, int feature) {
+  for_each_entry<Tile>(tile.rows(), features, [&](int row, int feature) {
     float sum = blurred ? 0.0f : g.at(row, feature), of_variance = 0.0f;
     for (int octave = 0; octave < octaves; ++octave) {
       const int sine = before + 2 * octave * features + feature, cosine = sine + features;

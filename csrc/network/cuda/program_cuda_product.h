@@ -108,12 +108,13 @@ struct HalfNumbers {
     multiply_halves<kBfloat16>(sums, left.words[1], second);
   }
 
-  // For sums over rows: columns from i on as the rows of a left operand, over the 16 rows from `row` on.
+  // For sums over rows: columns from i on as the rows of a left operand, over the 16 rows from `row` on. kWhole: in
+  // words.
   static constexpr int kRows = 16;
-  template <bool kShared, bool kWords>
+  template <bool kShared, bool kWhole>
   static __device__ __forceinline__ void turned_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
                                                      int rows, int lane) {
-    if (kWords || a.has_words) {
+    if (kWhole || a.has_words) {
       load_turned<kShared, true>(words, a.words + row * a.stride + i / 2, a.stride, lane);
     } else {
 #pragma unroll
@@ -121,10 +122,10 @@ struct HalfNumbers {
     }
   }
   // Columns from j on, two tiles of 8, as right operands.
-  template <bool kShared, bool kWords>
+  template <bool kShared, bool kWhole>
   static __device__ __forceinline__ void turned_right(uint32_t (&words)[2][2], const ProductValue& b, int j, int row,
                                                       int rows, bool cut, int lane) {
-    if (kWords || b.has_words) {
+    if (kWhole || b.has_words) {
       uint32_t four[4];
       load_turned<kShared, false>(four, b.words + row * b.stride + j / 2, b.stride, lane);
 #pragma unroll
@@ -188,17 +189,17 @@ struct Tf32Numbers {
 
   // A lane takes rows 2 m and 2 m + 1, not m and m + 4: its 32 lanes are then in different banks.
   static constexpr int kRows = 8;
-  template <bool kShared, bool>
+  template <bool kShared, bool kWhole>
   static __device__ __forceinline__ void turned_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
                                                      int rows, int lane) {
 #pragma unroll
-    for (int j = 0; j < 4; ++j) words[j] = turned(a, row + j / 2, i + 8 * (j % 2), rows, lane);
+    for (int j = 0; j < 4; ++j) words[j] = turned<kWhole>(a, row + j / 2, i + 8 * (j % 2), rows, lane);
   }
-  template <bool kShared, bool>
+  template <bool kShared, bool kWhole>
   static __device__ __forceinline__ void turned_right(uint32_t (&words)[2][2], const ProductValue& b, int j, int row,
                                                       int rows, bool, int lane) {
 #pragma unroll
-    for (int i = 0; i < 4; ++i) words[i / 2][i % 2] = turned(b, row + i % 2, j + 8 * (i / 2), rows, lane);
+    for (int i = 0; i < 4; ++i) words[i / 2][i % 2] = turned<kWhole>(b, row + i % 2, j + 8 * (i / 2), rows, lane);
   }
   static __device__ __forceinline__ void multiply_turned(float (&sums)[4], const uint32_t (&left)[4],
                                                          const uint32_t (&right)[2]) {
@@ -206,9 +207,11 @@ struct Tf32Numbers {
   }
 
  private:
+  template <bool kWhole>
   static __device__ __forceinline__ uint32_t turned(const ProductValue& a, int row, int column, int rows, int lane) {
-    const int at = row + 2 * (lane % 4);
-    return word(at < rows ? a.at(at, column + lane / 4) : 0.0f);
+    const int at = row + 2 * (lane % 4), of = column + lane / 4;
+    if (kWhole) return word(a.floats[at * a.stride + of]);
+    return word(at < rows ? a.at(at, of) : 0.0f);
   }
 };
 
@@ -295,34 +298,43 @@ struct TensorSteps {
     }
   }
 
-  // partial[i][j] += sum over rows of a[row][i] b[row][j]. A warp has 16 by 32 of them at a time.
+  // partial[i][j] += sum over rows of a[row][i] b[row][j]. A warp has 16 by 32 of them at a time. Those of a's first
+  // 16 columns add up the columns of b as well, where step.bias says so.
   static __device__ __forceinline__ void outer(const Tile& tile, const CudaStep& step) {
     const bool swapped = step.swapped != 0;
     const ProductValue a = product_value<true>(tile, step.x, step.x_words);
     const ProductValue b = product_value<true>(tile, step.y, step.y_words);
     const int warp = static_cast<int>(thread_again() / 32), lane = lane_again();
-    const bool words = Numbers::kHalves && a.has_words && b.has_words;
-    float* const partial = tile.partial + step.number;
+    const bool words = Numbers::kHalves && a.has_words && b.has_words, full = tile.all() % Tile::kRows == 0,
+               fill = tile.fill();
+    float* const partial = tile.partial() + step.number;
     // Without a division.
     const int down = 16 * ceil_div(a.columns, 16);
     int i0 = 16 * warp, j0 = 0;
 #pragma unroll 1
-    for (;; i0 += static_cast<int>(blockDim.x / 2)) {
+    for (;; i0 += static_cast<int>(threads_again() / 2)) {
       for (; i0 >= down; j0 += 32) i0 -= down;
       if (j0 >= b.columns) break;
       float sums[4][4] = {};
       float2 before[8];  // on their way meanwhile
-      const bool pairs = j0 + 32 <= b.columns && i0 + 16 <= a.columns && !tile.fill;
+      const bool pairs = j0 + 32 <= b.columns && i0 + 16 <= a.columns && !fill;
       float* const corner = partial + (i0 + lane / 4) * step.stride + j0 + 2 * (lane % 4);
 #pragma unroll
       for (int t = 0; t < 8; ++t) {
         before[t] = pairs ? *reinterpret_cast<const float2*>(corner + t % 2 * 8 * step.stride + t / 2 * 8)
                           : make_float2(0.0f, 0.0f);
       }
-      if (words) {
-        multiply_turned<true>(sums, tile, a, b, i0, j0, swapped, lane);
+      // Floats behind the columns of a row, up to where the next row begins, come to sums that are not stored.
+      const bool floats = !Numbers::kHalves && full && step.x.start + i0 + 16 <= step.x.stride &&
+                          step.y.start + j0 + 32 <= step.y.stride;
+      if (words && step.bias >= 0 && i0 == 0) {
+        float columns[4][4] = {};
+        multiply_turned<true, true>(sums, columns, tile, a, b, i0, j0, swapped, lane);
+        add_columns(columns, tile.partial() + step.bias, j0, b.columns, fill, lane);
+      } else if (words || floats) {
+        multiply_turned<true, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
       } else {
-        multiply_turned<false>(sums, tile, a, b, i0, j0, swapped, lane);
+        multiply_turned<false, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
       }
       if (j0 + 32 <= b.columns && i0 + 16 <= a.columns) {
 #pragma unroll
@@ -338,32 +350,17 @@ struct TensorSteps {
         const int from = i0 + at.row, to = j0 + i / 4 * 8 + at.column;
         if (from >= a.columns || to >= b.columns) continue;
         float& entry = partial[from * step.stride + to];
-        entry = (tile.fill ? 0.0f : entry) + sums[i / 4][i % 4];
+        entry = (fill ? 0.0f : entry) + sums[i / 4][i % 4];
       }
     }
   }
 
-  // partial[j] += sum over rows of b[row][j], by a product with ones.
+  // partial[j] += sum over rows of b[row][j]; of words by a product with ones.
   static __device__ __forceinline__ void columns(const Tile& tile, const CudaStep& step) {
-    const ProductValue b = product_value<true>(tile, step.x, step.x_words);
-    const int lane = lane_again();
-    float* const partial = tile.partial + step.number;
-    if (!b.has_words) return sum_columns(tile, step);
-    const uint32_t one = Numbers::pair(1.0f, 1.0f), ones[4] = {one, one, one, one};
-    for (int j0 = 16 * static_cast<int>(thread_again() / 32); j0 < step.width; j0 += static_cast<int>(blockDim.x / 2)) {
-      float sums[2][4] = {};
-      for_each_depth<true>(tile, b, b, [&](const ProductValue&, const ProductValue& own, int row, int rows) {
-        uint32_t right[2][2];
-        Numbers::template turned_right<kShared, true>(right, own, j0, row, rows, false, lane);
-        Numbers::multiply_turned(sums[0], ones, right[0]);
-        Numbers::multiply_turned(sums[1], ones, right[1]);
-      });
-#pragma unroll
-      for (int i = 0; i < 4; ++i) {
-        const int j = j0 + 8 * (i / 2) + 2 * lane + i % 2;
-        if (lane < 4 && j < step.width) partial[j] = (tile.fill ? 0.0f : partial[j]) + sums[i / 2][i % 2];
-      }
+    if constexpr (Numbers::kHalves) {
+      if (step.x_words) return sum_words(tile, step);
     }
+    sum_columns(tile, step);
   }
 
  private:
@@ -389,7 +386,7 @@ struct TensorSteps {
 #pragma unroll 1
       for (int c = 0; c < chunks; ++c) product.chunk(sums, c, [&](int r) { return product.template left<true>(r, c); });
     }
-    put_words<kTiles>(held, sums, tile, step, first, lane);
+    put_words<kTiles>(held, sums, tile, step, first);
   }
   // 8 kTiles columns from `first` on, by the kind of step that has them all.
   template <int kTiles>
@@ -400,7 +397,7 @@ struct TensorSteps {
 #pragma unroll 1
     for (;;) {
       multiply<kTiles>(sums, tile, step, first, held, lane);
-      if (step.added >= 0) add<kTiles>(sums, step, tile, first, lane);
+      if (step.added >= 0) add<kTiles>(sums, step, tile, first);
       if (!Numbers::kHalves || kTiles == 1 || !step.carries) break;
       step = load_step(tile.call.steps + ++number);
     }
@@ -408,16 +405,15 @@ struct TensorSteps {
     if (step.relu && floats) {
       for_each_sum<kTiles>([&](int r, int t, int i) { sums[r][t][i] = sums[r][t][i] < 0.0f ? 0.0f : sums[r][t][i]; });
     }
-    if (step.sloped && (floats || !by_words)) cut_slopes<kTiles>(sums, tile, step, first, lane);
-    if constexpr (kTiles > 1 && Numbers::kHalves) {
-      if (step.pairs >= 0 || step.holds) put_words<kTiles>(held, sums, tile, step, first, lane);
+    if (step.sloped && (floats || !by_words)) cut_slopes<kTiles>(sums, tile, step, first);
+    if (floats && tile.rows() == Tile::kRows && first + 8 * kTiles <= step.width) {
+      store<kTiles, true>(sums, tile, step, first);
+    } else if (floats) {
+      store<kTiles, false>(sums, tile, step, first);
     }
-    if (!floats) return;
-    if (tile.rows == Tile::kRows && first + 8 * kTiles <= step.width) {
-      store<kTiles, true>(sums, tile, step, first, lane);
-    } else {
-      store<kTiles, false>(sums, tile, step, first, lane);
-    }
+    // Whether or not anything reads these words: otherwise what was held before, which has at most 64 columns and so
+    // no other part that reads it, would stay in its registers beside the sums.
+    if constexpr (kTiles > 1 && Numbers::kHalves) put_words<kTiles>(held, sums, tile, step, first);
   }
 
   template <int kTiles, typename Visit>
@@ -510,50 +506,87 @@ struct TensorSteps {
 
   // visit(a, b, row, rows) for the depth of a sum over the block's rows: operands that lie from a warp's first row on,
   // and which of its rows come next, of those that have a sample.
-  template <bool kWords, typename Visit>
+  template <bool kWhole, typename Visit>
   static __device__ __forceinline__ void for_each_depth(const Tile& tile, ProductValue a, ProductValue b,
                                                         const Visit& visit) {
-#pragma unroll kWords ? 4 / kTall : 1
-    for (int left = tile.all; left > 0; left -= Tile::kRows) {
+#pragma unroll(!kWhole || !kShared ? 1 : Numbers::kRows / 4 / kTall)
+    for (int left = tile.all(); left > 0; left -= Tile::kRows) {
 #pragma unroll
       for (int row = 0; row < Tile::kRows; row += Numbers::kRows) visit(a, b, row, left);
-      a.floats += tile.pitch, a.words += tile.pitch;
-      b.floats += tile.pitch, b.words += tile.pitch;
+      a.floats += tile.pitch(), a.words += tile.pitch();
+      b.floats += tile.pitch(), b.words += tile.pitch();
     }
   }
 
-  // sums += over rows a's 16 columns from i0 on by b's 32 from j0 on. kWords: both lie in words, which are 0 up to
-  // there and in rows without a sample.
-  template <bool kWords>
-  static __device__ __forceinline__ void multiply_turned(float (&sums)[4][4], const Tile& tile, const ProductValue& a,
-                                                         const ProductValue& b, int i0, int j0, bool swapped,
-                                                         int lane) {
+  // sums += over rows a's 16 columns from i0 on by b's 32 from j0 on. kWhole: both lie in words, which are 0 up to
+  // there and in rows without a sample; or in floats, whose rows go so far and all have a sample. kColumns: columns +=
+  // the sum of b over rows.
+  template <bool kWhole, bool kColumns>
+  static __device__ __forceinline__ void multiply_turned(float (&sums)[4][4], float (&columns)[4][4], const Tile& tile,
+                                                         const ProductValue& a, const ProductValue& b, int i0, int j0,
+                                                         bool swapped, int lane) {
     const int tiles = ceil_div(b.columns - j0, 8);
-    for_each_depth<kWords>(tile, a, b, [&](const ProductValue& x, const ProductValue& y, int row, int rows) {
+    for_each_depth<kWhole>(tile, a, b, [&](const ProductValue& x, const ProductValue& y, int row, int rows) {
       uint32_t left[4];
-      Numbers::template turned_left<kShared, kWords>(left, x, i0, row, rows, lane);
+      Numbers::template turned_left<kShared, kWhole>(left, x, i0, row, rows, lane);
       if constexpr (Numbers::kCuts) {
         for (uint32_t& word : left) word = swapped ? clamp_halves(word) : word;
       }
 #pragma unroll
       for (int pair = 0; pair < 2; ++pair) {
-        if (!kWords && 2 * pair >= tiles) continue;
+        if (!kWhole && 2 * pair >= tiles) continue;
         uint32_t right[2][2];
-        Numbers::template turned_right<kShared, kWords>(right, y, j0 + 16 * pair, row, rows, !swapped, lane);
+        Numbers::template turned_right<kShared, kWhole>(right, y, j0 + 16 * pair, row, rows, !swapped, lane);
         Numbers::multiply_turned(sums[2 * pair], left, right[0]);
         Numbers::multiply_turned(sums[2 * pair + 1], left, right[1]);
+        if constexpr (kColumns) {
+          add_ones(columns[2 * pair], right[0]);
+          add_ones(columns[2 * pair + 1], right[1]);
+        }
       }
     });
   }
 
+  static __device__ __forceinline__ void sum_words(const Tile& tile, const CudaStep& step) {
+    const ProductValue b = product_value<true>(tile, step.x, true);
+    const int lane = lane_again(), across = static_cast<int>(threads_again() / 2);
+    const bool fill = tile.fill();
+#pragma unroll 1
+    for (int j0 = 16 * static_cast<int>(thread_again() / 32); j0 < step.width; j0 += across) {
+      float sums[2][4] = {};
+      for_each_depth<true>(tile, b, b, [&](const ProductValue&, const ProductValue& own, int row, int rows) {
+        uint32_t right[2][2];
+        Numbers::template turned_right<kShared, true>(right, own, j0, row, rows, false, lane);
+        add_ones(sums[0], right[0]);
+        add_ones(sums[1], right[1]);
+      });
+      add_columns(sums, tile.partial() + step.number, j0, step.width, fill, lane);
+    }
+  }
+  // A sum over rows of columns, by a product with ones.
+  static __device__ __forceinline__ void add_ones(float (&sums)[4], const uint32_t (&right)[2]) {
+    const uint32_t one = Numbers::pair(1.0f, 1.0f), ones[4] = {one, one, one, one};
+    Numbers::multiply_turned(sums, ones, right);
+  }
+  // partial[j] += such a sum, for columns from j0 on, eight of each of kTiles.
+  template <int kTiles>
+  static __device__ __forceinline__ void add_columns(const float (&sums)[kTiles][4], float* partial, int j0,
+                                                     int columns, bool fill, int lane) {
+#pragma unroll
+    for (int i = 0; i < 2 * kTiles; ++i) {
+      const int j = j0 + 8 * (i / 2) + 2 * lane + i % 2;
+      if (lane < 4 && j < columns) partial[j] = (fill ? 0.0f : partial[j]) + sums[i / 2][i % 2];
+    }
+  }
+
   // What is added to the product, where that is a value.
   template <int kTiles>
-  static __device__ __forceinline__ void add(Sums<kTiles>& sums, const CudaStep& step, const Tile& tile, int first,
-                                             int lane) {
+  static __device__ __forceinline__ void add(Sums<kTiles>& sums, const CudaStep& step, const Tile& tile, int first) {
+    const int lane = lane_again(), rows = tile.rows();
     const Rows added = tile.operand(tile.call.code.operands[step.added]);
     for_each_sum<kTiles>([&](int r, int t, int i) {
       const MapPlace at = place(r, t, i, lane);
-      const bool there = at.row < tile.rows && first + at.column < step.width;
+      const bool there = at.row < rows && first + at.column < step.width;
       if (there) sums[r][t][i] += added.at(at.row, first + at.column);
     });
   }
@@ -561,7 +594,8 @@ struct TensorSteps {
   // 0 where a value of ReLU is.
   template <int kTiles>
   static __device__ __forceinline__ void cut_slopes(Sums<kTiles>& sums, const Tile& tile, const CudaStep& step,
-                                                    int first, int lane) {
+                                                    int first) {
+    const int lane = lane_again();
     const ProductValue slope = product_value<false>(tile, step.y, step.y_words);
     if (Numbers::kHalves && slope.has_words) {
       const uint32_t* corner = slope.words + lane / 4 * slope.stride + first / 2 + lane % 4;
@@ -581,7 +615,8 @@ struct TensorSteps {
   // The value as words: to its slot, and held.
   template <int kTiles>
   static __device__ __forceinline__ void put_words(Held& held, const Sums<kTiles>& sums, const Tile& tile,
-                                                   const CudaStep& step, int first, int lane) {
+                                                   const CudaStep& step, int first) {
+    const int lane = lane_again();
     if (step.relu) {
       for_each_word<kTiles>([&](int r, int t, int h) {
         held.words[r][t][h] = Numbers::relu_pair(sums[r][t][2 * h], sums[r][t][2 * h + 1]);
@@ -597,7 +632,7 @@ struct TensorSteps {
         held.words[r][t][h] &= Numbers::above_zero(corner[(16 * r + 8 * h) * step.y.stride + 4 * t]);
       });
     }
-    if (tile.rows < Tile::kRows || first + 8 * kTiles > step.width) {
+    if (tile.rows() < Tile::kRows || first + 8 * kTiles > step.width) {
       clear_outside<kTiles>(held, tile, step.width - first, lane);
     }
     if (step.pairs < 0) return;
@@ -608,9 +643,10 @@ struct TensorSteps {
   // Words are 0 where there is no sample or no column, since products take whole sixteens of both.
   template <int kTiles>
   static __device__ __forceinline__ void clear_outside(Held& held, const Tile& tile, int columns, int lane) {
+    const int rows = tile.rows();
     for_each_word<kTiles>([&](int r, int t, int h) {
       const MapPlace at = place(r, t, 2 * h, lane);
-      const int left = at.row < tile.rows ? columns - at.column : 0;
+      const int left = at.row < rows ? columns - at.column : 0;
       held.words[r][t][h] &= left > 1 ? 0xffffffffu : left > 0 ? 0xffffu : 0u;
     });
   }
@@ -618,7 +654,8 @@ struct TensorSteps {
   // kWhole: there is a sample in every row, and each sum has a column.
   template <int kTiles, bool kWhole>
   static __device__ __forceinline__ void store(const Sums<kTiles>& sums, const Tile& tile, const CudaStep& step,
-                                               int first, int lane) {
+                                               int first) {
+    const int lane = lane_again(), rows = tile.rows();
     float* const floats = tile.slot(step.slot);
     const int stride = step.stride, width = step.width;
     for_each_sum<kTiles>([&](int r, int t, int i) {
@@ -626,7 +663,7 @@ struct TensorSteps {
       const MapPlace at = place(r, t, i, lane);
       const int column = first + at.column;
       float* const to = floats + at.row * stride + column;
-      if (!kWhole && (at.row >= tile.rows || column >= width)) return;
+      if (!kWhole && (at.row >= rows || column >= width)) return;
       if (kWhole || column + 1 < width) {
         *reinterpret_cast<float2*>(to) = make_float2(sums[r][t][i], sums[r][t][i + 1]);
       } else {
@@ -662,14 +699,15 @@ struct FloatSteps {
   static __device__ __forceinline__ void outer(const Tile& tile, const CudaStep& step) {
     const ProductValue a = product_value<true>(tile, step.x, false), b = product_value<true>(tile, step.y, false);
     const bool whole = (step.x.start | step.x.stride | step.y.start | step.y.stride) % 4 == 0;
-    const int across = ceil_div(b.columns, 4), units = ceil_div(a.columns, 4) * across;
+    const int across = ceil_div(b.columns, 4), units = ceil_div(a.columns, 4) * across, all = tile.all();
+    const bool fill = tile.fill();
 #pragma unroll 1
-    for (int unit = static_cast<int>(thread_again()); unit < units; unit += static_cast<int>(blockDim.x)) {
+    for (int unit = static_cast<int>(thread_again()); unit < units; unit += static_cast<int>(threads_again())) {
       const int i0 = 4 * (unit / across), j0 = 4 * (unit % across);
       float4 sums[4] = {};
       ProductValue x = a, y = b;
 #pragma unroll 1
-      for (int left = tile.all; left > 0; left -= Tile::kRows, x.floats += tile.pitch, y.floats += tile.pitch) {
+      for (int left = all; left > 0; left -= Tile::kRows, x.floats += tile.pitch(), y.floats += tile.pitch()) {
         const int rows = left < Tile::kRows ? left : Tile::kRows;
         if (whole) {
 #pragma unroll 4
@@ -693,9 +731,9 @@ struct FloatSteps {
 #pragma unroll
       for (int i = 0; i < 4; ++i) {
         if (i0 + i >= a.columns) continue;
-        float* const at = tile.partial + step.number + (i0 + i) * step.stride + j0;
+        float* const at = tile.partial() + step.number + (i0 + i) * step.stride + j0;
         if (j0 + 4 <= b.columns) {
-          float4 entry = tile.fill ? make_float4(0.0f, 0.0f, 0.0f, 0.0f) : *reinterpret_cast<float4*>(at);
+          float4 entry = fill ? make_float4(0.0f, 0.0f, 0.0f, 0.0f) : *reinterpret_cast<float4*>(at);
           entry.x += sums[i].x, entry.y += sums[i].y, entry.z += sums[i].z, entry.w += sums[i].w;
           *reinterpret_cast<float4*>(at) = entry;
           continue;
@@ -703,7 +741,7 @@ struct FloatSteps {
         const float three[3] = {sums[i].x, sums[i].y, sums[i].z};
 #pragma unroll
         for (int j = 0; j < 3; ++j) {
-          if (j0 + j < b.columns) at[j] = (tile.fill ? 0.0f : at[j]) + three[j];
+          if (j0 + j < b.columns) at[j] = (fill ? 0.0f : at[j]) + three[j];
         }
       }
     }
@@ -718,6 +756,7 @@ struct FloatSteps {
     constexpr int kApart = Tile::kRows / kRows;
     const ProductValue value = product_value<false>(tile, step.x, false);
     const int stride = padded(step.width, kProgramOutputs), down = kApart * value.stride, depth = step.depth;
+    const int samples = tile.rows();
     const float* const x = value.floats + row * value.stride;
     float4 sums[kRows] = {};
     if (step.bias >= 0) {
@@ -730,7 +769,7 @@ struct FloatSteps {
       for (int r = 0; r < kRows; ++r) {
         const int at = row + kApart * r;
         const auto added = [&](int i) {
-          return at < tile.rows && first + i < step.width ? rows.at(at, first + i) : 0.0f;
+          return at < samples && first + i < step.width ? rows.at(at, first + i) : 0.0f;
         };
         sums[r] = make_float4(added(0), added(1), added(2), added(3));
       }
@@ -764,7 +803,7 @@ struct FloatSteps {
 #pragma unroll
     for (int r = 0; r < kRows; ++r) {
       const int at = row + kApart * r;
-      if (at >= tile.rows) continue;
+      if (at >= samples) continue;
       float four[4] = {sums[r].x, sums[r].y, sums[r].z, sums[r].w};
 #pragma unroll
       for (int i = 0; i < 4; ++i) {  // comparisons keep NaN

@@ -12,8 +12,8 @@
 namespace voronerf {
 
 // Warps of a block and blocks of a multiprocessor, by rows of a team: 16 warps with 128 registers, or 12 with 168.
-constexpr int program_warps(int rows) { return rows == 32 ? 4 : 8; }
-constexpr int program_blocks(int rows) { return rows == 32 ? 3 : 2; }
+VN_HD constexpr int program_warps(int rows) { return rows == 32 ? 4 : 8; }
+VN_HD constexpr int program_blocks(int rows) { return rows == 32 ? 3 : 2; }
 constexpr int kProgramTeam = 4;          // warps that share their rows, where the values of few rows fit
 constexpr int kProgramWide = kMostHeld;  // columns of a product that a warp has at a time
 constexpr int kProgramSkew = 4;          // floats that rows of slots are longer than a multiple of 16
@@ -37,7 +37,7 @@ enum class CudaOp : int32_t { plain, input, output, linear, chain, outer, column
 // steps have `op` and `keeps` alone.
 struct alignas(16) CudaStep {
   CudaValue x;
-  int32_t weights, bias;  // places in what is packed; -1: none
+  int32_t weights, bias;  // places in what is packed; -1: none. outer: bias is where the sum of y's columns goes, or -1
   int32_t depth, width;   // output: `depth` is the first column where it goes
   CudaValue y;            // linear: where ReLU was. outer: x by y
   int32_t slot, stride;   // of what it makes as floats, or -1; outer: `stride` floats are a row of the sum
@@ -182,20 +182,39 @@ struct Target {
 // What products of a kernel multiply.
 enum class ProgramNumbers { floats, bfloat16, float16 };
 
-// Rows of a cell that a block has in hand, and those of them that are the own ones of a team of kTeam warps. A value is
-// [kRows][stride] at its slot for each team, rows without a sample included, which hold anything; as 16-bit numbers
-// they are 0. kShared: the slots are the block's shared memory.
+// The rows of a cell that a block has in hand, and which of them are the own ones of a warp's team. Each warp has a
+// copy in shared memory: in registers these numbers would take the place of sums.
+struct TileState {
+  const float* weights;  // what is packed for the cell
+  int64_t partial;       // where the task's partial is
+  int32_t cell, begin;   // begin: the team's first row
+  int32_t rows, all;     // that have a sample, of the team and of the block
+  int32_t left;          // rows of the task from this tile on
+  int32_t fill;          // 1 in the first tile of a task
+};
+constexpr int kProgramStates = 512;  // bytes of them, before the slots
+
+// A value is [kRows][stride] at its slot for each team, rows without a sample included, which hold anything; as 16-bit
+// numbers they are 0. kShared: the slots are the block's shared memory.
 template <int kOwnRows, int kWarps, bool kShared, ProgramNumbers kNumbers>
 struct ProgramTile {
   static constexpr int kRows = kOwnRows, kTeam = kWarps, kWorkers = 32 * kTeam;
   static constexpr bool kHalves = kNumbers != ProgramNumbers::floats, kBfloat16 = kNumbers == ProgramNumbers::bfloat16;
   const CudaProgram& call;
-  float *slots, *partial;  // slots: where they are not in shared memory
-  const float* weights;    // what is packed for the cell
-  int pitch;               // floats from the values of a team to those of the next one
-  int cell, begin;         // begin: the team's first row
-  int rows, all;           // that have a sample, of the team and of the block
-  bool fill;               // the first tile of a task
+
+  static __device__ __forceinline__ TileState& state() {
+    static_assert(program_warps(kRows) * sizeof(TileState) <= kProgramStates);
+    VN_DYN_SHARED(TileState, states);
+    return states[thread_again() / 32];
+  }
+  __device__ __forceinline__ int rows() const { return state().rows; }
+  __device__ __forceinline__ int all() const { return state().all; }
+  __device__ __forceinline__ int cell() const { return state().cell; }
+  __device__ __forceinline__ int begin() const { return state().begin; }
+  __device__ __forceinline__ bool fill() const { return state().fill != 0; }
+  __device__ __forceinline__ float* partial() const { return call.partials + state().partial; }
+  // Floats from the values of a team to those of the next one.
+  __device__ __forceinline__ int pitch() const { return call.code.columns * kRows; }
 
   // A thread's number in its team, and a warp's.
   static __device__ __forceinline__ int worker() { return static_cast<int>(thread_again() % kWorkers); }
@@ -211,22 +230,23 @@ struct ProgramTile {
 
   // Of the team; of the block's first one.
   __device__ __forceinline__ float* slot(int32_t columns) const {
-    return first_slot(columns) + static_cast<int>(thread_again() / kWorkers) * pitch;
+    return first_slot(columns) + static_cast<int>(thread_again() / kWorkers) * pitch();
   }
   __device__ __forceinline__ float* first_slot(int32_t columns) const {
     if constexpr (kShared) {
       VN_DYN_SHARED(float, shared);
-      return shared + columns * kRows;
+      return shared + kProgramStates / 4 + columns * kRows;
     } else {
-      return slots + columns * kRows;
+      const int height = static_cast<int>(threads_again() / kWorkers) * kRows;
+      return call.spilled + int64_t{blockIdx.x} * call.code.columns * height + columns * kRows;
     }
   }
   // Parameters but tables are float32.
   __device__ __forceinline__ const float* parameter(const ProgramPack& pack) const {
-    return static_cast<const float*>(call.parameters[pack.parameter]) + cell * call.strides[pack.parameter] +
+    return static_cast<const float*>(call.parameters[pack.parameter]) + cell() * call.strides[pack.parameter] +
            pack.start;
   }
-  __device__ __forceinline__ const float* packed(int32_t at) const { return weights + at; }
+  __device__ __forceinline__ const float* packed(int32_t at) const { return state().weights + at; }
   __device__ __forceinline__ Target<kBfloat16> target(const ProgramStep& step) const {
     return target(step.slot, step.stride, step.pairs, step.width, step.floats);
   }
@@ -267,12 +287,12 @@ __device__ __forceinline__ void for_each_entry(int rows, int width, const Visit&
 template <typename Tile>
 __device__ __forceinline__ void sum_columns(const Tile& tile, const CudaStep& step) {
   const float* const values = tile.first_slot(step.x.slot) + step.x.start;
-  const int lane = lane_again(), warps = static_cast<int>(blockDim.x / 32);
+  const int lane = lane_again(), warps = static_cast<int>(threads_again() / 32), all = tile.all();
   for (int first = 8 * static_cast<int>(thread_again() / 32); first < step.width; first += 8 * warps) {
     const int column = first + lane % 8;
     const float* x = values;
     float sum = 0.0f;
-    for (int left = tile.all; left > 0 && column < step.width; left -= Tile::kRows, x += tile.pitch) {
+    for (int left = all; left > 0 && column < step.width; left -= Tile::kRows, x += tile.pitch()) {
       const int rows = left < Tile::kRows ? left : Tile::kRows;
       for (int row = 2 * (lane / 8); row < rows; row += 8) {
         sum += x[row * step.x.stride + column];
@@ -282,8 +302,8 @@ __device__ __forceinline__ void sum_columns(const Tile& tile, const CudaStep& st
     sum += __shfl_xor_sync(kAllLanes, sum, 8);
     sum += __shfl_xor_sync(kAllLanes, sum, 16);
     if (lane >= 8 || column >= step.width) continue;
-    float& entry = tile.partial[step.number + column];
-    entry = (tile.fill ? 0.0f : entry) + sum;
+    float& entry = tile.partial()[step.number + column];
+    entry = (tile.fill() ? 0.0f : entry) + sum;
   }
 }
 
@@ -293,14 +313,14 @@ __device__ __forceinline__ void clear_rest(const Tile& tile, const CudaStep& ste
   const auto to = tile.target(step);
   auto* const words = reinterpret_cast<uint32_t*>(to.halves);
   const int width = step.width, stride = to.halves_stride / 2, behind = (width + 1) / 2, last = pair_words(width);
-  const int row = Tile::worker();
-  if (width % 2 != 0 && row < tile.rows) to.put_half(row, width, 0.0f);
+  const int row = Tile::worker(), rows = tile.rows();
+  if (width % 2 != 0 && row < rows) to.put_half(row, width, 0.0f);
   if (behind < last) {
-    for_each_entry<Tile>(tile.rows, last - behind, [&](int row, int word) { words[row * stride + behind + word] = 0; });
+    for_each_entry<Tile>(tile.rows(), last - behind,
+                         [&](int row, int word) { words[row * stride + behind + word] = 0; });
   }
-  if (tile.rows < Tile::kRows) {
-    for_each_entry<Tile>(Tile::kRows - tile.rows, last,
-                         [&](int row, int word) { words[(tile.rows + row) * stride + word] = 0; });
+  if (rows < Tile::kRows) {
+    for_each_entry<Tile>(Tile::kRows - rows, last, [&](int row, int word) { words[(rows + row) * stride + word] = 0; });
   }
 }
 
@@ -310,35 +330,35 @@ constexpr int kFewColumns = 8;
 template <typename Tile>
 __device__ __forceinline__ void input_step(const Tile& tile, const CudaStep& step) {
   const CudaProgram& call = tile.call;
-  const int width = step.width, input = step.number;
+  const int width = step.width, input = step.number, begin = tile.begin();
   const auto to = tile.target(step);
   if (width > kFewColumns && !call.turned[input]) {  // neighbouring lanes read neighbouring columns
-    return for_each_entry<Tile>(tile.rows, width, [&](int row, int column) {
-      to.put(row, column, input_row(call, input, width, source_row(call.rows, tile.begin + row)).column(column));
+    return for_each_entry<Tile>(tile.rows(), width, [&](int row, int column) {
+      to.put(row, column, input_row(call, input, width, source_row(call.rows, begin + row)).column(column));
     });
   }
   const int row = Tile::worker();
-  if (row >= tile.rows) return;
-  const InputRow from = input_row(call, input, width, source_row(call.rows, tile.begin + row));
+  if (row >= tile.rows()) return;
+  const InputRow from = input_row(call, input, width, source_row(call.rows, begin + row));
   for (int column = 0; column < width; ++column) to.put(row, column, from.column(column));
 }
 
 template <typename Tile>
 __device__ __forceinline__ void output_step(const Tile& tile, const CudaStep& step) {
   const CudaProgram& call = tile.call;
-  const int output = step.number, width = step.width, type = call.output_types[output];
+  const int output = step.number, width = step.width, type = call.output_types[output], begin = tile.begin();
   const int64_t wide = call.output_widths[output];
   const Rows x = tile.operand(call.code.operands[step.added]);
   const auto put = [&](int64_t source, int row, int column) {
     store_number(call.outputs[output], type, source * wide + step.depth + column, x.at(row, column));
   };
   if (width > kFewColumns) {
-    return for_each_entry<Tile>(
-        tile.rows, width, [&](int row, int column) { put(source_row(call.rows, tile.begin + row), row, column); });
+    return for_each_entry<Tile>(tile.rows(), width,
+                                [&](int row, int column) { put(source_row(call.rows, begin + row), row, column); });
   }
   const int row = Tile::worker();
-  if (row >= tile.rows) return;
-  const int64_t source = source_row(call.rows, tile.begin + row);
+  if (row >= tile.rows()) return;
+  const int64_t source = source_row(call.rows, begin + row);
   for (int column = 0; column < width; ++column) put(source, row, column);
 }
 
