@@ -24,7 +24,7 @@ from test_grouped_program import NUMBERS, arguments, check, derivatives, offsets
 
 KIB = 1024
 TILES = [227 * KIB, 40 * KIB, 12 * KIB]
-"""Of shared memory: warps with rows of their own, teams that share them, and values in the workspace."""
+"""Bytes of shared memory: enough for a warp with own rows, for a team that shares rows, and for neither."""
 ALLOWED = {"float32": 2e-5, "tf32": 4e-3, "float16": 4e-3, "bfloat16": 3e-2}
 """Norm of an error, in norms of what is right."""
 LARGEST = 65504.0
