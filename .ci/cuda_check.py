@@ -5,8 +5,8 @@ objects as they are.
 
 Registers, spills, shared memory, and the warps that registers let a multiprocessor hold, are printed for every kernel
 and compared with the table that is kept, .ci/cuda_resources.json: a spill that is not in it is a failure, and with the
-nvcc that it was made by so are registers or shared memory above it, fewer warps, or more instructions of a layer of a
-network (machine_code.py), which are counted where cuobjdump is found. sm_80 is an A100, sm_89 an RTX
+nvcc that it was made by so are registers or shared memory above it, fewer warps, or a layer of a network that has more
+instructions or is not found (machine_code.py, where there is cuobjdump). sm_80 is an A100, sm_89 an RTX
 4090, sm_90 an H200. ``--update`` notes the given architectures in it, and forgets kernels that are no more. The last
 architecture is compiled to PTX as well. Kernels of the toolkit's own (CUB) are counted and not judged: their names
 change with its version, and this project cannot change them. It is a failure if the resources of a kernel are not
@@ -136,6 +136,7 @@ def regressions(version: str, kernels: Kernels) -> list[str]:
     """What is worse than in the table, a line each; kernels and architectures that are not in it may not spill."""
     kept = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": "", "kernels": {}}
     compared = ("spilled_bytes", *(("registers", "shared_bytes", "layer") if kept["nvcc"] == version else ()))
+    counted = any("layer" in row for rows in kernels.values() for row in rows.values())
     worse = []
     for kernel, by_architecture in sorted(kernels.items()):
         for architecture, row in by_architecture.items():
@@ -143,6 +144,8 @@ def regressions(version: str, kernels: Kernels) -> list[str]:
             for key in compared:
                 if key in row and row[key] > known.get(key, row[key]):
                     worse.append(f"{kernel} ({architecture}): {key} {row[key]}, above {known[key]}")
+            if counted and "layer" in compared and "layer" in known and "layer" not in row:
+                worse.append(f"{kernel} ({architecture}): no layer was found, of {known['layer']} instructions before")
             if "registers" in compared and row["warps"] < known.get("warps", 0):
                 worse.append(f"{kernel} ({architecture}): warps {row['warps']}, below {known['warps']}")
     return worse

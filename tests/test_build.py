@@ -367,7 +367,10 @@ def test_cuda_check_tells_of_more_instructions_of_a_layer(check, monkeypatch, tm
     row = {"registers": 40, "spilled_bytes": 0, "shared_bytes": 0, "warps": 48}
     kept = {"kernel": {"sm_80": {**row, "layer": 200}}, "other": {"sm_80": row}}
     check.TABLE.write_text(check.as_text("V13", kept))
-    assert check.regressions("V13", {"kernel": {"sm_80": row}, "other": {"sm_80": {**row, "layer": 9}}}) == []
+    assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []  # none are counted without cuobjdump
+    found = {"kernel": {"sm_80": row}, "other": {"sm_80": {**row, "layer": 9}}}
+    assert check.regressions("V13", found) == ["kernel (sm_80): no layer was found, of 200 instructions before"]
+    assert check.regressions("V14", found) == []
     assert check.regressions("V13", {"kernel": {"sm_80": {**row, "layer": 201}}}) == [
         "kernel (sm_80): layer 201, above 200"
     ]
