@@ -411,8 +411,8 @@ struct TensorSteps {
     } else if (floats) {
       store<kTiles, false>(sums, tile, step, first);
     }
-    // Whether or not anything reads these words: otherwise what was held before, which has at most 64 columns and so
-    // no other part that reads it, would stay in its registers beside the sums.
+    // Even where nothing reads these words: what was held before would keep its registers beside the sums. No other
+    // part needs it, since a value in registers has at most 64 columns.
     if constexpr (kTiles > 1 && Numbers::kHalves) put_words<kTiles>(held, sums, tile, step, first);
   }
 
