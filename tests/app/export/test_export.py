@@ -117,6 +117,20 @@ def test_a_mesh_is_the_outer_surface_alone(run, tmp_path, suffix):
         assert np.abs(np.median(colours[where], axis=0) - colour.numpy() * 255).max() < 12  # pixels of the rim mix
 
 
+def test_steps_of_pixels_and_samples_are_smoothed(run, tmp_path, monkeypatch):
+    def slope(mesh):  # its triangles, in degrees, against the ball's surface
+        along = (mesh.face_normals * mesh.triangles_center).sum(-1) / np.linalg.norm(mesh.triangles_center, axis=-1)
+        return np.degrees(np.arccos(along.clip(-1, 1))).mean()
+
+    sharp = replace(run.scene, train=builtin_scene(64, train_views=20, test_views=1).train)
+    seen = replace(run, scene=sharp)
+    smooth = export_mesh(seen, tmp_path / "smooth.ply", resolution=48)
+    monkeypatch.setattr("voronerf.app.export.mesh.SMOOTH", 1e-3)
+    before = export_mesh(seen, tmp_path / "before.ply", resolution=48)
+    assert slope(smooth) < 0.5 * slope(before)
+    assert smooth.volume == pytest.approx(before.volume, rel=0.03)
+
+
 @pytest.mark.parametrize("to_files", [False, True])
 def test_a_glb_stands_upright_and_has_linear_colours(run, tmp_path, to_files):
     transform = torch.eye(4, dtype=torch.float64)

@@ -2,9 +2,9 @@
 
 The pictures of training views say how far away the surface is that each pixel shows. These distances are fused into one
 function, the signed distance from the surface along the rays, truncated, and averaged over the views (Curless and Levoy
-1996). It is zero on the surface. What one view takes for a surface and others look through is averaged away. A node of
-the grid has a value where a view sees it or where it lies shortly behind a surface; only blocks of nodes near what some
-pixel shows are filled.
+1996), then smoothed a little. It is zero on the surface. What one view takes for a surface and others look through is
+averaged away. A node of the grid has a value where a view sees it or where it lies shortly behind a surface; only
+blocks of nodes near what some pixel shows are filled.
 """
 
 from __future__ import annotations
@@ -41,6 +41,10 @@ LONGEST = 512
 #: Cubes before and behind a surface in which its distance is averaged. Fewer leave holes where views disagree, more let
 #: the two sides of a thin thing meet.
 REACH = 8
+#: Distances are smoothed by a Gaussian of so many cubes, since a learnt surface is rough. Before, they are cut off at
+#: this share of a reach: farther ones are too long where views see a surface from the side, and only before it, which
+#: would move it inwards.
+SMOOTH, CUT = 1.0, 0.3
 #: Nodes along the side of a block, and blocks that are filled at a time.
 BLOCK, BLOCKS = 8, 256
 #: Bytes of memory that a node takes at the most, in marching cubes.
@@ -142,7 +146,7 @@ def _surface(
     run: Run, resolution: int | None, faces: int, box: Tensor | None, track: Track, say: Callable[[str], None]
 ) -> Any:
     import trimesh
-    from scipy.ndimage import minimum_filter
+    from scipy.ndimage import gaussian_filter, minimum_filter
     from skimage.measure import marching_cubes
 
     if faces < 4:
@@ -166,7 +170,7 @@ def _surface(
     blocks = (extent / side / BLOCK).long() + 1
     value, seen = _fused(low, side, blocks, views, closed, track)
     shape = tuple(slice(count) for count in ((extent / side).round().long().clamp_min(1) + 1).tolist())
-    distance = value[shape].numpy()
+    distance = gaussian_filter(value[shape].clamp(-CUT, CUT).numpy(), SMOOTH)
     if closed:
         distance = np.pad(distance, 1, constant_values=1)
     if not distance.min() < 0 < distance.max():
