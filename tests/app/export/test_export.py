@@ -131,6 +131,17 @@ def test_steps_of_pixels_and_samples_are_smoothed(run, tmp_path, monkeypatch):
     assert smooth.volume == pytest.approx(before.volume, rel=0.03)
 
 
+@pytest.mark.parametrize("plain", [True, False])
+def test_the_surface_of_an_object_on_a_plain_background_lies_before_its_distances(run, tmp_path, monkeypatch, plain):
+    seen, radii = run if plain else replace(run, scene=replace(run.scene, box=None)), []
+    for share in (0.0, 0.01):
+        monkeypatch.setattr("voronerf.app.export.mesh.BEFORE", share)
+        mesh = export_mesh(seen, tmp_path / "mesh.ply", resolution=48, box=None if plain else BOX)
+        radii.append(np.linalg.norm(mesh.triangles_center, axis=-1).mean())
+    moved = (radii[1] - radii[0]) / (0.01 * float((BOX[1] - BOX[0]).max()))
+    assert 0.1 < moved < 1 if plain else moved == 0  # distances are along rays: most meet the surface at a slant
+
+
 @pytest.mark.parametrize("to_files", [False, True])
 def test_a_glb_stands_upright_and_has_linear_colours(run, tmp_path, to_files):
     transform = torch.eye(4, dtype=torch.float64)

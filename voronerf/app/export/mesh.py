@@ -2,9 +2,9 @@
 
 The pictures of training views say how far away the surface is that each pixel shows. These distances are fused into one
 function, the signed distance from the surface along the rays, truncated, and averaged over the views (Curless and Levoy
-1996), then smoothed a little. It is zero on the surface. What one view takes for a surface and others look through is
-averaged away. A node of the grid has a value where a view sees it or where it lies shortly behind a surface; only
-blocks of nodes near what some pixel shows are filled.
+1996), then smoothed a little. It is zero on the surface or, of an object on a plain background, a little behind it.
+What one view takes for a surface and others look through is averaged away. A node of the grid has a value where a view
+sees it or where it lies shortly behind a surface; only blocks of nodes near what some pixel shows are filled.
 """
 
 from __future__ import annotations
@@ -45,6 +45,10 @@ REACH = 8
 #: this share of a reach: farther ones are too long where views see a surface from the side, and only before it, which
 #: would move it inwards.
 SMOOTH, CUT = 1.0, 0.3
+#: The surface of an object on a plain background lies so far before the distances along rays, as a share of the longest
+#: side of the scene's box: its field is thin there, since pixels at an edge are half background, and smoothing makes it
+#: smaller.
+BEFORE = 0.003
 #: Nodes along the side of a block, and blocks that are filled at a time.
 BLOCK, BLOCKS = 8, 256
 #: Bytes of memory that a node takes at the most, in marching cubes.
@@ -170,7 +174,9 @@ def _surface(
     blocks = (extent / side / BLOCK).long() + 1
     value, seen = _fused(low, side, blocks, views, closed, track)
     shape = tuple(slice(count) for count in ((extent / side).round().long().clamp_min(1) + 1).tolist())
-    distance = gaussian_filter(value[shape].clamp(-CUT, CUT).numpy(), SMOOTH)
+    bounds = run.scene.box
+    before = 0.0 if bounds is None else BEFORE * float((bounds[1] - bounds[0]).max()) / (REACH * side)
+    distance = gaussian_filter((value[shape] - before).clamp(-CUT, CUT).numpy(), SMOOTH)
     if closed:
         distance = np.pad(distance, 1, constant_values=1)
     if not distance.min() < 0 < distance.max():
