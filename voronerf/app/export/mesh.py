@@ -46,8 +46,8 @@ REACH = 8
 #: would move it inwards.
 SMOOTH, CUT = 1.0, 0.3
 #: The surface of an object on a plain background lies so far before the distances along rays, as a share of the longest
-#: side of the scene's box: its field is thin there, since pixels at an edge are half background, and smoothing makes it
-#: smaller.
+#: side of the scene's box: views look a little into its field, and smoothing makes it smaller. Chosen on the built-in
+#: scene and Lego (docs/export.md); photographs without a box would lose by it.
 BEFORE = 0.003
 #: Nodes along the side of a block, and blocks that are filled at a time.
 BLOCK, BLOCKS = 8, 256
