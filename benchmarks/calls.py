@@ -1,4 +1,4 @@
-"""Small calls in turns on one thread: what surrounds a kernel counts, and the kernel hardly.
+"""Times small calls, and a router from few rows to many beside one network, in turns on one thread.
 
     python benchmarks/calls.py --json benchmarks/results/calls.json
 
@@ -25,7 +25,7 @@ from voronerf.app.files import json_text, write_text
 from voronerf.ops import sparse_depth_gradient
 from voronerf.ops._core import native
 
-CELLS, WIDTH = 16, 32
+CELLS, WIDTH = 16, 64
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
     found["sparse_depth_gradient, 8 tensors"] = {
         "public": lambda _: sparse_depth_gradient(loss, gradient, *given, factor=1.0, activated=True)
     }
-    for n in (16, 256):
+    for n in (16, 256, 4096, 65536):
         plain, x = network(), torch.rand(n, 3)
         router = VoronoiRouter(network(), torch.rand(CELLS, 3), coords="first3", fuse=True)
         linears = [layer for layer in router.module if isinstance(layer, nn.Linear)]

@@ -29,10 +29,6 @@ def test_python_on_a_page_runs(name: str) -> None:
         exec(compile(code, f"{name}, block {number}", "exec"), names)
 
 
-def test_the_readme_shows_the_example() -> None:
-    assert (ROOT / "examples/train.py").read_text() in blocks("README.md")
-
-
 @pytest.mark.parametrize("name", PAGES)
 def test_linked_files_are_there(name: str) -> None:
     # contributing.md and changelog.md show files of the root, which are checked as such by GitHub's readers.
