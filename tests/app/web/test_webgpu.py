@@ -261,3 +261,20 @@ def test_without_webgpu_the_page_says_so_and_turns_a_picture(browser, page, runs
             assert still_picture.is_displayed() and still_picture.get_property("naturalWidth") == 40
     finally:
         browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
+
+
+def test_a_lost_device_is_replaced_twice_within_a_minute(browser, page, runs):
+    with resized(browser, 160, 160):
+        page(runs("hash grid"))
+        still(browser)
+        browser.execute_script("hide(3, true)")
+        fragment = still_after(browser)
+        shown = seen(browser)
+        lose = "const lost = renderer; setTimeout(() => lost.device.destroy()); window.lost = lost;"
+        for _ in range(2):
+            browser.execute_script(lose)
+            until(lambda: browser.execute_script("return renderer !== lost && drawn === version"), 60)
+            assert still(browser) == fragment and np.array_equal(seen(browser), shown)
+        browser.execute_script(lose)
+        until(lambda: "took the GPU away 3 times in a minute" in browser.find_element("id", "note").text)
+        assert browser.find_element("css selector", "#still img").is_displayed()

@@ -5,6 +5,7 @@ const REST = 150; // milliseconds without a movement after which the sharp pictu
 const SMOOTH = 33; // milliseconds that a picture may take while the camera moves
 const SEGMENT = 1000; // milliseconds from one camera of the path to the next
 const FARTHEST = 1e6;
+const NEW_DEVICES = 2; // within a minute, for devices that the browser has taken away
 
 const element = (id) => document.getElementById(id);
 const text = (id) => element(id).textContent;
@@ -125,10 +126,12 @@ function sizes() {
   return [Math.max(1, Math.round(innerWidth * ratio)), Math.max(1, Math.round(innerHeight * ratio))];
 }
 
-async function drawAlways() {
+// Draws every change until another renderer is in use.
+async function drawAlways(current) {
   for (;;) {
     if (drawn === version) await new Promise((done) => { changed = done; });
     await new Promise(requestAnimationFrame);
+    if (renderer !== current) return;
     const mine = version;
     const [width, height] = sizes();
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -147,7 +150,7 @@ async function drawAlways() {
     renderer.resize(fine, width, height);
     const step = (rows) => renderer.present(look(), rows);
     const whole = await renderer.draw(fine, cameraOf(state.view, width, height), cutOf(), step, () => version !== mine);
-    if (!whole) continue;
+    if (!whole || renderer !== current) continue;
     drawn = mine;
     history.replaceState(null, "", addressOf());
     element("speed").value = `${width} x ${height}`;
@@ -460,16 +463,34 @@ async function start() {
   const data = await unpacked();
   const [first] = scene.parts.colours;
   colours = data.subarray(first, first + 4 * scene.cells);
-  const made = await Renderer.create(scene, data, { march: text("march"), screen: text("screen") });
-  made.device.lost.then((lost) => fail(new Error(`The GPU is gone: ${lost.message}`)));
-  made.attach(canvas);
-  renderer = made;
   readAddress();
-  for (const cell of state.hidden) renderer.hide(cell, true);
+  await open(data);
   wire();
   showState();
   fold(innerWidth > 600);
-  drawAlways().catch(fail);
+}
+
+async function open(data) {
+  const current = await Renderer.create(scene, data, { march: text("march"), screen: text("screen") });
+  current.attach(canvas);
+  for (const cell of state.hidden) current.hide(cell, true);
+  renderer = current;
+  drawn = 0;
+  const lost = current.device.lost.then(({ message }) => message);
+  const failed = drawAlways(current).catch(({ message }) => message);
+  Promise.race([lost, failed]).then((reason) => reopen(data, reason)).catch(fail);
+}
+
+// Browsers take devices away: from a page in the background, after a crash of the driver, or when memory is short.
+const losses = []; // their times in milliseconds
+async function reopen(data, reason) {
+  losses.push(performance.now());
+  if (losses.at(-1) - losses.at(-1 - NEW_DEVICES) < 60_000) {
+    throw new Error(`The browser took the GPU away ${NEW_DEVICES + 1} times in a minute. Reload the page to try again.`);
+  }
+  console.warn(`A new GPU device replaces one that is lost: ${reason}`);
+  await sleep(500); // a browser may have to start its GPU process again
+  await open(data);
 }
 
 function fail(error) {
