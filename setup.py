@@ -1,18 +1,18 @@
 """Build of the compiled module ``voronerf.ops._core._C``; everything else is in pyproject.toml.
 
-The extension knows nothing of torch: C++17, pybind11 and, where nvcc is found, CUDA. A build.ninja is written and run,
-so a build is parallel and redoes only what has changed, headers included. Files named ``*_isa.cpp`` are compiled once
-for each instruction set (csrc/common/isa.h); the choice among them is made at run time.
+The extension does not depend on torch: it needs C++17, pybind11 and, if nvcc is found, CUDA. The build writes and runs
+a build.ninja, so it is parallel and rebuilds only files whose sources or headers have changed. Files named
+``*_isa.cpp`` are compiled once per instruction set (csrc/common/isa.h), and one is chosen at run time.
 
 Environment:
     CXX, CXXFLAGS                the C++ compiler and its flags (default c++, else g++, clang++ on Windows, where MSVC
                                  cannot compile GNU's vectors); "ccache g++" works too
-    VORONERF_OPENMP              0: without OpenMP, so that operations run on one thread. It is so on macOS and Windows,
-                                 and clang on Linux asks for it, whose OpenMP is another than torch's
-    VORONERF_CUDA                auto (default): with CUDA where nvcc and a GPU are found, for that GPU; 1: for all
-                                 GPUs, also where none is found, and fail without nvcc; 0: never
-    VORONERF_CUDA_ARCHITECTURES  such as "80;90": machine code for each, and PTX of the last for what comes after it
-    CUDA_HOME, MAX_JOBS          where CUDA is; parallel jobs
+    VORONERF_OPENMP              0: without OpenMP: operations run on one thread, as always on macOS and Windows. clang
+                                 on Linux needs it, since its OpenMP runtime differs from torch's
+    VORONERF_CUDA                auto (default): with CUDA if nvcc and a GPU are found, for that GPU; 1: for all GPUs,
+                                 also on a machine without one, and fail without nvcc; 0: never
+    VORONERF_CUDA_ARCHITECTURES  such as "80;90": machine code for each, and PTX of the last one for later GPUs
+    CUDA_HOME, MAX_JOBS          the folder of the CUDA toolkit; the number of parallel jobs
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ ISAS = {
     },
     "aarch64": {"neon": ["-DVN_ISA=3"]},
 }
-"""Of an architecture, beside the portable path."""
+"""The compiler flags of each instruction set, by architecture; the portable code is built too."""
 WINDOWS = sys.platform == "win32"
 LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
-# One of each major version, which runs on its minor ones. Without 100 and 120 a Blackwell GPU would compile the PTX of
-# 90 for minutes when a kernel is first used.
+# One architecture of each major version, whose code also runs on later minor versions. Without 100 and 120 a Blackwell
+# GPU would compile the PTX of 90 for minutes on first use of a kernel.
 DEFAULT_ARCHITECTURES = "75;80;90;100;120"
 
 
 class NinjaBuildExt(build_ext):
-    """Writes build.ninja, runs it, and copies the module to where setuptools wants it."""
+    """A build command that writes and runs build.ninja, and copies the module to the path that setuptools expects."""
 
     def build_extension(self, ext: Extension) -> None:
-        """Build the one extension there is."""
+        """Builds the only extension."""
         build = build_folder()
         build.mkdir(parents=True, exist_ok=True)
         cuda = find_cuda()
@@ -68,7 +68,7 @@ class NinjaBuildExt(build_ext):
 
 
 def put(module: Path, target: Path) -> None:
-    """Copy the module to where it is imported from, and note what it binds."""
+    """Copies the module to its import path, and writes the stub of its bindings."""
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(module, target)
     if stub := stub_of(module):
@@ -78,25 +78,25 @@ def put(module: Path, target: Path) -> None:
 
 
 def build_folder() -> Path:
-    """Where objects lie."""
+    """Returns the folder of the object files."""
     return ROOT / "build" / f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
 
 
 class Cuda:
-    """What was found of CUDA: nvcc and architectures, or neither; the outcome in one line."""
+    """The CUDA set-up: nvcc and the architectures, or neither, and the outcome in one line."""
 
     def __init__(self, outcome: str, nvcc: Path | None = None, architectures: tuple[str, ...] = ()) -> None:
         self.outcome, self.nvcc, self.architectures = outcome, nvcc, architectures
 
     def flags(self) -> list[str]:
-        """Flags of nvcc that name the architectures."""
+        """Returns nvcc's flags for the architectures."""
         flags = [f"-gencode=arch=compute_{arch},code=sm_{arch}" for arch in self.architectures]
         last = self.architectures[-1]
         return [*flags, f"-gencode=arch=compute_{last},code=compute_{last}"]
 
 
 def find_cuda() -> Cuda:
-    """Follow VORONERF_CUDA and VORONERF_CUDA_ARCHITECTURES."""
+    """Returns the CUDA set-up that VORONERF_CUDA and VORONERF_CUDA_ARCHITECTURES ask for."""
     wish = os.environ.get("VORONERF_CUDA", "auto")
     if wish not in ("auto", "0", "1"):
         raise SystemExit(f"voronerf: VORONERF_CUDA must be auto, 0 or 1, got {wish!r}")
@@ -124,7 +124,7 @@ def find_cuda() -> Cuda:
 
 
 def architectures_there() -> tuple[str, ...] | None:
-    """The architectures of this machine's GPUs; () where the driver does not tell, None without a GPU."""
+    """Returns the architectures of this machine's GPUs; () if the driver does not report them, None without a GPU."""
     try:
         command = ["nvidia-smi", "--query-gpu=compute_cap", "--format=csv,noheader"]
         said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.split()
@@ -135,13 +135,13 @@ def architectures_there() -> tuple[str, ...] | None:
 
 
 def compiler() -> list[str]:
-    """The command of the C++ compiler: a launcher, if any, the program, and arguments."""
+    """Returns the command of the C++ compiler: an optional launcher, the program, and arguments."""
     default = "clang++" if WINDOWS else shutil.which("c++") or "g++"
     return shlex.split(os.environ.get("CXX", "")) or [default]
 
 
 def check_compiler() -> None:
-    """Say what to install where there is no C++ compiler."""
+    """Exits with advice on what to install if there is no C++ compiler."""
     for program in compiler()[: 2 if Path(compiler()[0]).name in LAUNCHERS else 1]:
         if shutil.which(program) is None:
             raise SystemExit(
@@ -152,19 +152,19 @@ def check_compiler() -> None:
 
 
 def host_compiler() -> list[str]:
-    """Flags of nvcc for the C++ compiler. It takes one program: no launcher, and arguments are passed on to it."""
+    """Returns nvcc's flags for the C++ compiler: one program without a launcher, and its arguments by -Xcompiler."""
     words = compiler()
     program, *arguments = words[1:] if Path(words[0]).name in LAUNCHERS and len(words) > 1 else words
     return ["-ccbin", program, *(part for argument in arguments for part in ("-Xcompiler", argument))]
 
 
 def openmp() -> bool:
-    """Whether operations run on torch's threads."""
+    """Returns whether the extension uses OpenMP, so that operations run on torch's threads."""
     return sys.platform.startswith("linux") and os.environ.get("VORONERF_OPENMP") != "0"
 
 
 def ninja() -> list[str]:
-    """The ninja of this environment, or the one on PATH."""
+    """Returns the command of ninja: of the Python package, else of PATH."""
     try:
         import ninja as package
 
@@ -174,15 +174,15 @@ def ninja() -> list[str]:
 
 
 def isas() -> dict[str, list[str]]:
-    """Instruction sets of the compiler's architecture and their flags."""
+    """Returns the instruction sets of the compiler's architecture and their flags."""
     target = subprocess.run([*compiler(), "-dumpmachine"], check=True, capture_output=True, text=True).stdout
     architecture = target.split("-")[0].replace("arm64", "aarch64")
-    # For processors that have none of the others; compiled faster.
+    # Runs on processors without the other instruction sets; -O2 compiles faster.
     return {"portable": ["-DVN_ISA=0", "-O2"], **ISAS.get(architecture, {})}
 
 
 def build_info(cuda: Cuda) -> str:
-    """A header that records the build."""
+    """Returns the text of a header that records the build."""
     version = subprocess.run([*compiler(), "--version"], check=True, capture_output=True, text=True).stdout
     if "clang" in version and openmp():
         raise SystemExit(
@@ -201,7 +201,7 @@ def build_info(cuda: Cuda) -> str:
 
 
 def toolkit_major(nvcc: Path) -> int:
-    """Major version of the CUDA toolkit, such as 13."""
+    """Returns the major version of the CUDA toolkit, such as 13."""
     said = subprocess.run([nvcc, "--version"], check=True, capture_output=True, text=True).stdout
     found = re.search(r"release (\d+)", said)
     if found is None:
@@ -210,32 +210,32 @@ def toolkit_major(nvcc: Path) -> int:
 
 
 def bindings() -> str:
-    """A file that includes those of csrc/bindings, whose headers take the compiler longer than themselves."""
+    """Returns the text of a file that includes all files of csrc/bindings, so that their headers compile only once."""
     files = sorted((SOURCES / "bindings").glob("*.cpp"))
     return "".join(f'#include "bindings/{file.name}"\n' for file in files)
 
 
 def ninja_file(module: Path, cuda: Cuda, folder: Path | None = None) -> str:
-    """Text of build.ninja; paths in it are quoted for ninja, commands run in the build folder or another.
+    """Returns the text of build.ninja, whose commands run in the build folder or in `folder`.
 
-    Sources are named from there, so that a copy of the tree with its objects need not be built again.
+    Paths are relative to this folder, so that a copy of the tree with its objects needs no rebuild.
     """
     sources = Path(os.path.relpath(SOURCES, folder or build_folder()))
     common = ["-std=c++17", "-O3", *([] if WINDOWS else ["-fPIC"]), "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
-    # Without OpenMP its pragmas mean nothing, nor do the numbers of threads that stand in them.
+    # Without OpenMP its pragmas are ignored, and the thread counts that they use are unused parameters.
     threads = ["-fopenmp"] if openmp() else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
     includes = [f"-I{sources.as_posix()}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
-    # After CXXFLAGS: results are defined by separate roundings (csrc/geometry/nearest_centre_math.h), fused ones are
-    # named, and NaN and infinity are distinguished from numbers. A root that may set errno is a call, which keeps its
-    # loop from becoming vectors.
+    # These flags follow CXXFLAGS: results are defined by separate roundings (csrc/geometry/nearest_centre_math.h) and
+    # explicit fused operations, with IEEE NaN and infinity. A square root that may set errno is a function call, which
+    # prevents vectorisation.
     extra = [*shlex.split(os.environ.get("CXXFLAGS", "")), "-fno-fast-math", "-ffp-contract=off", "-fno-math-errno"]
-    # libgomp is left out of the link: voronerf/ops/_core/native/__init__.py binds the module to torch's copy.
+    # The module is not linked with libgomp: voronerf/ops/_core/native/__init__.py binds it to torch's copy.
     if cuda.nvcc is not None:
-        # nvcc knows where its static runtime is. With that, the module loads on a machine without CUDA.
+        # nvcc knows the path of its static runtime, with which the module loads on a machine without CUDA.
         linker = [str(cuda.nvcc), "-shared", "-cudart=static", *host_compiler(), "-Xlinker", "--exclude-libs,ALL"]
     elif sys.platform == "darwin":
         linker = [*compiler(), "-bundle", "-undefined", "dynamic_lookup"]
-    elif WINDOWS:  # where pyconfig.h names the library of Python, and the processor's features are asked of compiler-rt
+    elif WINDOWS:  # pyconfig.h names Python's library, and compiler-rt detects the processor's features
         linker = [*compiler(), "-shared", f"-L{Path(sys.base_prefix) / 'libs'}", *compiler_rt()]
     else:
         linker = [*compiler(), "-shared", "-Wl,--exclude-libs,ALL"]
@@ -260,13 +260,13 @@ def ninja_file(module: Path, cuda: Cuda, folder: Path | None = None) -> str:
             "  description = $out",
         ]
     objects = ["bindings.cpp.o"]
-    # Without loops to optimise, of which they have none.
+    # The bindings have no loops to optimise, so -O1 is enough.
     flags_of_bindings = join(["-O1", *(["-DVN_WITH_CUDA"] if cuda.nvcc is not None else [])])
     lines += ["build bindings.cpp.o: cxx bindings.cpp", f"  flags = {flags_of_bindings}"]
     for source in sorted(SOURCES.rglob("*.c*")):
         if source.parent.name == "bindings":
             continue
-        name = source.relative_to(SOURCES).as_posix()  # files of two rooms may share theirs
+        name = source.relative_to(SOURCES).as_posix()  # files of different folders may have the same name
         path = quote((sources / name).as_posix())
         if source.name.endswith("_isa.cpp"):
             for isa, flags_of_isa in isas().items():
@@ -283,14 +283,14 @@ def ninja_file(module: Path, cuda: Cuda, folder: Path | None = None) -> str:
 
 
 def compiler_rt() -> list[str]:
-    """Clang's own library, which it leaves out where it links as MSVC does."""
+    """Returns Clang's runtime library, which Clang omits if it links like MSVC."""
     asked = [*compiler(), "--rtlib=compiler-rt", "-print-libgcc-file-name"]
     found = Path(subprocess.run(asked, check=True, capture_output=True, text=True).stdout.strip())
     return [str(found)] if found.is_file() else []
 
 
 def pybind11_headers() -> str:
-    """Those of the package, or the ones that torch brings: a machine without a network may have no others."""
+    """Returns the include folder of pybind11, or of torch, which contains the headers too (for offline builds)."""
     try:
         import pybind11
     except ImportError:
@@ -304,9 +304,9 @@ def pybind11_headers() -> str:
 
 
 def stub_of(module: Path) -> str:
-    """What a module binds, as it says itself; nothing of one for another machine, which keeps the files that are there.
+    """Returns the stub of a module, or "" if it does not run on this machine, which leaves the existing files.
 
-    In a process of its own, with some OpenMP runtime in the place of torch's.
+    A new process imports the module, with any OpenMP runtime instead of torch's.
     """
     code = f"""
 import ctypes, importlib.util, sys
@@ -324,23 +324,23 @@ print(module.stub, end="")
 
 
 def quote(path: str) -> str:
-    """A path in a build.ninja."""
+    """Quotes a path for build.ninja."""
     return path.replace("$", "$$").replace(":", "$:").replace(" ", "$ ")
 
 
 def join(flags: list[str]) -> str:
-    """Flags in a command of a build.ninja."""
+    """Joins flags to a command in build.ninja."""
     return (subprocess.list2cmdline(flags) if WINDOWS else shlex.join(flags)).replace("$", "$$")
 
 
 def write_if_changed(path: Path, text: str) -> None:
-    """Write a file, leaving its time of change alone where the text is the same."""
+    """Writes a file only if its text has changed, so that its modification time stays."""
     if not path.exists() or path.read_text() != text:
         path.write_text(text)
 
 
 if __name__ == "__main__":
-    if {"bdist_wheel", "editable_wheel", "build", "build_ext"}.intersection(sys.argv):  # before pages of copied files
+    if {"bdist_wheel", "editable_wheel", "build", "build_ext"}.intersection(sys.argv):  # before setuptools' long log
         check_compiler()
     setup(
         packages=[*find_packages(include=["voronerf", "voronerf.*"]), "voronerf.kernels"],

@@ -1,17 +1,17 @@
-"""Compile every .cu for every architecture, warnings as errors, without a GPU: ``cuda_check.py 80 90 ...``.
+"""Compiles every .cu for every architecture, warnings as errors, without a GPU: ``cuda_check.py 80 90 ...``.
 
-It does so by the rules of setup.py and into the folder of the build: a build for the same architectures takes the
-objects as they are.
+It uses the rules of setup.py and the build folder, so a build for the same architectures reuses the objects. The last
+architecture is compiled to PTX as well.
 
-Registers, spills, shared memory, and the warps that registers let a multiprocessor hold, are printed for every kernel
-and compared with the table that is kept, .ci/cuda_resources.json: a spill that is not in it is a failure, and with the
-nvcc that it was made by so are registers or shared memory above it, fewer warps, or a layer of a network that has more
-instructions or is not found (machine_code.py, where there is cuobjdump). sm_80 is an A100, sm_89 an RTX
-4090, sm_90 an H200. ``--update`` notes the given architectures in it, and forgets kernels that are no more. The last
-architecture is compiled to PTX as well. Kernels of the toolkit's own (CUB) are counted and not judged: their names
-change with its version, and this project cannot change them. It is a failure if the resources of a kernel are not
-reported for every architecture, or if there is no kernel at all.
-The last line says in one sentence what was compiled and whether it passed.
+For every kernel it prints registers, spills, shared memory and the warps that fit a multiprocessor's registers, and
+compares them with the table .ci/cuda_resources.json. A spill that is not in the table is a failure. With the table's
+version of nvcc, so are more registers, more shared memory, fewer warps, and a network's layer that has more
+instructions or is not found (machine_code.py, if cuobjdump is installed). sm_80 is an A100, sm_89 an RTX 4090, sm_90 an
+H200. It is a failure too if a kernel's resources are not reported for every architecture, or if there is no kernel.
+Kernels of the toolkit (CUB) are only counted: their names change with its version.
+
+``--update`` writes the named architectures to the table and removes kernels that no longer exist. The last line of the
+output is one sentence: what was compiled, and whether it passed.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ CODE = runpy.run_path(str(Path(__file__).with_name("machine_code.py")))
 OUT: Path = BUILD["build_folder"]()
 TABLE = ROOT / ".ci" / "cuda_resources.json"
 REGISTERS = 65536
-"""Of a multiprocessor."""
+"""The registers of a multiprocessor."""
 MOST_WARPS = {"sm_75": 32, "sm_86": 48, "sm_89": 48, "sm_120": 48}
-"""Of a multiprocessor; 64 elsewhere."""
+"""The maximum number of warps on a multiprocessor; 64 for other architectures."""
 NETWORKS = "network/cuda/program_cuda.cu.o"
-"""Whose kernels make layers."""
+"""The object file whose kernels contain network layers."""
 FLAGS = "-Werror all-warnings -Xcompiler -Wall,-Wextra,-Werror -Xptxas -v"
 OBJECT = re.compile(r"^\[\d+/\d+\] (?=\S+\.cu\.o$)", re.MULTILINE)
-"""Of ninja, before what a compilation says."""
+"""The line of ninja before a compilation's output."""
 KERNEL = re.compile(
     r"Compiling entry function '(?P<name>\w+)' for '(?P<arch>\w+)'.*?"
     r"(?P<stores>\d+) bytes spill stores, (?P<loads>\d+) bytes spill loads.*?"
@@ -48,7 +48,7 @@ KERNEL = re.compile(
 
 
 def main(architectures: list[str]) -> int:
-    """Compile, print, compare, and return the exit status."""
+    """Compiles, prints and compares; returns the exit status."""
     update = "--update" in architectures
     architectures = [architecture for architecture in architectures if architecture != "--update"]
     nvcc = shutil.which("nvcc") or shutil.which("nvcc", path="/usr/local/cuda/bin")
@@ -59,7 +59,7 @@ def main(architectures: list[str]) -> int:
     OUT.mkdir(parents=True, exist_ok=True)
     (OUT / "cuda.ninja").write_text(BUILD["ninja_file"](Path("_C.so"), cuda, OUT))
     objects = [f"{path.relative_to(ROOT / 'csrc').as_posix()}.o" for path in sorted((ROOT / "csrc").rglob("*.cu"))]
-    for name in objects:  # what is up to date says nothing
+    for name in objects:  # an up-to-date object prints nothing
         (OUT / name).unlink(missing_ok=True)
     command = [*BUILD["ninja"](), "-C", str(OUT), "-f", "cuda.ninja", "-k", "0", *objects]
     environment = {**os.environ, "NVCC_APPEND_FLAGS": FLAGS}
@@ -100,7 +100,7 @@ def main(architectures: list[str]) -> int:
     version = nvcc_version(nvcc)
     spilling = sum(row["spilled_bytes"] > 0 for rows in kernels.values() for row in rows.values())
     targets = f"{', '.join(f'sm_{arch}' for arch in architectures)} and PTX of {architectures[-1]}"
-    # What did not compile lacks architectures for that reason.
+    # A file that failed to compile lacks architectures anyway.
     broken = {Path(name).stem for name in failed}
     compiled = {kernel: found for kernel, found in kernels.items() if kernel.split(":")[0] not in broken}
     lacking = [
@@ -133,7 +133,7 @@ Kernels = dict[str, dict[str, dict[str, int]]]
 
 
 def regressions(version: str, kernels: Kernels) -> list[str]:
-    """What is worse than in the table, a line each; kernels and architectures that are not in it may not spill."""
+    """Returns a line for each value worse than in the table; kernels and architectures missing there must not spill."""
     kept = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": "", "kernels": {}}
     compared = ("spilled_bytes", *(("registers", "shared_bytes", "layer") if kept["nvcc"] == version else ()))
     counted = any("layer" in row for rows in kernels.values() for row in rows.values())
@@ -152,7 +152,7 @@ def regressions(version: str, kernels: Kernels) -> list[str]:
 
 
 def merged(version: str, kernels: Kernels) -> Kernels:
-    """What was found, and what the table has, by the same nvcc, of other architectures for these kernels."""
+    """Returns the new rows, and the table's rows of other architectures for these kernels by the same nvcc."""
     table = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": ""}
     kept = table["kernels"] if table["nvcc"] == version else {}
     return {
@@ -162,7 +162,7 @@ def merged(version: str, kernels: Kernels) -> Kernels:
 
 
 def number(architecture: str) -> int:
-    """Of "sm_90" 90."""
+    """Returns 90 for "sm_90"."""
     return int(architecture.removeprefix("sm_"))
 
 
@@ -170,7 +170,7 @@ COLUMNS = ("registers", "spilled_bytes", "shared_bytes", "warps", "layer")
 
 
 def as_text(version: str, kernels: Kernels) -> str:
-    """The table as JSON, a line for each kernel."""
+    """Returns the table as JSON, one line for each kernel."""
     rows = {
         kernel: {
             architecture: [row[key] for key in COLUMNS if key in row] for architecture, row in by_architecture.items()
@@ -182,17 +182,17 @@ def as_text(version: str, kernels: Kernels) -> str:
 
 
 def unpack(rows: dict[str, list[int]]) -> dict[str, dict[str, int]]:
-    """Rows of one kernel in the table, by architecture."""
+    """Returns a kernel's rows in the table, by architecture."""
     return {architecture: dict(zip(COLUMNS, row)) for architecture, row in rows.items()}
 
 
 def warps(registers: int, architecture: str) -> int:
-    """Warps of which the registers fit a multiprocessor."""
+    """Returns the number of warps whose registers fit a multiprocessor."""
     return min(MOST_WARPS.get(architecture, 64), REGISTERS // (32 * -(-max(registers, 1) // 8) * 8))
 
 
 def nvcc_version(nvcc: str) -> str:
-    """Such as "V13.0.88"."""
+    """Returns nvcc's version, such as "V13.0.88"."""
     found = re.search(
         r"V[\d.]+", subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True).stdout
     )
@@ -200,7 +200,7 @@ def nvcc_version(nvcc: str) -> str:
 
 
 def demangled(name: str) -> str:
-    """A kernel's name and template arguments, as far as c++filt is there to tell."""
+    """Returns a kernel's demangled name with template arguments, or `name` if c++filt is missing."""
     if shutil.which("c++filt") is None:
         return name
     full = subprocess.run(["c++filt", name], capture_output=True, text=True, check=True).stdout.strip()
@@ -208,7 +208,7 @@ def demangled(name: str) -> str:
 
 
 def span(values: list[int]) -> str:
-    """One number, or the range of several."""
+    """Returns one number as text, or the range of several."""
     return str(values[0]) if min(values) == max(values) else f"{min(values)}-{max(values)}"
 
 

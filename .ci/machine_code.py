@@ -1,6 +1,6 @@
-"""Instructions of a layer of a network in machine code, without a GPU: those on the way around its products.
+"""Counts the instructions of a network's layer in machine code, without a GPU: the shortest loop through its products.
 
-``layers(object, "90")`` reads a compiled file by cuobjdump of the toolkit or of the package nvidia-cuda-cuobjdump.
+``layers(object, "90")`` reads an object file with cuobjdump, of the toolkit or of the package nvidia-cuda-cuobjdump.
 """
 
 from __future__ import annotations
@@ -14,17 +14,16 @@ from collections import Counter
 from pathlib import Path
 
 PRODUCTS = {"HMMA": 32, "FFMA": 128}
-"""Instructions that multiply, matrices of a warp or else its floats, and how many a layer's block has: of fewer, other
-code may have as many."""
+"""The multiply instructions, for a warp's matrices or for its floats, and the minimum number in a layer's block."""
 LINE = re.compile(r"^\s+/\*([0-9a-f]{4,})\*/\s+(.*?);")
 BRANCH = re.compile(r"^(?P<when>@!?U?P\d+ )?(?P<what>[A-Z][A-Z0-9]*)(?P<kind>\S*)(?P<rest>.*)$")
 
 Code = list[tuple[int, str]]
-"""Addresses and instructions."""
+"""The addresses and instructions of a kernel."""
 
 
 def tools() -> str | None:
-    """The folders that cuobjdump and nvdisasm are in, as a PATH; None if one is missing."""
+    """Returns a PATH that contains cuobjdump and nvdisasm; None if one of them is missing."""
     folders = [str(folder) for folder in Path(sysconfig.get_path("purelib")).glob("nvidia/*/bin")]
     path = ":".join([*folders, *filter(None, [str(Path(found).parent) if (found := shutil.which("nvcc")) else None])])
     path = f"{path}:/usr/local/cuda/bin:/usr/local/bin:/usr/bin:/bin"
@@ -32,7 +31,7 @@ def tools() -> str | None:
 
 
 def layers(compiled: Path, architecture: str, path: str) -> dict[str, Counter[str]]:
-    """The instructions of a layer by their kinds, for each kernel that multiplies, by its mangled name."""
+    """Returns a layer's instruction counts by kind, for each kernel with products, by mangled name."""
     command = [shutil.which("cuobjdump", path=path) or "cuobjdump", "-arch", f"sm_{architecture}", "-sass", compiled]
     said = subprocess.run(command, capture_output=True, text=True, check=True, env={"PATH": path}).stdout
     kernels = dict[str, Code]()
@@ -45,10 +44,10 @@ def layers(compiled: Path, architecture: str, path: str) -> dict[str, Counter[st
 
 
 def layer(code: Code) -> Counter[str]:
-    """The instructions of the shortest way around through the block with the most products, by their kinds.
+    """Counts, by kind, the instructions of the shortest cycle through the basic block with the most products.
 
-    In a chain of layers that is one of them with all that happens in between; where a block is a loop itself, of the
-    depth of a product, once through it. Empty if no block multiplies much.
+    In a chain of layers this cycle is one layer with all code in between. A block that is itself a loop over a product
+    counts once. The result is empty if no block has enough products.
     """
     blocks, ways = _blocks(code)
     kinds = [Counter(kind(text) for _, text in block) for block in blocks]
@@ -72,15 +71,15 @@ def layer(code: Code) -> Counter[str]:
 
 
 def kind(instruction: str) -> str:
-    """Such as "LDG" of "@P0 LDG.E.128.CONSTANT R4, desc[UR4][R2.64]"."""
+    """Returns an instruction's kind, such as "LDG" for "@P0 LDG.E.128.CONSTANT R4, desc[UR4][R2.64]"."""
     match = BRANCH.match(instruction)
     return match["what"] if match else instruction
 
 
 def _blocks(code: Code) -> tuple[list[Code], list[set[int]]]:
-    """Instructions that are run one behind the other, and the numbers of the blocks that may follow on each."""
+    """Returns the basic blocks, and for each block the numbers of the blocks that may follow it."""
     places = {address: place for place, (address, _) in enumerate(code)}
-    jumps = dict[int, tuple[int | None, bool]]()  # from a place, where to, and whether the next one may follow
+    jumps = dict[int, tuple[int | None, bool]]()  # place -> (target, whether the next instruction may follow)
     for place, (_, text) in enumerate(code):
         match = BRANCH.match(text)
         what = match["what"] if match else ""

@@ -1,8 +1,8 @@
-"""Compiles every Warp kernel to machine code for GPUs, without one: ``warp_check.py [ARCHITECTURE ...] [--half]``.
+"""Compiles every Warp kernel to GPU machine code, without a GPU: ``warp_check.py [ARCHITECTURE ...] [--half]``.
 
-Warp brings its own compiler, so this needs neither nvcc nor a driver. Printed are the registers of a thread, its stack
-(spilled values) and the shared memory of a block for each kernel, the most of all architectures. Kernels for 16-bit
-weights (``--half``) take about a minute each, since products for tensor cores are compiled with them.
+Warp contains a compiler, so this needs neither nvcc nor a driver. For each kernel it prints the registers of a thread,
+its stack (spilled values) and the shared memory of a block, the maximum over the architectures. Kernels for 16-bit
+weights (``--half``) take about a minute each, because they contain products for tensor cores.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ REGISTERS, FRAME = 0x2F, 0x11  # attributes of a kernel in the section .nv.info 
 
 
 def resources(cubin: bytes) -> dict[str, tuple[int, int]]:
-    """Registers of a thread and bytes of its stack, for each kernel of a cubin (ELF of 64 bits)."""
+    """Returns the registers of a thread and the bytes of its stack, for attributes kernel of a cubin (64-bit ELF)."""
     start, count, names_at = *struct.unpack_from("<Q", cubin, 0x28), *struct.unpack_from("<HH", cubin, 0x3C)
     rows = [struct.unpack_from("<IIQQQQIIQQ", cubin, start + 64 * i) for i in range(count)]
     text = lambda table, at: cubin[(begin := rows[table][4] + at) : cubin.index(b"\0", begin)].decode()  # noqa: E731
@@ -44,11 +44,11 @@ def resources(cubin: bytes) -> dict[str, tuple[int, int]]:
             name = text(symbols[6], struct.unpack_from("<I", cubin, symbols[4] + 24 * symbol)[0])
             found.setdefault(name, {})[attribute] = value
         at += 4 + (size if form == 4 else 0)
-    return {name: (each.get(REGISTERS, 0), each.get(FRAME, 0)) for name, each in found.items() if "forward" in name}
+    return {name: (part.get(REGISTERS, 0), part.get(FRAME, 0)) for name, part in found.items() if "forward" in name}
 
 
 def main(arguments: list[str]) -> int:
-    """Compiles for the architectures that are named, or all, and prints the table."""
+    """Compiles for the named architectures, or all of them, and prints the table."""
     half = "--half" in arguments
     chosen = [int(argument) for argument in arguments if argument != "--half"] or list(ARCHITECTURES)
     files = Path(kernels.__path__[0]).glob("[a-z]*.py")
@@ -61,9 +61,9 @@ def main(arguments: list[str]) -> int:
         for module in modules:
             module.options["block_dim"] = THREADS if "kernels__locals" in module.name else 256
             for architecture in chosen:
-                begun = time.perf_counter()
+                start = time.perf_counter()
                 (cubin,) = wp.compile_aot_module(module, arch=architecture, module_dir=folder, use_ptx=False)
-                seconds[architecture] += round(time.perf_counter() - begun, 1)
+                seconds[architecture] += round(time.perf_counter() - start, 1)
                 shared = json.loads(next(Path(folder).glob(f"{cubin.name.split('.sm')[0]}*.meta")).read_text())
                 for name, (registers, stack) in resources(cubin.read_bytes()).items():
                     short = "_".join(part for part in name.split("_")[:-4] if part not in ("", "kernels", "locals"))
@@ -78,7 +78,7 @@ def main(arguments: list[str]) -> int:
 
 
 def imported(name: str) -> bool:
-    """Whether a file has kernels, after its import."""
+    """Imports a kernel file and returns whether it has kernels."""
     importlib.import_module(f"voronerf.kernels.{name}")
     return bool(wp.get_module(f"voronerf.kernels.{name}").kernels)
 

@@ -1,7 +1,7 @@
-"""krrish94/nerf-pytorch: `FlexibleNeRFModel.forward(x)`, encoded outside: [..., 39 + 27] -> [..., 4].
+"""The network of krrish94/nerf-pytorch: `FlexibleNeRFModel.forward(x)` maps encoded inputs [..., 66] to [..., 4].
 
-It takes any leading shape, so rays and samples need not be flattened: what goes in as [rays, samples, 66] comes out as
-[rays, samples, 4].
+The inputs have 39 columns of the position and 27 of the direction. Any leading shape works, so rays and samples need
+not be flattened: [rays, samples, 66] becomes [rays, samples, 4].
 """
 
 import torch
@@ -11,13 +11,13 @@ from voronerf import VoronoiRouter
 
 
 def encode(x: Tensor, octaves: int) -> Tensor:
-    """[..., d] -> [..., d (1 + 2 octaves)], x itself first."""
+    """Returns the encoding [..., d (1 + 2 octaves)] of x [..., d]; x itself comes first."""
     waves = [wave(2**i * x) for i in range(octaves) for wave in (torch.sin, torch.cos)]
     return torch.cat([x, *waves], dim=-1)
 
 
 class FlexibleNeRFModel(nn.Module):
-    """Stands for `nerf.models.FlexibleNeRFModel`, with its first two layers that no activation parts."""
+    """A stand-in for `nerf.models.FlexibleNeRFModel`, which has no activation between its first two layers."""
 
     def __init__(
         self, num_layers=4, hidden_size=128, skip_connect_every=4, num_encoding_fn_xyz=6, num_encoding_fn_dir=4

@@ -1,4 +1,4 @@
-"""An image as the weights of a network of each cell (COIN's SIREN), beside one network: dB after equal time.
+"""An image in the weights of one SIREN per cell (as in COIN), or in one network: dB after equal time.
 
 python examples/image.py PHOTO.jpg --seconds 40             # 16 cells of width 32
 python examples/image.py PHOTO.jpg --seconds 40 --one       # one network of width 128
@@ -20,7 +20,7 @@ from voronerf import VoronoiDiagram, VoronoiRouter
 
 
 class Siren(nn.Module):
-    """Layers of sines, 2 coordinates -> 3 colours (Sitzmann et al. 2020), as in EmilienDupont/coin."""
+    """A SIREN from 2 coordinates to 3 colours (Sitzmann et al. 2020), as in EmilienDupont/coin."""
 
     def __init__(self, width: int, depth: int = 6, w0: float = 30.0) -> None:
         super().__init__()
@@ -43,26 +43,26 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0, help="of processor time")
     parser.add_argument("--one", action="store_true", help="one network of width 128")
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    torch.manual_seed(given.seed)
-    if given.image:
-        colours = torch.from_numpy(np.array(Image.open(given.image).convert("RGB"))) / 255
+    options = parser.parse_args()
+    torch.manual_seed(options.seed)
+    if options.image:
+        colours = torch.from_numpy(np.array(Image.open(options.image).convert("RGB"))) / 255
     else:
         rows = torch.linspace(0, 1, 256)
         colours = torch.stack([rows[:, None] * rows, (40 * rows.outer(rows)).sin().abs(), rows.outer(1 - rows)], -1)
     h, w, _ = colours.shape
-    axes = torch.linspace(-1, 1, h), torch.linspace(-w / h, w / h, w)  # square pixels: cells are round
+    axes = torch.linspace(-1, 1, h), torch.linspace(-w / h, w / h, w)  # square pixels, so cells are round
     x, y = torch.cartesian_prod(*axes), colours.reshape(-1, 3)
 
-    # the four lines of cells
+    # The four lines that add cells.
     net: nn.Module = Siren(128)
-    if not given.one:
+    if not options.one:
         diagram = VoronoiDiagram.from_points(x, 16)
         net = VoronoiRouter(Siren(32), diagram, coords="first2", fuse=True)
 
     optimizer = torch.optim.Adam(net.parameters(), lr=5e-4)
     began, steps = time.process_time(), 0
-    while time.process_time() - began < given.seconds:
+    while time.process_time() - began < options.seconds:
         batch = torch.randint(len(x), (16384,))
         loss = (net(x[batch]) - y[batch]).square().mean()
         optimizer.zero_grad()
@@ -71,7 +71,7 @@ def main() -> None:
         steps += 1
     with torch.no_grad():
         error = torch.cat([(net(a).clamp(0, 1) - b).square() for a, b in zip(x.split(65536), y.split(65536))]).mean()
-    name = "one network" if given.one else "16 cells"
+    name = "one network" if options.one else "16 cells"
     print(f"{name}: {-10 * error.log10():.2f} dB of {len(x) / 1e6:.2f} megapixels after {steps} steps")
 
 

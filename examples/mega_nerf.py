@@ -1,7 +1,7 @@
-"""cmusatyalab/mega-nerf: k separate modules, one per centroid, become one router with the same outputs.
+"""The networks of cmusatyalab/mega-nerf: k modules, one per centroid, become one router with the same outputs.
 
-`NeRF.forward(x, sigma_only=False, sigma_noise=None)` takes [m, 7]: position, direction and the image's number,
-for an appearance vector. `MegaNeRF` loops over its sub-modules with a mask for each; the router runs all at once.
+`NeRF.forward(x, sigma_only=False, sigma_noise=None)` takes [m, 7]: position, direction and the image's index, which
+selects an appearance vector. `MegaNeRF` loops over its sub-modules with a mask for each; the router runs all at once.
 """
 
 import copy
@@ -14,13 +14,13 @@ from voronerf import VoronoiRouter
 
 
 def encode(x: Tensor, octaves: int) -> Tensor:
-    """[..., d] -> [..., d (1 + 2 octaves)], x itself first."""
+    """Returns the encoding [..., d (1 + 2 octaves)] of x [..., d]; x itself comes first."""
     waves = [wave(2**i * x) for i in range(octaves) for wave in (torch.sin, torch.cos)]
     return torch.cat([x, *waves], dim=-1)
 
 
 class NeRF(nn.Module):
-    """Stands for `mega_nerf.models.nerf.NeRF`."""
+    """A stand-in for `mega_nerf.models.nerf.NeRF`."""
 
     def __init__(self, layers=8, skip_layers=(4,), layer_dim=256, appearance_dim=48, appearance_count=10, affine=False):
         super().__init__()
@@ -62,7 +62,7 @@ class NeRF(nn.Module):
 
 
 class MegaNeRF(nn.Module):
-    """Stands for `mega_nerf.models.mega_nerf.MegaNeRF` with `boundary_margin=1`: a mask and a module per centroid."""
+    """A stand-in for `mega_nerf.models.mega_nerf.MegaNeRF` with `boundary_margin=1`: a mask and module per centroid."""
 
     def __init__(self, sub_modules: list[nn.Module], centroids: Tensor) -> None:
         super().__init__()
@@ -85,18 +85,18 @@ def main() -> None:
     noise = torch.randn(3000, 1)
     centroids = torch.rand(8, 3) * 2 - 1
 
-    # before: sub-modules that were trained one by one, in a container
+    # Before: a container of sub-modules that were trained one by one.
     sub_modules = [NeRF(layer_dim=32) for _ in range(8)]
     mega = MegaNeRF(sub_modules, centroids)
     out, sigma = mega(x, sigma_noise=noise), mega(x[:, :3], sigma_only=True)
 
-    # after: the same modules in one router
+    # After: the same modules in one router.
     router = VoronoiRouter.from_modules(sub_modules, centroids, coords="first3")
     routed, routed_sigma = router(x, sigma_noise=noise), router(x[:, :3], sigma_only=True)
     torch.testing.assert_close(routed, out)
     torch.testing.assert_close(routed_sigma, sigma)
 
-    # and back: a sub-module as it was, a checkpoint of one loaded into its cell
+    # And back: extracts a sub-module from its cell, and loads a retrained sub-module into its cell.
     for name, value in router.cell(3).state_dict().items():
         assert torch.equal(value, sub_modules[3].state_dict()[name])
     retrained = copy.deepcopy(sub_modules[3])

@@ -1,7 +1,8 @@
-"""hjxwhy/mipnerf_pl: `MLP.forward(x, view_direction=None)`: [rays, samples, 96] and [rays, 27] -> (rgb, density).
+"""The network of hjxwhy/mipnerf_pl: `MLP.forward(x, view_direction=None)` returns (rgb, density).
 
-An integrated encoding holds no position: the frustums' means are given at the call as `coords=`. Without it the router
-refuses, and says so. The view directions have a row for each ray, which `per_ray=` names.
+Its inputs are [rays, samples, 96] and [rays, 27]. An integrated encoding holds no position, so each call passes the
+means of the frustums as `coords=`; without them the router raises an error. The view directions have one row for each
+ray, so `per_ray=` names their argument.
 """
 
 import torch
@@ -12,20 +13,20 @@ from voronerf import VoronoiRouter
 
 
 def encode(x: Tensor, octaves: int) -> Tensor:
-    """[..., d] -> [..., d (1 + 2 octaves)], x itself first."""
+    """Returns the encoding [..., d (1 + 2 octaves)] of x [..., d]; x itself comes first."""
     waves = [wave(2**i * x) for i in range(octaves) for wave in (torch.sin, torch.cos)]
     return torch.cat([x, *waves], dim=-1)
 
 
 def integrated_encode(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
-    """Stands for `models.mip.integrated_pos_enc`: [..., 3] twice -> [..., 6 octaves], without the means themselves."""
+    """A stand-in for `models.mip.integrated_pos_enc`: means and variances [..., 3] to an encoding [..., 6 octaves]."""
     scaled = torch.cat([2**i * means for i in range(octaves)], dim=-1)
     fading = torch.exp(-0.5 * torch.cat([4**i * variances for i in range(octaves)], dim=-1))
     return torch.cat([torch.sin(scaled) * fading, torch.cos(scaled) * fading], dim=-1)
 
 
 class MLP(nn.Module):
-    """Stands for `models.mip_nerf.MLP`."""
+    """A stand-in for `models.mip_nerf.MLP`."""
 
     def __init__(self, net_depth=8, net_width=256, net_width_condition=128, skip_index=4, xyz_dim=96, view_dim=27):
         super().__init__()

@@ -1,6 +1,7 @@
-"""kwea123/nerf_pl: `NeRF.forward(x, sigma_only=False)`: [m, 63 + 27] -> [m, 4]; [m, 63] -> [m, 1] for densities alone.
+"""The network of kwea123/nerf_pl: `NeRF.forward(x, sigma_only=False)` maps [m, 63 + 27] to [m, 4].
 
-Layers are stored and found by name; the flag changes both what goes in and what is run. It is passed on as it is.
+With `sigma_only`, it maps [m, 63] to densities [m, 1]. So the flag changes both the input and the layers that run; the
+router passes it on. The layers are attributes that are looked up by name.
 """
 
 import torch
@@ -10,13 +11,13 @@ from voronerf import VoronoiRouter
 
 
 def encode(x: Tensor, octaves: int) -> Tensor:
-    """[..., d] -> [..., d (1 + 2 octaves)], x itself first."""
+    """Returns the encoding [..., d (1 + 2 octaves)] of x [..., d]; x itself comes first."""
     waves = [wave(2**i * x) for i in range(octaves) for wave in (torch.sin, torch.cos)]
     return torch.cat([x, *waves], dim=-1)
 
 
 class NeRF(nn.Module):
-    """Stands for `models.nerf.NeRF`."""
+    """A stand-in for `models.nerf.NeRF`."""
 
     def __init__(self, D=8, W=256, in_channels_xyz=63, in_channels_dir=27, skips=(4,)):
         super().__init__()

@@ -1,6 +1,6 @@
-"""yenchenlin/nerf-pytorch: `NeRF.forward(x)`, encoded outside: [m, 63 + 27] -> [m, 4], raw colour and density.
+"""The network of yenchenlin/nerf-pytorch: `NeRF.forward(x)` maps encoded inputs [m, 63 + 27] to raw outputs [m, 4].
 
-The encoding keeps the raw position in front, so `coords="first3"` says where it is.
+The first three columns of the encoding are the raw position, so the router takes `coords="first3"`.
 """
 
 import torch
@@ -11,13 +11,13 @@ from voronerf import VoronoiRouter
 
 
 def encode(x: Tensor, octaves: int) -> Tensor:
-    """[..., d] -> [..., d (1 + 2 octaves)], x itself first."""
+    """Returns the encoding [..., d (1 + 2 octaves)] of x [..., d]; x itself comes first."""
     waves = [wave(2**i * x) for i in range(octaves) for wave in (torch.sin, torch.cos)]
     return torch.cat([x, *waves], dim=-1)
 
 
 class NeRF(nn.Module):
-    """Stands for `run_nerf_helpers.NeRF`."""
+    """A stand-in for `run_nerf_helpers.NeRF`."""
 
     def __init__(self, D=8, W=256, input_ch=3, input_ch_views=3, output_ch=4, skips=(4,), use_viewdirs=False):
         super().__init__()
@@ -50,7 +50,7 @@ class NeRF(nn.Module):
 
 
 def run_network(inputs: Tensor, viewdirs: Tensor, fn: nn.Module, netchunk: int = 1024) -> Tensor:
-    """Stands for `run_nerf.run_network`: encodes [rays, samples, 3], calls the network in chunks; not changed."""
+    """Encodes points [rays, samples, 3] and calls the network in chunks, like `run_nerf.run_network`."""
     flat = inputs.reshape(-1, 3)
     views = viewdirs[:, None].expand(inputs.shape).reshape(-1, 3)
     embedded = torch.cat([encode(flat, 10), encode(views, 4)], -1)
@@ -68,7 +68,7 @@ def main() -> None:
     model = NeRF(D=8, W=64, input_ch=63, input_ch_views=27, use_viewdirs=True)
     raw = run_network(points, viewdirs, model)
 
-    # after: 16 copies of the model, one a cell; all that calls `model` stays as it is
+    # After: 16 copies of the model, one per cell; code that calls `model` does not change.
     router = VoronoiRouter(model, centres, coords="first3", fuse=True)
     routed = run_network(points, viewdirs, router)
     torch.testing.assert_close(routed, raw)
@@ -80,7 +80,7 @@ def main() -> None:
         loss.backward()
         optimizer.step()
 
-    # a split, and a run that resumes after it: build, make the optimiser, load both states
+    # A split, and a run that resumes after it: build the router and its optimiser, and load both states.
     flat = points.reshape(-1, 3)
     router.subdivide(4, optimizer=optimizer, points=flat, weights=torch.ones(len(flat)), min_samples=100)
     resumed = VoronoiRouter(model, centres[:1], coords="first3", fuse=True)

@@ -1,12 +1,12 @@
-"""A training loop in the style of nerf-pytorch, and the three lines that give it Voronoi cells.
+"""A training loop in the style of nerf-pytorch, with three lines that add Voronoi cells.
 
     python examples/nerf_pytorch_style.py SCENE --downscale 4 --seconds 480                          # width 256
     python examples/nerf_pytorch_style.py SCENE --downscale 4 --seconds 480 --width 64
     python examples/nerf_pytorch_style.py SCENE --downscale 4 --seconds 480 --width 64 --voronoi
 
-`--voronoi` takes the lines marked `changed`; all else is the same with and without it, learning rate and schedule too.
-The seconds are of training, evaluation comes on top. The network is encoded outside, samples are stratified, and the
-compositing is plain PyTorch, as in the original; density is a softplus (mip-NeRF) for the sake of short runs.
+`--voronoi` enables the lines marked `changed`; all other lines, the learning rate and its schedule are the same. The
+seconds count training only, not evaluation. As in the original, encoding is outside the network, samples are
+stratified, and compositing is plain PyTorch. The density is a softplus (mip-NeRF), which suits short runs.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from voronerf.app.scenes import load_scene
 
 
 def render(model: nn.Module, rays: Tensor, near: float, far: float, samples: int, jitter: bool) -> tuple[Tensor, ...]:
-    """Rays [r, 6] over white -> colours [r, 3], points [r, s, 3] and their weights [r, s]."""
+    """Renders rays [r, 6] over white; returns colours [r, 3], points [r, s, 3] and their weights [r, s]."""
     origins, directions = rays[:, :3], rays[:, 3:]
     strata = torch.arange(samples) + (torch.rand(len(rays), samples) if jitter else 0.5)
     depths = (near + (far - near) / samples * strata).expand(len(rays), samples)

@@ -1,7 +1,7 @@
-"""nerfacc's examples: `VanillaNeRFRadianceField.forward(x, condition=None)` and `query_density(x)`.
+"""The field of nerfacc's examples: `VanillaNeRFRadianceField.forward(x, condition=None)` and `query_density(x)`.
 
-Raw positions go in, [n, 3] from the packed sampler or [rays, samples, 3]; the encoding is inside. The estimator calls
-`query_density`, so it is routed as well. The condition has a row for each sample or for each ray.
+The inputs are raw positions, [n, 3] from the packed sampler or [rays, samples, 3]; the field encodes them. The
+estimator calls `query_density`, so it is routed as well. The condition has a row for each sample or for each ray.
 """
 
 import torch
@@ -12,7 +12,7 @@ from voronerf import VoronoiRouter
 
 
 class SinusoidalEncoder(nn.Module):
-    """Stands for nerfacc's encoder: no parameters, one buffer."""
+    """A stand-in for nerfacc's encoder, which has no parameters and one buffer."""
 
     def __init__(self, x_dim: int, max_deg: int) -> None:
         super().__init__()
@@ -25,7 +25,7 @@ class SinusoidalEncoder(nn.Module):
 
 
 class MLP(nn.Module):
-    """Stands for nerfacc's MLP: hidden layers, a skip connection, an output layer or none."""
+    """A stand-in for nerfacc's MLP: hidden layers, a skip connection, an optional output layer."""
 
     def __init__(self, input_dim: int, output_dim: int | None, depth: int, width: int, skip: int | None = None) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class MLP(nn.Module):
 
 
 class VanillaNeRFRadianceField(nn.Module):
-    """Stands for `radiance_fields.mlp.VanillaNeRFRadianceField`."""
+    """A stand-in for `radiance_fields.mlp.VanillaNeRFRadianceField`."""
 
     def __init__(self, net_depth=8, net_width=256, skip_layer=4, net_width_condition=128) -> None:
         super().__init__()

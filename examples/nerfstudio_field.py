@@ -1,7 +1,7 @@
-"""nerfstudio: `Field.forward(ray_samples)` -> a dict keyed by an Enum; also `get_density`, `get_outputs`, `density_fn`.
+"""A field of nerfstudio: `Field.forward(ray_samples)` returns a dictionary whose keys are an Enum.
 
-Positions stand inside `RaySamples`, so a callable on the arguments says where. Models call `get_density` and
-`get_outputs` by themselves as well, and occupancy grids call `density_fn(positions)`: all are routed.
+`RaySamples` holds the positions, so a function gets them from the arguments. Models also call `get_density` and
+`get_outputs` directly, and occupancy grids call `density_fn(positions)`. All of these methods are routed.
 """
 
 from collections.abc import Callable
@@ -17,14 +17,14 @@ from voronerf import VoronoiRouter
 
 
 class FieldHeadNames(Enum):
-    """Stands for `field_components.field_heads.FieldHeadNames`."""
+    """A stand-in for `field_components.field_heads.FieldHeadNames`."""
 
     RGB = "rgb"
     DENSITY = "density"
 
 
 class TensorDataclass:
-    """Stands for `utils.tensor_dataclass.TensorDataclass`: tensors broadcast to one batch shape."""
+    """A stand-in for `utils.tensor_dataclass.TensorDataclass`, whose tensors are broadcast to one batch shape."""
 
     def __post_init__(self) -> None:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -49,7 +49,7 @@ class TensorDataclass:
         return self.reshape((-1,))
 
     def mapped(self, function: Callable[[Any], Any]) -> "TensorDataclass":
-        """The same with every tensor changed, those of nested objects and dicts as well."""
+        """Returns a copy with `function` applied to every tensor, also in nested objects and dictionaries."""
 
         def change(value: Any) -> Any:
             if isinstance(value, dict):
@@ -61,7 +61,7 @@ class TensorDataclass:
 
 @dataclass
 class Frustums(TensorDataclass):
-    """Stands for `cameras.rays.Frustums`."""
+    """A stand-in for `cameras.rays.Frustums`."""
 
     origins: Tensor
     directions: Tensor
@@ -76,7 +76,7 @@ class Frustums(TensorDataclass):
 
 @dataclass
 class RaySamples(TensorDataclass):
-    """Stands for `cameras.rays.RaySamples`."""
+    """A stand-in for `cameras.rays.RaySamples`."""
 
     frustums: Frustums
     camera_indices: Tensor | None = None
@@ -86,13 +86,13 @@ class RaySamples(TensorDataclass):
 
 
 def encode(x: Tensor, octaves: int) -> Tensor:
-    """[..., d] -> [..., d (1 + 2 octaves)], x itself first."""
+    """Returns the encoding [..., d (1 + 2 octaves)] of x [..., d]; x itself comes first."""
     waves = [wave(2**i * x) for i in range(octaves) for wave in (torch.sin, torch.cos)]
     return torch.cat([x, *waves], dim=-1)
 
 
 class AppearanceField(nn.Module):
-    """Stands for a field of nerfstudio: scene box, base and head network, one appearance vector an image."""
+    """A stand-in for a field of nerfstudio: scene box, base and head network, an appearance vector per image."""
 
     def __init__(self, aabb: Tensor, num_images: int, hidden_dim: int = 64, geo_feat_dim: int = 15) -> None:
         super().__init__()
@@ -141,12 +141,12 @@ class AppearanceField(nn.Module):
 
 
 def positions_of(argument: RaySamples | Tensor, *_: object, **__: object) -> Tensor:
-    """Where the router finds positions: in the ray samples, or in the tensor that `density_fn` takes."""
+    """Returns the positions of the ray samples, or the tensor argument of `density_fn`."""
     return argument if isinstance(argument, Tensor) else argument.frustums.get_positions()
 
 
 def ray_samples_of(rays: int, samples: int) -> RaySamples:
-    """Random ray samples as a sampler of nerfstudio makes them, broadcast from rays to samples."""
+    """Returns random ray samples like a sampler of nerfstudio, broadcast from rays to samples."""
     edges = torch.linspace(0.5, 2.5, samples + 1)[:, None].expand(rays, samples + 1, 1)
     frustums = Frustums(
         origins=torch.rand(rays, 1, 3) - 0.5,

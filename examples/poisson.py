@@ -1,8 +1,8 @@
-"""A differential equation by one network per cell: -div grad u = f in the unit square, u = 0 at its border.
+"""A Poisson equation solved by one network per cell: -div grad u = f in the unit square, u = 0 at the border.
 
-Cells are not continuous, so the equation and the border alone leave each cell a solution of its own, which has a small
-loss and is wrong. What joins them are conditions on faces, as in XPINNs (Jagtap and Karniadakis 2020): values, and
-derivatives across the face, are the same on both sides. ``--alone`` leaves them out.
+The networks of two cells need not agree at their face. With the equation and the border alone, each cell gets its own
+solution, which has a small loss but is wrong. Conditions on faces join the cells, as in XPINNs (Jagtap and Karniadakis
+2020): values, and derivatives across the face, are equal on both sides. ``--alone`` omits the conditions.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
 
-ASIDE = 1e-4  # of a face, in the cell to be asked
+ASIDE = 1e-4  # offset from a face into a cell, for evaluation
 
 
 def points_on_faces(centres: Tensor, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Points [m, d] on faces between cells in the unit cube, and unit normals [m, d]; m is at most ``count``."""
+    """Returns points [m, d] on faces of cells in the unit cube, and unit normals [m, d]; m is at most ``count``."""
     x = torch.rand(count, centres.shape[1], generator=generator)
     near = torch.cdist(x, centres).topk(2, largest=False).indices
     a, b = centres[near[:, 0]], centres[near[:, 1]]
     normal = nn.functional.normalize(b - a, dim=1)
-    x = x + (((a + b) / 2 - x) * normal).sum(1, keepdim=True) * normal  # onto the plane between both centres
+    x = x + (((a + b) / 2 - x) * normal).sum(1, keepdim=True) * normal  # projection onto the plane between both centres
     distances = torch.cdist(x, centres)
-    on_face = distances.amin(1) > (x - a).norm(dim=1) - 1e-6  # no third centre is nearer there
+    on_face = distances.amin(1) > (x - a).norm(dim=1) - 1e-6  # no third centre is nearer
     inside = ((x > 0) & (x < 1)).all(1)
     return x[on_face & inside], normal[on_face & inside]
 
 
 def slopes(u: Tensor, x: Tensor) -> Tensor:
-    """The gradients [n, d] of values [n, 1] at points [n, d]."""
+    """Returns the gradients [n, d] of values [n, 1] at points [n, d]."""
     return torch.autograd.grad(u.sum(), x, create_graph=True)[0]
 
 
@@ -43,7 +43,7 @@ def solve(*, cells: int = 6, steps: int = 2000, joined: bool = True, seed: int =
     field = nn.Sequential(nn.Linear(2, 32), nn.Tanh(), nn.Linear(32, 32), nn.Tanh(), nn.Linear(32, 1))
     centres = torch.rand(cells, 2, generator=generator)
     router = VoronoiRouter(field, centres, coords="first2", fuse=True)
-    with torch.no_grad():  # other weights for each cell
+    with torch.no_grad():  # each cell starts with different weights
         for parameter in router.parameters():
             parameter.mul_(1 + 0.1 * torch.randn(parameter.shape, generator=generator))
     optimizer = torch.optim.Adam(router.parameters(), lr=5e-3)
@@ -78,7 +78,7 @@ def solve(*, cells: int = 6, steps: int = 2000, joined: bool = True, seed: int =
 
 
 def solution(x: Tensor) -> Tensor:
-    """u [n] at points [n, 2], whose Laplacian is -2 pi^2 u."""
+    """Returns the exact solution u [n] at points [n, 2], whose Laplacian is -2 pi^2 u."""
     return torch.sin(math.pi * x).prod(1)
 
 

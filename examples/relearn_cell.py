@@ -1,4 +1,4 @@
-"""One cell of a trained router learns something new; all others keep their parameters and results to the bit."""
+"""A retraining of one cell of a trained router; all other cells keep their parameters and results to the bit."""
 
 import torch
 from torch import Tensor, nn
@@ -7,7 +7,7 @@ from voronerf import VoronoiRouter
 
 
 def colour(x: Tensor) -> Tensor:
-    """What the router learns: a smooth pattern of positions [n, 3] in -1 to 1."""
+    """Returns the colours [n, 3] to learn, a smooth pattern of positions [n, 3] in -1..1."""
     return 0.5 + 0.5 * torch.sin(3 * x + x.roll(1, dims=1))
 
 
@@ -26,7 +26,7 @@ def main() -> None:
     optimizer = torch.optim.Adam(router.parameters(), lr=3e-3)
     fit(router, optimizer, colour, 100)
 
-    # the scene changes in cell 5: its colours are inverted there
+    # The scene changes in cell 5: its colours are inverted.
     points = torch.rand(20_000, 3) * 2 - 1
     inside = router.assign(points) == 5
 

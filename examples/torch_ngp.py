@@ -1,8 +1,8 @@
-"""ashawkey/torch-ngp: `NeRFNetwork.forward(x, d)` -> sigma [n], rgb [n, 3]; `density(x)` -> a dict; `color(x, d, ...)`.
+"""The network of ashawkey/torch-ngp: `NeRFNetwork.forward(x, d)` returns sigma [n] and rgb [n, 3].
 
-The renderer asks `density` to update its occupancy grid, so that is routed as well. All cells share the hash grid,
-and each has networks of its own behind it. The original's hash grid is a compiled extension; the same in PyTorch stands
-in its place, and a frequency encoding in the place of its spherical harmonics.
+The renderer also calls `density` to update its occupancy grid, so this method is routed as well. All cells share the
+hash grid, and each cell has its own networks behind it. The stand-in replaces the compiled hash grid by PyTorch, and
+the spherical harmonics by a frequency encoding.
 """
 
 import itertools
@@ -16,13 +16,13 @@ from voronerf import VoronoiRouter
 
 
 def encode(x: Tensor, octaves: int) -> Tensor:
-    """[..., d] -> [..., d (1 + 2 octaves)], x itself first."""
+    """Returns the encoding [..., d (1 + 2 octaves)] of x [..., d]; x itself comes first."""
     waves = [wave(2**i * x) for i in range(octaves) for wave in (torch.sin, torch.cos)]
     return torch.cat([x, *waves], dim=-1)
 
 
 class TruncExp(torch.autograd.Function):
-    """Stands for `activation.trunc_exp`: an exponential whose gradient is bounded."""
+    """A stand-in for `activation.trunc_exp`, an exponential whose gradient is bounded."""
 
     @staticmethod
     def forward(ctx, x: Tensor) -> Tensor:
@@ -36,7 +36,7 @@ class TruncExp(torch.autograd.Function):
 
 
 class GridEncoder(nn.Module):
-    """Stands for `gridencoder.GridEncoder`: features at eight corners of each level, hashed where they do not fit."""
+    """A stand-in for `gridencoder.GridEncoder`, which hashes the corners of levels that do not fit into the table."""
 
     def __init__(self, num_levels=8, level_dim=2, base_resolution=16, log2_hashmap_size=14, desired_resolution=512):
         super().__init__()
@@ -65,7 +65,7 @@ class GridEncoder(nn.Module):
 
 
 class NeRFNetwork(nn.Module):
-    """Stands for `nerf.network.NeRFNetwork`: a hash grid and two small networks without biases."""
+    """A stand-in for `nerf.network.NeRFNetwork`: a hash grid and two small networks without biases."""
 
     def __init__(self, hidden_dim=64, geo_feat_dim=15, num_layers=2, num_layers_color=3, bound=1):
         super().__init__()

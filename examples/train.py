@@ -1,4 +1,4 @@
-"""The whole method on the library's pieces: python examples/train.py SCENE SECONDS"""
+"""A training with the library's parts: python examples/train.py SCENE SECONDS"""
 
 import sys
 import time
@@ -19,7 +19,7 @@ space, views, generator = scene.space(), scene.train, torch.Generator().manual_s
 cube, pixel, contracted = scene.cube(space), scene.pixel(space), space.contraction is not None
 samples = usual_samples((cube[1][0] - cube[0][0]) / pixel, contracted=contracted, seconds=seconds)
 field = HashGridField(**HashGridField.scene_options(pixel, cube, contracted, seconds))
-router = VoronoiRouter(field, torch.zeros(1, 3), coords="first3", way="fused", share=["features"])  # one cell: coarse
+router = VoronoiRouter(field, torch.zeros(1, 3), coords="first3", way="fused", share=["features"])  # coarse: one cell
 sampler = Occupancy(OccupancyGrid.for_training(scene.box, samples, contraction=space.contraction), samples, space=space)
 renderer = Renderer({"field": router}, sampler).train()
 loss = RayLoss(renderer, terms=[SparseDepth(0.003)])
@@ -30,7 +30,7 @@ batches = RayBatches(views.cameras, views.images, masks=views.masks, sparse=view
 training_step = TrainingStep(batches, loss, optimizer, strategy=strategy, generator=generator)  # recorded and replayed
 rays, step, start = 512, 0, time.perf_counter()
 while (fraction := (time.perf_counter() - start) / seconds) < 1:
-    strategy.step_pre_backward(optimizer, fraction, step)  # into 16 cells, each with a copy of the coarse network
+    strategy.step_pre_backward(optimizer, fraction, step)  # splits into 16 copies of the coarse cell
     optimizer.set_learning_rate(learning_rate(0.02, fraction, step + GROUP // 2, hold=0.25))
     made = training_step(rays, GROUP, at=step)
     step += GROUP

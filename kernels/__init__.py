@@ -1,10 +1,10 @@
 """NVIDIA Warp kernels, installed as ``voronerf.kernels``: one file per op, one source for CPU and CUDA.
 
-They are for a GPU without a compiler. On the CPU Warp runs on one thread, so there it serves as a check. Importing this
-package raises ``BackendUnavailable`` where Warp is missing or too old; ``import voronerf`` never imports it.
+They are for machines with a GPU but no CUDA compiler. On the CPU Warp has one thread and serves as a check. Importing
+this package raises ``BackendUnavailable`` if Warp is missing or too old; ``import voronerf`` never imports it.
 
-Kernels are compiled when they are first used, a file at a time, or by :func:`loads`. Compiled kernels stay in Warp's
-cache, in the folder WARP_CACHE_PATH or Warp's default.
+A file's kernels are compiled on first use, or by :func:`loads`. Compiled kernels stay in Warp's cache, in the folder
+WARP_CACHE_PATH or Warp's default.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 
 @contextlib.contextmanager
 def _without_driver_warning() -> Iterator[None]:
-    """Passes on what is written to file descriptor 2 meanwhile, except for Warp's line about the missing driver."""
+    """Forwards writes to file descriptor 2 inside the context, except Warp's line about the missing driver."""
     try:
         before = os.dup(2)
     except OSError:  # there is no standard error
@@ -56,7 +56,8 @@ def _without_driver_warning() -> Iterator[None]:
             stderr.writelines(line for line in written if not line.startswith(_NO_DRIVER))
 
 
-# The banner and the notes on compilation, silenced unless someone has asked for more. Older releases say `quiet`.
+# Silence the banner and the notes on compilation, unless the user has changed the log level. Older releases have
+# `quiet`.
 if not hasattr(wp.config, "log_level"):
     wp.config.quiet = True
 elif wp.config.log_level == wp.LOG_INFO:
@@ -66,14 +67,14 @@ with _without_driver_warning():
 
 
 def missing(device: torch.device) -> str | None:
-    """Reason, with the remedy, why Warp cannot run on a device; None if it can."""
+    """Returns the reason why Warp cannot run on a device, with the remedy, or None if it can."""
     if device.type == "cuda" and not wp.is_cuda_available():
         return "this build of NVIDIA Warp sees no CUDA driver; install warp-lang from PyPI and check the driver"
     return None
 
 
 def describe() -> dict[str, Any]:
-    """Version, devices, and where compiled kernels are kept."""
+    """Returns Warp's version, its devices and the folder of compiled kernels."""
     return {
         "version": _VERSION,
         "devices": [str(device) for device in wp.get_devices()],
@@ -81,18 +82,18 @@ def describe() -> dict[str, Any]:
     }
 
 
-_OF_A_STEP = (
+_STEP_FILES = (
     *("nearest_centre", "locate_cell", "cell_sort", "hash_encode", "frequency_encode"),
     *("march_rays", "observe_occupancy", "render_loss"),
 )
 
 
 def loads(device: torch.device, dtype: torch.dtype) -> list[Callable[[], None]]:
-    """Functions that together load the kernels of a training step with weights of a dtype; only new ones compile."""
+    """Returns functions that load the kernels of a training step for a dtype of weights; only new kernels compile."""
     from voronerf.kernels.grouped_mlp import THREADS, kernels
 
     where = wp.device_from_torch(device)
-    names = [f"voronerf.kernels.{name}" for name in _OF_A_STEP]
+    names = [f"voronerf.kernels.{name}" for name in _STEP_FILES]
     for name in names:
         importlib.import_module(name)
     files = [functools.partial(wp.load_module, name, where) for name in names]

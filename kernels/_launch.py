@@ -1,4 +1,4 @@
-"""What the kernels' files share: views of torch's tensors, and launches on torch's stream."""
+"""Helpers of all kernel files: Warp views of torch's tensors, and launches on torch's stream."""
 
 from __future__ import annotations
 
@@ -12,32 +12,33 @@ from torch import Tensor
 
 
 def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float32) -> Any:
-    """A view of a tensor with its strides, without a copy; for None an empty array of a dtype, on the device of `like`.
+    """Returns a Warp view of a tensor, with its strides and without a copy.
 
-    Kernels do not read an absent array, but Warp needs one.
+    For None it is an empty array of `dtype` on the device of `like`: kernels do not read it, but Warp needs an array.
     """
     if tensor is None:
         tensor = like.new_empty(0, dtype=dtype)
     if tensor.dtype == torch.bool:
         tensor = tensor.view(torch.uint8)
-    return wp.from_torch(tensor.detach().resolve_neg())  # which torch leaves to ops that take lists
+    # Ops that take lists of tensors receive them with an unresolved negative bit.
+    return wp.from_torch(tensor.detach().resolve_neg())
 
 
 def filled(struct: Any, **fields: Any) -> Any:
-    """A struct with values in these fields: views of tensors, or numbers."""
+    """Sets fields of a struct to numbers, or to views of tensors, and returns the struct."""
     for name, value in fields.items():
         setattr(struct, name, array(value, value) if isinstance(value, Tensor) else value)
     return struct
 
 
 def of_both_dtypes(kernel: Any) -> None:
-    """Has a kernel of points and centres compiled for float32 and float64 when its file is."""
+    """Registers float32 and float64 overloads of a kernel of points and centres, which compile with its file."""
     for scalar in (wp.float32, wp.float64):
         wp.overload(kernel, dict.fromkeys(("points", "centres"), wp.array2d(dtype=scalar)))
 
 
 def on_stream(tensor: Tensor) -> AbstractContextManager[Any]:
-    """Makes torch's current stream Warp's, for calls without a stream argument."""
+    """Returns a context in which Warp uses torch's current stream, for calls without a stream argument."""
     if not tensor.is_cuda:
         return nullcontext()
     context: AbstractContextManager[Any] = wp.ScopedStream(wp.stream_from_torch(tensor.device), sync_enter=False)
@@ -45,7 +46,7 @@ def on_stream(tensor: Tensor) -> AbstractContextManager[Any]:
 
 
 def launch(kernel: Any, threads: int | Sequence[int], inputs: Sequence[Any], tensor: Tensor) -> None:
-    """Runs a kernel on the device of a tensor, on torch's current stream; with 0 threads it launches nothing."""
+    """Runs a kernel on a tensor's device and torch's current stream; with 0 threads it is a no-op."""
     if (threads if isinstance(threads, int) else min(threads)) == 0:
         return
     stream = wp.stream_from_torch(tensor.device) if tensor.is_cuda else None
@@ -53,7 +54,7 @@ def launch(kernel: Any, threads: int | Sequence[int], inputs: Sequence[Any], ten
 
 
 def launch_tiles(kernel: Any, tiles: int, threads: int, inputs: Sequence[Any], tensor: Tensor) -> None:
-    """Runs a kernel with a block of threads for each tile; otherwise as `launch`."""
+    """Runs a kernel as `launch` does, with a block of threads for each tile."""
     if tiles == 0:
         return
     stream = wp.stream_from_torch(tensor.device) if tensor.is_cuda else None

@@ -1,4 +1,4 @@
-"""Sorting samples by cell with Warp's radix sort, which is stable. n samples, k cells."""
+"""Sorts samples by cell with Warp's radix sort, which is stable. n samples, k cells."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ def _keys_kernel(
     cells: wp.array(dtype=wp.int32), k: wp.int32, keys: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32)
 ) -> None:
     i = wp.tid()
-    # Cells out of range (possible where values are not read) go before cell 0, whose key is 1, or behind the last.
+    # Cells out of range (possible if values are not checked) sort before cell 0, whose key is 1, or behind the last
+    # cell.
     keys[i] = wp.clamp(cells[i], -1, k) + 1
     order[i] = i
 
@@ -27,7 +28,7 @@ def _keys_kernel(
 @wp.kernel
 def _offsets_kernel(keys: wp.array(dtype=wp.int32), n: wp.int32, offsets: wp.array(dtype=wp.int32)) -> None:
     cell = wp.tid()
-    # First row of the sorted keys that is not below this cell's.
+    # Find the first row whose sorted key is not below this cell's key.
     low = wp.int32(0)
     high = n
     while low < high:
@@ -40,12 +41,12 @@ def _offsets_kernel(keys: wp.array(dtype=wp.int32), n: wp.int32, offsets: wp.arr
 
 
 @declared("cell_sort").custom_op("cell_sort_warp")
-def cell_sort(given: Any, found: tuple[Tensor, Tensor]) -> None:
-    """Stable order and cell offsets; see ``voronerf.ops.cell_sort``."""
-    cells, k, n = given.cells, given.k, given.n
-    order, offsets = found
+def cell_sort(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
+    """Writes the stable order and the cell offsets; see ``voronerf.ops.cell_sort``."""
+    cells, k, n = arguments.cells, arguments.k, arguments.n
+    order, offsets = results
     check_range("cell_sort", "cells", cells, k)
-    # The sort needs room for twice the pairs, and leaves them in the first half.
+    # The sort needs memory for twice the pairs, and leaves the result in the first half.
     keys, rows = cells.new_empty(2, 2 * n)
     launch(_keys_kernel, n, [array(cells, cells), k, array(keys, cells), array(rows, cells)], cells)
     with on_stream(cells):

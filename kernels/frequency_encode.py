@@ -1,8 +1,8 @@
 """``frequency_encode`` as Warp kernels. n points, d features, L octaves.
 
-A thread takes one feature of one point. Columns are ``[x,] sin x, cos x, sin 2x, ...`` with d of each. Backward, sines
-and cosines are computed again: they are each other's derivatives. The arithmetic is float32; second derivatives come
-from the reference formula.
+One thread handles one feature of one point. Columns are ``[x,] sin x, cos x, sin 2x, ...``, d columns each. The
+backward pass recomputes sines and cosines, which are each other's derivatives. The arithmetic is float32; second
+derivatives come from the reference formula.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _encode_backward_kernel(
     x: wp.array2d(dtype=wp.float32),
     octaves: wp.int32,
     include_input: wp.bool,
-    found: wp.array2d(dtype=wp.float32),
+    of_x: wp.array2d(dtype=wp.float32),
 ) -> None:
     i, j = wp.tid()
     d = x.shape[1]
@@ -63,20 +63,20 @@ def _encode_backward_kernel(
         total += scale * (gradient[i, column] * wp.cos(angle) - gradient[i, column + d] * wp.sin(angle))
         column += 2 * d
         scale *= 2.0
-    found[i, j] = total
+    of_x[i, j] = total
 
 
 @_OP.custom_op("frequency_encode_warp")
-def _forward(given: Any, out: Tensor) -> None:
-    inputs = [array(given.x, out), given.octaves, given.include_input, array(out, out)]
-    launch(_encode_kernel, given.x.shape, inputs, out)
+def _forward(arguments: Any, out: Tensor) -> None:
+    inputs = [array(arguments.x, out), arguments.octaves, arguments.include_input, array(out, out)]
+    launch(_encode_kernel, arguments.x.shape, inputs, out)
 
 
 @_OP.backward_op("frequency_encode_warp_backward", _forward, reference.frequency_encode)
-def _backward(given: Any, arriving: Any, gradients: Any) -> None:
-    found = gradients.x
-    rest = [array(given.x, found), given.octaves, given.include_input, array(found, found)]
-    launch(_encode_backward_kernel, given.x.shape, [array(arriving.result, found), *rest], found)
+def _backward(arguments: Any, arriving: Any, gradients: Any) -> None:
+    of_x = gradients.x
+    rest = [array(arguments.x, of_x), arguments.octaves, arguments.include_input, array(of_x, of_x)]
+    launch(_encode_backward_kernel, arguments.x.shape, [array(arriving.result, of_x), *rest], of_x)
 
 
 frequency_encode = in_float32(_forward)

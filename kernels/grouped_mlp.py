@@ -1,20 +1,20 @@
-"""A whole network for each cell as Warp kernels, and ``grouped_linear``, a network of one layer.
+"""A network for each cell as Warp kernels, and ``grouped_linear``, a network of one layer.
 
 n samples, k cells, t tiles of rows, c columns.
 
-Everything is made of tiles. Samples come sorted by cell; the rows of each cell are padded to tiles of ``ROWS``, so that
-a tile is of one cell. Features are padded to columns of ``WIDTH``: those of the encoded positions, of the directions,
-and of what each layer puts out. A weight matrix falls into blocks [WIDTH, WIDTH], each of which takes one column to
-another, and a network with skips, branches and odd widths is a list of products::
+Data are tiled. Samples are sorted by cell, and the rows of each cell are padded to tiles of ``ROWS``, so that a tile
+belongs to one cell. The features of the encoded positions, of the directions and of each layer's output are padded to
+columns of ``WIDTH``. A weight matrix consists of blocks [WIDTH, WIDTH], each of which maps one column to another. So a
+network with skips, branches and any widths is a list of products::
 
     column o of the layers = bias o + sum over the products p of o: activation(column source[p]) @ block p ^T
 
-One kernel runs any such list, so a new network compiles nothing. A block of threads takes a tile through all of it.
-The columns of a tile, as sums before the activation, which whoever reads them applies, lie in global memory: all of
-them do not fit into shared memory, and what a block has just written is in the cache. No other block touches them.
+One kernel runs any list of products, so a new network compiles no code. A block of threads runs the whole list for one
+tile. The columns of a tile hold sums before the activation, which each reader applies. They lie in global memory: they
+do not all fit in shared memory, and a block's recent writes are in the cache. No other block accesses them.
 
-Padding is harmless, since its weights are 0. Encodings are launches before this one. Sums and columns are float32; of
-float16 and bfloat16 weights the operands of products are rounded to these types, which tensor cores multiply.
+Padding has weight 0 and changes no result. Encodings are launched before. Sums and columns are float32. If weights are
+float16 or bfloat16, the operands of products are rounded to this dtype for the tensor cores.
 """
 # mypy: disable-error-code="arg-type, operator"
 
@@ -46,15 +46,15 @@ from voronerf.ops.grouped_linear.reference import check_offsets
 from voronerf.ops.grouped_program.reference import cells_of
 
 ROWS, WIDTH, THREADS = 64, 16, 128
-"""Wider columns would be emptier: heads have 1 to 4 outputs. Each thread has 4 x 2 sums of a tile and a column; with
-fewer threads a block, registers are spilled (.ci/warp_check.py)."""
+"""The tile sizes. Wider columns would waste more padding: heads have 1 to 4 outputs. Each thread has 4 x 2 sums of a
+tile's column; with fewer threads per block, registers spill (.ci/warp_check.py)."""
 _LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)) for activation in ACTIVATIONS}
 _TYPES = {torch.float32: wp.float32, torch.float16: wp.float16, torch.bfloat16: wp.bfloat16}
 
 
 @wp.func
 def _activate(x: wp.float32, kind: wp.int32) -> wp.float32:
-    """One of ``ACTIVATIONS`` by its number."""
+    """Applies one of ``ACTIVATIONS``, by its number."""
     y = x
     if kind == 1:
         y = wp.where(x < 0.0, 0.0, x)  # NaN stays NaN
@@ -69,7 +69,7 @@ def _activate(x: wp.float32, kind: wp.int32) -> wp.float32:
 
 @wp.func
 def _slope(x: wp.float32, kind: wp.int32) -> wp.float32:
-    """Its derivative."""
+    """Returns the derivative of an activation."""
     y = wp.float32(1.0)
     if kind == 1:
         y = wp.where(x <= 0.0, 0.0, 1.0)
@@ -84,8 +84,10 @@ def _slope(x: wp.float32, kind: wp.int32) -> wp.float32:
 
 @wp.struct
 class Products:
-    """Products ``first[o]`` to ``first[o + 1]`` add up to column o of the layers; each reads the column ``source[p]``,
-    and applies ``activation[column]`` to it."""
+    """The products of a network: products ``first[o]`` to ``first[o + 1]`` sum to column o of the layers.
+
+    Product p reads the column ``source[p]`` and applies ``activation[source[p]]`` to it.
+    """
 
     first: wp.array(dtype=wp.int32)
     source: wp.array(dtype=wp.int32)
@@ -94,21 +96,21 @@ class Products:
 
 @functools.cache
 def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
-    """The kernels, forward and backward, for weights of a dtype; each is compiled when it is first used."""
+    """Returns the forward and the backward kernel for a dtype of weights; each is compiled on first use."""
     scalar: Any = _TYPES[dtype]
-    # Tensor cores multiply 16 bits. In float32 Warp's own products compile in a second instead of twenty.
+    # Tensor cores multiply 16-bit types. For float32 Warp's own products compile in one second instead of twenty.
     options = {"enable_backward": False, "enable_mathdx_gemm": dtype != torch.float32}
     kernel = functools.partial(wp.kernel, module="unique", module_options=options)
 
     @kernel
     def forward(
-        cells: wp.array(dtype=wp.int32),  # of each tile, -1 for none
+        cells: wp.array(dtype=wp.int32),  # the cell of each tile, -1 for none
         blocks: wp.array2d(dtype=scalar),
         biases: wp.array(dtype=wp.float32),
         products: Products,
         columns: wp.array2d(dtype=wp.float32),
     ) -> None:
-        """A block of threads takes a tile through all layers: a layer costs neither a launch nor a wait for others."""
+        """Evaluates all layers of one tile per block of threads, without a launch or a grid barrier per layer."""
         tile = wp.tid()
         cell = cells[tile]
         if cell < 0:
@@ -117,7 +119,7 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
         outputs = products.first.shape[0] - 1
         inputs = products.activation.shape[0] - outputs
         for o in range(outputs):
-            # A shared tile that is filled again is a barrier: all threads read what all have stored before.
+            # Refilling a shared tile is a barrier: then all threads see the earlier stores of all threads.
             total = wp.tile_zeros(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
             for p in range(products.first[o], products.first[o + 1]):
                 source = products.source[p]
@@ -127,8 +129,8 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
                 weight = wp.tile_load(blocks, shape=(WIDTH, WIDTH), offset=(at, 0), storage="shared")
                 wp.tile_matmul(x, wp.tile_transpose(weight), total)
             bias = wp.tile_load(biases, shape=WIDTH, offset=(cell * outputs + o) * WIDTH)
-            found = total + wp.tile_broadcast(bias, shape=(ROWS, WIDTH))
-            wp.tile_store(columns, found, offset=(row, (inputs + o) * WIDTH))
+            biased = total + wp.tile_broadcast(bias, shape=(ROWS, WIDTH))
+            wp.tile_store(columns, biased, offset=(row, (inputs + o) * WIDTH))
 
     @kernel
     def backward(
@@ -141,11 +143,11 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
         of_blocks: wp.array2d(dtype=wp.float32),
         of_biases: wp.array(dtype=wp.float32),
     ) -> None:
-        """The products in reverse, each once for the weights and once for the column that it read.
+        """Runs the products in reverse, each once for its weights and once for the column that it reads.
 
-        ``gradients`` are those of the sums, at first of the outputs alone; a column's is complete when its turn comes,
-        since whoever reads it stands behind it. Columns below ``lowest`` need none. The tiles of a cell add up the
-        gradients of its weights by atomics, so that none waits for another; on a GPU that is in any order.
+        ``gradients`` holds the gradients of the sums, initially of the outputs alone. A column's gradient is complete
+        when its turn comes, since all readers of the column come later in the list. Columns below ``lowest`` need no
+        gradient. The tiles of a cell sum the gradients of its weights by atomics, in any order on a GPU.
         """
         tile = wp.tid()
         cell = cells[tile]
@@ -156,7 +158,7 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
         inputs = products.activation.shape[0] - outputs
         for reverse in range(outputs):
             o = outputs - 1 - reverse
-            # Shared, as it may be what other threads have just stored: that it is filled again is the barrier.
+            # Shared, because other threads may have just stored these values: refilling the tile is the barrier.
             arrived = wp.tile_load(gradients, shape=(ROWS, WIDTH), offset=(row, (inputs + o) * WIDTH), storage="shared")
             wp.tile_atomic_add(of_biases, wp.tile_sum(arrived, axis=0), offset=(cell * outputs + o) * WIDTH)
             g = wp.tile_astype(arrived, dtype=scalar)
@@ -180,8 +182,15 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
 
 
 class _Tiles(NamedTuple):
-    """Float32 x [t * ROWS, inputs * WIDTH], blocks [k, products, WIDTH, WIDTH], biases float32 [k, columns, WIDTH], the
-    cells of tiles, int32 [t], and the plan."""
+    """The arguments of the kernels.
+
+    Attributes:
+        x: float32 [t * ROWS, inputs * WIDTH].
+        blocks: [k, products, WIDTH, WIDTH].
+        biases: float32 [k, columns, WIDTH].
+        cells: the cells of the tiles, int32 [t].
+        plan: the result of `_plan`.
+    """
 
     x: Tensor
     blocks: Tensor
@@ -190,17 +199,17 @@ class _Tiles(NamedTuple):
     plan: str
 
     def results(self: _Tiles) -> Tensor:
-        """Memory for the sums of the columns put out, [t * ROWS, outputs * WIDTH]."""
+        """Returns memory for the sums of the output columns, [t * ROWS, outputs * WIDTH]."""
         return self.x.new_empty(self.x.shape[0], len(json.loads(self.plan)[-1]) * WIDTH)
 
     def columns(self) -> Tensor:
-        """All columns [t * ROWS, c * WIDTH]."""
+        """Computes all columns [t * ROWS, c * WIDTH]."""
         x, blocks, biases, cells, plan = self
         products = _products(plan, x.device)
         columns = x.new_zeros(x.shape[0], products.activation.shape[0] * WIDTH)
         columns[:, : x.shape[1]] = x
-        given = [array(cells, x), array(blocks.view(-1, WIDTH), x), array(biases.view(-1), x), products]
-        launch_tiles(kernels(blocks.dtype)[0], len(cells), THREADS, [*given, array(columns, x)], x)
+        inputs = [array(cells, x), array(blocks.view(-1, WIDTH), x), array(biases.view(-1), x), products]
+        launch_tiles(kernels(blocks.dtype)[0], len(cells), THREADS, [*inputs, array(columns, x)], x)
         return columns
 
 
@@ -214,20 +223,20 @@ class _TilesGradient(NamedTuple):
     wanted: Sequence[bool]
 
     def results(self: _TilesGradient) -> list[Tensor]:
-        """Memory for the gradients of x, blocks and biases."""
+        """Returns memory for the gradients of x, blocks and biases."""
         return [self.x.new_zeros(part.shape) for part in self[1:4]]
 
 
 @custom_op("grouped_mlp_warp", _Tiles.results)
-def _run(given: _Tiles, out: Tensor) -> None:
-    columns = given.columns()
-    torch.cat([columns[:, o * WIDTH : (o + 1) * WIDTH] for o in json.loads(given.plan)[-1]], dim=1, out=out)
+def _run(tiles: _Tiles, out: Tensor) -> None:
+    columns = tiles.columns()
+    torch.cat([columns[:, o * WIDTH : (o + 1) * WIDTH] for o in json.loads(tiles.plan)[-1]], dim=1, out=out)
 
 
 @custom_op("grouped_mlp_warp_backward", _TilesGradient.results)
-def _run_backward(arriving: _TilesGradient, found: list[Tensor]) -> None:
-    """The columns are made again, so nothing is kept but the inputs."""
-    (gradient, x, blocks, _, cells, plan, wanted), (of_x, of_blocks, of_biases) = arriving, found
+def _run_backward(arriving: _TilesGradient, results: list[Tensor]) -> None:
+    """Computes the gradients. Columns are recomputed, so only the inputs are saved for the backward pass."""
+    (gradient, x, blocks, _, cells, plan, wanted), (of_x, of_blocks, of_biases) = arriving, results
     products, columns = _products(plan, x.device), _Tiles(*arriving[1:6]).columns()
     gradients = torch.zeros_like(columns)
     for o, part in zip(json.loads(plan)[-1], gradient.split(WIDTH, dim=1)):
@@ -240,31 +249,35 @@ def _run_backward(arriving: _TilesGradient, found: list[Tensor]) -> None:
 
 
 def _formula(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, plan: str) -> Tensor:
-    """The same in plain PyTorch, for derivatives of the gradients."""
+    """Computes the same in plain PyTorch, for second derivatives."""
     first, source, activation, outputs = json.loads(plan)
     columns = list(x.view(len(cells), ROWS, -1).split(WIDTH, dim=2))
-    there, cell = (cells >= 0)[:, None, None], cells.clamp(min=0)
+    has_cell, cell = (cells >= 0)[:, None, None], cells.clamp(min=0)
     for o, (begin, end) in enumerate(itertools.pairwise(first)):
         total = biases[:, o].index_select(0, cell)[:, None]
         for p in range(begin, end):
             read = activate(ACTIVATIONS[activation[source[p]]], columns[source[p]])
             total = total + read.to(blocks.dtype).to(x.dtype) @ blocks[:, p].index_select(0, cell).to(x.dtype).mT
-        columns.append(total * there)
+        columns.append(total * has_cell)
     return torch.cat([columns[o] for o in outputs], dim=2).view(x.shape[0], -1)
 
 
 register_derivatives(_run, _run_backward, _formula, places=(0, 1, 2), width=5, count=1)
 
 
-@constant_result  # torch.compile looks through a cache
+@constant_result  # torch.compile would trace a cached function
 def _plan(text: str, widths: tuple[int, ...]) -> str:
     return _plan_once(text, widths)
 
 
 @functools.lru_cache(maxsize=256)
 def _plan_once(text: str, widths: tuple[int, ...]) -> str:
-    """The lists of `Products` and the columns put out, as JSON. Of a table (``MLP.text``) and the widths of the encoded
-    positions, the directions (0: none are read) and the layers."""
+    """Returns the lists of `Products` and the output columns, as JSON.
+
+    Args:
+        text: a layer table (``MLP.text``).
+        widths: the widths of the encoded positions, the directions (0 if no layer reads them) and the layers.
+    """
     layers, first, source, activation = MLP.parse(text), [0], list[int](), list[int]()
     columns: dict[int | str, range] = {}
     for name, width in zip((POSITIONS, DIRECTIONS, *range(len(layers.layers))), widths):
@@ -294,17 +307,17 @@ def layers_of_cells(
     features: Tensor | None,
     dtype: torch.dtype,
 ) -> Tensor:
-    """The outputs, float32 [n, layers.out_features], of a layer table on rows that are sorted by cell.
+    """Returns the outputs of a layer table on rows sorted by cell, float32 [n, layers.out_features].
 
     Args:
-        inputs: positions [n, p] and, if a layer reads them, directions, [n, q] or [r, q] by the ``ray_index``.
+        inputs: positions [n, p] and, if a layer reads them, directions, [n, q] or with ``ray_index`` [r, q].
         offsets: int32 [k + 1].
         weights: [k, o, i] for each layer.
         biases: [k, o] or None for each layer.
-        layers: the table; its widths are those of the weights.
+        layers: the table, whose widths match the weights.
         ray_index: int32 [n], or None.
         features: the table of the hash grid, [e, f] or [k, e, f], or None.
-        dtype: what operands of products are rounded to.
+        dtype: the dtype to which operands of products are rounded.
     """
     positions, cell = inputs[0], cells_of(offsets, inputs[0])
     of_positions, of_directions = _encodings(layers.text)
@@ -312,13 +325,13 @@ def layers_of_cells(
         where = hash_encode(positions, features, layers.grid, cell if features.dim() == 3 else None)
     else:
         where = _encoded(positions, of_positions)
-    read = {POSITIONS: where, DIRECTIONS: positions[:, :0]}
+    encoded = {POSITIONS: where, DIRECTIONS: positions[:, :0]}
     if len(inputs) > 1:
-        seen = _encoded(inputs[1], of_directions)
-        read[DIRECTIONS] = seen if ray_index is None else seen.index_select(0, ray_index)
-    widths = {name: len(range(part.shape[1])) for name, part in (*read.items(), *enumerate(weights))}  # no symbols
+        directions = _encoded(inputs[1], of_directions)
+        encoded[DIRECTIONS] = directions if ray_index is None else directions.index_select(0, ray_index)
+    widths = {name: len(range(part.shape[1])) for name, part in (*encoded.items(), *enumerate(weights))}  # no symbols
     tiles, place, inside = _tiles(offsets, cell)
-    x = torch.cat([_padded(part.to(dtype).float()) for part in read.values()], dim=1)
+    x = torch.cat([_padded(part.to(dtype).float()) for part in encoded.values()], dim=1)
     x = x.new_zeros(len(tiles) * ROWS, x.shape[1]).index_copy(0, place, x)
     blocks, rows = [], []
     for layer, weight, bias in zip(layers.layers, weights, biases):
@@ -327,17 +340,17 @@ def layers_of_cells(
         rows.append(_padded(bias.to(dtype).float()).unflatten(1, (-1, WIDTH)))
     plan = _plan(layers.text, tuple(widths.values()))
     sums = _run(x, torch.cat(blocks, dim=1), torch.cat(rows, dim=1), tiles, plan).index_select(0, place)
-    found = []
+    results = []
     for output in layers.outputs:
-        found.append(activate(layers.layers[output].activation, sums[:, : widths[output]]))
+        results.append(activate(layers.layers[output].activation, sums[:, : widths[output]]))
         sums = sums[:, widths[output] + -widths[output] % WIDTH :]
-    return torch.where(inside[:, None], torch.cat(found, dim=1), 0)
+    return torch.where(inside[:, None], torch.cat(results, dim=1), 0)
 
 
 def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
-    """A network of one layer, whose width is that of the weights; see ``voronerf.ops.grouped_linear``."""
+    """Returns the outputs of a network of one layer per cell; see ``voronerf.ops.grouped_linear``."""
     kind, dtype = x.device.type, x.dtype
     if torch.is_autocast_enabled(kind) and dtype != torch.float64:
         dtype = torch.get_autocast_dtype(kind)
@@ -348,9 +361,9 @@ def grouped_linear(
 
 
 def _tiles(offsets: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The cell of each tile, int32 [t], the row of each sample in them, [n], and whether it has a cell.
+    """Returns the cell of each tile, int32 [t], each sample's row in the tiles, [n], and whether it has a cell, [n].
 
-    There are as many as there might be, so that the host reads nothing. The last is of no cell, for samples of none.
+    t is an upper bound, so that the host reads no values. The last tile has no cell and takes samples without a cell.
     """
     (n,), k = cell.shape, offsets.shape[0] - 1
     tiles = (offsets.diff() + (ROWS - 1)) // ROWS
@@ -364,7 +377,7 @@ def _tiles(offsets: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _blocks(weight: Tensor, widths: Sequence[int]) -> Tensor:
-    """[k, products, WIDTH, WIDTH] of a matrix [k, o, i] whose sources have these widths."""
+    """Returns the blocks [k, products, WIDTH, WIDTH] of a matrix [k, o, i] whose sources have widths ``widths``."""
     wide = torch.cat([_padded(part) for part in weight.split(widths, dim=2)], dim=2)
     high = _padded(wide.mT).mT.unflatten(2, (-1, WIDTH)).unflatten(1, (-1, WIDTH))
     return high.transpose(2, 3).flatten(1, 2)
@@ -376,7 +389,7 @@ def _padded(x: Tensor) -> Tensor:
 
 @constant_result
 def _encodings(text: str) -> tuple[tuple[str, int] | None, ...]:
-    """The encodings of positions and directions of a table, by their names and sizes."""
+    """Returns a table's encodings of positions and directions, as names and sizes."""
     return tuple(MLP.parse(text).encoding(source) for source in (POSITIONS, DIRECTIONS))
 
 
@@ -384,11 +397,11 @@ _ENCODINGS: dict[str, Callable[[Tensor, int], Tensor]] = {
     "frequency": lambda x, octaves: frequency_encode(x, octaves, True),
     "spherical": spherical_harmonics,
 }
-"""The kernels of some `ENCODINGS`, by their names."""
+"""The encodings that have a Warp kernel, by name."""
 
 
 def _encoded(x: Tensor, encoding: tuple[str, int] | None) -> Tensor:
-    """Raw features encoded in float32; what is encoded already as it is."""
+    """Encodes raw features in float32; without an encoding returns x unchanged."""
     if encoding is None:
         return x
     name, size = encoding

@@ -1,4 +1,4 @@
-"""Programs that are chains of layers as Warp kernels: the layers in one, what follows them in plain PyTorch.
+"""Programs that are chains of layers: the layers run in one Warp kernel, the later steps in plain PyTorch.
 
 n rows, w columns. Any other program runs in PyTorch.
 """
@@ -26,21 +26,21 @@ from voronerf.ops._core.layers import (
     Layer,
 )
 from voronerf.ops._core.program import HASH, VALUE, Builder, Columns, Program, Step
-from voronerf.ops.grouped_program.given import Given
-from voronerf.ops.grouped_program.reference import check_rows, of_rows, parsed
+from voronerf.ops.grouped_program.arguments import ProgramArguments
+from voronerf.ops.grouped_program.reference import check_rows, evaluate_rows, parsed
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
 
 
 class Chain(NamedTuple):
-    """A program as a layer table, and what follows it.
+    """A program as a layer table and a program of the later steps.
 
     Attributes:
-        layers: the table, whose outputs are those of every layer that something else than a layer reads.
-        reads: the inputs that it reads, positions and then directions.
-        weights: the number of each layer's weight among the parameters of the program.
-        biases: of its bias, or None.
-        features: of the table of the hash grid, or None.
-        behind: the text of a program that takes the outputs, one input, to those of the whole one.
+        layers: the table; its outputs are the layers that a later step or an output of the program reads.
+        reads: the numbers of the inputs that the table reads, positions and then directions.
+        weights: the number of each layer's weight among the program's parameters.
+        biases: the number of each layer's bias, or None.
+        features: the number of the hash grid's table, or None.
+        behind: the text of the program of later steps, whose single input is the table's outputs.
     """
 
     layers: MLP
@@ -51,13 +51,13 @@ class Chain(NamedTuple):
     behind: str
 
 
-def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
-    """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
-    text, inputs, parameters, ray_index, dtype, _ = given
+def grouped_program(arguments: ProgramArguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
+    """Runs a program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
+    text, inputs, parameters, ray_index, dtype, _ = arguments
     chain, k = chain_of(text), offsets.shape[0] - 1
     if chain is None:
-        return in_torch(given, offsets, order)
-    check_rows(given, offsets, order)
+        return in_torch(arguments, offsets, order)
+    check_rows(arguments, offsets, order)
     with torch.autocast(inputs[0].device.type, enabled=False):
         rays = parsed(text).rays
         if order is not None:
@@ -67,7 +67,7 @@ def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list
         inside = ((row >= offsets[0]) & (row < offsets[-1]))[:, None]
         inputs = [x if i in rays else torch.where(inside, x, 0) for i, x in enumerate(inputs)]
         features = None if chain.features is None else parameters[chain.features]
-        if features is not None and features.shape[0] == 1:  # which all cells share
+        if features is not None and features.shape[0] == 1:  # a table that all cells share
             features = features[0]
         raw = layers_of_cells(
             [inputs[i] for i in chain.reads],
@@ -79,15 +79,15 @@ def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list
             features,
             dtype,
         )
-        results = [torch.where(inside, result, 0).to(dtype) for result in of_rows([raw], chain.behind)]
+        results = [torch.where(inside, result, 0).to(dtype) for result in evaluate_rows([raw], chain.behind)]
         if order is None:
             return results
         return [torch.zeros_like(result).index_copy(0, order.long(), result) for result in results]
 
 
-@constant_result  # of a function: torch.compile would look through the cache, and trace what is behind it
+@constant_result  # around the cached function, which torch.compile would trace
 def chain_of(text: str) -> Chain | None:
-    """A program, given by its text, as a chain; None where it is none."""
+    """Returns the chain of a program's text, or None if the program is no chain."""
     return _chain_of(text)
 
 
@@ -105,7 +105,7 @@ _INPUTS = POSITIONS, DIRECTIONS
 
 
 class _Layer(NamedTuple):
-    """A layer as far as its steps are read."""
+    """A layer under construction, from the steps read so far."""
 
     weight: int
     bias: int | None = None
@@ -114,50 +114,50 @@ class _Layer(NamedTuple):
 
 
 class _Reader:
-    """Reads the steps of a program as a layer table; LookupError where they are none."""
+    """A converter of a program's steps to a layer table; it raises LookupError if they are no chain."""
 
     def __init__(self, program: Program) -> None:
         self.program, self.steps = program, {step.out: step for step in program.steps}
         operands = [c for step in program.steps for c in step.operands]
         self.read = Counter(c.index for c in (*operands, *program.outputs) if c.of == VALUE)
-        self.sources: dict[int, int | str] = {}  # what a value is to a layer that reads it
+        self.sources: dict[int, int | str] = {}  # the source that each value is for layers
         self.encodings: dict[str, Step] = {}
-        self.started: dict[int, _Layer] = {}  # by the value that is the sum so far
+        self.started: dict[int, _Layer] = {}  # by the value of the sum so far
         self.layers: list[Layer] = []
-        self.made: list[_Layer] = []
+        self.finished: list[_Layer] = []
 
     def chain(self) -> Chain:
-        """The whole program."""
+        """Returns the chain of the whole program."""
         behind = [step for step in self.program.steps if not self._takes(step)]
-        own, places, width = {step.out for step in behind}, dict[int, int](), 0
+        values_behind, places, width = {step.out for step in behind}, dict[int, int](), 0
         for columns in (*(c for step in behind for c in step.operands), *self.program.outputs):
             if columns.of != VALUE:
                 raise LookupError
-            if columns.index not in own | places.keys():
+            if columns.index not in values_behind | places.keys():
                 places[columns.index], width = width, width + self.layers[self._layer(columns)].width
         b = Builder()
         x, values = b.input(width), dict[int, Columns]()
 
-        def taken(c: Columns) -> Columns:
+        def operand(c: Columns) -> Columns:
             whole = x.part(places[c.index], width) if c.index in places else values[c.index]
             return whole.part(c.start, c.width)._replace(spread=c.spread)
 
         for step in behind:
-            values[step.out] = b.emit(step.op, step.width, [*map(taken, step.operands)], step.numbers, step.name)
+            values[step.out] = b.emit(step.op, step.width, [*map(operand, step.operands)], step.numbers, step.name)
         outputs = tuple(int(self.sources[value]) for value in places)
         features = [int(step.numbers[1]) for step in self.encodings.values() if step.name == HASH]
         layers = MLP(tuple(self.layers), outputs, **self._encoded())
         return Chain(
             layers,
             (0, 1) if layers.uses_directions else (0,),
-            tuple(layer.weight for layer in self.made),
-            tuple(layer.bias for layer in self.made),
+            tuple(layer.weight for layer in self.finished),
+            tuple(layer.bias for layer in self.finished),
             features[0] if features else None,
-            b.program(map(taken, self.program.outputs)).text,
+            b.program(map(operand, self.program.outputs)).text,
         )
 
     def _takes(self, step: Step) -> bool:
-        """Whether a step is read as a part of a layer."""
+        """Returns whether a step is a part of a layer, and reads it if so."""
         if step.op == "input":
             self.sources[step.out] = _INPUTS[int(step.numbers[0])]
         elif step.op == "encode":
@@ -176,7 +176,7 @@ class _Reader:
         return True
 
     def _add(self, step: Step) -> None:
-        """A product of a layer, the first one or a further one."""
+        """Reads a product of a layer, the first one or a later one."""
         (x, *added), (weight, start, transposed) = step.operands, map(int, step.numbers)
         layer, shapes = _Layer(weight), self.program.parameters
         if added and added[0].of == VALUE:
@@ -190,7 +190,7 @@ class _Reader:
         self.started[step.out] = layer._replace(inputs=inputs, depth=start + x.width)
 
     def _activates(self, step: Step) -> bool:
-        """Whether a function is the activation of a layer, of which nothing else is read."""
+        """Returns whether a step is the activation of a layer whose sum no other step reads."""
         x = step.operands[0]
         numbers: tuple[float, ...] = (0, *NUMBERS.get(step.name, (0, 0)))
         if len(step.operands) > 1 or step.numbers != numbers or not self._is_whole(x):
@@ -201,12 +201,12 @@ class _Reader:
         layer = self.started.pop(value)
         if layer.depth != self.program.parameters[layer.weight][1]:
             raise LookupError
-        self.sources[out] = len(self.made)
-        self.made.append(layer)
+        self.sources[out] = len(self.finished)
+        self.finished.append(layer)
         self.layers.append(Layer(layer.inputs, self.program.parameters[layer.weight][0], activation))
 
     def _source(self, columns: Columns) -> int | str:
-        """The source of a layer that a whole value is."""
+        """Returns the layer source that a whole value is."""
         if not self._is_whole(columns):
             raise LookupError
         if columns.index in self.started:
@@ -217,22 +217,22 @@ class _Reader:
         return columns.of == VALUE and not columns.spread and columns.width == self.steps[columns.index].width
 
     def _layer(self, columns: Columns) -> int:
-        """The number of the layer whose output columns are a part of."""
-        found = self._source(Columns(VALUE, columns.index, 0, self.steps[columns.index].width))
-        if isinstance(found, str):
+        """Returns the number of the layer whose output contains the columns."""
+        source = self._source(Columns(VALUE, columns.index, 0, self.steps[columns.index].width))
+        if isinstance(source, str):
             raise LookupError
-        return found
+        return source
 
     def _encoded(self) -> dict[str, Any]:
-        """The encodings as arguments of a table."""
-        found: dict[str, Any] = {}
+        """Returns the encodings as arguments of MLP."""
+        arguments: dict[str, Any] = {}
         for name, step in self.encodings.items():
             size, of = int(step.numbers[0]), name.removesuffix("s")
             if step.name not in (POSITION_ENCODINGS if name == POSITIONS else DIRECTION_ENCODINGS):
                 raise LookupError
-            found[f"{of}_encoding"] = step.name
+            arguments[f"{of}_encoding"] = step.name
             if step.name == HASH:
-                found["grid"] = HashGrid.parse(self.program.grids[size])
+                arguments["grid"] = HashGrid.parse(self.program.grids[size])
             else:
-                found["direction_degree" if step.name == "spherical" else f"{of}_octaves"] = size
-        return found
+                arguments["direction_degree" if step.name == "spherical" else f"{of}_octaves"] = size
+        return arguments

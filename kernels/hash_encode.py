@@ -1,8 +1,8 @@
-"""The hash encoding as Warp kernels. n points, k tables, e entries of all levels, f features of a level.
+"""The hash encoding as Warp kernels. n points, k tables, e entries in all levels, f features per level.
 
-Forward, a thread takes one level of one point; for the gradient of the table as well, which is added up by atomics, so
-that on a GPU its last bits depend on the order. For the gradient to the positions a thread takes a point. With
-directions, the weights of the corners are replaced by their derivatives along them.
+In the forward pass one thread handles one level of one point, and likewise for the gradient of the table. Atomics sum
+this gradient, so that on a GPU its last bits depend on the order. For the gradient of the positions one thread handles
+one point. With directions, the derivatives of the corners' weights along them replace the weights.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _PRIME_Y, _PRIME_Z = wp.constant(wp.uint32(2654435761)), wp.constant(wp.uint32(8
 
 @wp.struct
 class Grid:
-    """Of all levels: the box, the interpolation, the features, the tables, and the entries of one.
+    """The grid's constants: box, interpolation, features per level, number of tables, entries of a table.
 
-    ``numbers`` [levels, 2] holds scale and shift, ``sizes`` [levels, 4] side, entries, offset and whether it is hashed.
+    ``numbers`` [levels, 2] holds scale and shift, ``sizes`` [levels, 4] side, entries, offset and the hashed flag.
     """
 
     low: wp.vec3
@@ -45,7 +45,7 @@ class Grid:
 
 @wp.struct
 class Place:
-    """Of a point in a level: the lower corner; the weight of the upper one on each axis, and its two derivatives."""
+    """A point on a level: its lower corner, and on each axis the upper corner's weight with two derivatives."""
 
     x: wp.int32
     y: wp.int32
@@ -57,8 +57,8 @@ class Place:
 
 @wp.func
 def _place(positions: wp.array2d(dtype=wp.float32), i: wp.int32, level: wp.int32, grid: Grid) -> Place:
-    found = Place()
-    corners = wp.vec3(0.0, 0.0, 0.0)  # whole numbers below 2^24
+    result = Place()
+    corners = wp.vec3(0.0, 0.0, 0.0)  # integers below 2^24
     for axis in range(3):
         place = (positions[i, axis] - grid.low[axis]) * grid.inverse[axis]
         slope = wp.float32(0.0)
@@ -75,17 +75,17 @@ def _place(positions: wp.array2d(dtype=wp.float32), i: wp.int32, level: wp.int32
         t = where - corner
         corners[axis] = corner
         if grid.smooth:
-            found.upper[axis] = t * t * (3.0 - 2.0 * t)
-            found.slope[axis] = slope * 6.0 * t * (1.0 - t)
-            found.bend[axis] = slope * slope * (6.0 - 12.0 * t)
+            result.upper[axis] = t * t * (3.0 - 2.0 * t)
+            result.slope[axis] = slope * 6.0 * t * (1.0 - t)
+            result.bend[axis] = slope * slope * (6.0 - 12.0 * t)
         else:
-            found.upper[axis] = t
-            found.slope[axis] = slope
-            found.bend[axis] = wp.float32(0.0)
-    found.x = wp.int32(corners[0])
-    found.y = wp.int32(corners[1])
-    found.z = wp.int32(corners[2])
-    return found
+            result.upper[axis] = t
+            result.slope[axis] = slope
+            result.bend[axis] = wp.float32(0.0)
+    result.x = wp.int32(corners[0])
+    result.y = wp.int32(corners[1])
+    result.z = wp.int32(corners[2])
+    return result
 
 
 @wp.func
@@ -106,12 +106,15 @@ def _entry(place: Place, corner: wp.int32, level: wp.int32, grid: Grid) -> wp.in
 
 @wp.func
 def _of_corner(upper: wp.vec3, corner: wp.int32, one: wp.float32) -> wp.vec3:
-    """Weights of a corner on each axis, from those of the upper one: 1 - w for a lower one, or -w for derivatives."""
-    found = upper
+    """Returns a corner's weights on each axis from the weights w of the upper corner.
+
+    On an axis where the corner is the lower one they are ``one - w``; ``one`` is 0 for derivatives.
+    """
+    weights = upper
     for axis in range(3):
         if ((corner >> axis) & 1) == 0:
-            found[axis] = one - upper[axis]
-    return found
+            weights[axis] = one - upper[axis]
+    return weights
 
 
 @wp.func
@@ -207,7 +210,7 @@ def _positions_kernel(
                     change = direction[i, axis] * bend[axis] * at[b] * at[c] + slope[axis] * (
                         direction[i, b] * slope[b] * at[c] + direction[i, c] * slope[c] * at[b]
                     )
-                # Outside of the box there is no gradient, not even of NaN.
+                # Outside the box the gradient is 0, even if a product is NaN.
                 if place.slope[axis] != 0.0 or place.bend[axis] != 0.0:
                     total[axis] = total[axis] + change * product
     for axis in range(3):
@@ -215,44 +218,44 @@ def _positions_kernel(
 
 
 def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor | None = None) -> Tensor:
-    """Features of points [n, levels * f] from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
+    """Returns features [n, levels * f] of points from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
     encoded: Tensor = _encode(positions.float(), table.float(), None, cells, grid.text)
     return encoded
 
 
 @custom_op("hash_encode_warp", Hashed.result)
-def _encode(given: Hashed, out: Tensor) -> None:
-    points, tables, rows = _inputs(given, given.table)
-    levels = HashGrid.parse(given.grid).levels
-    if given.cells is not None:
-        check_range("hash_encode", "cells", given.cells, len(given.table))
+def _encode(arguments: Hashed, out: Tensor) -> None:
+    points, tables, rows = _inputs(arguments, arguments.table)
+    levels = HashGrid.parse(arguments.grid).levels
+    if arguments.cells is not None:
+        check_range("hash_encode", "cells", arguments.cells, len(arguments.table))
     launch(_encode_kernel, (len(out), levels), [*points, rows, *tables, array(out, out)], out)
 
 
 @custom_op("hash_encode_warp_backward", HashedGradient.results)
-def _backward(taken: HashedGradient, found: list[Tensor]) -> None:
-    (gradient, given, to_positions, to_table), (of_positions, of_table) = taken, found
-    n, levels, arriving = len(gradient), HashGrid.parse(given.grid).levels, array(gradient, gradient)
+def _backward(backward_arguments: HashedGradient, results: list[Tensor]) -> None:
+    (gradient, arguments, to_positions, to_table), (of_positions, of_table) = backward_arguments, results
+    n, levels, arriving = len(gradient), HashGrid.parse(arguments.grid).levels, array(gradient, gradient)
     if to_table:
-        points, tables, rows = _inputs(given, of_table.zero_())
+        points, tables, rows = _inputs(arguments, of_table.zero_())
         launch(_table_kernel, (n, levels), [arriving, *points, *tables, rows], gradient)
     if to_positions:
-        points, tables, rows = _inputs(given, given.table)
+        points, tables, rows = _inputs(arguments, arguments.table)
         inputs = [arriving, *points, rows, *tables, array(of_positions, gradient)]
         launch(_positions_kernel, n, inputs, gradient)
 
 
-def _inputs(given: Hashed, table: Tensor) -> tuple[list[object], list[object], object]:
-    """What all kernels take: points and directions; cells and the grid; the rows of a table."""
-    positions, cells, direction = given.positions, given.cells, given.direction
+def _inputs(arguments: Hashed, table: Tensor) -> tuple[list[object], list[object], object]:
+    """Returns arguments of the kernels: points and directions; cells and the grid; the rows of a table."""
+    positions, cells, direction = arguments.positions, arguments.cells, arguments.direction
     along = positions[:0] if direction is None else direction
-    levels, grid = HashGrid.parse(given.grid), Grid()
+    levels, grid = HashGrid.parse(arguments.grid), Grid()
     low, high = levels.box
     grid.low, grid.inverse = wp.vec3(*low), wp.vec3(*(1 / (b - a) for a, b in zip(low, high)))
     grid.smooth, grid.along = levels.interpolation == "smoothstep", direction is not None
-    grid.features, grid.entries, grid.several = levels.features, given.table.shape[-2], cells is not None
-    grid.tables = given.table.shape[0]
-    numbers, sizes = _levels(given.grid, positions.device)
+    grid.features, grid.entries, grid.several = levels.features, arguments.table.shape[-2], cells is not None
+    grid.tables = arguments.table.shape[0]
+    numbers, sizes = _levels(arguments.grid, positions.device)
     grid.numbers, grid.sizes = array(numbers, positions), array(sizes, positions)
     points: list[object] = [array(positions, positions), array(along, positions)]
     return points, [array(cells, positions, torch.int32), grid], array(table.reshape(-1, levels.features), positions)

@@ -1,7 +1,7 @@
-"""The nested query as a Warp kernel. n points, m centres of all diagrams together, g diagrams.
+"""The nested query as a Warp kernel. n points, m centres in all diagrams, g diagrams.
 
-A thread takes a point down the tree. Distances are those of the reference: float64, each operation rounded on its own.
-Nothing outside the tables is read; a walk that leads out of them or ends at no leaf gives a negative number.
+One thread moves one point down the tree. Distances are float64, each operation rounded separately, as in the reference.
+Nothing outside the tables is read; a walk that leads out of them or reaches no leaf gives a negative number.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def _locate_cell_kernel(
     x = wp.float64(points[i, 0])
     y = wp.float64(points[i, 1])
     z = wp.float64(points[i, 2])
-    # The diagram the point is in, or (negative) the leaf it has reached.
+    # The point's diagram, or a negative number for its leaf.
     state = wp.int32(0)
     for _ in range(depth):
         if state >= 0 and state < child_offsets.shape[0] - 1:
@@ -44,7 +44,8 @@ def _locate_cell_kernel(
                 dy = y - wp.float64(centres[j, 1])
                 dz = z - wp.float64(centres[j, 2])
                 value = dx * dx + dy * dy + dz * dz
-                # Strict: ties keep the lowest index, and a point that is not finite takes the first centre.
+                # The comparison is strict: ties keep the lowest index, and a point that is not finite takes the first
+                # centre.
                 if value < best:
                     best = value
                     nearest = j
@@ -59,11 +60,11 @@ of_both_dtypes(_locate_cell_kernel)
 
 
 @declared("locate_cell").custom_op("locate_cell_warp")
-def locate_cell(given: Any, leaves: Tensor) -> None:
-    """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
-    *tables, depth = given
-    check_tree(given.child_offsets, given.child, "locate_cell")
-    levels = min(depth, given.child_offsets.shape[0] - 1)  # a tree has no more than diagrams
+def locate_cell(arguments: Any, leaves: Tensor) -> None:
+    """Writes the leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
+    *tables, depth = arguments
+    check_tree(arguments.child_offsets, arguments.child, "locate_cell")
+    levels = min(depth, arguments.child_offsets.shape[0] - 1)  # a tree has at most one level per diagram
     inputs = [*[array(tensor, leaves) for tensor in tables], levels, array(leaves, leaves)]
-    launch(_locate_cell_kernel, given.n, inputs, leaves)
+    launch(_locate_cell_kernel, arguments.n, inputs, leaves)
     check_leaves(leaves, depth, "locate_cell")

@@ -1,8 +1,8 @@
-"""Ray marching as Warp kernels. r rays, s strata of a ray, m samples of all rays (packed).
+"""Ray marching as Warp kernels. r rays, s strata per ray, m samples of all rays (packed).
 
-A thread takes a ray. It walks the ray twice, once to count its samples and, when the offsets are known, once to write
-them, rather than keeping a bit for every stratum. Operations and their order are those of the reference, each rounded
-on its own (``fuse_fp`` off): a sample falls in the same cell.
+One thread walks along one ray, twice: first to count its samples and then, with the offsets, to write them. So no bits
+of strata need to be stored. Operations and their order equal the reference's, each rounded separately (``fuse_fp``
+off), so that a sample falls in the same cell.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _edge(near: wp.float32, far: wp.float32, stratum: wp.int32, samples: wp.int3
 
 @wp.func
 def _point(origin: wp.vec3, direction: wp.vec3, at: wp.float32, space: wp.array2d(dtype=wp.float32)) -> wp.vec3:
-    # In the space of the grid: `space` has a row for the centre and the radius of a sphere, five for a perspective.
+    # Returns a point in the grid's space. `space` has one row (centre and radius of a sphere) or five (a perspective).
     x = origin[0] + at * direction[0]
     y = origin[1] + at * direction[1]
     z = origin[2] + at * direction[2]
@@ -84,7 +84,7 @@ def _mixed(bits: wp.uint32) -> wp.uint32:
 
 @wp.func
 def _hashed(key: wp.uint32, stratum: wp.int32) -> wp.float32:
-    # A number in [0, 1) for each stratum of a ray.
+    # Returns a number in [0, 1) for each stratum of a ray.
     h = _mixed(key ^ (wp.uint32(stratum) * _GOLDEN))
     return wp.float32(h >> wp.uint32(8)) / 16777216.0
 
@@ -100,8 +100,8 @@ def _cell(point: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) 
 
 
 @wp.struct
-class Given:
-    """Rays and a grid; ``space`` is [0, 0] for the world's own, [1, 4] or [5, 3]."""
+class Inputs:
+    """The rays and the grid; ``space`` is [0, 0] for world space, [1, 4] for a sphere, [5, 3] for a perspective."""
 
     origins: wp.array2d(dtype=wp.float32)
     directions: wp.array2d(dtype=wp.float32)
@@ -123,7 +123,7 @@ class Given:
 
 @wp.struct
 class Samples:
-    """Numbers of samples of the rays, or the samples."""
+    """The rays' numbers of samples, or the samples."""
 
     counts: wp.array(dtype=wp.int32)
     ray_index: wp.array(dtype=wp.int32)
@@ -134,96 +134,96 @@ class Samples:
 
 
 @wp.kernel
-def _march_kernel(given: Given, counting: wp.bool, offsets: wp.array(dtype=wp.int32), out: Samples) -> None:
+def _march_kernel(inputs: Inputs, counting: wp.bool, offsets: wp.array(dtype=wp.int32), out: Samples) -> None:
     ray = wp.tid()
-    origin = wp.vec3(given.origins[ray, 0], given.origins[ray, 1], given.origins[ray, 2])
-    direction = wp.vec3(given.directions[ray, 0], given.directions[ray, 1], given.directions[ray, 2])
-    begin = given.near[ray]
-    end = given.far[ray]
+    origin = wp.vec3(inputs.origins[ray, 0], inputs.origins[ray, 1], inputs.origins[ray, 2])
+    direction = wp.vec3(inputs.directions[ray, 0], inputs.directions[ray, 1], inputs.directions[ray, 2])
+    begin = inputs.near[ray]
+    end = inputs.far[ray]
     stratum = wp.int32(0)
-    if given.started:
-        stratum = wp.max(given.start[ray], 0)
+    if inputs.started:
+        stratum = wp.max(inputs.start[ray], 0)
     row = wp.int32(0)
     room = wp.int32(0)
     if not counting:
         row = offsets[ray]
         room = offsets[ray + 1] - row
     key = wp.uint32(0)
-    if given.hashed:
-        key = _mixed(wp.uint32(given.seed[0]) + wp.uint32(ray))
-    found = wp.int32(0)
-    going = end > begin and stratum < given.samples
+    if inputs.hashed:
+        key = _mixed(wp.uint32(inputs.seed[0]) + wp.uint32(ray))
+    samples = wp.int32(0)
+    going = end > begin and stratum < inputs.samples
     while going:
-        first = _edge(begin, end, stratum, given.samples, given.spacing)
-        last = _edge(begin, end, stratum + 1, given.samples, given.spacing)
+        first = _edge(begin, end, stratum, inputs.samples, inputs.spacing)
+        last = _edge(begin, end, stratum + 1, inputs.samples, inputs.spacing)
         inside = wp.float32(0.5)
-        if given.jittered:
-            inside = given.uniforms[ray, stratum]
-        if given.hashed:
+        if inputs.jittered:
+            inside = inputs.uniforms[ray, stratum]
+        if inputs.hashed:
             inside = _hashed(key, stratum)
-        at = _depth(begin, end, (wp.float32(stratum) + inside) / wp.float32(given.samples), given.spacing)
-        # Not min and max, which would turn NaN into a number.
+        at = _depth(begin, end, (wp.float32(stratum) + inside) / wp.float32(inputs.samples), inputs.spacing)
+        # min and max would turn NaN into a number.
         if at < first:
             at = first
         if at > last:
             at = last
-        point = _point(origin, direction, at, given.space)
-        x = _cell(point[0], given.box[0, 0], given.box[1, 0], given.occupied.shape[0])
-        y = _cell(point[1], given.box[0, 1], given.box[1, 1], given.occupied.shape[1])
-        z = _cell(point[2], given.box[0, 2], given.box[1, 2], given.occupied.shape[2])
+        point = _point(origin, direction, at, inputs.space)
+        x = _cell(point[0], inputs.box[0, 0], inputs.box[1, 0], inputs.occupied.shape[0])
+        y = _cell(point[1], inputs.box[0, 1], inputs.box[1, 1], inputs.occupied.shape[1])
+        z = _cell(point[2], inputs.box[0, 2], inputs.box[1, 2], inputs.occupied.shape[2])
         taken = wp.bool(False)
         if x >= 0 and y >= 0 and z >= 0:
-            taken = given.occupied[x, y, z] != wp.uint8(0)
+            taken = inputs.occupied[x, y, z] != wp.uint8(0)
         if taken and not counting:
-            if found == room:
-                # The ray is cut; the next call starts here.
+            if samples == room:
+                # The ray is truncated; the next call starts here.
                 going = wp.bool(False)
             else:
-                out.ray_index[row + found] = ray
-                out.depths[row + found] = at
-                out.deltas[row + found] = last - first
+                out.ray_index[row + samples] = ray
+                out.depths[row + samples] = at
+                out.deltas[row + samples] = last - first
                 for axis in range(3):
-                    out.positions[row + found, axis] = point[axis]
+                    out.positions[row + samples, axis] = point[axis]
         if going:
             stratum += 1
             if taken:
-                found += 1
-            going = stratum < given.samples and found < given.most
+                samples += 1
+            going = stratum < inputs.samples and samples < inputs.most
     if counting:
-        out.counts[ray] = found
+        out.counts[ray] = samples
     elif end > begin:
-        out.stop[ray] = wp.min(stratum, given.samples)
+        out.stop[ray] = wp.min(stratum, inputs.samples)
     else:
-        out.stop[ray] = given.samples
+        out.stop[ray] = inputs.samples
 
 
 @_OP.custom_op("march_rays_warp", fake=fake)
-def march_rays(given: Any) -> March:
-    """Samples in occupied cells; see ``voronerf.ops.march_rays``."""
-    near, r, capacity, inputs = given.near, given.r, given.capacity, _inputs(given)
+def march_rays(arguments: Any) -> March:
+    """Returns samples in occupied cells; see ``voronerf.ops.march_rays``."""
+    near, r, capacity, inputs = arguments.near, arguments.r, arguments.capacity, _inputs(arguments)
     counts = near.new_zeros(r + 1, dtype=torch.int32)
-    out = filled(Samples(), counts=counts[1:], positions=given.origins[:0])
+    out = filled(Samples(), counts=counts[1:], positions=arguments.origins[:0])
     filled(out, ray_index=counts[:0], depths=near[:0], deltas=near[:0], stop=counts[:0])
     launch(_march_kernel, r, [inputs, True, array(counts[:0], near), out], near)
-    # In int64: the number of samples of all rays may not fit int32; the capacity does.
+    # The sum is int64, since the number of samples may exceed int32; the capacity does not.
     offsets = counts.cumsum(dim=0).clamp(max=MAX_COUNT if capacity is None else capacity).int()
-    found = memory(near, offsets, int(offsets[-1]) if capacity is None else capacity)
-    for part in found[1:5]:  # 0 in rows that belong to no ray
+    samples = memory(near, offsets, int(offsets[-1]) if capacity is None else capacity)
+    for part in samples[1:5]:  # zeros in rows that belong to no ray
         part.zero_()
-    launch(_march_kernel, r, [inputs, False, array(offsets, near), _samples(found)], near)
-    return found
+    launch(_march_kernel, r, [inputs, False, array(offsets, near), _samples(samples)], near)
+    return samples
 
 
-def _samples(found: March) -> Any:
-    out = filled(Samples(), counts=found.ray_offsets[:0], ray_index=found.ray_index, depths=found.depths)
-    return filled(out, deltas=found.deltas, positions=found.positions, stop=found.stop)
+def _samples(march: March) -> Any:
+    out = filled(Samples(), counts=march.ray_offsets[:0], ray_index=march.ray_index, depths=march.depths)
+    return filled(out, deltas=march.deltas, positions=march.positions, stop=march.stop)
 
 
 def _inputs(rays: Any) -> Any:
     near, contraction = rays.near, rays.contraction
     none = near.new_empty(0, dtype=torch.int32)
-    given = filled(
-        Given(),
+    inputs = filled(
+        Inputs(),
         uniforms=near.new_empty(0, 0) if rays.uniforms is None else rays.uniforms,
         jittered=rays.uniforms is not None,
         seed=none if rays.seed is None else rays.seed,
@@ -234,5 +234,5 @@ def _inputs(rays: Any) -> Any:
     )
     rest = ("origins", "directions", "near", "far", "occupied", "box", "samples")
     most = rays.samples if rays.most is None else rays.most
-    filled(given, spacing=SPACINGS.index(rays.spacing), most=most)
-    return filled(given, **{name: getattr(rays, name) for name in rest})
+    filled(inputs, spacing=SPACINGS.index(rays.spacing), most=most)
+    return filled(inputs, **{name: getattr(rays, name) for name in rest})

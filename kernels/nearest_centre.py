@@ -1,7 +1,7 @@
 """Nearest centre as a Warp kernel. n points, k centres, any number of coordinates.
 
-A thread takes a point and evaluates the definition in float64, each operation rounded on its own (``fuse_fp`` off), so
-that the answer is that of the reference and of csrc/ to the last index.
+One thread evaluates the definition for one point in float64. Each operation is rounded separately (``fuse_fp`` off), so
+that all indices equal the results of the reference and of csrc/.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ def _nearest_centre_kernel(
         for axis in range(centres.shape[1]):
             difference = wp.float64(points[i, axis]) - wp.float64(centres[j, axis])
             value = value + difference * difference
-        # Strict: ties keep the lowest index, and a non-finite point, whose values are NaN or infinite, gets cell 0.
+        # The comparison is strict: ties keep the lowest index, and a non-finite point, with NaN or infinite values,
+        # gets cell 0.
         if value < best:
             best = value
             cell = j
@@ -41,8 +42,8 @@ of_both_dtypes(_nearest_centre_kernel)
 
 
 @declared("nearest_centre").custom_op("nearest_centre_warp")
-def nearest_centre(given: Any, cells: Tensor) -> None:
-    """Index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
-    check_sizes("nearest_centre", given.centres)
-    inputs = [array(tensor, cells) for tensor in (given.points, given.centres, cells)]
-    launch(_nearest_centre_kernel, given.n, inputs, cells)
+def nearest_centre(arguments: Any, cells: Tensor) -> None:
+    """Writes the index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
+    check_sizes("nearest_centre", arguments.centres)
+    inputs = [array(tensor, cells) for tensor in (arguments.points, arguments.centres, cells)]
+    launch(_nearest_centre_kernel, arguments.n, inputs, cells)

@@ -1,4 +1,4 @@
-"""What rendered samples teach an occupancy grid as Warp kernels, in place. x, y, z cells along each axis, m samples."""
+"""``observe_occupancy`` as Warp kernels, in place. x, y, z cells along each axis, m samples."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _INFINITY = wp.constant(float("inf"))
 def _place(x: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) -> wp.int32:
     place = (x - low) / (high - low) * wp.float32(size)
     inside = wp.float32(0.0)
-    if place > 0.0:  # NaN is not
+    if place > 0.0:  # false for NaN
         inside = wp.min(place, wp.float32(size - 1))
     return wp.int32(inside)
 
 
 @wp.func
 def _stretch(x: wp.float32, y: wp.float32, z: wp.float32, space: wp.array2d(dtype=wp.float32)) -> wp.float32:
-    # World length of a unit of the space: `space` has a row for the centre and the radius of a sphere, five for a
-    # perspective.
+    # Returns the world length of a unit of grid space. `space` has one row (centre and radius of a sphere) or five (a
+    # perspective).
     if space.shape[0] == 1:
         offset = wp.vec3(x - space[0, 0], y - space[0, 1], z - space[0, 2])
         left = wp.float32(2.0) - wp.length(offset) / space[0, 3]
         inside = wp.float32(1.0e-3)
-        if left > 1.0e-3:  # NaN is not
+        if left > 1.0e-3:  # false for NaN
             inside = wp.min(left, wp.float32(1.0))
         return wp.float32(1.0) / (inside * inside)
     if space.shape[0] == 5:
@@ -58,12 +58,12 @@ def _find_kernel(
     y = _place(positions[i, 1], box[0, 1], box[1, 1], density.shape[1])
     z = _place(positions[i, 2], box[0, 2], box[1, 2], density.shape[2])
     cells[i] = -1
-    said = wp.bool(True)
+    observes = wp.bool(True)
     if deltas.shape[0] > 0:
-        said = deltas[i] != 0.0
+        observes = deltas[i] != 0.0
     if fixed.shape[0] > 0:
-        said = said and fixed[x, y, z] == wp.uint8(0)
-    if said:
+        observes = observes and fixed[x, y, z] == wp.uint8(0)
+    if observes:
         cells[i] = (x * density.shape[1] + y) * density.shape[2] + z
         before[i] = density[x, y, z]
 
@@ -78,7 +78,7 @@ def _fade_kernel(
     i = wp.tid()
     if cells[i] < 0:
         return
-    # From the old density: all samples of a cell write the same.
+    # Computed from the old density, so that all samples of a cell write the same value.
     density[cells[i]] = before[i] * decay
 
 
@@ -96,20 +96,20 @@ def _raise_kernel(
     i = wp.tid()
     if cells[i] < 0:
         return
-    found = sigma[i]
-    if wp.isnan(found):
-        found = _INFINITY
+    observed = sigma[i]
+    if wp.isnan(observed):
+        observed = _INFINITY
     seen = wp.bool(True)
     if weights.shape[0] > 0:
-        thickness = found * deltas[i]
-        # 1 - exp(-t), by its series where the subtraction would cost digits.
+        thickness = observed * deltas[i]
+        # 1 - exp(-t), by its series for small t to avoid cancellation.
         absorbed = 1.0 - wp.exp(-thickness)
         if thickness < 0.01:
             absorbed = thickness * (1.0 - 0.5 * thickness * (1.0 - thickness / 3.0))
         seen = weights[i] > hidden * absorbed
     if seen:
-        found *= _stretch(positions[i, 0], positions[i, 1], positions[i, 2], space)
-        wp.atomic_max(density, cells[i], found)
+        observed *= _stretch(positions[i, 0], positions[i, 1], positions[i, 2], space)
+        wp.atomic_max(density, cells[i], observed)
 
 
 @wp.kernel
@@ -126,18 +126,18 @@ def _compare_kernel(
 
 
 @declared("observe_occupancy").custom_op("observe_occupancy_warp")
-def observe_occupancy(given: Any, _: None) -> None:
-    """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    density, m = given.density, given.positions.shape[0]
+def observe_occupancy(arguments: Any, _: None) -> None:
+    """Updates the cells of the samples: decays and raises densities; see ``voronerf.ops.observe_occupancy``."""
+    density, m = arguments.density, arguments.positions.shape[0]
     cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
     flat, rows, faded = (array(tensor, density) for tensor in (density.view(-1), cells, before))
-    samples = [array(tensor, density) for tensor in (given.sigma, given.deltas, given.weights)]
-    fixed = density.new_empty(0, 0, 0, dtype=torch.uint8) if given.fixed is None else given.fixed
-    grid = [array(fixed, density), array(given.box, density), array(density, density)]
-    positions, contraction = array(given.positions, density), given.contraction
+    samples = [array(tensor, density) for tensor in (arguments.sigma, arguments.deltas, arguments.weights)]
+    fixed = density.new_empty(0, 0, 0, dtype=torch.uint8) if arguments.fixed is None else arguments.fixed
+    grid = [array(fixed, density), array(arguments.box, density), array(density, density)]
+    positions, contraction = array(arguments.positions, density), arguments.contraction
     space = density.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1])
     seen = [*samples, positions, array(space, density)]
     launch(_find_kernel, m, [positions, samples[1], *grid, rows, faded], density)
-    launch(_fade_kernel, m, [rows, faded, given.decay, flat], density)
-    launch(_raise_kernel, m, [rows, *seen, given.hidden, flat], density)
-    launch(_compare_kernel, m, [rows, flat, given.threshold, array(given.occupied.view(-1), density)], density)
+    launch(_fade_kernel, m, [rows, faded, arguments.decay, flat], density)
+    launch(_raise_kernel, m, [rows, *seen, arguments.hidden, flat], density)
+    launch(_compare_kernel, m, [rows, flat, arguments.threshold, array(arguments.occupied.view(-1), density)], density)

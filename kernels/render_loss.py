@@ -1,10 +1,10 @@
 """The loss of rendered rays and its gradient as Warp kernels. r rays, m samples of all rays (packed).
 
-A thread takes a ray, whose samples lie side by side. With o_i = sigma_i delta_i the optical depth of sample i and F_i
-the sum of those in front of it, its weight is exp(-F_i) (1 - exp(-o_i)); the background is seen with exp(-F) over the
-whole ray. F is summed in float64, the rest is float32. With G_i the gradient to weight i, that to o_i is
-``G_i exp(-F_i - o_i) - sum over j > i of G_j w_j``: one sweep finds the colour of the ray and leaves F_i where the
-gradient of the density is to be, a second one comes back with the sum of what is behind.
+One thread handles one ray, whose samples are adjacent. Let o_i = sigma_i delta_i be the optical depth of sample i and
+F_i the sum of the optical depths in front of it. Its weight is exp(-F_i) (1 - exp(-o_i)), and the background's weight
+is exp(-F) over the whole ray. F is summed in float64, other values are float32. With G_i the gradient of weight i, the
+gradient of o_i is ``G_i exp(-F_i - o_i) - sum over j > i of G_j w_j``. A first sweep computes the colour of the ray and
+stores F_i in the memory of the density's gradient; a second sweep runs back with the sum over samples behind.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from voronerf.ops.render_loss.reference import robust_error
 wp.set_module_options({"enable_backward": False})
 
 _OPAQUE = wp.constant(wp.float32(1.0e30))
-"""Stands for infinite density: as opaque over any length but 0, and 0 times it is 0."""
+"""The substitute for infinite density: just as opaque over any length but 0, and 0 times it is 0."""
 
 
 @wp.func
@@ -37,7 +37,7 @@ def _density(sigma: wp.float32) -> wp.float32:
 
 @wp.func
 def _absorbed(optical: wp.float32) -> wp.float32:
-    """1 - exp(-x) without the digits that the subtraction would cost (Kahan's way)."""
+    """Returns 1 - exp(-x) without cancellation (Kahan's method)."""
     left = wp.exp(-optical)
     absorbed = 1.0 - left
     if left == 1.0:
@@ -49,13 +49,13 @@ def _absorbed(optical: wp.float32) -> wp.float32:
 
 @wp.func
 def sigmoid(x: wp.float32) -> wp.float32:
-    """1 / (1 + e^-x), which is 0 where e^-x is infinite."""
+    """Returns 1 / (1 + e^-x), which is 0 if e^-x is infinite."""
     return 1.0 / (1.0 + wp.exp(-x))
 
 
 @wp.func
 def softplus(x: wp.float32) -> wp.float32:
-    """Without the digits that 1 + exp(-|x|) would cost (Kahan's way); NaN stays NaN."""
+    """Returns log(1 + e^x) without the rounding of 1 + exp(-|x|) (Kahan's method); NaN stays NaN."""
     small = wp.exp(-wp.abs(x))
     sum = 1.0 + small
     rest = small
@@ -68,9 +68,9 @@ def softplus(x: wp.float32) -> wp.float32:
 
 @wp.struct
 class Inputs:
-    """Outputs of networks for the samples of rays, and what the rays are compared with.
+    """The networks' outputs for the samples, and the targets of the rays.
 
-    ``activated``: the outputs are colour and density as they are. ``seen``: the number of rays with a colour to learn.
+    ``activated``: the outputs are colour and density themselves. ``seen``: the number of rays with a target colour.
     """
 
     raw: wp.array2d(dtype=wp.float32)
@@ -86,8 +86,8 @@ class Inputs:
 
 
 @wp.struct
-class Found:
-    """Results of rays and of samples."""
+class Outputs:
+    """The results for rays and for samples."""
 
     colour: wp.array2d(dtype=wp.float32)
     weights: wp.array(dtype=wp.float32)
@@ -96,9 +96,9 @@ class Found:
 
 
 @wp.func
-def _colour_of(given: Inputs, i: wp.int32) -> wp.vec3:
-    raw = wp.vec3(given.raw[i, 0], given.raw[i, 1], given.raw[i, 2])
-    if given.activated:
+def _colour_of(inputs: Inputs, i: wp.int32) -> wp.vec3:
+    raw = wp.vec3(inputs.raw[i, 0], inputs.raw[i, 1], inputs.raw[i, 2])
+    if inputs.activated:
         return raw
     return wp.vec3(sigmoid(raw[0]), sigmoid(raw[1]), sigmoid(raw[2]))
 
@@ -111,90 +111,90 @@ def _density_of(raw: wp.float32, scale: wp.float32, activated: wp.bool) -> wp.fl
 
 
 @wp.kernel
-def _render_loss_kernel(given: Inputs, found: Found) -> None:
+def _render_loss_kernel(inputs: Inputs, outputs: Outputs) -> None:
     ray = wp.tid()
-    begin = wp.clamp(given.offsets[ray], 0, given.raw.shape[0])
-    end = wp.clamp(given.offsets[ray + 1], 0, given.raw.shape[0])
+    begin = wp.clamp(inputs.offsets[ray], 0, inputs.raw.shape[0])
+    end = wp.clamp(inputs.offsets[ray + 1], 0, inputs.raw.shape[0])
     front = wp.float64(0.0)
     light = wp.vec3(0.0, 0.0, 0.0)
     for i in range(begin, end):
-        optical = _density(_density_of(given.raw[i, 3], given.scale, given.activated)) * given.deltas[i]
+        optical = _density(_density_of(inputs.raw[i, 3], inputs.scale, inputs.activated)) * inputs.deltas[i]
         weight = wp.exp(-wp.float32(front)) * _absorbed(optical)
-        found.gradient[i, 3] = wp.float32(front)
+        outputs.gradient[i, 3] = wp.float32(front)
         front += wp.float64(optical)
-        found.weights[i] = weight
-        light = light + weight * _colour_of(given, i)
+        outputs.weights[i] = weight
+        light = light + weight * _colour_of(inputs, i)
     left = wp.exp(-wp.float32(front))
     shown = wp.vec3(0.0, 0.0, 0.0)
-    if given.background.shape[0] > 0:
-        shown = wp.vec3(given.background[ray, 0], given.background[ray, 1], given.background[ray, 2])
+    if inputs.background.shape[0] > 0:
+        shown = wp.vec3(inputs.background[ray, 0], inputs.background[ray, 1], inputs.background[ray, 2])
     seen = light + left * shown
-    off = seen - wp.vec3(given.target[ray, 0], given.target[ray, 1], given.target[ray, 2])
-    share = 2.0 / (3.0 * wp.float32(given.target.shape[0]))
-    if given.robust > 0.0:
-        share = share * given.robust / wp.sqrt(wp.dot(off, off) + given.robust * given.robust)
+    off = seen - wp.vec3(inputs.target[ray, 0], inputs.target[ray, 1], inputs.target[ray, 2])
+    share = 2.0 / (3.0 * wp.float32(inputs.target.shape[0]))
+    if inputs.robust > 0.0:
+        share = share * inputs.robust / wp.sqrt(wp.dot(off, off) + inputs.robust * inputs.robust)
     slopes = off * share
     for k in range(3):
-        found.colour[ray, k] = seen[k]
-    if ray >= given.seen:
-        found.error[ray] = 0.0
+        outputs.colour[ray, k] = seen[k]
+    if ray >= inputs.seen:
+        outputs.error[ray] = 0.0
         for i in range(begin, end):
             for k in range(4):
-                found.gradient[i, k] = 0.0
+                outputs.gradient[i, k] = 0.0
         return
-    found.error[ray] = wp.dot(off, off)
+    outputs.error[ray] = wp.dot(off, off)
     behind = left * wp.dot(slopes, shown)
     for reverse in range(end - begin):
         i = end - 1 - reverse
-        density = _density_of(given.raw[i, 3], given.scale, given.activated)
-        optical = _density(density) * given.deltas[i]
-        ahead = found.gradient[i, 3]
-        value = _colour_of(given, i)
+        density = _density_of(inputs.raw[i, 3], inputs.scale, inputs.activated)
+        optical = _density(density) * inputs.deltas[i]
+        ahead = outputs.gradient[i, 3]
+        value = _colour_of(inputs, i)
         to_weight = wp.dot(slopes, value)
         to_optical = to_weight * wp.exp(-(ahead + optical)) - behind
-        behind += to_weight * found.weights[i]
+        behind += to_weight * outputs.weights[i]
         for k in range(3):
-            to_colour = found.weights[i] * slopes[k]
-            if not given.activated:
+            to_colour = outputs.weights[i] * slopes[k]
+            if not inputs.activated:
                 to_colour = to_colour * (value[k] * (1.0 - value[k]))
-            found.gradient[i, k] = to_colour
+            outputs.gradient[i, k] = to_colour
         slope = wp.float32(1.0)
-        if not given.activated:
-            slope = sigmoid(given.raw[i, 3]) * given.scale
+        if not inputs.activated:
+            slope = sigmoid(inputs.raw[i, 3]) * inputs.scale
         if density > _OPAQUE:
             slope = wp.float32(0.0)
-        found.gradient[i, 3] = to_optical * given.deltas[i] * slope
-        if wp.exp(-ahead) <= given.hidden:
+        outputs.gradient[i, 3] = to_optical * inputs.deltas[i] * slope
+        if wp.exp(-ahead) <= inputs.hidden:
             for k in range(4):
-                found.gradient[i, k] = 0.0
+                outputs.gradient[i, k] = 0.0
 
 
 @wp.kernel
-def _density_kernel(given: Inputs, density: wp.array(dtype=wp.float32)) -> None:
+def _density_kernel(inputs: Inputs, density: wp.array(dtype=wp.float32)) -> None:
     i = wp.tid()
-    density[i] = _density_of(given.raw[i, 3], given.scale, given.activated)
+    density[i] = _density_of(inputs.raw[i, 3], inputs.scale, inputs.activated)
 
 
 def render_loss(raw: Tensor, *others: Any) -> list[Tensor]:
-    """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
+    """Returns activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
     *parts, _ = _render_loss(raw.float(), *others)
     return parts
 
 
 @declared("render_loss_gradient").custom_op("render_loss_warp")
-def _render_loss(given: Any, found: Any) -> None:
-    raw, target, m, r = given.raw, given.target, given.m, given.r
-    check_ray_offsets("render_loss", given.ray_offsets, m)
-    for of_strays in (found.weights, found.gradient):  # samples that belong to no ray
+def _render_loss(arguments: Any, results: Any) -> None:
+    raw, target, m, r = arguments.raw, arguments.target, arguments.m, arguments.r
+    check_ray_offsets("render_loss", arguments.ray_offsets, m)
+    for of_strays in (results.weights, results.gradient):  # samples that belong to no ray
         of_strays.zero_()
-    behind = target.new_empty(0, 3) if given.background is None else given.background.expand_as(target)
-    compared = {"target": target, "background": behind, "hidden": given.hidden, "robust": given.robust}
-    rule = {"scale": given.density_scale, "activated": given.activated, "seen": r - 3 * given.triples}
-    inputs = filled(Inputs(), raw=raw, deltas=given.deltas, offsets=given.ray_offsets, **compared, **rule)
-    outputs = {name: getattr(found, name) for name in ("colour", "weights", "error", "gradient")}
-    launch(_render_loss_kernel, r, [inputs, filled(Found(), **outputs)], raw)
-    launch(_density_kernel, m, [inputs, array(found.density, raw)], raw)
-    found.loss.copy_(robust_error(found.error.double(), given.robust).mean() / 3)
+    behind = target.new_empty(0, 3) if arguments.background is None else arguments.background.expand_as(target)
+    compared = {"target": target, "background": behind, "hidden": arguments.hidden, "robust": arguments.robust}
+    rule = {"scale": arguments.density_scale, "activated": arguments.activated, "seen": r - 3 * arguments.triples}
+    inputs = filled(Inputs(), raw=raw, deltas=arguments.deltas, offsets=arguments.ray_offsets, **compared, **rule)
+    outputs = {name: getattr(results, name) for name in ("colour", "weights", "error", "gradient")}
+    launch(_render_loss_kernel, r, [inputs, filled(Outputs(), **outputs)], raw)
+    launch(_density_kernel, m, [inputs, array(results.density, raw)], raw)
+    results.loss.copy_(robust_error(results.error.double(), arguments.robust).mean() / 3)
 
 
 register(_render_loss)

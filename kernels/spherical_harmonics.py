@@ -1,4 +1,4 @@
-"""``spherical_harmonics`` as Warp kernels. n directions, a thread each.
+"""``spherical_harmonics`` as Warp kernels. n directions, one thread each.
 
 The arithmetic is float32; second derivatives come from the reference formula.
 """
@@ -53,7 +53,7 @@ def _harmonics_backward_kernel(
     gradient: wp.array2d(dtype=wp.float32),
     directions: wp.array2d(dtype=wp.float32),
     degree: wp.int32,
-    found: wp.array2d(dtype=wp.float32),
+    of_x: wp.array2d(dtype=wp.float32),
 ) -> None:
     i = wp.tid()
     x = directions[i, 0]
@@ -82,21 +82,21 @@ def _harmonics_backward_kernel(
         to_y += -b * y * z * gradient[i, 14] + 2.0 * a * x * y * gradient[i, 15]
         to_z += b * x * y * gradient[i, 10] - 4.5704579946446572 * z * (y * gradient[i, 11] + x * gradient[i, 13])
         to_z += 1.1195289977703462 * (5.0 * z * z - 1.0) * gradient[i, 12] + 0.5 * b * d * gradient[i, 14]
-    found[i, 0] = to_x
-    found[i, 1] = to_y
-    found[i, 2] = to_z
+    of_x[i, 0] = to_x
+    of_x[i, 1] = to_y
+    of_x[i, 2] = to_z
 
 
 @_OP.custom_op("spherical_harmonics_warp")
-def _forward(given: Any, out: Tensor) -> None:
-    launch(_harmonics_kernel, given.n, [array(given.directions, out), given.degree, array(out, out)], out)
+def _forward(arguments: Any, out: Tensor) -> None:
+    launch(_harmonics_kernel, arguments.n, [array(arguments.directions, out), arguments.degree, array(out, out)], out)
 
 
 @_OP.backward_op("spherical_harmonics_warp_backward", _forward, reference.spherical_harmonics)
-def _backward(given: Any, arriving: Any, gradients: Any) -> None:
-    found, directions = gradients.directions, given.directions
-    inputs = [array(arriving.result, found), array(directions, found), given.degree, array(found, found)]
-    launch(_harmonics_backward_kernel, given.n, inputs, found)
+def _backward(arguments: Any, arriving: Any, gradients: Any) -> None:
+    of_x, directions = gradients.directions, arguments.directions
+    inputs = [array(arriving.result, of_x), array(directions, of_x), arguments.degree, array(of_x, of_x)]
+    launch(_harmonics_backward_kernel, arguments.n, inputs, of_x)
 
 
 spherical_harmonics = in_float32(_forward)

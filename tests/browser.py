@@ -1,4 +1,4 @@
-"""A real browser for tests: Debian's packages chromium and chromium-driver, without a screen and without a GPU."""
+"""A headless browser without a GPU for tests, from Debian's packages chromium and chromium-driver."""
 
 import contextlib
 import io
@@ -12,14 +12,14 @@ from PIL import Image
 FLAGS = """--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update
 --disable-sync --hide-scrollbars --force-device-scale-factor=1"""
 WEBGL = "--headless --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
-#: On the CPU; without Vulkan, a canvas cannot be drawn to.
+#: WebGPU on the CPU. A canvas can only be drawn to with Vulkan.
 WEBGPU = """--headless=new --enable-unsafe-webgpu --use-webgpu-adapter=swiftshader --enable-features=Vulkan
 --use-vulkan=swiftshader --use-angle=swiftshader"""
 
 
 @contextlib.contextmanager
 def chromium(profile: Path, width: int = 1000, height: int = 700, *, flags: str = WEBGL):
-    """A driver of a browser whose profile is in a folder of its own; skips the test where there is none."""
+    """Yields a selenium driver of a browser with its own profile folder; skips the test without a browser."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     paths = [shutil.which(name) for name in ("chromium", "chromedriver")]
     if None in paths:
@@ -37,14 +37,14 @@ def chromium(profile: Path, width: int = 1000, height: int = 700, *, flags: str 
 
 
 def until(done, seconds=30.0):
-    """What a function gives when it gives something true; fails where it does not within so many seconds."""
+    """Calls ``done`` until its value is true and returns it; fails after ``seconds``."""
     end = time.monotonic() + seconds
-    while not (found := done()):
+    while not (value := done()):
         assert time.monotonic() < end, f"waited {seconds} s in vain"
         time.sleep(0.1)
-    return found
+    return value
 
 
 def screenshot(driver) -> Image.Image:
-    """What the page shows, in RGB."""
+    """Returns the visible page as an RGB image."""
     return Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")

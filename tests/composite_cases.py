@@ -1,4 +1,4 @@
-"""Rays to composite, and what composite gives for them: shared by the tests of its backends."""
+"""Ray samples to composite and results of `composite`, shared by the tests of its backends."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ PARTS = ("colour", "opacity", "depth", "weights")
 
 
 def scene(counts: list[int], c: int = 3, background: str = "ray", outside: tuple[int, int] = (0, 0)) -> dict:
-    """Float64 arguments of rays with so many samples each, packed; `outside` before and after them are of no ray."""
+    """Returns packed float64 arguments of `composite`.
+
+    ``counts`` holds the number of samples of each ray, ``outside`` the numbers of samples before and after them that
+    belong to no ray.
+    """
     m, r = sum(counts) + sum(outside), len(counts)
     double = torch.float64
     return {
@@ -30,18 +34,18 @@ def dense(r: int, s: int, c: int = 3, background: str = "ray") -> dict:
     return {**packed, **{name: packed[name].view(shape) for name, shape in shapes.items()}, "ray_offsets": None}
 
 
-def leaves_of(given: dict, dtype: torch.dtype) -> tuple[dict, list[Tensor]]:
-    """The arguments in a dtype, and those of them that have gradients."""
+def leaves_of(arguments: dict, dtype: torch.dtype) -> tuple[dict, list[Tensor]]:
+    """Returns (arguments in a dtype, list of the floating-point ones), which require gradients."""
     cast = {
         name: tensor.to(dtype).requires_grad_() if tensor is not None and tensor.is_floating_point() else tensor
-        for name, tensor in given.items()
+        for name, tensor in arguments.items()
     }
     return cast, [tensor for tensor in cast.values() if tensor is not None and tensor.requires_grad]
 
 
-def evaluate(given: dict, dtype: torch.dtype, backend: str, parts: tuple[str, ...] = PARTS) -> list[Tensor]:
-    """All outputs, and the gradients of a weighted sum of some of them."""
-    cast, leaves = leaves_of(given, dtype)
+def evaluate(arguments: dict, dtype: torch.dtype, backend: str, parts: tuple[str, ...] = PARTS) -> list[Tensor]:
+    """Returns all outputs, followed by the gradients of a weighted sum of the outputs named by ``parts``."""
+    cast, leaves = leaves_of(arguments, dtype)
     result = composite(**cast, backend=backend)
     chosen = [getattr(result, part) for part in parts]
     slopes = [torch.linspace(-1, 1.5, part.numel(), dtype=torch.float64).view_as(part).to(dtype) for part in chosen]

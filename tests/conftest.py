@@ -1,4 +1,4 @@
-"""Device and backend fixtures, and ``--require``.
+"""Device and backend fixtures, and the option ``--require``.
 
 A test that takes ``device`` and ``backend`` runs once for every pair; ``@pytest.mark.op("nearest_centre")`` keeps the
 pairs that implement that op. Taking ``device`` alone runs it on each device, ``backend`` alone on each backend of the
@@ -11,8 +11,8 @@ CPU::
     def test_empty(device):  # cpu, cuda
         ...
 
-``@pytest.mark.native``, ``@pytest.mark.cuda`` and ``@pytest.mark.warp`` say that a test needs that part. What is absent
-is a skip with its reason; ``--require native,cuda,warp`` turns those skips into failures.
+``@pytest.mark.native``, ``@pytest.mark.cuda`` and ``@pytest.mark.warp`` say that a test needs this part. A test whose
+part is absent is skipped with the reason; ``--require native,cuda,warp`` turns these skips into failures.
 
 ``--emulate-cuda SEED`` runs the native backend's CUDA kernels in place of its CPU ones, on the CPU (cuda_emulation/).
 """
@@ -55,8 +55,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     wants_device = "device" in metafunc.fixturenames
     wants_backend = "backend" in metafunc.fixturenames
-    own = {name for mark in metafunc.definition.iter_markers("parametrize") for name in _names(mark)}
-    if own & {"device", "backend"}:
+    parametrized = {name for mark in metafunc.definition.iter_markers("parametrize") for name in _names(mark)}
+    if parametrized & {"device", "backend"}:
         return
     devices = ("cpu", "cuda") if wants_device else ("cpu",)
     if not wants_backend:
@@ -67,9 +67,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     names = backends.BACKENDS if mark is None else backends.implemented(mark.args[0])
     if wants_device:
         pairs = [(backend, device) for device in devices for backend in names]
-        if mark is not None:  # an implementation may be of one device alone
+        if mark is not None:  # some implementations support one device only
             pairs = [pair for pair in pairs if mark.args[0] in backends.ops(*pair)]
-        if NO_CUDA:  # one row stays to say so
+        if NO_CUDA:  # one CUDA row stays, to report the skip
             pairs = pairs[: 1 + sum(device != "cuda" for _, device in pairs)]
         metafunc.parametrize(("backend", "device"), pairs, indirect=["device"], ids=["-".join(pair) for pair in pairs])
     else:
@@ -83,7 +83,7 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 @pytest.fixture(params=["portable", "neon", "avx2", "avx512", "avx512_bf16", "amx"])
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Native CPU kernels with each instruction set that this processor has."""
+    """Runs the native CPU kernels with each instruction set of this processor; its value is the set's name."""
     native = pytest.importorskip("voronerf.ops._core.native")
     if request.param not in native.SUPPORTED_ISAS:
         pytest.skip(f"this processor has no {request.param}")
@@ -93,8 +93,10 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 @pytest.fixture
 def poisoned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.Tensor]]:
-    """Whatever ``Tensor.new_empty`` and ``torch.empty`` give in the test holds NaN or a large number, and lies between
-    guards of the same, which must survive. The guards there are so far."""
+    """Poisons ``Tensor.new_empty`` and ``torch.empty``; its value is the growing list of guards.
+
+    New tensors hold NaN, 121 or False, and lie between guards of the same value. The test fails if a guard changes.
+    """
     guards: list[torch.Tensor] = []
 
     def empty(*shape: Any, dtype: torch.dtype = torch.float32, device: Any = "cpu") -> torch.Tensor:
@@ -117,7 +119,7 @@ def poisoned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.Tensor]]:
 
 @pytest.fixture(autouse=True)
 def _same_seed() -> None:
-    torch.default_generator.manual_seed(0)  # torch.manual_seed also formats the stack, once for every kind of device
+    torch.default_generator.manual_seed(0)  # torch.manual_seed is slower: it formats the stack per device type
     if not NO_CUDA:
         torch.cuda.manual_seed_all(0)
 
@@ -135,7 +137,7 @@ def _emulated_cuda(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Of the rows of a test that need a device that is not there, the first stays to say so."""
+    """Deselects all but the first of a test's rows that need an absent GPU; the first reports the skip."""
     seen: set[str] = set()
     rows: tuple[list[pytest.Item], list[pytest.Item]] = [], []
     for item in items:
@@ -150,7 +152,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Leaves torch, and thousands of collected tests, out of what the collector looks through again and again."""
+    """Excludes torch and the collected tests from garbage collection, which would scan them again and again."""
     gc.disable()
     try:
         return (yield)
@@ -168,7 +170,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def _absent(item: pytest.Item) -> Iterator[tuple[str, str]]:
-    """Parts a test needs and this machine lacks, each with the reason."""
+    """Yields (part, reason) for each part that a test needs and this machine lacks."""
     params = getattr(getattr(item, "callspec", None), "params", {})
     device = torch.device(params.get("device", "cpu"))
     named = {part for part in PARTS if item.get_closest_marker(part) is not None}

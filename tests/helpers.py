@@ -1,4 +1,4 @@
-"""What tests of every room share: refusals, covering sets, seeds, equal tensors, threads, scripts, files of JSON."""
+"""Helpers of all tests: expected errors, pairwise parameters, seeds, tensor equality, threads, scripts, JSON files."""
 
 import contextlib
 import io
@@ -20,7 +20,7 @@ from voronerf.nerf import Hierarchical, Occupancy, Renderer, Space, Stratified
 
 
 def refuses(message, call, *args, error=ValueError, **options):
-    """Fails unless the call raises an error of one line that contains ``message``, which is no pattern."""
+    """Fails unless the call raises a one-line error that contains ``message`` literally."""
     with pytest.raises(error) as caught:
         call(*args, **options)
     text = str(caught.value)
@@ -28,9 +28,9 @@ def refuses(message, call, *args, error=ValueError, **options):
 
 
 def all_pairs(values):
-    """Arguments for ``parametrize``: few of all products, in which every two values of different parameters meet.
+    """Returns arguments for ``parametrize`` with few rows in which all pairs of values of two parameters occur.
 
-    A name of several parameters, such as "i, o", has tuples as values.
+    A key may name several parameters, such as "i, o"; its values are tuples.
     """
     columns = [list(column) for column in values.values()]
     numbers = [range(len(column)) for column in columns]
@@ -53,7 +53,7 @@ def seeded(seed=0):
 
 
 def same(first, second):
-    """Whether two sequences of tensors, or two dictionaries of them, are equal bit for bit. None equals None."""
+    """Returns whether two sequences or dictionaries of tensors are equal bit for bit. None equals None."""
     if isinstance(first, Mapping):
         return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
     return all(
@@ -62,28 +62,28 @@ def same(first, second):
 
 
 def anonymous_memory():
-    """Bytes of this process that are no pages of files; a test that asks is skipped where Linux does not say."""
+    """Returns this process's anonymous memory (pages of no file) in bytes; skips the test except on Linux."""
     if sys.platform != "linux":
         pytest.skip("asks Linux what memory holds")
     return 1024 * int(re.search(r"RssAnon:\s+(\d+)", Path("/proc/self/status").read_text())[1])
 
 
 def on_any_number_of_threads(run, counts=(1, 2, 3)):
-    """The tensors that ``run`` returns, which must be equal bit for bit for each number of threads."""
-    before, found = torch.get_num_threads(), []
+    """Returns the tensors of ``run``; fails unless they are equal bit for bit for each number of threads."""
+    before, results = torch.get_num_threads(), []
     try:
         for count in counts:
             torch.set_num_threads(count)
-            found.append(list(run()))
+            results.append(list(run()))
     finally:
         torch.set_num_threads(before)
-    for count, other in zip(counts, found):
-        assert same(found[0], other), f"{count} threads give other bits than {counts[0]}"
-    return found[0]
+    for count, other in zip(counts, results):
+        assert same(results[0], other), f"{count} threads give other bits than {counts[0]}"
+    return results[0]
 
 
 def python(*args, **options):
-    """The output of a Python process, which must succeed."""
+    """Runs Python in a new process, which must succeed; returns its output."""
     command = [sys.executable, *map(str, args)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, **options)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -91,7 +91,7 @@ def python(*args, **options):
 
 
 def script(path, *args):
-    """What a Python script prints, run in this process, where torch is imported already."""
+    """Runs a Python script in this process, where torch is already imported; returns its output."""
     said = io.StringIO()
     with (
         contextlib.redirect_stdout(said),
@@ -110,9 +110,9 @@ def read_json(path):
 
 
 def trained(config, scene, *, stop_at=None, resume=False, on_event=None, callbacks=(), **options):
-    """Trains into ``config.out`` as `voronerf train` does, without a display; returns the summary.
+    """Trains into ``config.out`` like `voronerf train` without a display; returns the summary.
 
-    ``stop_at`` is the step after which the training is asked to stop; other options are those of ``run``.
+    ``stop_at`` is the step after which the training is stopped; other options go to ``run``.
     """
     state = train.build(config, scene, on_event=on_event)
     if resume:
@@ -129,16 +129,16 @@ def trained(config, scene, *, stop_at=None, resume=False, on_event=None, callbac
     return scores.summary
 
 
-def render_image(field, cameras, index, *, samples, occupancy=None, **given):
-    """The image of one field."""
-    return renderer_of({"field": field}, samples=samples, occupancy=occupancy).image(cameras, index, **given)
+def render_image(field, cameras, index, *, samples, occupancy=None, **options):
+    """Renders an image of a single field."""
+    return renderer_of({"field": field}, samples=samples, occupancy=occupancy).image(cameras, index, **options)
 
 
 def renderer_of(fields, *, samples, fine_samples=0, occupancy=None, picture_samples=None, backend="auto", **space):
-    """A renderer with the sampler that suits the names of the fields and what else is given."""
-    given = {"space": Space(**space), "backend": backend}
+    """Returns a renderer; the arguments choose its sampler: Occupancy, Hierarchical or Stratified."""
+    options = {"space": Space(**space), "backend": backend}
     if occupancy is not None:
-        sampler = Occupancy(occupancy, samples, picture_samples=picture_samples or samples, **given)
+        sampler = Occupancy(occupancy, samples, picture_samples=picture_samples or samples, **options)
     else:
-        sampler = Hierarchical(samples, fine_samples, **given) if fine_samples else Stratified(samples, **given)
+        sampler = Hierarchical(samples, fine_samples, **options) if fine_samples else Stratified(samples, **options)
     return Renderer(fields, sampler, backend=backend)

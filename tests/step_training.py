@@ -1,4 +1,4 @@
-"""A small training whose steps are recorded and replayed, or run as they are, to compare the two."""
+"""A small training to compare replayed steps with eager steps."""
 
 import torch
 
@@ -23,7 +23,7 @@ BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 
 
 class Scaled(torch.nn.Module):
-    """A field of one's own, with an attribute that changes."""
+    """A custom field with an attribute that the tests change."""
 
     def __init__(self):
         super().__init__()
@@ -35,9 +35,9 @@ class Scaled(torch.nn.Module):
 
 
 class Training:
-    """A small training, whose grid empties a part of the box, so that its numbers of samples vary.
+    """A small training whose occupancy grid is partly empty, so that its numbers of samples vary.
 
-    With ``photograph`` it has points of a sparse model, and rays from where no camera was.
+    With ``photograph`` it has points of a sparse model and rays from unseen views.
     """
 
     def __init__(self, cells=1, field=None, sampler=Occupancy, photograph=False, **options):
@@ -59,12 +59,12 @@ class Training:
         self.loss = RayLoss(Renderer({"field": shown}, self.sampler), terms=terms)
         self.optimizer = Adam.of({"field": self.router}, lr=0.01, sparse=["features"])
         for group in self.optimizer.param_groups:
-            group["betas"] = list(group["betas"])  # which can be changed in place
+            group["betas"] = list(group["betas"])  # a list can be changed in place
         self.guard, self.generator = Guard.on("cpu"), torch.Generator().manual_seed(1)
         given = {"guard": self.guard, "generator": self.generator}
         self.step = TrainingStep(self.batches, self.loss, self.optimizer, **given)
         self.recorded = self.done = 0
-        self.handles, self.other = [], None  # of hooks, and a second optimiser
+        self.handles, self.other = [], None  # hook handles, and a second optimiser
         run = self.step._run_stages
 
         def counted(*of):
@@ -74,25 +74,25 @@ class Training:
         self.step._run_stages = counted
 
     def run_as_it_is(self):
-        """Records no step from here on."""
+        """Makes all further steps run eagerly."""
         self.step.forget()
         self.step._standing_obstacle = lambda: "a test"
 
     def train(self, steps, rays=lambda step: 64, as_it_is=False):
-        """Makes steps, without recording if ``as_it_is``; returns their results."""
-        found = []
+        """Runs steps, eagerly if ``as_it_is``; returns a flat list of their results."""
+        results = []
         for step in range(steps):
             if as_it_is:
                 self.run_as_it_is()
             self.optimizer.set_learning_rate(0.01 / (1 + step))
-            made = self.step(rays(step))
-            output = made.output
-            kept = made.loss, output.weights, output.samples.ray_index, output.colour, made.batch.target
-            found += [*(each.clone() for each in kept), torch.tensor([made.rays, made.samples])]
-        return found
+            result = self.step(rays(step))
+            output = result.output
+            kept = result.loss, output.weights, output.samples.ray_index, output.colour, result.batch.target
+            results += [*(tensor.clone() for tensor in kept), torch.tensor([result.rays, result.samples])]
+        return results
 
     def everything(self):
-        moments = [value for each in self.optimizer.state.values() for value in each.values()]
+        moments = [value for state in self.optimizer.state.values() for value in state.values()]
         grid = self.sampler.grid
         gradients = [p.grad for p in self.router.parameters()]
         return [*self.router.parameters(), *gradients, *moments, grid.density, grid.occupied, *self.guard[:3]]

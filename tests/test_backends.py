@@ -1,4 +1,4 @@
-"""Selection of implementations, and what is said of those that are missing."""
+"""Tests of the selection of backends, and of the messages about missing backends."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_unknown_names_list_the_choices() -> None:
 
 def test_named_backend_never_falls_back(monkeypatch: pytest.MonkeyPatch) -> None:
     backends._choose_once.cache_clear()
-    monkeypatch.delitem(backends._TABLE, ("grouped_program", "warp"))  # as of an op that has none
+    monkeypatch.delitem(backends._TABLE, ("grouped_program", "warp"))  # an op without Warp
     with pytest.raises(BackendUnavailable, match=r"there is no warp implementation of grouped_program; use backend="):
         resolve("grouped_program", backend="warp", device=CPU, dtype=torch.float32)
     with pytest.raises(BackendUnavailable, match="takes 'int32', not int64"):
@@ -82,7 +82,7 @@ def test_table_agrees_with_resolve() -> None:
         assert "\n" not in row.reason
         for dtype in row.dtypes:
             for device in row.devices:
-                kind = getattr(torch, dtype, torch.float32)  # of "any" and "plain torch"
+                kind = getattr(torch, dtype, torch.float32)  # for "any" and "plain torch"
                 resolve(row.op, backend=row.backend, device=torch.device(device), dtype=kind)
 
 
@@ -134,7 +134,7 @@ assert main(["info"]) == 1
 
 
 def test_sources_without_their_compiled_module_say_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A checkout after ``pip install .``: Python finds the sources first."""
+    """The message names the compiled module's place, for a checkout after ``pip install .`` that shadows it."""
     monkeypatch.delitem(sys.modules, "voronerf.ops._core.native")
     monkeypatch.setitem(sys.modules, "voronerf.ops._core._C", None)
     backends._warn_once.cache_clear()
@@ -251,7 +251,7 @@ def test_auto_takes_warp_on_cuda_where_native_is_missing(monkeypatch: pytest.Mon
         kind = torch.int32 if op == "cell_sort" else torch.float32
         assert choose(op, "auto", "cuda", None, kind) == "warp"
         assert choose(op, "auto", "cpu", None, kind) == "native"
-    for op in ("routed_mlp", "adam", "composite"):  # plain torch, which calls what is of Warp
+    for op in ("routed_mlp", "adam", "composite"):  # the reference, which calls Warp ops
         assert choose(op, "auto", "cuda", None, torch.float32) == "reference"
         assert choose(op, "warp", "cuda", None, torch.float32) == "warp"
 
@@ -279,7 +279,7 @@ def test_what_warp_has_no_kernel_of_runs_as_plain_torch_with_its_operations_on_w
 
 @pytest.mark.slow
 def test_a_source_folder_that_is_not_installed_says_so() -> None:
-    """As on a machine that has the sources alone: no finder of an editable install, no ``voronerf.kernels``."""
+    """Sources without an install, which lack ``voronerf.kernels``, give a message that says how to install."""
     code = f"""
 import sys
 sys.meta_path = [finder for finder in sys.meta_path if "editable" not in repr(finder).lower()]

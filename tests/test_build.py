@@ -1,4 +1,4 @@
-"""The build scripts: commands of build.ninja, from compilers of more than one word, and the check of the CUDA files."""
+"""Tests of the build scripts: the commands of build.ninja, compilers of several words, and the CUDA check."""
 
 import importlib.metadata
 import importlib.util
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture
 def build(monkeypatch):
-    """The functions of setup.py, which is run without its last call."""
+    """The globals of setup.py, which runs without its call of `setup`."""
     if not (ROOT / "setup.py").is_file():
         pytest.skip("setup.py is not there: the tests are not in the source tree")
     pytest.importorskip("pybind11")
@@ -29,7 +29,7 @@ def build(monkeypatch):
 
 
 def commands(build, cuda):
-    """Command of every rule; the compiler, which is asked for its architecture, need not exist."""
+    """Returns the command of every build.ninja rule; the compiler need not exist."""
     build["ninja_file"].__globals__["isas"] = lambda: {"portable": ["-DVN_ISA=0"]}
     lines = build["ninja_file"](Path("_C.so"), cuda).splitlines()
     rules = [line.removeprefix("rule ") for line in lines if line.startswith("rule ")]
@@ -69,7 +69,7 @@ def test_arithmetic_is_exact_whatever_flags_are_given(build, monkeypatch, given)
 
 
 def test_every_module_lies_in_a_package():
-    """Folders without ``__init__.py`` work in a checkout and are left out of wheels."""
+    """Every folder has an ``__init__.py``; without it a folder works in a checkout but is missing in wheels."""
     setuptools = pytest.importorskip("setuptools")
     modules = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / "voronerf").rglob("*.py")}
     packages = setuptools.find_packages(str(ROOT), include=["voronerf", "voronerf.*"])
@@ -77,7 +77,7 @@ def test_every_module_lies_in_a_package():
 
 
 def test_clang_on_linux_is_refused_before_it_builds(build, monkeypatch):
-    """It would link, and then ask torch's OpenMP for what GCC's has not."""
+    """clang is refused on Linux: it would need symbols that torch's OpenMP, GCC's, lacks."""
     answer = SimpleNamespace(stdout="Ubuntu clang version 18.1.3\nTarget: x86_64")
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
     monkeypatch.setattr(sys, "platform", "linux")
@@ -94,7 +94,7 @@ def test_clang_on_linux_is_refused_before_it_builds(build, monkeypatch):
 
 
 def test_windows_builds_with_clang(build, monkeypatch):
-    """What the commands are; no machine with Windows has run them."""
+    """The build commands for Windows use clang; they are not tested on Windows."""
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setitem(build["ninja_file"].__globals__, "WINDOWS", True)
@@ -105,13 +105,13 @@ def test_windows_builds_with_clang(build, monkeypatch):
 
 
 def test_nvcc_is_found_where_cuda_home_has_none(build, monkeypatch, tmp_path):
-    nvcc, own = tmp_path / "path" / "nvcc", tmp_path / "home" / "bin" / "nvcc"
-    for path in (nvcc, own):
+    nvcc, home_nvcc = tmp_path / "path" / "nvcc", tmp_path / "home" / "bin" / "nvcc"
+    for path in (nvcc, home_nvcc):
         path.parent.mkdir(parents=True)
     settings = {"VORONERF_CUDA": "1", "VORONERF_CUDA_ARCHITECTURES": "80", "PATH": str(nvcc.parent)}
     for name, value in (settings | {"CUDA_HOME": str(tmp_path / "home")}).items():
         monkeypatch.setenv(name, value)
-    for path in (nvcc, own):
+    for path in (nvcc, home_nvcc):
         program(path)
         assert build["find_cuda"]().nvcc == path
 
@@ -121,17 +121,17 @@ def test_cuda_is_compiled_for_the_gpu_that_is_there(build, monkeypatch, tmp_path
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     for name in ("VORONERF_CUDA_ARCHITECTURES", "CUDA_HOME", "CUDA_PATH"):
         monkeypatch.delenv(name, raising=False)
-    every = ("75", "80", "90")
-    for said, auto in (("exit 1", None), ("echo 8.9; echo 8.0; echo 8.9", ("80", "89")), ("echo 13.0", every)):
+    supported = ("75", "80", "90")
+    for said, auto in (("exit 1", None), ("echo 8.9; echo 8.0; echo 8.9", ("80", "89")), ("echo 13.0", supported)):
         program(tmp_path / "nvidia-smi", said)
         if auto is None and any(Path(device).exists() for device in ("/dev/nvidiactl", "/dev/dxg")):
-            continue  # a GPU of which the driver says nothing
-        for wish, architectures in (("auto", auto), ("1", every)):
+            continue  # a GPU whose driver does not answer
+        for wish, architectures in (("auto", auto), ("1", supported)):
             monkeypatch.setenv("VORONERF_CUDA", wish)
-            found = build["find_cuda"]()
-            assert found.architectures == (architectures or ())
-            assert (found.nvcc is None) == (architectures is None)
-            assert architectures is not None or "no GPU here; VORONERF_CUDA=1 compiles it" in found.outcome
+            cuda = build["find_cuda"]()
+            assert cuda.architectures == (architectures or ())
+            assert (cuda.nvcc is None) == (architectures is None)
+            assert architectures is not None or "no GPU here; VORONERF_CUDA=1 compiles it" in cuda.outcome
 
 
 @pytest.mark.parametrize("cxx", ["nocompiler -m64", "ccache nocompiler"])
@@ -144,8 +144,8 @@ def test_without_a_compiler_a_line_says_what_to_install(build, monkeypatch, tmp_
         build["check_compiler"]()
     assert "\n" not in stop.value.code
     command = [sys.executable, str(ROOT / "setup.py"), "build_ext"]
-    made = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert made.returncode == 1 and made.stderr == f"{stop.value.code}\n" and not made.stdout
+    process = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert process.returncode == 1 and process.stderr == f"{stop.value.code}\n" and not process.stdout
 
 
 def test_one_word_and_none(build, monkeypatch):
@@ -168,7 +168,7 @@ ptxas info    : Used 8 registers, used 0 barriers
 
 @pytest.fixture
 def check(monkeypatch, tmp_path):
-    """The script, which says into the folder of the test."""
+    """The module cuda_check.py, which writes into the test's folder."""
     path = ROOT / ".ci" / "cuda_check.py"
     if not path.is_file():
         pytest.skip(".ci/cuda_check.py is not there: the tests are not in the source tree")
@@ -186,7 +186,7 @@ def program(path, text="") -> None:
 
 @pytest.fixture
 def reporting(check, monkeypatch, capsys, tmp_path):
-    """Status and words of a check with an nvcc that compiles nothing and reports what it is told to."""
+    """A function that runs the check with a stub nvcc that prints a report; returns (status, printed text)."""
 
     def run(report, *architectures, command="cat '{}' >&2"):
         (tmp_path / "report").write_text(report)
@@ -236,7 +236,7 @@ def test_cuda_check_leaves_the_toolkits_own_kernels_alone(reporting):
 def test_cuda_check_compares_with_the_table(check, monkeypatch, tmp_path):
     row = {"registers": 40, "spilled_bytes": 8, "shared_bytes": 0, "warps": 48}
     monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
-    # Not in the table, which is not there: no spills.
+    # A kernel that is not in the table must have no spills; the table is absent.
     assert len(check.regressions("V13", {"kernel": {"sm_80": row}})) == 1
     check.TABLE.write_text(check.as_text("V13", {"kernel": {"sm_80": row}}))
     assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []
@@ -257,11 +257,11 @@ def test_cuda_check_notes_the_architectures_it_was_asked_for(check, monkeypatch,
     old = {"registers": 40, "spilled_bytes": 0, "shared_bytes": 0, "warps": 48}
     _, said = reporting(REPORT.format("90"), "90")
     kernel = next(line for line in said.splitlines() if "kernel" in line).split(": registers")[0]
-    known = {kernel: {"sm_100": old, "sm_90": old}, "gone": {"sm_100": old}}
-    check.TABLE.write_text(check.as_text("V12", known))
+    kernels = {kernel: {"sm_100": old, "sm_90": old}, "gone": {"sm_100": old}}
+    check.TABLE.write_text(check.as_text("V12", kernels))
     reporting(REPORT.format("90"), "90", "--update")
-    assert list(check.json.loads(check.TABLE.read_text())["kernels"][kernel]) == ["sm_90"]  # of another nvcc
-    check.TABLE.write_text(check.as_text("", known))
+    assert list(check.json.loads(check.TABLE.read_text())["kernels"][kernel]) == ["sm_90"]  # drops rows of another nvcc
+    check.TABLE.write_text(check.as_text("", kernels))
     reporting(REPORT.format("90"), "90", "--update")
     kept = check.json.loads(check.TABLE.read_text())["kernels"]
     assert list(kept[kernel]) == ["sm_90", "sm_100"] and "gone" not in kept
@@ -270,9 +270,9 @@ def test_cuda_check_notes_the_architectures_it_was_asked_for(check, monkeypatch,
 
 @pytest.fixture
 def installed(tmp_path):
-    """Runs programs of a new environment with the wheel of `make wheel` and its requirements.
+    """A function that runs programs of a new virtual environment with the wheel of `make wheel`.
 
-    Nothing is fetched or compiled: the environment has links to what this one has of them.
+    Nothing is downloaded or compiled: the environment links to the requirements in this one.
     """
     wheels = sorted((ROOT / "dist").glob("voronerf-*.whl"), key=os.path.getmtime)
     if not wheels:
@@ -295,7 +295,7 @@ def installed(tmp_path):
 
 
 def link_requirements(metadata, extras, packages, seen=None) -> None:
-    """Links what a distribution requires, with some of its extras, into a folder."""
+    """Links the requirements of a distribution and of the given extras into a folder, recursively."""
     requirements = pytest.importorskip("packaging.requirements", reason="packaging is not installed")
     seen = set() if seen is None else seen
     for text in metadata.requires or ():
@@ -304,11 +304,11 @@ def link_requirements(metadata, extras, packages, seen=None) -> None:
         if not any(chosen) or wanted.name in seen:
             continue
         seen.add(wanted.name)
-        found = importlib.metadata.distribution(wanted.name)
-        for name in {file.parts[0] for file in found.files or () if file.parts[0] not in ("..", "__pycache__")}:
+        distribution = importlib.metadata.distribution(wanted.name)
+        for name in {file.parts[0] for file in distribution.files or () if file.parts[0] not in ("..", "__pycache__")}:
             if not (packages / name).exists():
-                (packages / name).symlink_to(found.locate_file(name))
-        link_requirements(found, wanted.extras, packages, seen)
+                (packages / name).symlink_to(distribution.locate_file(name))
+        link_requirements(distribution, wanted.extras, packages, seen)
 
 
 @pytest.mark.slow
@@ -317,7 +317,7 @@ def test_the_wheel_does_the_main_job_in_a_new_environment(installed):
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
     for command in settings["tool"]["cibuildwheel"]["test-command"]:
         said = installed(*command.split())
-        assert "built with" in said or not command.endswith("info")  # with CUDA or without
+        assert "built with" in said or not command.endswith("info")  # with or without CUDA
     assert "Building" not in installed("pip", "install", "--no-index", "voronerf[viewer]")
     installed("python", "-c", "import voronerf.app.viewer, sys; assert '.venv' not in voronerf.__file__")
 
@@ -350,9 +350,9 @@ def test_instructions_of_a_layer_are_those_of_the_shortest_way_around(code, tmp_
     products = "\n".join(f"        /*2{i:02x}1*/ HMMA.16816.F32.BF16 R8, R4, R6, R8 ;" for i in range(32))
     (tmp_path / "sass").write_text(SASS.format(products=products))
     program(tmp_path / "cuobjdump", f'test "$1 $2" = "-arch sm_90" && cat "{tmp_path}/sass"')
-    found = code["layers"](tmp_path / "program.o", "90", f"{tmp_path}:/bin:/usr/bin")
-    # Neither what is skipped on the way, nor what is behind its end.
-    assert found == {"kernel": {"BRA": 3, "LDG": 1, "HMMA": 32}}
+    layers = code["layers"](tmp_path / "program.o", "90", f"{tmp_path}:/bin:/usr/bin")
+    # Skipped instructions and those after the layer's end do not count.
+    assert layers == {"kernel": {"BRA": 3, "LDG": 1, "HMMA": 32}}
 
 
 def test_a_block_that_is_a_loop_is_counted_once(code):
@@ -367,10 +367,10 @@ def test_cuda_check_tells_of_more_instructions_of_a_layer(check, monkeypatch, tm
     row = {"registers": 40, "spilled_bytes": 0, "shared_bytes": 0, "warps": 48}
     kept = {"kernel": {"sm_80": {**row, "layer": 200}}, "other": {"sm_80": row}}
     check.TABLE.write_text(check.as_text("V13", kept))
-    assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []  # none are counted without cuobjdump
-    found = {"kernel": {"sm_80": row}, "other": {"sm_80": {**row, "layer": 9}}}
-    assert check.regressions("V13", found) == ["kernel (sm_80): no layer was found, of 200 instructions before"]
-    assert check.regressions("V14", found) == []
+    assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []  # without cuobjdump nothing is counted
+    kernels = {"kernel": {"sm_80": row}, "other": {"sm_80": {**row, "layer": 9}}}
+    assert check.regressions("V13", kernels) == ["kernel (sm_80): no layer was found, of 200 instructions before"]
+    assert check.regressions("V14", kernels) == []
     assert check.regressions("V13", {"kernel": {"sm_80": {**row, "layer": 201}}}) == [
         "kernel (sm_80): layer 201, above 200"
     ]

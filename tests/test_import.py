@@ -1,4 +1,4 @@
-"""What ``import voronerf`` costs and says."""
+"""Tests of ``import voronerf``: its cost and its output."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ assert not {"torch._dynamo", "sympy"} & sys.modules.keys()
 
 @pytest.mark.parametrize("files", ["[!n]*.py", pytest.param("native.py", marks=pytest.mark.native)])
 def test_functions_of_ops_hide_no_modules(files: str) -> None:
-    """``import a.b as c`` looks for a module at what has the name of its package, which is the function of the op."""
+    """``import a.b as c`` works for the modules of ops, although a function hides the package of the same name."""
     paths = sorted(Path(ops.__path__[0]).glob(f"[a-z]*/{files}"))
     lines = ["import sys", *(f"from voronerf.ops import {op}; assert callable({op})" for op in ops.__all__)]
     for name in (f"voronerf.ops.{path.parent.name}.{path.stem}" for path in paths if path.stem != "__init__"):
@@ -61,7 +61,7 @@ def test_functions_of_ops_hide_no_modules(files: str) -> None:
 @pytest.mark.native
 @pytest.mark.parametrize("code", [START, TRAINING], ids=["calls", "training"])
 def test_neither_first_calls_nor_a_training_print_or_import_compilers(code: str) -> None:
-    """Each compiler takes about as long as torch itself."""
+    """First calls and trainings print nothing and import no compiler, which would take as long as torch."""
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
@@ -79,19 +79,19 @@ def test_a_missing_torch_is_one_line(tmp_path) -> None:
 
 
 def test_threads_of_the_command_sleep_while_they_wait() -> None:
-    """A library leaves that to its program, and the command to its user."""
+    """Only the command sets the OpenMP wait policy, not the library, and the user's variables take precedence."""
     code = "import os, sys; sys.modules['torch'] = None; {}"
     code += "; print(*map(os.environ.get, ('OMP_WAIT_POLICY', 'GOMP_SPINCOUNT')))"
     command = "from voronerf.app.cli import main; main()"
-    for program, given, found in (
+    for program, variables, expected in (
         (command, {}, "passive 1000"),
         (command, {"OMP_WAIT_POLICY": "active"}, "active None"),
         (command, {"GOMP_SPINCOUNT": "7"}, "passive 7"),
         ("import voronerf.app.cli", {}, "None None"),
     ):
-        env = {name: value for name, value in os.environ.items() if "OMP_" not in name} | given
+        env = {name: value for name, value in os.environ.items() if "OMP_" not in name} | variables
         run = subprocess.run([sys.executable, "-c", code.format(program)], env=env, capture_output=True, text=True)
-        assert run.stdout.strip() == found, run.stderr
+        assert run.stdout.strip() == expected, run.stderr
 
 
 @pytest.mark.slow

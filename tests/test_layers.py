@@ -1,4 +1,4 @@
-"""The rooms of the code and who may enter them, read from the sources: imports go down only."""
+"""Tests of the layers of the code, read from the sources: a module imports only its own layer and lower ones."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# From the bottom up; a module may import its own room and those below. Three houses: the library (ops to nerf), the
-# application, the town.
+# The layers from the bottom up: the library (ops to nerf), the application, the town. A module may import its own room
+# (a member of a layer) and the rooms of lower layers.
 LAYERS = (
     {"ops._core"},
     {"ops", "kernels"},
@@ -27,11 +27,11 @@ LAYERS = (
     {"app.export", "app.web"},
     {"app.viewer"},
     {"town"},
-    {"app.cli", "app.nerfstudio"},  # the table of commands, and what nothing else imports
+    {"app.cli", "app.nerfstudio"},  # entry points: the commands, and nerfstudio's method
     {"__init__", "__main__"},
 )
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
-# What a layer may import from outside, where that is limited.
+# The only external packages that a room may import.
 OUTSIDE = {"kernels": {"warp", "torch"}}
 OUTSIDE |= {room: {"torch"} for room in ("ops._core", "ops", "diagram", "router", "nerf")}
 STANDARD_OF_ISA_FILES = {"cstdint", "cstddef", "immintrin.h", "arm_neon.h"}
@@ -41,61 +41,61 @@ CORE = sorted(path for path in (ROOT / "csrc").rglob("*") if path.is_file())
 
 
 def module_name(path: Path) -> str:
-    """Dotted name; files of kernels/ are installed as voronerf.kernels."""
+    """Returns the dotted name of a module; kernels/ is installed as voronerf.kernels."""
     parts = list(path.relative_to(ROOT).with_suffix("").parts)
     return ".".join(parts if parts[0] == "voronerf" else ["voronerf", *parts])
 
 
 def room(module: str) -> str:
-    """The layer's member a module belongs to: voronerf.ops.resample -> ops, voronerf -> __init__."""
+    """Returns the room (member of a layer) of a module: voronerf.ops.resample -> ops, voronerf -> __init__."""
     parts = module.split(".")
-    own = ".".join(parts[1:3])
-    return own if own in LEVEL else parts[1] if len(parts) > 1 else "__init__"
+    member = ".".join(parts[1:3])
+    return member if member in LEVEL else parts[1] if len(parts) > 1 else "__init__"
 
 
 def imports(source: str, module: str) -> list[tuple[int, str]]:
-    """Line and dotted name of everything imported, at any depth of the file; names of a package count as modules."""
-    found = []
+    """Returns (line, dotted name) of all imports, also nested ones; names of a package count as modules."""
+    names = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            found += [(node.lineno, alias.name) for alias in node.names]
+            names += [(node.lineno, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
                 package = module.split(".")[: -node.level]
                 base = ".".join([*package, base] if base else package)
             if base in ("voronerf", "voronerf.app") or base.startswith("voronerf.ops"):
-                found += [(node.lineno, f"{base}.{alias.name}") for alias in node.names]
+                names += [(node.lineno, f"{base}.{alias.name}") for alias in node.names]
             else:
-                found.append((node.lineno, base))
-    return found
+                names.append((node.lineno, base))
+    return names
 
 
 def faults(source: str, module: str) -> list[str]:
-    """What is wrong with the imports of one file."""
-    own, wrong = room(module), []
-    if own not in LEVEL:
+    """Returns error messages about the imports of one file."""
+    importer, wrong = room(module), []
+    if importer not in LEVEL:
         return [f"{module} belongs to no layer; name it in LAYERS"]
     for line, name in imports(source, module):
         if name.split(".")[0] != "voronerf":
-            allowed = OUTSIDE.get(own)
+            allowed = OUTSIDE.get(importer)
             top = name.split(".")[0]
             if allowed is not None and top not in allowed | sys.stdlib_module_names:
-                wrong.append(f"{module}:{line} imports {top}; {own} may import {' and '.join(sorted(allowed))}")
+                wrong.append(f"{module}:{line} imports {top}; {importer} may import {' and '.join(sorted(allowed))}")
             continue
-        # A name of the package itself, such as __version__, is not a module.
+        # Names of the package itself, such as __version__, are no modules.
         target = room(name)
         if name != "voronerf" and target.startswith("__") and target != "__main__":
             continue
         if target not in LEVEL:
             wrong.append(f"{module}:{line} imports {name}, which belongs to no layer")
-        elif LEVEL[target] > LEVEL[own]:
+        elif LEVEL[target] > LEVEL[importer]:
             wrong.append(f"{module}:{line} imports {name} from a layer above")
-        if target == "town" and own not in ("town", "app.cli"):
+        if target == "town" and importer not in ("town", "app.cli"):
             wrong.append(f"{module}:{line} imports {name}, of which the table of commands alone knows")
         if name.endswith("._C") and not module.startswith("voronerf.ops._core.native"):
             wrong.append(f"{module}:{line} imports the compiled module, which only native may")
-        if target == "ops" and "reference" in name.split(".") and own not in ("ops", "kernels"):
+        if target == "ops" and "reference" in name.split(".") and importer not in ("ops", "kernels"):
             wrong.append(f"{module}:{line} imports {name}, a specification that only ops read")
     return wrong
 
@@ -105,7 +105,7 @@ def test_imports_go_down() -> None:
 
 
 def test_backends_alone_choose() -> None:
-    """A fast path is an op with a row in their table; whoever asks whether a backend is there has one beside it."""
+    """Only few rooms ask whether a backend is available; fast paths are rows in the table of backends."""
     asking = [
         path
         for path in SOURCES
@@ -132,27 +132,27 @@ def test_backends_alone_choose() -> None:
     ],
 )
 def test_faults_are_found(source: str, module: str, fault: str) -> None:
-    assert any(fault in found for found in faults(source, module))
+    assert any(fault in message for message in faults(source, module))
 
 
-def needed(source: str, module: str, known: set[str]) -> set[str]:
-    """The modules that one imports, at any depth; but for types in the viewer, whose parts hold each other."""
+def needed(source: str, module: str, modules: set[str]) -> set[str]:
+    """Returns the modules that a module imports, without the viewer's type-only imports, which form circles."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and "app.viewer" in module:
             node.body = []
-    found: set[str] = set()
+    imported: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found.update(alias.name for alias in node.names)
+            imported.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             names = {alias.name: f"{node.module}.{alias.name}" for alias in node.names}
-            found.update(name if name in known else node.module for name in names.values())
-    return (found & known) - {module, "voronerf"}
+            imported.update(name if name in modules else node.module for name in names.values())
+    return (imported & modules) - {module, "voronerf"}
 
 
 def circles(graph: dict[str, set[str]]) -> list[str]:
-    """Modules that need themselves by way of others."""
+    """Returns the modules in import cycles."""
 
     def reached(module: str) -> set[str]:
         seen: set[str] = set()
@@ -168,8 +168,8 @@ def circles(graph: dict[str, set[str]]) -> list[str]:
 
 def test_no_module_needs_itself() -> None:
     names = {path: module_name(path).removesuffix(".__init__") for path in SOURCES}
-    known = set(names.values())
-    assert circles({name: needed(path.read_text(), name, known) for path, name in names.items()}) == []
+    modules = set(names.values())
+    assert circles({name: needed(path.read_text(), name, modules) for path, name in names.items()}) == []
 
 
 def test_circles_are_found() -> None:
@@ -188,8 +188,8 @@ def test_few_functions_take_many_arguments() -> None:
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef):
-                every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-                if len([argument for argument in every if argument.arg not in ("self", "cls")]) > 8:
+                arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                if len([argument for argument in arguments if argument.arg not in ("self", "cls")]) > 8:
                     many.append(f"{path.relative_to(ROOT)}: {node.name}")
     assert len(many) <= 26, many
 
@@ -204,7 +204,7 @@ def test_core_knows_no_framework() -> None:
 
 
 def test_instruction_set_files_share_no_inline_functions() -> None:
-    """A standard header's inline function compiled for AVX-512 could be what the linker keeps for every processor."""
+    """Files of an instruction set include no header with inline functions: the linker could keep an AVX-512 copy."""
     waiting = [path for path in CORE if path.name.endswith("_isa.cpp")]
     assert waiting
     seen = set()

@@ -1,4 +1,4 @@
-"""The library leaves its host as it finds it: no class, hook, variable, handler or limit of others is changed."""
+"""Tests that the library changes no foreign class, hook, variable, signal handler or limit of its host process."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ assert state() == before
 
 
 class Truncated(torch.autograd.Function):
-    """An exponential with a gradient of its own, as torch-ngp has it."""
+    """An exponential with a custom gradient, as in torch-ngp."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -57,7 +57,7 @@ class Truncated(torch.autograd.Function):
 
 
 class Field(nn.Module):
-    """Calls something of its host in each ``forward``, also while it is traced."""
+    """A field that calls ``host`` in each ``forward``, also while it is traced."""
 
     scale, host = 2.0, staticmethod(lambda: None)
 
@@ -71,7 +71,7 @@ class Field(nn.Module):
 
 
 def host() -> list[Any]:
-    """What the library could have changed of PyTorch and of the process."""
+    """Returns the state of PyTorch and of the process that the library could change."""
     function = torch.autograd.function
     classes = [nn.Module, nn.Linear, function.Function, function._SingleLevelFunction, torch.optim.Optimizer, Tensor]
     optimizer, module = sys.modules[torch.optim.Optimizer.__module__], nn.modules.module
@@ -89,7 +89,7 @@ def test_a_process_that_trains_is_as_it_was() -> None:
 
 @pytest.mark.native
 def test_limits_of_malloc_are_the_programs() -> None:
-    """Nobody can ask for them, so nothing but the command line may know how they are set."""
+    """Only the command line sets malloc's limits, which nobody can read back."""
     from voronerf.ops._core.native import compiled
 
     assert b"mallopt" not in Path(compiled.__file__).read_bytes()
@@ -99,13 +99,13 @@ def test_limits_of_malloc_are_the_programs() -> None:
 
 
 def test_classes_and_hooks_are_the_same_during_a_trace(monkeypatch: pytest.MonkeyPatch) -> None:
-    for kind in (torch.optim.Adam, torch.optim.SGD):  # the first of each changes its class and loads PyTorch's compiler
+    for kind in (torch.optim.Adam, torch.optim.SGD):  # the first step of each changes its class
         kind(nn.Linear(1, 1).parameters()).step()
     before, during, profiles = host(), list[list[Any]](), list[Any]()
     entered, go_on, other = threading.Event(), threading.Event(), dict[str, Any]()
 
     def beside() -> None:
-        """Another thread, which trains a module of its own while this one traces."""
+        """Trains another module in a second thread while this thread traces."""
         entered.wait(20)
         own, x = Field.__new__(Field), torch.linspace(-1, 1, 30).reshape(10, 3)
         nn.Module.__init__(own)
@@ -136,10 +136,10 @@ def test_classes_and_hooks_are_the_same_during_a_trace(monkeypatch: pytest.Monke
         router(x).sum().backward()
         optimizer.step()
     assert router.explain().startswith("forward: fused") and len(during) > 2
-    assert all(found == before for found in during) and other["host"] == before == host()
-    assert any(own is not profile for own in profiles) and sys.getprofile() is profile  # traced, and back again
+    assert all(state == before for state in during) and other["host"] == before == host()
+    assert any(own is not profile for own in profiles) and sys.getprofile() is profile  # set, then restored
     assert other["profile"] is None and other["type"] is nn.Linear
-    router.module.scale = 3.0  # as the trace has seen
+    router.module.scale = 3.0  # the traced value was 2
     expected = torch.stack([router.cell(int(c))(row[None])[0] for c, row in zip(router.assign(x), x, strict=True)])
     torch.testing.assert_close(router(x), expected)
 

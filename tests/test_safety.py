@@ -1,4 +1,4 @@
-"""Kernels under what programs do to them: several Python threads, forked children, thread counts, odd numbers."""
+"""Tests of kernels under stress: several Python threads, forked children, thread counts, NaN and infinity."""
 
 import sys
 import threading
@@ -35,8 +35,8 @@ def calls(seed):
     cells = v.nearest_centre(points, centres)
 
     def gradient():
-        own = weight.clone().requires_grad_()
-        return torch.autograd.grad(network(points, own).square().sum(), own)
+        leaf = weight.clone().requires_grad_()
+        return torch.autograd.grad(network(points, leaf).square().sum(), leaf)
 
     return [
         lambda: (v.nearest_centre(points, centres),),
@@ -55,18 +55,18 @@ def test_calls_from_several_python_threads_at_once():
     expected = [[call() for call in own] for own in everything]
     wrong = []
 
-    def work(which):
+    def work(index):
         try:
-            torch.set_num_threads(1 + which % 2)
+            torch.set_num_threads(1 + index % 2)
             for _ in range(5):
-                for i, call in enumerate(everything[which]):
-                    if not same(call(), expected[which][i]):
-                        wrong.append((which, i))
-        except Exception as error:  # a thread's exception would be lost
+                for i, call in enumerate(everything[index]):
+                    if not same(call(), expected[index][i]):
+                        wrong.append((index, i))
+        except Exception as error:  # a thread's exception is lost otherwise
             wrong.append(error)
 
     before = torch.get_num_threads()
-    threads = [threading.Thread(target=work, args=(which,)) for which in range(4)]
+    threads = [threading.Thread(target=work, args=(index,)) for index in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -77,7 +77,7 @@ def test_calls_from_several_python_threads_at_once():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
 def test_a_forked_child_runs_on_one_thread():
-    """After the parent has used a team; with more than one thread the child would wait for it, as torch's own do."""
+    """A forked child works on one thread after its parent used several; with more it would wait for the parent's."""
     code = """
 import os, torch, voronerf
 torch.set_num_threads(2)
@@ -97,7 +97,7 @@ raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")
 def test_set_num_threads_is_honoured():
-    """A team of the asked size and no larger: threads of the process before and after."""
+    """Kernels start exactly the threads of `set_num_threads`, counted in the process."""
     code = """
 import os, torch, voronerf
 torch.set_num_threads(1)
@@ -114,7 +114,7 @@ assert len(os.listdir("/proc/self/task")) == before + 2
 
 
 def agree(op, *args):
-    """The native result, which has NaN where the reference has, the same infinities, and is close elsewhere."""
+    """Returns the native result; fails unless it is close to the reference, with the same NaNs and infinities."""
     native, reference = (op(*args, backend=backend) for backend in ("native", "reference"))
     torch.testing.assert_close(native, reference, equal_nan=True, rtol=1e-4, atol=1e-5)
     return native
@@ -138,7 +138,7 @@ def test_odd_numbers_propagate_as_in_the_reference(bad):
     agree(v.integrated_encode, torch.rand(70, 3), variances.abs(), 4)
 
 
-# A density is at least 0: minus infinity is outside of the contract.
+# Densities are at least 0, so minus infinity is not a valid input.
 @pytest.mark.parametrize(
     ("where", "bad"),
     [(where, bad) for where in ("sigma", "rgb", "depths") for bad in BAD[: 2 if where == "sigma" else 3]],

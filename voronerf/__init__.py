@@ -80,7 +80,7 @@ _PLACES = (*_PARTS, "nerf.fields", "ops._core.backends", "ops._core.grids", "ops
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for: the program says how threads wait before torch is loaded."""
+    """Imports a public name at its first use, so that the program can set the OpenMP wait policy before torch loads."""
     if name not in __all__ and name not in _PARTS:
         raise AttributeError(f"module 'voronerf' has no attribute {name!r}")
     try:
@@ -92,8 +92,8 @@ def __getattr__(name: str) -> Any:
     if name in _PARTS:
         return import_module(f"voronerf.{name}")
     modules = (import_module(f"voronerf.{place}") for place in _PLACES)
-    globals()[name] = found = next(vars(module)[name] for module in modules if name in vars(module))
-    return found
+    globals()[name] = value = next(vars(module)[name] for module in modules if name in vars(module))
+    return value
 
 
 def __dir__() -> list[str]:

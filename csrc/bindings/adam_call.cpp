@@ -8,15 +8,16 @@ namespace voronerf {
 
 namespace {
 
-bool number(PyObject* given, double& value) {
-  if (!PyFloat_CheckExact(given) && !PyLong_CheckExact(given)) return false;
-  value = PyFloat_AsDouble(given);
+bool number(PyObject* object, double& value) {
+  if (!PyFloat_CheckExact(object) && !PyLong_CheckExact(object)) return false;
+  value = PyFloat_AsDouble(object);
   if (value == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
   return true;
 }
 
-// A Rule of voronerf/ops/adam: step, learning_rate, betas, epsilon, every. False: it breaks a rule.
-bool load_rule(PyObject* rule, py::list& scalars, AdamRule& found) {
+// Loads a Rule of voronerf/ops/adam: the named tuple (step, learning_rate, betas, epsilon, every). Returns false if a
+// value is not supported.
+bool load_rule(PyObject* rule, py::list& scalars, AdamRule& result) {
   PyObject *const step = PyTuple_GET_ITEM(rule, 0), *const rate = PyTuple_GET_ITEM(rule, 1),
                   *const betas = PyTuple_GET_ITEM(rule, 2), *const every = PyTuple_GET_ITEM(rule, 4);
   const auto address = [&scalars](PyObject* scalar) {
@@ -24,28 +25,28 @@ bool load_rule(PyObject* rule, py::list& scalars, AdamRule& found) {
     TensorView view;
     return view.look(scalar) ? static_cast<float*>(view.address()) : nullptr;
   };
-  found.step = address(step);
-  found.rate_at = number(rate, found.rate) ? nullptr : address(rate);
+  result.step = address(step);
+  result.rate_at = number(rate, result.rate) ? nullptr : address(rate);
   const bool pair = (PyTuple_Check(betas) || PyList_Check(betas)) && PySequence_Fast_GET_SIZE(betas) == 2;
-  if (!pair || !number(PySequence_Fast_GET_ITEM(betas, 0), found.decay)) return false;
-  if (!number(PySequence_Fast_GET_ITEM(betas, 1), found.decay_sq)) return false;
-  if (!number(PyTuple_GET_ITEM(rule, 3), found.epsilon) || !PyBool_Check(every)) return false;
-  found.every = every == Py_True;
+  if (!pair || !number(PySequence_Fast_GET_ITEM(betas, 0), result.decay)) return false;
+  if (!number(PySequence_Fast_GET_ITEM(betas, 1), result.decay_sq)) return false;
+  if (!number(PyTuple_GET_ITEM(rule, 3), result.epsilon) || !PyBool_Check(every)) return false;
+  result.every = every == Py_True;
   const auto is_share = [](double beta) { return beta >= 0 && beta < 1; };
-  return is_share(found.decay) && is_share(found.decay_sq) && found.epsilon > 0;
+  return is_share(result.decay) && is_share(result.decay_sq) && result.epsilon > 0;
 }
 
-// The step of `adam` (voronerf/ops/adam) on the CPU. False: it is not made, since an argument breaks a rule, or is of
-// another kind, or the step is recorded.
-bool adam_step(const py::type& rule_class, const py::type& guard_class, const py::args& given) {
+// Makes the step of `adam` (voronerf/ops/adam) on the CPU. Returns false without a step if an argument is invalid or of
+// an unsupported type, or if a recording is active.
+bool adam_step(const py::type& rule_class, const py::type& guard_class, const py::args& arguments) {
   const Function& function = functions().at("adam");
   const Bound* bound = nullptr;
-  for (const Bound& each : function.overloads) {
-    if (each.machine == &type_of<Cpu>()) bound = &each;
+  for (const Bound& overload : function.overloads) {
+    if (overload.machine == &type_of<Cpu>()) bound = &overload;
   }
   if (recorded() != nullptr || bound == nullptr || bound->function == nullptr || !questions.compiled_here())
     return false;
-  PyObject *const rules = given[0].ptr(), *const guard = given[5].ptr(), *const loss = given[6].ptr();
+  PyObject *const rules = arguments[0].ptr(), *const guard = arguments[5].ptr(), *const loss = arguments[6].ptr();
   if (!PyList_CheckExact(rules) && !PyTuple_CheckExact(rules)) return false;
 
   Loaded loaded{&function, bound, {}, {}};
@@ -64,7 +65,7 @@ bool adam_step(const py::type& rule_class, const py::type& guard_class, const py
     if (!load_rule(rule, scalars, of_rules[i])) return false;
   }
   of_guard = {};
-  if (guard != Py_None) {  // found, skipped, in_a_row, scale, limit
+  if (guard != Py_None) {  // a Guard: (found, skipped, in_a_row, scale, limit)
     if (reinterpret_cast<PyObject*>(Py_TYPE(guard)) != guard_class.ptr()) return false;
     double limit = 0;
     if (PyTuple_GET_ITEM(guard, 3) != Py_None || !number(PyTuple_GET_ITEM(guard, 4), limit)) return false;
@@ -84,8 +85,8 @@ bool adam_step(const py::type& rule_class, const py::type& guard_class, const py
     scalars.append(py::handle(loss));
   }
   py::list tensors;
-  for (size_t i = 1; i < 5; ++i) tensors.append(given[i]);
-  if (!alike(tensors, {true, false, true, true}, scalars)) return false;  // gradients may lie in any order
+  for (size_t i = 1; i < 5; ++i) tensors.append(arguments[i]);
+  if (!alike(tensors, {true, false, true, true}, scalars)) return false;  // gradients need not be contiguous
 
   std::vector<std::vector<void*>> addresses(4, std::vector<void*>(of_rules.size()));
   for (size_t i = 0; i < 4; ++i) {

@@ -1,4 +1,4 @@
-// A step of Adam from Python, checked and made in one go.
+// The Adam step of Python, which checks its arguments and runs in one call.
 #pragma once
 
 #include <pybind11/pybind11.h>

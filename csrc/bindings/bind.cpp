@@ -1,4 +1,4 @@
-// Calls from Python of what the binding files list.
+// Calls from Python to the functions that the binding files list.
 #include "bindings/bind.h"
 
 #include <pybind11/stl.h>
@@ -48,7 +48,7 @@ py::object to_python(const Type* type, const Result& result) {
   }
 }
 
-// A call that was traced (common/trace.h).
+// A traced call (common/trace.h).
 struct Traced {
   const std::string* name;
   double seconds;
@@ -57,7 +57,7 @@ struct Traced {
 bool tracing = false;
 std::vector<Traced> traced_calls;
 
-// Without the GIL.
+// Calls the C++ function, and traces the call if tracing is on. It runs without the GIL.
 void call(const Loaded& loaded, Result& result) {
   Trace regions;
   if (tracing) trace = &regions;
@@ -71,25 +71,26 @@ void call(const Loaded& loaded, Result& result) {
 
 }  // namespace
 
-// Calls of a step in their order, with what they have taken, to be made again on the same memory, which is held. A
-// number of rows is read again from where it lies, so the memory must do for the most rows.
+// The calls of a step in order, with their arguments. They are replayed on the same memory, which the recording holds.
+// Row counts are read again from memory at each replay, so tensors must be large enough for the most rows.
 class Recording {
  public:
-  // Calls of this thread are added from here to `end`.
+  // Adds the calls of this thread from here to `end`.
   void begin() { recorded() = this; }
   void end() { recorded() = nullptr; }
 
-  // A tensor that a call takes, or of which such a tensor is a view. What is made for the calls stays where it is.
-  // Gives whether its rows are counted.
+  // Adds a tensor argument of a call, or the base of a view. A tensor in memory that was made for the calls needs no
+  // check. Returns whether its rows are counted (RowCount).
   bool add_tensor(const py::object& tensor) {
     const auto found = made_.find(py::cast<std::uintptr_t>(tensor.attr("untyped_storage")().attr("data_ptr")()));
     if (found != made_.end()) return found->second;
     tensors_.layout(tensor);
     return false;
   }
-  // One that was made for the calls, and that others hold too.
+  // Adds a tensor that was made for the calls but is also referenced elsewhere.
   void hold_tensor(const py::object& tensor) { tensors_.place(tensor); }
-  // The storage at an address is memory for these calls, or for others that are made before; of counted rows, or not.
+  // Registers a storage, by its address, as memory made for these calls or for an earlier recording. `counted`: its
+  // rows are counted.
   void made(std::uintptr_t address, bool counted) { made_[address] = counted; }
   bool hold() const { return tensors_.holds(); }
   void add(std::unique_ptr<Loaded> loaded) {
@@ -98,17 +99,17 @@ class Recording {
     calls_.push_back(std::move(loaded));
   }
 
-  // Makes the calls from `first` to `last` again, so many times in a row. Before each time the next random numbers,
-  // `bytes` for each of `places`, are copied there. Gives how often they were made: it ends before a call that would
-  // exceed its memory. With a trace they have no team.
+  // Replays the calls [first, last) `times` times in a row. Before each replay the next random numbers, `bytes` for
+  // each of `places`, are copied there. Returns the number of complete replays: it stops before a call whose rows would
+  // exceed its memory. Traced calls run on one thread.
   int replay(int threads, int times, size_t first, size_t last, std::uintptr_t drawn,
              const std::vector<std::uintptr_t>& places, size_t bytes) {
     const py::gil_scoped_release released;
-    int made = 0;
+    int repeats = 0;
     std::exception_ptr failure;
     with_team(tracing ? 1 : threads, [&] {
       try {
-        for (; made < times; ++made) {
+        for (; repeats < times; ++repeats) {
           for (const std::uintptr_t place : places) {
             std::memcpy(reinterpret_cast<void*>(place), reinterpret_cast<const void*>(drawn), bytes);
             drawn += bytes;
@@ -122,7 +123,7 @@ class Recording {
       }
     });
     if (failure) std::rethrow_exception(failure);
-    return made;
+    return repeats;
   }
 
   void refuse(const std::string& why) {
@@ -130,11 +131,11 @@ class Recording {
   }
   size_t size() const { return calls_.size(); }
   int each_held(const Visit& visit) const {
-    int found = tensors_.each_held(visit);
+    int status = tensors_.each_held(visit);
     for (const auto& call : calls_) {
-      for (PyObject* const object : call->frame.kept()) found = found != 0 ? found : visit(object);
+      for (PyObject* const object : call->frame.kept()) status = status != 0 ? status : visit(object);
     }
-    return found;
+    return status;
   }
   void release() {
     calls_.clear();
@@ -199,24 +200,24 @@ py::object run(Loaded& loaded) {
 
 namespace {
 
-// Whether all arguments are of the types that a function takes.
-bool load(Loaded& loaded, const py::args& given) {
-  for (size_t i = 0; i < given.size(); ++i) {
-    PyObject* const argument = PyTuple_GET_ITEM(given.ptr(), static_cast<Py_ssize_t>(i));
+// Loads the arguments of a call. Returns false if one does not have the type of its parameter.
+bool load(Loaded& loaded, const py::args& arguments) {
+  for (size_t i = 0; i < arguments.size(); ++i) {
+    PyObject* const argument = PyTuple_GET_ITEM(arguments.ptr(), static_cast<Py_ssize_t>(i));
     if (!loaded.values.load(loaded.frame, *loaded.bound->given[i], argument)) return false;
   }
   return true;
 }
 
-py::object call_any(const Function& function, const py::args& given) {
+py::object call_any(const Function& function, const py::args& arguments) {
   for (const Bound& bound : function.overloads) {
-    if (bound.function == nullptr || bound.given.size() != given.size()) continue;
+    if (bound.function == nullptr || bound.given.size() != arguments.size()) continue;
     if (recorded() == nullptr || bound.machine == nullptr) {
       Loaded loaded{&function, &bound, {}, {}};
-      if (load(loaded, given)) return run(loaded);
+      if (load(loaded, arguments)) return run(loaded);
     } else {
       auto loaded = std::unique_ptr<Loaded>(new Loaded{&function, &bound, {}, {}});
-      if (!load(*loaded, given)) continue;
+      if (!load(*loaded, arguments)) continue;
       py::object result = run(*loaded);
       if (recorded() != nullptr) recorded()->add(std::move(loaded));
       return result;
@@ -225,7 +226,7 @@ py::object call_any(const Function& function, const py::args& given) {
   throw py::type_error(function.name + ": incompatible function arguments");
 }
 
-// CRC-32 as in zlib.
+// Returns the CRC-32 of a text, as in zlib.
 uint32_t checksum(const std::string& text) {
   uint32_t sum = ~0u;
   for (const char letter : text) {
@@ -297,7 +298,8 @@ constexpr const char* kStub =
     "def know_torch(dtypes: dict[str, torch.dtype], classes: tuple[type, ...], exchange: Any) -> None: ...\n"
     "def trace(on: bool) -> list[tuple[str, float, int, float, list[float]]]: ...\n";
 
-// What is bound, as a stub for type checkers (voronerf/ops/_core/_C.pyi), and the classes that it needs.
+// The stub of the module for type checkers (voronerf/ops/_core/_C.pyi). Declaring a struct or an enumeration also adds
+// its class or its names to the module.
 class Declarations {
  public:
   explicit Declarations(const py::module_& module) : module_(module) {}
@@ -340,7 +342,7 @@ class Declarations {
     const bool overloaded = std::count(lines.begin(), lines.end(), lines[0]) < static_cast<long>(lines.size());
     for (size_t i = 0; i < lines.size(); ++i) {
       std::string exact;
-      for (const Type* each : function.overloads[i].given) exact += (exact.empty() ? "" : ", ") + each->exact;
+      for (const Type* type : function.overloads[i].given) exact += (exact.empty() ? "" : ", ") + type->exact;
       text_ += "# " + exact + "\n";
       if (std::find(lines.begin(), lines.end(), lines[i]) != lines.begin() + static_cast<long>(i)) continue;
       text_ += (overloaded ? "@overload\n" : "") + lines[i];
@@ -355,9 +357,9 @@ class Declarations {
 
  private:
   static py::tuple tuple_of(const std::vector<std::string>& texts) {
-    py::list all;
-    for (const std::string& text : texts) all.append(text);
-    return py::tuple(all);
+    py::list result;
+    for (const std::string& text : texts) result.append(text);
+    return py::tuple(result);
   }
 
   py::module_ module_;
@@ -369,24 +371,24 @@ class Declarations {
 
 void Module::add(const char* name, AnyFunction function, Call call, std::vector<const Type*> parameters,
                  const Type* result, const Type* machine) {
-  std::vector<const Type*> given = parameters;
+  std::vector<const Type*> arguments = parameters;
   if (machine != nullptr) {
-    const bool two = given.size() > 1 && given[given.size() - 2] == &type_of<Isa>();
-    if (machine == &type_of<Cpu>()) given.resize(given.size() - (two ? 2 : 1));
-    if (machine == &type_of<Cuda>() && given.back() == &type_of<void*>()) given.pop_back();
-    given.push_back(machine);
+    const bool two = arguments.size() > 1 && arguments[arguments.size() - 2] == &type_of<Isa>();
+    if (machine == &type_of<Cpu>()) arguments.resize(arguments.size() - (two ? 2 : 1));
+    if (machine == &type_of<Cuda>() && arguments.back() == &type_of<void*>()) arguments.pop_back();
+    arguments.push_back(machine);
   }
   size_t bytes = 0;
-  for (const Type* type : given) bytes += type->size + alignof(std::max_align_t);
-  if (bytes > kMostBytes || given.size() >= kMostParameters) throw std::logic_error(name);
+  for (const Type* type : arguments) bytes += type->size + alignof(std::max_align_t);
+  if (bytes > kMostBytes || arguments.size() >= kMostParameters) throw std::logic_error(name);
   Function& all = functions()[name];
   all.name = name;
-  all.overloads.push_back({function, call, std::move(given), std::move(parameters), result, machine});
+  all.overloads.push_back({function, call, std::move(arguments), std::move(parameters), result, machine});
 }
 
-void load_struct(const Type& type, PyObject* given, void* place) {
+void load_struct(const Type& type, PyObject* tuple, void* place) {
   Frame frame;
-  if (!frame.load(type, given, place)) throw std::invalid_argument(type.exact);
+  if (!frame.load(type, tuple, place)) throw std::invalid_argument(type.exact);
 }
 
 void bind_all(PyObject* python) {
@@ -396,12 +398,12 @@ void bind_all(PyObject* python) {
   Declarations declarations(bound);
   for (const auto& [name, function] : functions()) {
     declarations.declare(function);
-    bool there = false;
-    for (const Bound& one : function.overloads) there = there || one.function != nullptr;
-    if (!there) continue;
-    bound.def(name.c_str(), [one = &function](const py::args& given) { return call_any(*one, given); });
+    bool available = false;
+    for (const Bound& overload : function.overloads) available = available || overload.function != nullptr;
+    if (!available) continue;
+    bound.def(name.c_str(), [target = &function](const py::args& arguments) { return call_any(*target, arguments); });
   }
-  // Local: the emulated module of the tests has them too.
+  // The classes are module-local: the emulated module of the tests has classes of the same names.
   bind_unchanged(bound);
   py::class_<Recording>(bound, "Recording", py::module_local(), in_cycles<Recording>())
       .def(py::init())
@@ -417,25 +419,25 @@ void bind_all(PyObject* python) {
   bind_signatures(bound);
   bind_program_calls(bound);
   bind_adam_step(bound);
-  // The dtypes and the plain classes of tensors, objects of Python that this module knows by name alone, and the
-  // exchange of tensor_view.h or None.
+  // know_torch takes Python objects of torch, with which this module is not linked: the dtypes by name, the classes of
+  // plain tensors, and the exchange of tensor_view.h or None.
   bound.def("know_torch", [](const py::dict& names, const py::tuple& classes, const py::object& exchange) {
     for (const auto& entry : names) {
       dtypes()[py::cast<std::string>(entry.first)] = py::reinterpret_borrow<py::object>(entry.second).release().ptr();
     }
     know_tensors(classes.ptr(), exchange.ptr());
   });
-  // Whether calls are traced from now on; of those before, name, seconds, regions, the seconds in these, and what they
-  // would take on each number of Trace::kTeams.
+  // trace(on) switches the tracing of calls. It returns the calls traced before, as tuples: name, seconds, number of
+  // regions, seconds in regions, and the estimated seconds on each number of threads in Trace::kTeams.
   bound.def("trace", [](bool on) {
     tracing = on;
-    py::list found;
+    py::list calls;
     for (const Traced& call : std::exchange(traced_calls, {})) {
       py::list shared;
       for (const double seconds : call.regions.shared) shared.append(seconds);
-      found.append(py::make_tuple(*call.name, call.seconds, call.regions.regions, call.regions.inside, shared));
+      calls.append(py::make_tuple(*call.name, call.seconds, call.regions.regions, call.regions.inside, shared));
     }
-    return found;
+    return calls;
   });
   const std::string text = declarations.stub();
   bound.attr("stub") = text;

@@ -5,10 +5,9 @@
 //     module.cuda("nearest_centre", VN_CUDA(nearest_centre_cuda<float>));
 //   }
 //
-// From Python the parameters are those of the C++ function (load.h), except that the last ones are the machine: Cpu
-// where the function ends with (Isa, int threads) or (int threads), Cuda where it ends with a stream, which is the
-// device's. Functions of one name are told apart by dtypes, numbers of arguments and the machine. The GIL is released
-// for what has a machine.
+// In Python a function has the parameters of the C++ function (load.h), but its last parameter is the machine: Cpu in
+// place of a final (Isa, int threads) or (int threads), Cuda in place of a final stream. Overloads are selected by
+// dtypes, number of arguments and machine. The GIL is released for functions with a machine.
 #pragma once
 
 #include <cstdint>
@@ -20,7 +19,8 @@
 #include "bindings/load.h"
 #include "common/isa.h"
 
-// A build without CUDA, and the emulated one without the CPU's half, has no such function, but its signature.
+// A build without CUDA has null pointers for the CUDA functions, and the emulated build for the CPU functions. Their
+// signatures remain.
 #ifdef VN_WITH_CUDA
 #define VN_CUDA(...) &__VA_ARGS__
 #else
@@ -48,23 +48,23 @@ VN_STRUCT(Cuda, device, stream);
 
 class Module {
  public:
-  // A function that ends with (Isa, int threads) or (int threads).
+  // Binds a function that ends with (Isa, int threads) or (int threads).
   template <typename R, typename... A>
   void cpu(const char* name, R (*function)(A...)) {
     add(name, function, &type_of<Cpu>());
   }
-  // A function that ends with a stream, or asks something of the device.
+  // Binds a function that ends with a stream, or queries the device.
   template <typename R, typename... A>
   void cuda(const char* name, R (*function)(A...)) {
     add(name, function, &type_of<Cuda>());
   }
-  // A function of its parameters alone: a size, a check.
+  // Binds a function without a machine, such as a size or a check.
   template <typename R, typename... A>
   void plain(const char* name, R (*function)(A...)) {
     add(name, function, nullptr);
   }
 
-  // Any function; call(function, places of its parameters, place of its result).
+  // A type-erased function, and its caller: call(function, addresses of the parameters, address of the result).
   using AnyFunction = void (*)();
   using Call = void (*)(AnyFunction, void* const*, void*);
 
@@ -72,7 +72,7 @@ class Module {
   template <typename R, typename... A>
   void add(const char* name, R (*function)(A...), const Type* machine) {
     const Type* result = nullptr;
-    if constexpr (std::is_class_v<R>) {  // a std::unique_ptr
+    if constexpr (std::is_class_v<R>) {  // R is a std::unique_ptr
       result = &type_of<typename ElementOf<R>::Type>();
     } else if constexpr (!std::is_void_v<R>) {
       result = &type_of<R>();
@@ -99,10 +99,10 @@ class Module {
   }
 };
 
-// The binding files of the ops, which name themselves here, several of them in one compilation.
+// The binding functions of the ops, each registered by VN_BINDINGS. A compilation unit may have several of them.
 inline std::vector<void (*)(Module&)>& bindings() {
-  static std::vector<void (*)(Module&)> all;
-  return all;
+  static std::vector<void (*)(Module&)> functions;
+  return functions;
 }
 #define VN_BINDINGS(module) VN_BINDINGS_NUMBERED(module, __COUNTER__)
 #define VN_BINDINGS_NUMBERED(module, number) VN_BINDINGS_NAMED(module, number)
@@ -111,15 +111,16 @@ inline std::vector<void (*)(Module&)>& bindings() {
   static const bool bound_##number = (::voronerf::bindings().push_back(&bind_##number), true); \
   static void bind_##number([[maybe_unused]] ::voronerf::Module& module)
 
-// Binds everything to a Python module, with the stub and its checksum.
+// Adds all bound functions, the stub and its checksum to a Python module.
 void bind_all(_object* python);
 
-// A struct of VN_STRUCT, without tensors, from a named tuple: for the tests' modules. Throws std::invalid_argument.
-void load_struct(const Type& type, _object* given, void* place);
+// Loads a struct of VN_STRUCT without tensors from a named tuple, for the modules of the tests. Throws
+// std::invalid_argument if the tuple does not fit.
+void load_struct(const Type& type, _object* tuple, void* place);
 template <typename S>
-S struct_of(_object* given) {
+S struct_of(_object* tuple) {
   S value;
-  load_struct(type_of<S>(), given, &value);
+  load_struct(type_of<S>(), tuple, &value);
   return value;
 }
 

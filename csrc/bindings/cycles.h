@@ -1,4 +1,4 @@
-// Classes whose objects hold objects of Python, which may hold them: Python's collector finds such cycles.
+// Support of Python's cyclic garbage collector for C++ classes that hold Python objects.
 #pragma once
 
 #include <pybind11/pybind11.h>
@@ -15,8 +15,8 @@ T* value_in(PyObject* self) {
   return value.holder_constructed() ? value.value_ptr<T>() : nullptr;
 }
 
-// For a class with each_held(visit), which calls visit with each object that is held, or null, until that gives
-// something else than 0, and gives that; and with release().
+// Returns the type setup of a class T with two methods. each_held(visit) calls visit with each held object (or null)
+// until visit returns a non-zero status, and returns the status. release() drops the held objects.
 template <typename T>
 pybind11::custom_type_setup in_cycles() {
   return pybind11::custom_type_setup([](PyHeapTypeObject* heap_type) {

@@ -1,4 +1,4 @@
-// What a call takes from Python, as C++ takes it: included by the files that read pybind11.
+// The arguments of a call from Python, converted for C++. Only files that use pybind11 include this header.
 #pragma once
 
 #include <pybind11/pybind11.h>
@@ -16,13 +16,13 @@ namespace voronerf {
 namespace py = pybind11;
 
 constexpr size_t kMostParameters = 24;
-constexpr size_t kMostBytes = 2048;  // of all parameters of a call
+constexpr size_t kMostBytes = 2048;  // limit for all parameters of a call
 
 struct Bound {
   Module::AnyFunction function;
   Module::Call call;
-  std::vector<const Type*> given;       // by Python
-  std::vector<const Type*> parameters;  // of the function
+  std::vector<const Type*> given;       // parameters in Python
+  std::vector<const Type*> parameters;  // parameters of the C++ function
   const Type *result, *machine;         // null: none
 };
 
@@ -36,24 +36,24 @@ inline std::map<std::string, Function>& functions() {
   return all;
 }
 
-// Objects that Python has for dtypes, by the names of load.h.
+// Returns the Python objects of torch's dtypes, by the names of load.h.
 inline std::map<std::string, PyObject*>& dtypes() {
-  static std::map<std::string, PyObject*> known;
-  return known;
+  static std::map<std::string, PyObject*> objects;
+  return objects;
 }
 
 class Recording;
-inline Recording*& recorded() {  // the one that the calling thread's calls are added to, or null
+inline Recording*& recorded() {  // the active recording of the calling thread, or null
   static thread_local Recording* recording = nullptr;
   return recording;
 }
 void refuse(Recording& recording, const std::string& why);
 bool add_tensor(Recording& recording, PyObject* tensor);
 
-// What a call has taken from Python, given back when it ends.
+// The Python references that a call holds, released when it ends.
 class Frame {
  public:
-  // A number of rows that a recorded call has taken, where it lies, less so many, and the most that it may be.
+  // A row count of a recorded call: each replay sets *rows = *memory + more. *memory may be at most `most`.
   struct Counted {
     RowCount* rows;
     const int64_t* memory;
@@ -70,32 +70,33 @@ class Frame {
   const std::vector<Counted>& counted() const { return counted_; }
   bool misses_rows() const { return has_rows_ && counted_.empty(); }
 
-  // False: not of that type. `place` becomes that of an opaque object itself.
-  bool load(const Type& type, PyObject* given, void*& place) {
+  // Loads a value into `place`. Returns false if the value is not of the type. For an opaque object, `place` becomes
+  // its address.
+  bool load(const Type& type, PyObject* object, void*& place) {
     switch (type.kind) {
       case Type::Kind::boolean:
-        if (!PyBool_Check(given)) return false;
-        *static_cast<bool*>(place) = given == Py_True;
+        if (!PyBool_Check(object)) return false;
+        *static_cast<bool*>(place) = object == Py_True;
         return true;
       case Type::Kind::integer: {
-        if (!PyLong_Check(given)) return false;
+        if (!PyLong_Check(object)) return false;
         const auto value =
-            type.is_signed ? PyLong_AsLongLong(given) : static_cast<long long>(PyLong_AsUnsignedLongLong(given));
+            type.is_signed ? PyLong_AsLongLong(object) : static_cast<long long>(PyLong_AsUnsignedLongLong(object));
         if (value == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
         store(place, value, type.size);
         return true;
       }
       case Type::Kind::rows: {
-        if (!PyLong_Check(given)) return false;
-        const int64_t rows = PyLong_AsLongLong(given);
+        if (!PyLong_Check(object)) return false;
+        const int64_t rows = PyLong_AsLongLong(object);
         if (rows == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
         *static_cast<RowCount*>(place) = rows;
-        if (recorded() != nullptr && rows != 0) count(given, *static_cast<RowCount*>(place));
+        if (recorded() != nullptr && rows != 0) count(object, *static_cast<RowCount*>(place));
         return true;
       }
       case Type::Kind::floating: {
-        if (!PyFloat_Check(given) && !PyLong_Check(given)) return false;
-        const double value = PyFloat_AsDouble(given);
+        if (!PyFloat_Check(object) && !PyLong_Check(object)) return false;
+        const double value = PyFloat_AsDouble(object);
         if (type.size == sizeof(float)) {
           *static_cast<float*>(place) = static_cast<float>(value);
         } else {
@@ -104,81 +105,81 @@ class Frame {
         return true;
       }
       case Type::Kind::enumeration:
-        if (!PyUnicode_Check(given)) return false;
+        if (!PyUnicode_Check(object)) return false;
         for (size_t i = 0; i < type.values.size(); ++i) {
-          if (PyUnicode_CompareWithASCIIString(given, type.values[i].c_str()) != 0) continue;
+          if (PyUnicode_CompareWithASCIIString(object, type.values[i].c_str()) != 0) continue;
           store(place, static_cast<long long>(i), type.size);
           return true;
         }
         return false;
       case Type::Kind::text:
-        if (!PyUnicode_Check(given)) return false;
-        *static_cast<const char**>(place) = PyUnicode_AsUTF8(given);
-        keep(given);  // which owns the characters
+        if (!PyUnicode_Check(object)) return false;
+        *static_cast<const char**>(place) = PyUnicode_AsUTF8(object);
+        keep(object);  // the string owns the characters
         return *static_cast<const char**>(place) != nullptr;
       case Type::Kind::tensor:
-        return load_tensor(type, given, *static_cast<void**>(place));
+        return load_tensor(type, object, *static_cast<void**>(place));
       case Type::Kind::tensors:
         *static_cast<void***>(place) = nullptr;
-        if (given == Py_None) return true;
+        if (object == Py_None) return true;
         arrays_.emplace_back();
-        return load_sequence(*type.of, given, [&](size_t count) {
+        return load_sequence(*type.of, object, [&](size_t count) {
           arrays_.back().resize(count + 1);
           *static_cast<void***>(place) = arrays_.back().data();
           return arrays_.back().data();
         });
       case Type::Kind::sequence:
-        return load_sequence(*type.of, given, [&](size_t count) { return type.resize(place, count); });
+        return load_sequence(*type.of, object, [&](size_t count) { return type.resize(place, count); });
       case Type::Kind::structure:
-        return load_structure(type, given, static_cast<char*>(place));
+        return load_structure(type, object, static_cast<char*>(place));
       case Type::Kind::opaque:
-        if (!PyCapsule_IsValid(given, type.exact.c_str())) return false;
-        place = PyCapsule_GetPointer(given, type.exact.c_str());
-        keep(given);
+        if (!PyCapsule_IsValid(object, type.exact.c_str())) return false;
+        place = PyCapsule_GetPointer(object, type.exact.c_str());
+        keep(object);
         return true;
       default:
         return false;
     }
   }
 
-  // A tensor that was looked at already.
-  bool load_view(const Type& type, PyObject* given, const TensorView& view, void*& address) {
+  // Loads a tensor whose view is known.
+  bool load_view(const Type& type, PyObject* object, const TensorView& view, void*& address) {
     if (type.dtypes != 0 && (view.dtype() & type.dtypes) == 0) return false;
-    if (!view.is_contiguous() || is_negative(given)) return load_by_methods(type, given, address);
-    keep(given);
+    if (!view.is_contiguous() || is_negative(object)) return load_by_methods(type, object, address);
+    keep(object);
     address = view.address();
-    if (recorded() != nullptr && add_tensor(*recorded(), given)) has_rows_ = true;
+    if (recorded() != nullptr && add_tensor(*recorded(), object)) has_rows_ = true;
     return true;
   }
-  // Holds it as long as the call lasts.
-  void keep(PyObject* given) {
-    Py_INCREF(given);
-    kept_.push_back(given);
+  // Holds a reference to the object during the call.
+  void keep(PyObject* object) {
+    Py_INCREF(object);
+    kept_.push_back(object);
   }
 
  private:
   static void store(void* place, long long value, size_t size) { std::memcpy(place, &value, size); }
 
-  // A RowCount of voronerf/ops/_core/rows.py, which is an int too.
-  void count(PyObject* given, RowCount& rows) {
-    if (PyLong_CheckExact(given)) {
+  // Records a RowCount of voronerf/ops/_core/rows.py, a subclass of int. A plain int cannot be recorded.
+  void count(PyObject* object, RowCount& rows) {
+    if (PyLong_CheckExact(object)) {
       return refuse(*recorded(), "a number of rows lies in no memory, " + std::to_string(rows.value));
     }
-    const auto number = [given](const char* name) { return py::cast<int64_t>(py::handle(given).attr(name)); };
-    const auto* memory = reinterpret_cast<const int64_t*>(py::cast<std::uintptr_t>(py::handle(given).attr("address")));
+    const auto number = [object](const char* name) { return py::cast<int64_t>(py::handle(object).attr(name)); };
+    const auto* memory = reinterpret_cast<const int64_t*>(py::cast<std::uintptr_t>(py::handle(object).attr("address")));
     counted_.push_back({&rows, memory, number("more"), number("most")});
-    keep(given);  // which holds the memory
+    keep(object);  // the RowCount holds the memory
   }
 
-  bool load_tensor(const Type& type, PyObject* given, void*& address) {
+  bool load_tensor(const Type& type, PyObject* object, void*& address) {
     address = nullptr;
-    if (given == Py_None) return true;
+    if (object == Py_None) return true;
     TensorView view;
-    return view.look(given) ? load_view(type, given, view, address) : load_by_methods(type, given, address);
+    return view.look(object) ? load_view(type, object, view, address) : load_by_methods(type, object, address);
   }
 
-  // Anything with a dtype, contiguous(), is_contiguous(), is_neg(), resolve_neg() and data_ptr().
-  bool load_by_methods(const Type& type, PyObject* given, void*& address) {
+  // Loads any object with dtype, contiguous(), is_contiguous(), is_neg(), resolve_neg() and data_ptr().
+  bool load_by_methods(const Type& type, PyObject* object, void*& address) {
     static PyObject *const dtype_word = PyUnicode_InternFromString("dtype"),
                            *const address_word = PyUnicode_InternFromString("data_ptr"),
                            *const resolve_word = PyUnicode_InternFromString("resolve_neg"),
@@ -186,31 +187,31 @@ class Frame {
                            *const is_contiguous_word = PyUnicode_InternFromString("is_contiguous");
     if (type.dtypes != 0) {
       if (type.known_dtype == nullptr) type.known_dtype = dtypes().at(type.dtype);
-      PyObject* const dtype = PyObject_GetAttr(given, dtype_word);
-      Py_XDECREF(dtype);  // a dtype lives as long as Python
-      const bool known = dtype == type.known_dtype || ((type.dtypes & kBool) != 0 && dtype == dtypes().at("bool"));
-      if (!known) return PyErr_Clear(), false;
+      PyObject* const dtype = PyObject_GetAttr(object, dtype_word);
+      Py_XDECREF(dtype);  // dtypes are never freed
+      const bool matches = dtype == type.known_dtype || ((type.dtypes & kBool) != 0 && dtype == dtypes().at("bool"));
+      if (!matches) return PyErr_Clear(), false;
     }
-    PyObject* const answer = PyObject_CallMethodNoArgs(given, type.constant ? contiguous_word : is_contiguous_word);
-    if (answer == nullptr) throw py::error_already_set();  // no memory
+    PyObject* const reference = PyObject_CallMethodNoArgs(object, type.constant ? contiguous_word : is_contiguous_word);
+    if (reference == nullptr) throw py::error_already_set();  // out of memory
     if (type.constant) {
-      kept_.push_back(answer);
+      kept_.push_back(reference);
     } else {
-      Py_DECREF(answer);  // True or False
-      if (answer != Py_True) return false;
-      keep(given);
+      Py_DECREF(reference);  // True and False are never freed
+      if (reference != Py_True) return false;
+      keep(object);
     }
-    if (is_negative(kept_.back())) {  // memory holds the values negated, as of x.conj().imag
+    if (is_negative(kept_.back())) {  // memory holds the negated values, as for x.conj().imag
       PyObject* const resolved = type.constant ? PyObject_CallMethodNoArgs(kept_.back(), resolve_word) : nullptr;
       if (resolved == nullptr) return PyErr_Clear(), false;
       Py_DECREF(std::exchange(kept_.back(), resolved));
     }
     PyObject* const number = PyObject_CallMethodNoArgs(kept_.back(), address_word);
     if (number == nullptr) return PyErr_Clear(), false;
-    void* const found = PyLong_AsVoidPtr(number);
+    void* const pointer = PyLong_AsVoidPtr(number);
     Py_DECREF(number);
-    if (found == nullptr && holds_entries(kept_.back())) return false;  // memory that was freed, as by storage.resize_
-    address = found == nullptr ? TensorView::nothing() : found;
+    if (pointer == nullptr && holds_entries(kept_.back())) return false;  // freed, as by storage.resize_
+    address = pointer == nullptr ? TensorView::nothing() : pointer;
     if (recorded() != nullptr && add_tensor(*recorded(), kept_.back())) has_rows_ = true;
     return true;
   }
@@ -224,8 +225,8 @@ class Frame {
   }
 
   template <typename Resize>
-  bool load_sequence(const Type& type, PyObject* given, const Resize& resize) {
-    PyObject* const items = PySequence_Fast(given, "");
+  bool load_sequence(const Type& type, PyObject* object, const Resize& resize) {
+    PyObject* const items = PySequence_Fast(object, "");
     if (items == nullptr) return PyErr_Clear(), false;
     kept_.push_back(items);
     const Py_ssize_t count = PySequence_Fast_GET_SIZE(items);
@@ -237,22 +238,22 @@ class Frame {
     return true;
   }
 
-  bool load_structure(const Type& type, PyObject* given, char* place) {
-    if (!is_one(type, given)) return false;
+  bool load_structure(const Type& type, PyObject* object, char* place) {
+    if (!is_one(type, object)) return false;
     for (size_t i = 0; i < type.members.size(); ++i) {
       const Member& member = type.members[i];
       void* at = place + member.offset;
-      if (load(*member.type, PyTuple_GET_ITEM(given, static_cast<Py_ssize_t>(i)), at)) continue;
+      if (load(*member.type, PyTuple_GET_ITEM(object, static_cast<Py_ssize_t>(i)), at)) continue;
       throw py::type_error(type.exact + ": " + member.name + " is no " + member.type->exact);
     }
     return true;
   }
 
-  // A named tuple of these members.
-  static bool is_one(const Type& type, PyObject* given) {
-    if (Py_TYPE(given) == type.known_class) return true;
-    if (!PyTuple_Check(given)) return false;
-    PyObject* const names = PyObject_GetAttrString(given, "_fields");
+  // Returns whether the object is a named tuple with the type's members.
+  static bool is_one(const Type& type, PyObject* object) {
+    if (Py_TYPE(object) == type.known_class) return true;
+    if (!PyTuple_Check(object)) return false;
+    PyObject* const names = PyObject_GetAttrString(object, "_fields");
     if (names == nullptr) return PyErr_Clear(), false;
     bool same = PyTuple_Check(names) && PyTuple_GET_SIZE(names) == static_cast<Py_ssize_t>(type.members.size());
     for (size_t i = 0; same && i < type.members.size(); ++i) {
@@ -261,18 +262,18 @@ class Frame {
     }
     Py_DECREF(names);
     if (!same) return false;
-    Py_INCREF(Py_TYPE(given));
-    type.known_class = Py_TYPE(given);
+    Py_INCREF(Py_TYPE(object));
+    type.known_class = Py_TYPE(object);
     return true;
   }
 
   std::vector<PyObject*> kept_;
   std::list<std::vector<void*>> arrays_;
   std::vector<Counted> counted_;
-  bool has_rows_ = false;  // a tensor whose rows are counted
+  bool has_rows_ = false;  // a tensor has counted rows
 };
 
-// Values of parameters, made when they are loaded.
+// The values of a call's parameters, constructed as they are loaded.
 class Values {
  public:
   Values() = default;
@@ -283,7 +284,7 @@ class Values {
       if (types_[i]->construct != nullptr) types_[i]->destroy(begins_[i]);
     }
   }
-  // The place of the next one.
+  // Constructs the next value and returns its address.
   void*& place(const Type& type) {
     void*& begin = begins_[count_];
     begin = memory_ + used_;
@@ -304,7 +305,7 @@ class Values {
   size_t count_ = 0, used_ = 0;
 };
 
-// A call with what it has taken.
+// A call with its loaded arguments.
 struct Loaded {
   const Function* function;
   const Bound* bound;
@@ -312,7 +313,7 @@ struct Loaded {
   Values values;
 };
 
-// Makes the call, without the GIL where it has a machine.
+// Runs the call and returns its result. The GIL is released if the function has a machine.
 py::object run(Loaded& loaded);
 
 }  // namespace voronerf

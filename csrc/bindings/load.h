@@ -1,15 +1,15 @@
-// What Python passes as what C++ takes: a Type for each kind of parameter. Templates only describe; loading is compiled
-// once (frame.h), since pybind11's templates for each function took the compiler a fifth of the whole extension's
-// time.
+// The conversion of Python arguments to C++ parameters: a Type describes each kind of parameter. Templates only build
+// the descriptions, and loading is compiled once (frame.h): pybind11's templates for each function would take a fifth
+// of the compile time of the extension.
 //
-//   T*            a tensor of that dtype (or None, which is null); a const one is made contiguous for the call, and has
-//                 its negative bit resolved. A tensor without elements is there all the same: its address is not null.
+//   T*            a tensor of this dtype, or None for null. A const tensor is made contiguous for the call, and its
+//                 negative bit is resolved. The address of an empty tensor is not null.
 //   T* const*     a sequence of such tensors, or None
 //   std::vector   a sequence
 //   enumeration   the name of a value (VN_NAMES)
-//   struct        a named tuple with its members (VN_STRUCT), of a class that the module makes
+//   struct        a named tuple with its members (VN_STRUCT); the module makes its class
 //   numbers       int, float and bool
-//   RowCount          an int, which a recording reads again (frame.h, bind.cpp)
+//   RowCount      an int, which a recording reads again at each replay (frame.h, bind.cpp)
 #pragma once
 
 #include <cstddef>
@@ -52,25 +52,25 @@ struct Type {
   };
   Kind kind = Kind::none;
   size_t size = 0;
-  std::string python, exact;        // in Python's words and in C++'s, for the stub; of what has a name, that
-  std::string dtype;                // of a tensor, "any" for all
-  unsigned dtypes = 0;              // that it may have; 0 for any. A bool is read as an uint8
-  bool constant = false;            // a tensor
-  bool is_signed = false;           // an integer
-  const Type* of = nullptr;         // what a sequence consists of
-  std::vector<std::string> values;  // of an enumeration
-  std::vector<Member> members;      // of a struct
+  std::string python, exact;        // types in Python and in C++, for the stub; a named type has its name
+  std::string dtype;                // of a tensor; "any": all dtypes
+  unsigned dtypes = 0;              // accepted dtypes of a tensor; 0: any. uint8 accepts bool
+  bool constant = false;            // a const tensor
+  bool is_signed = false;           // a signed integer
+  const Type* of = nullptr;         // element type of a sequence
+  std::vector<std::string> values;  // value names of an enumeration
+  std::vector<Member> members;      // members of a struct
   void (*construct)(void*) = nullptr;
-  void (*destroy)(void*) = nullptr;          // of an opaque object: delete it
-  void* (*resize)(void*, size_t) = nullptr;  // of a std::vector: gives its data
+  void (*destroy)(void*) = nullptr;          // for an opaque object: deletes it
+  void* (*resize)(void*, size_t) = nullptr;  // for a std::vector: returns its data
   mutable _object* known_dtype = nullptr;
-  mutable _typeobject* known_class = nullptr;  // of a struct: almost always the one that was looked at last
+  mutable _typeobject* known_class = nullptr;  // cached class of a struct's last argument
 };
 
 template <typename T>
 const Type& type_of();
 
-// Names of an enumeration's values, in their order: VN_NAMES(Isa, "portable", "avx2", "avx512").
+// Declares the names of an enumeration's values in order: VN_NAMES(Isa, "portable", "avx2", "avx512").
 template <typename E>
 struct Names;
 #define VN_NAMES(E, ...)                                      \
@@ -80,7 +80,7 @@ struct Names;
     static constexpr const char* vn_values[] = {__VA_ARGS__}; \
   }
 
-// Members of a struct, in the order in which its named tuple has them: VN_STRUCT(Cpu, isa, threads).
+// Declares the members of a struct, in the order of its named tuple: VN_STRUCT(Cpu, isa, threads).
 template <typename S>
 struct Fields;
 #define VN_STRUCT(S, ...)                                                                          \
@@ -91,19 +91,19 @@ struct Fields;
   }
 template <typename... M>
 std::vector<Member> members_of(const void* object, const char* names, const M&... members) {
-  std::vector<Member> all;
+  std::vector<Member> result;
   const auto add = [&](const void* member, const Type& type) {
     const char* end = names;
     while (*end != ',' && *end != '\0') ++end;
     const auto offset = static_cast<const char*>(member) - static_cast<const char*>(object);
-    all.push_back({std::string(names, end), static_cast<size_t>(offset), &type});
+    result.push_back({std::string(names, end), static_cast<size_t>(offset), &type});
     names = *end == ',' ? end + 2 : end;
   };
   (add(&members, type_of<M>()), ...);
-  return all;
+  return result;
 }
 
-// Objects of a class that Python has from the module, and only hands back.
+// Declares a class whose objects Python gets from the module and only passes back.
 template <typename T>
 struct Opaque;
 #define VN_OPAQUE(T)                           \
@@ -130,7 +130,7 @@ struct ElementOf<std::unique_ptr<T>> {
   using Type = T;
 };
 
-// A set of dtypes of tensors, by their bits; 0 is any of them.
+// Sets of tensor dtypes as bit masks; 0 means any dtype.
 constexpr unsigned kFloat16 = 1, kBfloat16 = 2, kFloat32 = 4, kFloat64 = 8, kInt32 = 16, kInt64 = 32, kUint8 = 64,
                    kBool = 128, kOther = 256;
 constexpr unsigned kFloating = kFloat16 | kBfloat16 | kFloat32 | kFloat64;
@@ -226,7 +226,7 @@ Type describe() {
   }
 }
 
-// Of a parameter, reference or not.
+// Returns the Type of a parameter, by value or by reference.
 template <typename T>
 const Type& type_of() {
   using Plain = std::remove_cv_t<std::remove_reference_t<T>>;

@@ -1,4 +1,4 @@
-// What belongs to no op: the processor and its memory.
+// Functions about the processor and its memory, which belong to no op.
 #include "bindings/bind.h"
 #include "common/huge_pages.h"
 #include "common/isa.h"

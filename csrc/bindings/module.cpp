@@ -1,5 +1,5 @@
-// The Python module voronerf.ops._core._C, which is not linked with torch: it knows of tensors what they tell
-// (tensor_view.h, frame.h). voronerf/ops/_core/native is its only importer.
+// The Python module voronerf.ops._core._C. It is not linked with torch: it reads tensors through DLPack or their Python
+// methods (tensor_view.h, frame.h). Only voronerf/ops/_core/native imports it.
 #include <pybind11/pybind11.h>
 
 #include "bindings/bind.h"

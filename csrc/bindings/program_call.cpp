@@ -15,12 +15,14 @@ TableType table_type(unsigned dtype) {
   return dtype == kBfloat16 ? TableType::bfloat16 : dtype == kFloat16 ? TableType::float16 : TableType::float32;
 }
 
-// A program with what the memory of its results is to be.
+// A program with the shapes and types of its results, which a call allocates.
 class ProgramCall {
  public:
-  // Of outputs (columns, whether they have a row for each ray), sums (table whose tables they have, or -1, and the
-  // shape for one of them), the columns of kept look-ups, the parameters that are tables, the entries of each for one
-  // cell, the first input of rays or -1, and what gives a large tensor other memory.
+  // `widths` has the columns of each output, and whether it has a row per ray. `sums` has the shape of an entry of each
+  // sum, and the parameter whose number of tables it has (-1: one entry per cell). `kept` has the columns of each kept
+  // look-up, `tables` the parameters that are tables, `sizes` the elements of each parameter per cell. `rays` is the
+  // first input with a row per ray, or -1. on_large is called with each result of at least `large` bytes, to place it
+  // on huge pages.
   ProgramCall(py::object program, std::vector<std::pair<int64_t, bool>> widths,
               std::vector<std::pair<int, std::vector<int64_t>>> sums, std::vector<int64_t> kept,
               std::vector<size_t> tables, std::vector<int64_t> sizes, int rays, int64_t large, py::object on_large)
@@ -40,9 +42,9 @@ class ProgramCall {
     function_ = &function;
   }
 
-  // The outputs, sums and, if they are to be kept, look-ups, of inputs, parameters, offsets, order, ray_index and what
-  // was looked up before. None where Python has to make the call: while it is recorded, or of tensors of other kinds;
-  // if it is asked, also where something of torch's is to see the call.
+  // Runs the program on `rows`: inputs, parameters, offsets, order, ray_index and the kept look-ups of an earlier call.
+  // Returns the outputs, the sums and, if `keep`, the look-ups. Returns None if Python has to make the call: during a
+  // recording or for unsupported tensors and, if `asked`, also if a part of torch must see the call.
   py::object call(const py::tuple& rows, bool keep, int64_t gradients, const char* caller, bool asked) const {
     if (recorded() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
       return py::none();
@@ -55,29 +57,29 @@ class ProgramCall {
     auto& out = *static_cast<ProgramResults*>(loaded.values.place(type_of<ProgramResults>()));
     *static_cast<Cpu*>(loaded.values.place(type_of<Cpu>())) = questions.cpu();
 
-    const py::object inputs = fast(rows[0]), parameters = fast(rows[1]), before = fast(rows[5]);
-    const size_t count = size(inputs), learnt = size(parameters);
-    if (learnt != sizes_.size() || count == 0) return py::none();
-    std::vector<TensorView> views(count), of_parameters(learnt);
+    const py::object inputs = fast(rows[0]), parameters = fast(rows[1]), kept_lookups = fast(rows[5]);
+    const size_t count = size(inputs), parameter_count = size(parameters);
+    if (parameter_count != sizes_.size() || count == 0) return py::none();
+    std::vector<TensorView> views(count), parameter_views(parameter_count);
     for (size_t i = 0; i < count; ++i) {
       if (!views[i].look(at(inputs, i)) || views[i].dimensions != 2) return py::none();
     }
-    for (size_t i = 0; i < learnt; ++i) {
-      if (!of_parameters[i].look(at(parameters, i)) || of_parameters[i].dimensions < 1) return py::none();
+    for (size_t i = 0; i < parameter_count; ++i) {
+      if (!parameter_views[i].look(at(parameters, i)) || parameter_views[i].dimensions < 1) return py::none();
     }
-    TensorView offsets, index;
+    TensorView offsets, ray_view;
     PyObject* const ray_index = PyTuple_GET_ITEM(rows.ptr(), 4);
     if (!offsets.look(PyTuple_GET_ITEM(rows.ptr(), 2)) || !offsets.on_cpu()) return py::none();
-    if (ray_index != Py_None && !index.look(ray_index)) return py::none();
-    in.n = ray_index == Py_None ? views[0].shape[0] : index.shape[0];
+    if (ray_index != Py_None && !ray_view.look(ray_index)) return py::none();
+    in.n = ray_index == Py_None ? views[0].shape[0] : ray_view.shape[0];
     in.r = rays_ < 0 ? 0 : views[static_cast<size_t>(rays_)].shape[0];
     in.k = offsets.shape[0] - 1;
 
-    // Which inputs are of samples: none where that is not known.
+    // The row count of inputs per sample; -1 if rays and samples cannot be told apart by their counts.
     const int64_t samples = ray_index != Py_None && in.n == in.r ? -1 : int64_t{in.n};
     const unsigned dtype = views[0].dtype();
     if (dtype != kFloat32 && dtype != kBfloat16) return py::none();
-    std::vector<void*> pointers(count + learnt + kept_.size());
+    std::vector<void*> pointers(count + parameter_count + kept_.size());
     for (size_t i = 0; i < count; ++i) {
       if (views[i].dtype() != dtype) return py::none();
       const bool turned = is_turned(views[i], samples) && !is_negative(at(inputs, i));
@@ -90,8 +92,8 @@ class ProgramCall {
         return py::none();
       }
     }
-    for (size_t i = 0; i < learnt; ++i) {
-      const TensorView& view = of_parameters[i];
+    for (size_t i = 0; i < parameter_count; ++i) {
+      const TensorView& view = parameter_views[i];
       const bool table = std::find(tables_.begin(), tables_.end(), i) != tables_.end();
       if (!table && view.dtype() != kFloat32) return py::none();
       in.parameter_types.push_back(table_type(view.dtype()));
@@ -103,40 +105,40 @@ class ProgramCall {
     if (!load(frame, rows, 2, in.offsets) || !load(frame, rows, 3, in.order) || !load(frame, rows, 4, in.ray_index)) {
       return py::none();
     }
-    in.gradients = keep && !kept_.empty() ? -1 : gradients;  // what is kept is of all rows
+    in.gradients = keep && !kept_.empty() ? -1 : gradients;  // look-ups are kept for all rows
     in.caller = caller;
     in.ray_name = std::strstr(caller, "_mlp") != nullptr ? "direction_index" : "ray_index";
 
-    py::list found;
-    std::vector<void*> made;
+    py::list results;
+    std::vector<void*> addresses;
     for (const auto& [width, by_ray] : widths_) {
-      if (by_ray && dtype != kFloat32) return py::none();  // sums of rays are float32
+      if (by_ray && dtype != kFloat32) return py::none();  // per-ray outputs are float32
       out.output_types.push_back(table_type(dtype));
-      made.push_back(memory(found, dtype, {by_ray ? in.r : in.n, width}));
+      addresses.push_back(memory(results, dtype, {by_ray ? in.r : in.n, width}));
     }
     for (const auto& [table, shape] : sums_) {
-      std::vector<int64_t> sizes = {table < 0 ? in.k : of_parameters[static_cast<size_t>(table)].shape[0]};
+      std::vector<int64_t> sizes = {table < 0 ? in.k : parameter_views[static_cast<size_t>(table)].shape[0]};
       sizes.insert(sizes.end(), shape.begin(), shape.end());
-      made.push_back(memory(found, kFloat32, sizes));
+      addresses.push_back(memory(results, kFloat32, sizes));
     }
     in.kept = nullptr;
     in.ready = true;
-    void** const looked_up = pointers.data() + count + learnt;
+    void** const looked_up = pointers.data() + count + parameter_count;
     if (keep) {
-      for (size_t i = 0; i < kept_.size(); ++i) looked_up[i] = memory(found, kFloat32, {in.n, kept_[i]});
+      for (size_t i = 0; i < kept_.size(); ++i) looked_up[i] = memory(results, kFloat32, {in.n, kept_[i]});
       in.ready = kept_.empty();
     } else {
-      for (size_t i = 0; i < size(before); ++i) {
+      for (size_t i = 0; i < size(kept_lookups); ++i) {
         TensorView view;
-        if (i >= kept_.size() || !view.look(at(before, i))) return py::none();
-        if (!frame.load_view(any(), at(before, i), view, looked_up[i])) return py::none();
+        if (i >= kept_.size() || !view.look(at(kept_lookups, i))) return py::none();
+        if (!frame.load_view(any(), at(kept_lookups, i), view, looked_up[i])) return py::none();
       }
     }
-    if (!kept_.empty() && (keep || size(before) != 0)) in.kept = reinterpret_cast<float* const*>(looked_up);
-    out.outputs = made.data();
-    out.sums = reinterpret_cast<float* const*>(made.data() + widths_.size());
+    if (!kept_.empty() && (keep || size(kept_lookups) != 0)) in.kept = reinterpret_cast<float* const*>(looked_up);
+    out.outputs = addresses.data();
+    out.sums = reinterpret_cast<float* const*>(addresses.data() + widths_.size());
     run(loaded);
-    return std::move(found);
+    return std::move(results);
   }
 
  private:
@@ -148,8 +150,8 @@ class ProgramCall {
   static PyObject* at(const py::object& items, size_t i) {
     return PySequence_Fast_GET_ITEM(items.ptr(), static_cast<Py_ssize_t>(i));
   }
-  // Whether rows of samples lie as PyTorch's look-ups in planes give them. Points of hash grids, which are read where
-  // they are, are copied.
+  // Returns whether an input per sample is column-major, as PyTorch's look-ups in planes return it. Inputs with three
+  // columns are excluded: hash grids read their points in place, which must be row-major.
   static bool is_turned(const TensorView& view, int64_t samples) {
     if (view.is_contiguous() || view.shape[0] != samples || view.shape[1] == 3 || view.dtype() != kFloat32)
       return false;
@@ -157,17 +159,17 @@ class ProgramCall {
   }
   template <typename T>
   static bool load(Frame& frame, const py::tuple& rows, Py_ssize_t place, const T*& address) {
-    void* found = &address;
-    return frame.load(type_of<const T*>(), PyTuple_GET_ITEM(rows.ptr(), place), found);
+    void* target = &address;
+    return frame.load(type_of<const T*>(), PyTuple_GET_ITEM(rows.ptr(), place), target);
   }
-  void* memory(py::list& found, unsigned dtype, const std::vector<int64_t>& shape) const {
-    const auto made = questions.new_memory(shape, questions.dtypes.at(dtype));
+  void* memory(py::list& results, unsigned dtype, const std::vector<int64_t>& shape) const {
+    const auto tensor = questions.new_memory(shape, questions.dtypes.at(dtype));
     int64_t bytes = dtype == kBfloat16 ? 2 : 4;
-    for (const int64_t each : shape) bytes *= each;
-    if (bytes >= large_) on_large_(made);
-    found.append(made);
+    for (const int64_t length : shape) bytes *= length;
+    if (bytes >= large_) on_large_(tensor);
+    results.append(tensor);
     TensorView view;
-    if (!view.look(made.ptr())) throw std::runtime_error("torch does not tell where new memory is");
+    if (!view.look(tensor.ptr())) throw std::runtime_error("torch does not tell where new memory is");
     return view.address();
   }
 

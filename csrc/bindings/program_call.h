@@ -1,4 +1,4 @@
-// Calls of programs (network/program.h) from Python, with whatever their tensors tell.
+// Calls of programs (network/program.h) from Python, which derive the arguments of the program from its tensors.
 #pragma once
 
 #include <pybind11/pybind11.h>

@@ -1,4 +1,4 @@
-// What torch and voronerf are asked in every call, by functions of Python that the module is handed once.
+// The state of torch and voronerf that every call queries, through Python functions that the module receives once.
 #pragma once
 
 #include <vector>
@@ -21,7 +21,7 @@ inline bool is_inference(PyObject* tensor) {
   return is_true(PyObject_CallMethodNoArgs(tensor, word));
 }
 
-// What torch and voronerf answer to questions of every call; objects live as long as Python.
+// Queries of the state of torch and voronerf. The Python objects live as long as the interpreter.
 struct Questions {
   PyObject *own = nullptr, *torch = nullptr, *grad_enabled = nullptr, *tangents = nullptr, *threads = nullptr,
            *kept = nullptr, *native = nullptr, *choose = nullptr;
@@ -29,7 +29,8 @@ struct Questions {
   std::map<unsigned, PyObject*> dtypes;
 
   bool grad() const { return is_true(PyObject_CallNoArgs(grad_enabled)); }
-  // Whether modes, transforms, tracers or profilers of torch are to see what is called, or tangents have to.
+  // Returns whether a mode, transform, tracer or profiler of torch must see the call, or forward-mode differentiation
+  // is active.
   bool is_watched() const {
     for (PyObject* listener : listeners) {
       PyObject* const answer = PyObject_CallNoArgs(listener);
@@ -42,7 +43,7 @@ struct Questions {
     PyObject* const level = PyDict_GetItemWithError(tangents, word);
     return level == nullptr || PyLong_AsLong(level) >= 0;
   }
-  // Memory of the CPU: torch.empty gives there what Tensor.new_empty gives, in half the time.
+  // Allocates a CPU tensor. torch.empty takes half the time of Tensor.new_empty.
   py::object new_memory(const std::vector<int64_t>& shape, PyObject* dtype) const {
     static PyObject* const word = PyUnicode_InternFromString("empty");
     static PyObject* const names = PyTuple_Pack(1, PyUnicode_InternFromString("dtype"));
@@ -53,35 +54,35 @@ struct Questions {
     for (const int64_t size : shape) arguments[count++] = PyLong_FromLongLong(size);
     if (shape.empty()) arguments[count++] = PyTuple_New(0);
     arguments[count] = dtype;
-    PyObject* const made = PyObject_Vectorcall(PyDict_GetItemWithError(torch, word), arguments, count, names);
+    PyObject* const tensor = PyObject_Vectorcall(PyDict_GetItemWithError(torch, word), arguments, count, names);
     for (size_t i = 0; i < count; ++i) Py_DECREF(arguments[i]);
-    if (made == nullptr) throw py::error_already_set();
-    return py::reinterpret_steal<py::object>(made);
+    if (tensor == nullptr) throw py::error_already_set();
+    return py::reinterpret_steal<py::object>(tensor);
   }
-  // native.cpu()
+  // Returns the same as native.cpu() in Python.
   Cpu cpu() const {
     static PyObject *const isa_word = PyUnicode_InternFromString("_isa"), *const threads_word =
                                                                               PyUnicode_InternFromString("threads");
-    static PyObject* known = nullptr;  // a name stays, and almost always the one that was looked at last
+    static PyObject* cached_name = nullptr;  // the name of `isa`, which almost never changes
     static Isa isa;
     PyObject* const name = PyDict_GetItemWithError(native, isa_word);
-    if (name != known) {
+    if (name != cached_name) {
       Frame frame;
       void* place = &isa;
       if (!frame.load(type_of<Isa>(), name, place)) throw py::type_error("_isa");
       Py_INCREF(name);
-      known = name;
+      cached_name = name;
     }
     PyObject* count = PyObject_GetAttr(kept, threads_word);
     if (count == Py_None) {
       Py_DECREF(count);
       count = PyObject_CallNoArgs(threads);
     }
-    const auto many = static_cast<int>(PyLong_AsLong(count));
+    const auto thread_count = static_cast<int>(PyLong_AsLong(count));
     Py_XDECREF(count);
-    return {isa, many};
+    return {isa, thread_count};
   }
-  // Whether the compiled module is this one, and no other one stands in.
+  // Returns whether this module is the compiled module in use, and not replaced by another.
   bool compiled_here() const {
     static PyObject* const word = PyUnicode_InternFromString("compiled");
     return native != nullptr && PyDict_GetItemWithError(native, word) == own;

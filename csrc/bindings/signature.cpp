@@ -15,23 +15,24 @@ namespace {
 
 constexpr int kMostArguments = 32;
 
-// How a custom op may be called with these arguments: 0 past torch's dispatcher, which has nothing to do there, 1 with
-// gradients that are recorded, 2 as a custom op, or as Python says.
+// Returns how to call a custom op with these arguments: 0: bypass torch's dispatcher, which has nothing to do; 1:
+// bypass it and record gradients; 2: Python decides, for example for the dispatcher.
 int way_of(PyObject* arguments, bool top = true) {
   if (top && questions.is_watched()) return 2;
   bool learns = false;
   for (Py_ssize_t i = 0; i < PySequence_Fast_GET_SIZE(arguments); ++i) {
-    PyObject* const each = PySequence_Fast_GET_ITEM(arguments, i);
-    if (each == Py_None || PyUnicode_CheckExact(each) || PyLong_CheckExact(each) || PyBool_Check(each)) continue;
+    PyObject* const argument = PySequence_Fast_GET_ITEM(arguments, i);
+    if (argument == Py_None || PyUnicode_CheckExact(argument) || PyLong_CheckExact(argument) || PyBool_Check(argument))
+      continue;
     TensorView view;
-    if (view.look(each)) {
+    if (view.look(argument)) {
       if (!view.on_cpu()) return 2;
-      learns = learns || ((view.dtype() & kFloating) != 0 && requires_gradient(each));
-    } else if (PyList_CheckExact(each) || PyTuple_CheckExact(each)) {
-      const int inner = way_of(each, false);
+      learns = learns || ((view.dtype() & kFloating) != 0 && requires_gradient(argument));
+    } else if (PyList_CheckExact(argument) || PyTuple_CheckExact(argument)) {
+      const int inner = way_of(argument, false);
       if (inner == 2) return 2;
       learns = learns || inner == 1;
-    } else if (!PyFloat_CheckExact(each)) {
+    } else if (!PyFloat_CheckExact(argument)) {
       return 2;
     }
   }
@@ -43,10 +44,10 @@ struct Argument {
   Kind kind = Kind::any;
   py::str name;
   bool optional = false, detached = false, small = false, written = false;
-  py::object otherwise;  // the default, null for none
+  py::object otherwise;  // the default; null: none
   TensorRule rule;
-  int condition = -1;  // the argument with which the shape is the first of two
-  int letter = -1;     // that shapes have for it
+  int condition = -1;  // the shape is the first of two if this argument is not None
+  int letter = -1;     // the letter of an integer argument that shapes refer to
   int64_t low = 0, high = 0;
   double from = 0, to = 0;
   bool positive = false, interval = false, open = false;
@@ -54,16 +55,16 @@ struct Argument {
   py::object kind_of;
 };
 
-// A call whose arguments are checked.
+// The state of a call while its arguments are checked.
 struct Call {
   PyObject* values[kMostArguments] = {};
   TensorView views[kMostArguments];
   Common common;
-  std::vector<py::object> own;  // what was made for it
-  py::object given;             // the values as a named tuple, once somebody asks for it
+  std::vector<py::object> own;  // converted arguments, kept alive
+  py::object given;             // the values as a named tuple, made on demand
 };
 
-// How a compiled function is called with the arguments of an op: where each of its parameters comes from.
+// A plan to call a compiled function with the arguments of an op: the source of each of its parameters.
 class Plan {
  public:
   struct Source {
@@ -77,7 +78,7 @@ class Plan {
   };
   struct Size {
     Letters::Size size;
-    py::object function;  // null for a letter or a number
+    py::object function;  // null: the size is a letter or a number
   };
   struct Result {
     int like, condition;
@@ -85,7 +86,8 @@ class Plan {
     std::vector<Size> shape, otherwise;
   };
 
-  // From (name of the function, sources, results, class of the results or None, what is called where it gives False).
+  // Reads (name of the function, sources, results, class of the results or None, function that is called if the result
+  // is False).
   Plan(const py::tuple& parts, Letters& letters) : function_(&functions().at(py::cast<std::string>(parts[0]))) {
     for (const auto& source : parts[1]) sources_.push_back(source_of(source, letters));
     for (const auto& row : parts[2]) {
@@ -97,21 +99,21 @@ class Plan {
     fault_ = parts[4];
   }
 
-  // Null where the function does not take these arguments.
+  // Runs the function and returns its results; null if no overload takes these arguments.
   py::object run(Call& call, const py::object& inputs, size_t count) const {
-    std::vector<py::object> found;
-    found.reserve(results_.size());
+    std::vector<py::object> results;
+    results.reserve(results_.size());
     std::vector<TensorView> views(results_.size());
     for (size_t i = 0; i < results_.size(); ++i) {
-      found.push_back(memory(results_[i], call, inputs, count));
-      if (!found.back() || !views[i].look(found.back().ptr())) return {};
+      results.push_back(memory(results_[i], call, inputs, count));
+      if (!results.back() || !views[i].look(results.back().ptr())) return {};
     }
     for (const Bound& bound : function_->overloads) {
       if (bound.function == nullptr || bound.machine != &type_of<Cpu>()) continue;
       if (bound.given.size() != sources_.size() + 1) continue;
       Loaded loaded{function_, &bound, {}, {}};
       std::vector<std::unique_ptr<char[]>> memories;
-      const Loading loading{call, found, views, loaded.frame, memories, inputs, count};
+      const Loading loading{call, results, views, loaded.frame, memories, inputs, count};
       bool fits = true;
       for (size_t i = 0; fits && i < sources_.size(); ++i) {
         void*& place = loaded.values.place(*bound.given[i]);
@@ -119,19 +121,19 @@ class Plan {
       }
       if (!fits) continue;
       *static_cast<Cpu*>(loaded.values.place(type_of<Cpu>())) = questions.cpu();
-      const py::object said = voronerf::run(loaded);
-      if (said.ptr() == Py_False && !fault_.is_none()) fault_(given(call, inputs, count));
-      if (found.size() == 1) return found[0];
-      if (found.empty()) return py::none();
-      py::tuple all(found.size());
-      for (size_t i = 0; i < found.size(); ++i) all[i] = found[i];
-      if (kind_.is_none()) return std::move(all);
-      return PyType_Check(kind_.ptr()) ? named(kind_, all) : kind_(all);
+      const py::object answer = voronerf::run(loaded);
+      if (answer.ptr() == Py_False && !fault_.is_none()) fault_(given(call, inputs, count));
+      if (results.size() == 1) return results[0];
+      if (results.empty()) return py::none();
+      py::tuple tuple(results.size());
+      for (size_t i = 0; i < results.size(); ++i) tuple[i] = results[i];
+      if (kind_.is_none()) return std::move(tuple);
+      return PyType_Check(kind_.ptr()) ? named(kind_, tuple) : kind_(tuple);
     }
     return {};
   }
 
-  // An instance of a class of named tuples.
+  // Returns an instance of a named tuple class.
   static py::object named(const py::object& kind, const py::tuple& values) {
     const py::tuple arguments = py::make_tuple(values);
     return py::reinterpret_steal<py::object>(
@@ -148,18 +150,18 @@ class Plan {
 
  private:
   static std::vector<Size> sizes_of(const py::handle& entries, Letters& letters) {
-    std::vector<Size> found;
+    std::vector<Size> results;
     for (const auto& entry : entries) {
       if (PyCallable_Check(entry.ptr()) != 0) {
-        found.push_back({{}, py::reinterpret_borrow<py::object>(entry)});
+        results.push_back({{}, py::reinterpret_borrow<py::object>(entry)});
       } else {
-        found.push_back({letters.sizes(py::make_tuple(entry))[0], {}});
+        results.push_back({letters.sizes(py::make_tuple(entry))[0], {}});
       }
     }
-    return found;
+    return results;
   }
-  static Source source_of(const py::handle& given, Letters& letters) {
-    const auto parts = py::cast<py::tuple>(given);
+  static Source source_of(const py::handle& description, Letters& letters) {
+    const auto parts = py::cast<py::tuple>(description);
     const auto kind = py::cast<std::string>(parts[0]);
     Source source;
     if (kind == "argument" || kind == "result" || kind == "rays") {
@@ -185,10 +187,10 @@ class Plan {
   }
 
   py::object memory(const Result& result, Call& call, const py::object& inputs, size_t count) const {
-    const bool other = result.condition >= 0 && call.values[result.condition] == Py_None;
+    const bool second = result.condition >= 0 && call.values[result.condition] == Py_None;
     std::vector<int64_t> shape;
     shape.reserve(4);
-    for (const Size& size : other ? result.otherwise : result.shape) {
+    for (const Size& size : second ? result.otherwise : result.shape) {
       shape.push_back(size.function ? py::cast<int64_t>(size.function(given(call, inputs, count)))
                                     : call.common.size(size.size));
     }
@@ -197,10 +199,10 @@ class Plan {
                                 dtype.is_none() ? questions.dtypes.at(call.views[result.like].dtype()) : dtype.ptr());
   }
 
-  // What a call of the function is loaded from.
+  // Loads the parameters of the function from their sources.
   struct Loading {
     Call& call;
-    const std::vector<py::object>& found;
+    const std::vector<py::object>& results;
     const std::vector<TensorView>& views;
     Frame& frame;
     std::vector<std::unique_ptr<char[]>>& memories;
@@ -214,7 +216,7 @@ class Plan {
           if (type.kind != Type::Kind::tensor || value == Py_None) return frame.load(type, value, place);
           return frame.load_view(type, value, call.views[source.place], *static_cast<void**>(place));
         }
-        case Source::Kind::rays:  // whether there is a row for each of them
+        case Source::Kind::rays:  // whether the argument has a row per ray
           if (type.kind != Type::Kind::boolean) return false;
           *static_cast<bool*>(place) = call.views[source.place].dimensions > 1;
           return true;
@@ -270,7 +272,7 @@ class Plan {
 
 class Signature {
  public:
-  // From the op's name, rows of its arguments, and what Declaration._first_call (declare.py) says.
+  // Reads the op's name, a row for each argument, and the dictionary of Declaration._first_call (declare.py).
   Signature(const py::str& op, const py::sequence& rows, int positional, const py::dict& more)
       : op_(op), positional_(positional) {
     for (const auto& row : rows) arguments_.push_back(argument_of(py::cast<py::dict>(row)));
@@ -284,10 +286,10 @@ class Signature {
     pack_ = more["pack"];
   }
 
-  // The results of a call; NotImplemented where its arguments break a rule, or torch does not say whether they do.
+  // Returns the results of a call; NotImplemented if an argument breaks a rule, or if the rules cannot be checked here.
   py::object call(PyObject* args, PyObject* options) {
     Call call;
-    const size_t count = arguments_.size() - 1;  // without the backend
+    const size_t count = arguments_.size() - 1;  // excludes the backend
     if (!bind(args, options, call) || !check(call)) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
     bool learns = false;
     for (size_t i = 0; i < count; ++i) learns = detach(i, call) || learns;
@@ -301,9 +303,9 @@ class Signature {
         (!chosen->narrow || call.common.first_float == kFloat32) && !questions.is_watched()) {
       if (py::object result = chosen->plan->run(call, inputs_, count)) return result;
     }
-    PyObject* const found = PyObject_Vectorcall(chosen->run.ptr(), call.values, count, nullptr);
-    if (found == nullptr) throw py::error_already_set();
-    const py::object result = py::reinterpret_steal<py::object>(found);
+    PyObject* const reference = PyObject_Vectorcall(chosen->run.ptr(), call.values, count, nullptr);
+    if (reference == nullptr) throw py::error_already_set();
+    const py::object result = py::reinterpret_steal<py::object>(reference);
     return pack_.is_none() ? result : pack_(result);
   }
 
@@ -357,20 +359,20 @@ class Signature {
   }
 
   bool bind(PyObject* args, PyObject* options, Call& call) const {
-    const auto given = static_cast<size_t>(PyTuple_GET_SIZE(args));
-    if (given > static_cast<size_t>(positional_)) return false;
-    for (size_t i = 0; i < given; ++i) call.values[i] = PyTuple_GET_ITEM(args, static_cast<Py_ssize_t>(i));
+    const auto positional_count = static_cast<size_t>(PyTuple_GET_SIZE(args));
+    if (positional_count > static_cast<size_t>(positional_)) return false;
+    for (size_t i = 0; i < positional_count; ++i) call.values[i] = PyTuple_GET_ITEM(args, static_cast<Py_ssize_t>(i));
     PyObject *key, *value;
     for (Py_ssize_t at = 0; PyDict_Next(options, &at, &key, &value) != 0;) {
-      size_t i = given;
+      size_t i = positional_count;
       while (i < arguments_.size() && arguments_[i].name.ptr() != key) ++i;
-      if (i == arguments_.size()) {  // a name that is not interned, or of an argument that was given already
-        for (i = given; i < arguments_.size() && PyUnicode_Compare(arguments_[i].name.ptr(), key) != 0;) ++i;
+      if (i == arguments_.size()) {  // the name is not interned, or the argument was already passed by position
+        for (i = positional_count; i < arguments_.size() && PyUnicode_Compare(arguments_[i].name.ptr(), key) != 0;) ++i;
         if (i == arguments_.size()) return false;
       }
       call.values[i] = value;
     }
-    for (size_t i = given; i < arguments_.size(); ++i) {
+    for (size_t i = positional_count; i < arguments_.size(); ++i) {
       if (call.values[i] == nullptr) call.values[i] = arguments_[i].otherwise.ptr();
       if (call.values[i] == nullptr) return false;
     }
@@ -396,8 +398,8 @@ class Signature {
   bool check(const Argument& argument, PyObject*& value, TensorView& view, Call& call) const {
     switch (argument.kind) {
       case Argument::Kind::tensor: {
-        const bool other = argument.condition >= 0 && call.values[argument.condition] == Py_None;
-        if (!view.look(value) || !argument.rule.fits(view, other, call.common)) return false;
+        const bool second = argument.condition >= 0 && call.values[argument.condition] == Py_None;
+        if (!view.look(value) || !argument.rule.fits(view, second, call.common)) return false;
         if (argument.written && (!view.is_contiguous() || is_negative(value))) return false;
         return !argument.small || view.entries() <= kMostRows;
       }
@@ -436,7 +438,7 @@ class Signature {
         return true;
     }
   }
-  // Whether the value requires a gradient after all.
+  // Detaches the value if its argument has no gradient. Returns whether the value still requires a gradient.
   bool detach(size_t i, Call& call) const {
     if (!call.views[i].is_there() || (call.views[i].dtype() & kFloating) == 0) return false;
     if (!requires_gradient(call.values[i])) return false;
@@ -470,7 +472,8 @@ class Signature {
     call.own.push_back(values);
     call.given = {};
   }
-  // The implementation for the backend, and for device and dtype of the first argument; null where these are unknown.
+  // Returns the implementation for the backend and the device and dtype of the first argument; null if the device or
+  // dtype is unknown.
   const Implementation* choose(const Call& call) {
     static PyObject *const cpu = PyUnicode_InternFromString("cpu"), *const cuda = PyUnicode_InternFromString("cuda");
     const TensorView& first = call.views[0];
@@ -506,8 +509,7 @@ class Signature {
   std::vector<std::unique_ptr<Implementation>> implementations_;
 };
 
-// Signature.call as a function of Python that takes a tuple and a dict, which pybind11 would call in four times the
-// time.
+// Signature.call as a Python function of a tuple and a dict. A call through pybind11 would take four times as long.
 PyObject* call_signature(PyObject* self, PyObject* const* given, Py_ssize_t) {
   auto* const signature = static_cast<Signature*>(PyCapsule_GetPointer(self, nullptr));
   try {

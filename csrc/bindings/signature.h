@@ -1,6 +1,6 @@
-// Calls of ops from Python: their arguments are checked and, where nothing else has to see the call, a compiled
-// function is called with them, all in one go. What they must be is said by the signature of the public function
-// (voronerf/ops/_core/declare.py), which is read here once.
+// Calls of ops from Python. One call checks the arguments and runs a compiled function, unless a part of torch has to
+// see the call. The rules come from the signature of the public function (voronerf/ops/_core/declare.py), which is read
+// once.
 #pragma once
 
 #include <pybind11/pybind11.h>

@@ -1,4 +1,4 @@
-// What tensors of a call must be: the rows of voronerf/ops/_core/checks.py and the signatures of declare.py.
+// The rules for the tensors of a call, from voronerf/ops/_core/checks.py and the signatures of declare.py.
 #pragma once
 
 #include <algorithm>
@@ -14,21 +14,21 @@ constexpr int kMostLetters = 32;
 constexpr int64_t kMostRows = (int64_t{1} << 31) - 1, kMostGroups = int64_t{1} << 27;  // checks.MAX_COUNT, MAX_GROUPS
 
 inline unsigned dtypes_of(const py::handle& names) {
-  static const std::map<std::string, unsigned> known = {
+  static const std::map<std::string, unsigned> masks = {
       {"float16", kFloat16}, {"bfloat16", kBfloat16}, {"float32", kFloat32}, {"float64", kFloat64},
       {"int32", kInt32},     {"int64", kInt64},       {"uint8", kUint8},     {"bool", kBool}};
-  unsigned found = 0;
+  unsigned bits = 0;
   for (const auto& name : names) {
-    const auto one = known.find(py::cast<std::string>(name));
-    if (one != known.end()) found |= one->second;  // no tensor of another dtype fits: Python says why
+    const auto entry = masks.find(py::cast<std::string>(name));
+    if (entry != masks.end()) bits |= entry->second;  // other dtypes fail the check, and Python raises the error
   }
-  return found;
+  return bits;
 }
 
-// The numbers that letters of shapes stand for.
+// A numbering of the letters in shapes.
 class Letters {
  public:
-  // A size of a shape: a number, that of a letter and some more, or 1 in its place.
+  // An entry of a shape: a number (`more`), or the value of a letter plus `more`. With or_one it may also be 1.
   struct Size {
     int letter = -1;
     int64_t more = 0;
@@ -41,32 +41,32 @@ class Letters {
     return entry->second;
   }
   std::vector<Size> sizes(const py::handle& shape) {
-    std::vector<Size> found;
+    std::vector<Size> result;
     for (const auto& entry : shape) {
       if (py::isinstance<py::int_>(entry)) {
-        found.push_back({-1, py::cast<int64_t>(entry)});
+        result.push_back({-1, py::cast<int64_t>(entry)});
         continue;
       }
       auto text = py::cast<std::string>(entry);
       const bool or_one = text.compare(0, 2, "1|") == 0;
       if (or_one) text.erase(0, 2);
       const size_t end = text.find("+1");
-      found.push_back({number(text.substr(0, end)), end == std::string::npos ? 0 : 1, or_one});
+      result.push_back({number(text.substr(0, end)), end == std::string::npos ? 0 : 1, or_one});
     }
-    return found;
+    return result;
   }
 
  private:
   std::map<std::string, int> names_;
 };
 
-// What the tensors of a call have in common so far.
+// The values that all tensors of a call share: letters, dtype and device. Each checked tensor may add values.
 struct Common {
   int64_t letters[kMostLetters] = {};
   uint32_t bound = 0;
   unsigned first_float = 0;
   int32_t device_type = -1, device_index = 0;
-  bool learns = false;  // whether one requires a gradient
+  bool learns = false;  // whether a tensor requires a gradient
 
   bool bind(int letter, int64_t value) {
     if ((bound >> letter & 1) != 0) return letters[letter] == value;
@@ -79,15 +79,16 @@ struct Common {
   }
 };
 
-// What a tensor must be: as Checked.tensor of checks.py asks it.
+// The rule for one tensor, as in Checked.tensor of checks.py.
 struct TensorRule {
   unsigned dtypes = 0;
-  bool same = false, wide = false;  // as the first floating-point tensor; at least float32
-  bool either = false;              // of two shapes
-  bool filled = false;              // the letter of the first size is at least 1
+  // same: dtype of the first floating-point tensor; wide: that dtype, but at least float32
+  bool same = false, wide = false;
+  bool either = false;  // either of the two shapes
+  bool filled = false;  // the letter of the first size is at least 1
   std::vector<Letters::Size> shape, otherwise;
 
-  // From (dtypes, "same", "wide", "filled" or "", shape, otherwise or None).
+  // Reads (dtypes, "same", "wide", "filled" or "", shape, otherwise or None).
   static TensorRule of(const py::handle& row, Letters& letters) {
     const auto parts = py::cast<py::tuple>(row);
     const auto kind = py::cast<std::string>(parts[1]);
@@ -100,15 +101,15 @@ struct TensorRule {
     if (!parts[3].is_none()) rule.otherwise = letters.sizes(parts[3]);
     return rule;
   }
-  bool fits(const TensorView& view, bool other, Common& common) const {
-    const auto& sizes = other || (either && view.dimensions != static_cast<int>(shape.size())) ? otherwise : shape;
+  bool fits(const TensorView& view, bool second, Common& common) const {
+    const auto& sizes = second || (either && view.dimensions != static_cast<int>(shape.size())) ? otherwise : shape;
     if (view.dimensions != static_cast<int>(sizes.size())) return false;
     for (int i = 0; i < view.dimensions; ++i) {
       const Letters::Size& size = sizes[static_cast<size_t>(i)];
-      const int64_t there = view.shape[i];
-      if (size.or_one && there == 1) continue;
-      if (size.letter < 0 ? there != size.more : !common.bind(size.letter, there - size.more)) return false;
-      if (size.letter >= 0 && size.more == 1 && (there < 1 || there > kMostGroups + 1)) return false;
+      const int64_t actual = view.shape[i];
+      if (size.or_one && actual == 1) continue;
+      if (size.letter < 0 ? actual != size.more : !common.bind(size.letter, actual - size.more)) return false;
+      if (size.letter >= 0 && size.more == 1 && (actual < 1 || actual > kMostGroups + 1)) return false;
     }
     if (view.dimensions > 0 && view.shape[0] > kMostRows) return false;
     if (filled && view.shape[0] <= sizes[0].more) return false;
@@ -127,11 +128,11 @@ struct TensorRule {
   }
 };
 
-// The rules of tensors whose number is not that of arguments, such as those of a network.
+// The rules for a list of tensors that are not separate arguments, such as the tensors of a network.
 class Rules {
  public:
-  // Of rows of checks.py: (dtypes, kind, shape, otherwise) of a tensor, or (letter, number) that it is if it is not
-  // bound. A call gives `names`, which are letters.
+  // Reads the rows of checks.py: (dtypes, kind, shape, otherwise) is the rule of a tensor, (letter, number) the default
+  // of an unbound letter. A check returns the values of the letters `names`.
   Rules(const py::sequence& rows, const std::vector<std::string>& names) {
     for (const auto& row : rows) {
       const auto parts = py::cast<py::tuple>(row);
@@ -145,14 +146,15 @@ class Rules {
     }
     for (const std::string& name : names) asked_.push_back(letters_.number(name));
   }
-  // The letters, or None where a tensor breaks a rule, or torch does not say whether it does; 0 for what is not bound.
+  // Returns the values of the letters (0: unbound); None if a tensor breaks a rule, or if the rules cannot be checked
+  // here.
   py::object check(const py::list& tensors) const {
     Common common;
     Py_ssize_t i = 0;
     for (size_t row = 0; row < rules_.size(); ++row) {
-      const Letters::Size& own = defaults_[row];
-      if (own.letter >= 0) {
-        if ((common.bound >> own.letter & 1) == 0) common.bind(own.letter, own.more);
+      const Letters::Size& fallback = defaults_[row];
+      if (fallback.letter >= 0) {
+        if ((common.bound >> fallback.letter & 1) == 0) common.bind(fallback.letter, fallback.more);
         continue;
       }
       if (i == PyList_GET_SIZE(tensors.ptr())) return py::none();
@@ -167,20 +169,20 @@ class Rules {
         if (is_inference(tensor.ptr())) return py::none();
       }
     }
-    py::tuple found(asked_.size());
-    for (size_t each = 0; each < asked_.size(); ++each) found[each] = py::int_(common.letters[asked_[each]]);
-    return std::move(found);
+    py::tuple result(asked_.size());
+    for (size_t each = 0; each < asked_.size(); ++each) result[each] = py::int_(common.letters[asked_[each]]);
+    return std::move(result);
   }
 
  private:
   Letters letters_;
   std::vector<TensorRule> rules_;
-  std::vector<Letters::Size> defaults_;  // of a row that is one
+  std::vector<Letters::Size> defaults_;  // of rows (letter, number)
   std::vector<int> asked_;
 };
 
-// Whether lists have as many tensors, those at one place have one shape, all are float32 and on one device, those of
-// the lists that are written lie in order, and the scalars are tensors [] like them.
+// Returns whether the lists have equally many tensors, with equal shapes at each place. All tensors must be float32 and
+// on one device, tensors of `written` lists must be contiguous, and the scalars must be tensors [].
 inline bool alike(const py::sequence& lists, const std::vector<bool>& written, const py::list& scalars) {
   std::vector<TensorView> first;
   for (size_t i = 0; i < lists.size(); ++i) {
@@ -194,8 +196,9 @@ inline bool alike(const py::sequence& lists, const std::vector<bool>& written, c
       TensorView view;
       if (!view.look(tensor) || view.dtype() != kFloat32) return false;
       if (i == 0) first[j] = view;
-      const TensorView& own = first[j];
-      if (view.dimensions != own.dimensions || !std::equal(view.shape, view.shape + view.dimensions, own.shape)) {
+      const TensorView& expected = first[j];
+      if (view.dimensions != expected.dimensions ||
+          !std::equal(view.shape, view.shape + view.dimensions, expected.shape)) {
         return false;
       }
       if (view.device_type != first[0].device_type || view.device_index != first[0].device_index) return false;

@@ -6,7 +6,7 @@ namespace voronerf {
 
 namespace {
 
-// The head of DLPackExchangeAPI, with what is called of it.
+// The first fields of DLPackExchangeAPI. Only `look` is called.
 struct Exchange {
   uint32_t major, minor;
   void *previous, *allocate, *managed_from_python, *managed_to_python;
@@ -24,14 +24,14 @@ bool TensorView::look(PyObject* tensor) {
   for (Py_ssize_t i = 0; i < PyTuple_GET_SIZE(plain_classes); ++i) plain |= kind == PyTuple_GET_ITEM(plain_classes, i);
   if (!plain) return false;
   if (exchange->look(tensor, this) != 0) return PyErr_Clear(), false;
-  return data != nullptr || entries() == 0;  // else its memory was freed, as by storage.resize_
+  return data != nullptr || entries() == 0;  // false if its memory was freed, for example by storage.resize_
 }
 
 bool is_negative(PyObject* tensor) {
   static PyObject* const word = PyUnicode_InternFromString("is_neg");
   PyObject* const answer = PyObject_CallMethodNoArgs(tensor, word);
   PyErr_Clear();
-  Py_XDECREF(answer);  // True or False
+  Py_XDECREF(answer);  // True and False are never freed
   return answer != Py_False;
 }
 

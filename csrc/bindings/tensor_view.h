@@ -1,5 +1,5 @@
-// What torch says of a tensor in one call of 50 ns, where its methods take a microsecond: the exchange of DLPack, whose
-// structs these are (https://dmlc.github.io/dlpack/latest/c_api.html). torch has it from 2.10 on.
+// A view of a torch tensor through the DLPack exchange API (https://dmlc.github.io/dlpack/latest/c_api.html), in torch
+// from 2.10 on. One call takes 50 ns, while the Python methods of a tensor take a microsecond.
 #pragma once
 
 #include <cstddef>
@@ -19,8 +19,8 @@ struct TensorView {
   const int64_t *shape = nullptr, *strides = nullptr;
   uint64_t byte_offset = 0;
 
-  // False where torch does not say: no tensor of a plain class, or one without strides, without memory, or of a
-  // transform. Then the methods of Python tell.
+  // Fills the view. Returns false if the tensor is not of a plain class, has no strides or memory, or belongs to a
+  // transform. Then the caller uses the tensor's Python methods.
   bool look(_object* tensor);
 
   bool is_there() const { return device_type != 0; }
@@ -62,7 +62,7 @@ struct TensorView {
     }
     return rising || size == 0;
   }
-  // Of its first entry; not null where it has none.
+  // Returns the address of the first entry; not null for an empty tensor.
   void* address() const { return data == nullptr ? nothing() : static_cast<char*>(data) + byte_offset; }
   static void* nothing() {
     alignas(64) static char memory[64];
@@ -70,10 +70,10 @@ struct TensorView {
   }
 };
 
-// That memory holds the values negated, as of x.conj().imag.
+// Returns whether the tensor has the negative bit: its memory holds the negated values, as for x.conj().imag.
 bool is_negative(_object* tensor);
 
-// Has the classes of plain tensors, and the capsule of torch's exchange, or None.
+// Sets the classes of plain tensors, and the capsule of torch's DLPack exchange (or None).
 void know_tensors(_object* classes, _object* exchange);
 
 }  // namespace voronerf

@@ -23,7 +23,8 @@ bool is_same(PyObject* was, PyObject* is) {
   return plain && are_equal(was, is);
 }
 
-// Calls look(key or null, value) for all that a container holds, until that is false.
+// Calls look(key or null, value) for each element of a container until it returns false. Returns whether all calls
+// returned true.
 template <typename Look>
 bool each(PyObject* container, Look&& look) {
   if (PyDict_Check(container)) {
@@ -147,7 +148,7 @@ void Unchanged::kind(const py::dict& dictionary, const std::string& name) {
 
 bool Unchanged::holds() const {
   for (const Container& noted : containers_) {
-    if (noted.values.empty() && PyDict_Check(noted.container.ptr())) {  // as nearly all dictionaries of hooks are
+    if (noted.values.empty() && PyDict_Check(noted.container.ptr())) {  // the usual case: dictionaries of hooks
       if (PyDict_GET_SIZE(noted.container.ptr()) != 0) return false;
       continue;
     }
@@ -189,9 +190,9 @@ int Unchanged::each_held(const Visit& visit) const {
   for (const auto& [function, answer] : answers_) held.insert(held.end(), {function.ptr(), answer.ptr()});
   for (const Tensor& noted : tensors_) held.insert(held.end(), {noted.tensor.ptr(), noted.storage.ptr()});
   for (const Kind& noted : kinds_) held.push_back(noted.dictionary.ptr());
-  int found = 0;
-  for (size_t i = 0; i < held.size() && found == 0; ++i) found = visit(held[i]);
-  return found;
+  int status = 0;
+  for (size_t i = 0; i < held.size() && status == 0; ++i) status = visit(held[i]);
+  return status;
 }
 
 void bind_unchanged(py::module_& module) {

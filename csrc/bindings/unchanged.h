@@ -1,4 +1,4 @@
-// Whether objects of Python are as they were: what a step, a router or a field was made for, asked in every call.
+// A check, in every call, that the Python objects for which a step, router or field was prepared are unchanged.
 #pragma once
 
 #include <pybind11/pybind11.h>
@@ -15,31 +15,32 @@ namespace voronerf {
 
 namespace py = pybind11;
 
-// A value is unchanged as long as it is the same object, or an equal number, text or device. Whatever is noted is held,
-// with the storages of tensors: memory that a tensor has left (`x.data = y`) is not freed.
+// A value is unchanged if it is the same object, or an equal number, text or device. The noted objects and the storages
+// of tensors are held, so the memory of a tensor is not freed after `x.data = y`.
 class Unchanged {
  public:
-  // What a list, a tuple, a set or a dictionary holds, in its order; under the keys `free` of a dictionary any value.
+  // Notes the elements of a list, tuple, set or dictionary in order. The values of the keys `free` may change.
   void contents(const py::object& container, const std::vector<std::string>& free);
-  // Some entries of a dictionary: their values, or that there are none.
+  // Notes the values of some keys of a dictionary, or that the keys are missing.
   void entries(const py::dict& dictionary, const std::vector<std::string>& names);
   void attributes(const py::object& object, const std::vector<std::string>& names);
-  // What a function answers without arguments.
+  // Notes the result of function().
   void answer(const py::object& function);
-  // Where the memory of a tensor is; or that, and how it lies there.
+  // Notes the address of a tensor's memory (place), or also its sizes and strides (layout).
   void place(const py::object& tensor) { add(tensor, false); }
   void layout(const py::object& tensor) { add(tensor, true); }
-  // Sizes, dtype and device of the tensor that is an entry of a dictionary, whichever tensor it is.
+  // Notes the sizes, dtype and device of the tensor under a key of a dictionary. The tensor itself may change.
   void kind(const py::dict& dictionary, const std::string& name);
 
-  // Compares as little as may be: between the kernels of a loop, whatever is looked at must come from memory.
+  // Returns whether all noted objects are unchanged. It reads as little as possible: between the kernels of a loop,
+  // each read is a cache miss.
   bool holds() const;
 
   int each_held(const Visit& visit) const;
   void release() { *this = {}; }
 
  private:
-  // How a tensor was.
+  // The noted state of a tensor.
   struct Seen {
     Seen(PyObject* tensor, bool place, bool layout);
     bool holds(PyObject* tensor) const;
@@ -48,14 +49,14 @@ class Unchanged {
     bool place, layout;
     TensorView view;
     std::vector<int64_t> sizes, strides;
-    std::vector<py::object> answers;  // of the methods of a tensor that gives no view
+    std::vector<py::object> answers;  // results of the methods of a tensor without a view
   };
   struct Container {
     py::object container;
-    std::vector<py::object> values;  // of a dictionary with their keys; null for any
+    std::vector<py::object> values;  // for a dictionary, keys and values alternate; null: any value
   };
   struct Named {
-    py::object owner, name, value;  // null for none
+    py::object owner, name, value;  // null value: none
   };
   struct Tensor {
     py::object tensor, storage;
@@ -68,11 +69,11 @@ class Unchanged {
   };
   void add(const py::object& tensor, bool layout);
 
-  std::vector<std::pair<py::object, py::object>> answers_;  // by function
+  std::vector<std::pair<py::object, py::object>> answers_;  // functions and their results
   std::vector<Container> containers_;
   std::vector<Named> entries_, attributes_;
   std::vector<Tensor> tensors_;
-  std::set<std::pair<PyObject*, bool>> known_;  // of these
+  std::set<std::pair<PyObject*, bool>> known_;  // the tensors in tensors_, with their `layout`
   std::vector<Kind> kinds_;
 };
 

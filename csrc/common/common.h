@@ -1,5 +1,5 @@
-// The few macros and helpers that every file may use. Torch-free: the standard library and, under nvcc, the CUDA
-// toolkit.
+// The macros and helpers that every file may use. They do not depend on torch, only on the standard library and, under
+// nvcc, on the CUDA toolkit.
 #pragma once
 
 #include <cstdint>
@@ -14,8 +14,8 @@
 #else
 #include "emulation.h"
 #endif
-// A CUDA error becomes an exception that names the call. Launches are checked with cudaGetLastError(), which does not
-// synchronise: a fault inside a kernel shows at the caller's next synchronisation.
+// Throws an exception that names the call on a CUDA error. Launches are checked with cudaGetLastError(), which does not
+// synchronise: a fault inside a kernel appears at the caller's next synchronisation.
 #define VN_CUDA_CHECK(call)                                                               \
   do {                                                                                    \
     const cudaError_t vn_error = (call);                                                  \
@@ -25,7 +25,7 @@
   } while (false)
 #endif
 
-// Internal invariants: arguments that Python has validated are not validated again.
+// Checks an internal invariant. Arguments that Python has validated are not validated again.
 #define VN_CHECK(condition, message)                     \
   do {                                                   \
     if (!(condition)) throw std::runtime_error(message); \

@@ -9,7 +9,7 @@ CudaDevice::CudaDevice(int device) : device_(device), before_(device) {
 }
 
 CudaDevice::~CudaDevice() {
-  if (before_ != device_) cudaSetDevice(before_);  // it was current a moment ago, and a destructor must not throw
+  if (before_ != device_) cudaSetDevice(before_);  // unchecked: a destructor must not throw
 }
 
 }  // namespace voronerf

@@ -1,10 +1,11 @@
-// The device that a CUDA call is for.
+// The current device of a CUDA call.
 #pragma once
 
 namespace voronerf {
 
-// Makes a device current for this thread while it lives, so that launches go where the caller's stream is. The static
-// runtime here and torch's own share the driver's contexts, and with them what is current: it is put back.
+// A scope in which a device is the current one of this thread, so that kernels are launched on the device of the
+// caller's stream. The destructor restores the previous device: this static CUDA runtime and torch's own share the
+// driver's contexts, hence the current device.
 class CudaDevice {
  public:
   explicit CudaDevice(int device);

@@ -1,12 +1,12 @@
-// The one header that knows how a .cu file is compiled: by nvcc for a GPU, or by g++ under VN_EMULATE for the tests
-// that run the same source on the CPU (tests/cuda_emulation). Launches and shared memory go through macros, because
-// CUDA's own words for them mean nothing, or something else, to g++:
+// The one header that depends on how a .cu file is compiled: by nvcc for a GPU, or by g++ under VN_EMULATE for the
+// tests that run the same source on the CPU (tests/cuda_emulation). Launches and shared memory go through macros,
+// because g++ does not know CUDA's syntax for them:
 //
-//   VN_LAUNCH((kernel<64>), grid, block, bytes, stream, arguments...)     checked
+//   VN_LAUNCH((kernel<64>), grid, block, bytes, stream, arguments...)     launches a kernel and checks for errors
 //   VN_SHARED(name, float[8][64]);   VN_DYN_SHARED(float4, name);
-//   kernel(const VN_GRID_CONSTANT Struct argument)     which functions may have by reference without a copy
+//   kernel(const VN_GRID_CONSTANT Struct argument)     functions may take it by reference, without a copy
 //
-// Below them are the instructions that CUDA C++ has no function for.
+// The functions below wrap instructions for which CUDA C++ has no function.
 #pragma once
 
 #include "common/common.h"
@@ -27,7 +27,7 @@
 #define VN_SHARED(name, ...)       \
   using name##_type = __VA_ARGS__; \
   __shared__ name##_type name
-// One symbol for all kernels, hence bytes: C++ allows it no second type.
+// All kernels share one symbol, which can have only one type in C++: bytes.
 #define VN_DYN_SHARED(T, name)                                        \
   extern __shared__ __align__(128) unsigned char vn_dynamic_shared[]; \
   T* name = reinterpret_cast<T*>(vn_dynamic_shared)
@@ -37,8 +37,8 @@ namespace voronerf {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
 
-// threadIdx.x, read where it is used: the compiler would otherwise keep values derived from it in scarce registers.
-// Unsigned, since a signed number cannot be divided by a shift alone.
+// Returns threadIdx.x, read again at each use: otherwise the compiler would keep values derived from it in scarce
+// registers. It is unsigned, since a signed number cannot be divided by a shift alone.
 __device__ __forceinline__ unsigned thread_again() {
 #ifdef VN_EMULATE
   return threadIdx.x;
@@ -48,7 +48,7 @@ __device__ __forceinline__ unsigned thread_again() {
   return thread;
 #endif
 }
-// blockDim.x, likewise.
+// Returns blockDim.x, read again at each use.
 __device__ __forceinline__ unsigned threads_again() {
 #ifdef VN_EMULATE
   return blockDim.x;
@@ -59,10 +59,11 @@ __device__ __forceinline__ unsigned threads_again() {
 #endif
 }
 
-// Largest number of float16.
+// The largest finite float16.
 constexpr float kLargestHalf = 65504.0f;
 
-// Two floats rounded to 16 bits each, the first in the low half; from sm_80 on one instruction.
+// Rounds two floats to 16 bits each and packs them into a word, the first in the low half. One instruction from sm_80
+// on.
 template <bool kBfloat16>
 __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
 #ifdef VN_EMULATE
@@ -93,7 +94,7 @@ __device__ __forceinline__ float unpack_half(uint16_t bits) {
 #endif
 }
 
-// Two float16 in a word, infinities as the largest numbers; NaN stays.
+// Clamps the two float16 of a word to the largest finite numbers; NaN stays.
 __device__ __forceinline__ uint32_t clamp_halves(uint32_t word) {
 #ifdef VN_EMULATE
   for (int shift = 0; shift < 32; shift += 16) {
@@ -110,7 +111,7 @@ __device__ __forceinline__ uint32_t clamp_halves(uint32_t word) {
 #endif
 }
 
-// The same with 0 for what is below; NaN stays. From sm_80 on one instruction.
+// Packs two floats like pack_halves, with negative numbers set to 0; NaN stays. One instruction from sm_80 on.
 template <bool kBfloat16>
 __device__ __forceinline__ uint32_t pack_relu(float x, float y) {
 #if !defined(VN_EMULATE) && __CUDA_ARCH__ >= 800
@@ -126,7 +127,7 @@ __device__ __forceinline__ uint32_t pack_relu(float x, float y) {
 #endif
 }
 
-// All bits of each half of a word where its number is above 0, or NaN; else none.
+// Returns a mask: all bits of a half are set if its number is above 0 or NaN, else none.
 template <bool kBfloat16>
 __device__ __forceinline__ uint32_t above_zero_halves(uint32_t word) {
 #ifdef VN_EMULATE
@@ -148,7 +149,7 @@ __device__ __forceinline__ uint32_t above_zero_halves(uint32_t word) {
 #endif
 }
 
-// Adds to one, two or four numbers of global memory, by an operation that nobody waits for.
+// Adds atomically to one, two or four numbers in global memory, without waiting for the result.
 template <int kCount>
 __device__ __forceinline__ void add_in_global(float* to, const float* values) {
 #ifdef VN_EMULATE
@@ -175,7 +176,7 @@ __device__ __forceinline__ void add_in_global(float* to, const float* values) {
 #endif
 }
 
-// What no kernel writes while this one runs.
+// Loads a value that no kernel writes while this one runs.
 template <typename T>
 __device__ __forceinline__ T load_constant(const T* from) {
 #ifdef VN_EMULATE
@@ -185,8 +186,8 @@ __device__ __forceinline__ T load_constant(const T* from) {
 #endif
 }
 
-// Four matrices [8][8] of 16-bit numbers as fragments, from rows of `stride` words, which begin at multiples of 16
-// bytes: those of a left operand [16][16] of mma.sync. kShared: in shared memory, by ldmatrix.
+// Loads the fragments of a left operand [16][16] of mma.sync: four matrices [8][8] of 16-bit numbers, from rows of
+// `stride` words that begin at multiples of 16 bytes. kShared: the rows are in shared memory, and ldmatrix loads them.
 template <bool kShared>
 __device__ __forceinline__ void load_matrices(uint32_t (&words)[4], const uint32_t* from, int stride, int lane) {
 #ifndef VN_EMULATE
@@ -203,7 +204,8 @@ __device__ __forceinline__ void load_matrices(uint32_t (&words)[4], const uint32
   }
 }
 
-// The same of 16 rows by 16 columns with rows as the depth: as a left operand [columns][rows], or as two right ones.
+// Loads 16 rows by 16 columns transposed, with the rows as the depth of the product: as a left operand [columns][rows]
+// (kLeft), or as two right operands.
 template <bool kShared, bool kLeft>
 __device__ __forceinline__ void load_turned(uint32_t (&words)[4], const uint32_t* from, int stride, int lane) {
 #ifndef VN_EMULATE
@@ -226,7 +228,7 @@ __device__ __forceinline__ void load_turned(uint32_t (&words)[4], const uint32_t
   }
 }
 
-// x with the ten bits of fraction that tensor cores multiply, ties away from zero; as float32.
+// Returns x rounded to TF32 (ten bits of fraction, ties away from zero), as a float32.
 __device__ __forceinline__ float round_to_tf32(float x) {
 #ifdef VN_EMULATE
   uint32_t bits;
@@ -243,8 +245,8 @@ __device__ __forceinline__ float round_to_tf32(float x) {
 #endif
 }
 
-// d [16][8] += a [16][16] b [16][8] in float32; fragments as in the PTX manual. Before sm_80 float16 alone, in two
-// steps.
+// Computes d [16][8] += a [16][16] b [16][8] in float32, with fragments as in the PTX manual. Before sm_80 only float16
+// is supported, in two instructions.
 template <bool kBfloat16>
 __device__ __forceinline__ void multiply_halves(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
 #ifdef VN_EMULATE
@@ -278,7 +280,7 @@ __device__ __forceinline__ void multiply_halves(float (&d)[4], const uint32_t (&
 #endif
 }
 
-// d [16][8] += a [16][8] b [8][8], operands rounded to tf32. From sm_80 on.
+// Computes d [16][8] += a [16][8] b [8][8] with operands rounded to TF32, from sm_80 on.
 __device__ __forceinline__ void multiply_tf32(float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]) {
 #ifdef VN_EMULATE
   emulated_multiply(Multiplied::tf32, d, a, b);

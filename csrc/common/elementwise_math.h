@@ -1,5 +1,5 @@
-// Vector sine, exponential and the activations built on them, to about 1e-7: polynomials after one range reduction
-// each.
+// Vector sine, exponential and the activations built on them, accurate to about 1e-7. Each is one range reduction and a
+// polynomial.
 #pragma once
 
 #include "common/simd.h"
@@ -12,13 +12,13 @@ typedef int32_t Bits __attribute__((vector_size(4 * kLanes)));
 
 // Adding 1.5 * 2^23 rounds to the nearest integer, which is then in the low bits of the sum.
 constexpr float kRound = 12582912.0f;
-// Largest angle of the vector sine: beyond it the reduction is no longer exact, and the scalar function takes over.
+// The largest angle of the vector sine. Beyond it the reduction is not exact, and the scalar function is the fallback.
 constexpr float kLargestAngle = VN_ISA == 0 ? 8192.0f : 65536.0f;
 
-// angle - multiple * pi, for the multiples of 0.5 that belong to angles up to kLargestAngle.
+// Returns angle - multiple * pi, where `multiple` is a multiple of 0.5 and |angle| <= kLargestAngle.
 VN_INLINE F32 less_multiple_of_pi(F32 angle, F32 multiple) {
 #if VN_ISA == 0
-  // Without fused multiply-add: parts of pi so short that their products are exact.
+  // Without fused multiply-add, pi is split into parts so short that their products are exact.
   const F32 r = angle - multiple * splat(3.140625f) - multiple * splat(9.67502593994140625e-4f);
   return r - multiple * splat(1.509957990978376432e-7f);
 #else
@@ -26,9 +26,10 @@ VN_INLINE F32 less_multiple_of_pi(F32 angle, F32 multiple) {
 #endif
 }
 
-// sin(angle + half * pi) for |angle| <= kLargestAngle, half 0 or 0.5 (the cosine). With angle = (m - half) pi + r,
-// |r| <= pi / 2, it is (-1)^m sin r; pi in parts makes r exact to rounding. The polynomial's own error is 5e-9. N at a
-// time, step by step: one is a chain of a dozen operations that wait for each other.
+// Computes sin(angle + half * pi) in place for |angle| <= kLargestAngle, with half 0 or 0.5 (the cosine). With angle =
+// (m - half) pi + r and |r| <= pi / 2, the result is (-1)^m sin r. Pi is split into parts, so r is exact up to
+// rounding. The polynomial's error is 5e-9. N vectors are interleaved to hide latency: one sine is a chain of a dozen
+// dependent operations.
 template <int N>
 VN_INLINE void sines(F32* angle, const F32* half) {
   F32 shifted[N], r[N], u[N], p[N];
@@ -44,10 +45,11 @@ VN_INLINE void sines(F32* angle, const F32* half) {
   }
 }
 
-// Sines and cosines of angles up to kLargestAngle, from one reduction: angle = k pi/2 + r, |r| <= pi/4. N at a time.
+// Computes sines and cosines of N vectors of angles up to kLargestAngle, from one reduction: angle = k pi/2 + r, |r| <=
+// pi/4.
 template <int N>
 VN_INLINE void sines_and_cosines(const F32* angle, F32* sine, F32* cosine) {
-  const F32 round = splat(0.5f * kRound);  // to multiples of 1/2, which count half turns by quarters
+  const F32 round = splat(0.5f * kRound);  // rounds half turns to multiples of 1/2
   F32 turns[N], r[N], u[N], s[N], c[N];
   for (int i = 0; i < N; ++i) turns[i] = fma(angle[i], splat(0.318309886f), round);
   for (int i = 0; i < N; ++i) r[i] = less_multiple_of_pi(angle[i], turns[i] - round);
@@ -72,13 +74,13 @@ VN_INLINE F32 sine(F32 angle, F32 half) {
   return angle;
 }
 
-// e^x = scale (1 + p), x clamped to what float32 holds; NaN passes.
+// The factors of e^x = scale (1 + p), with x clamped to the range of float32; NaN passes through.
 struct Exponential {
   F32 scale, p;
 };
 
 VN_INLINE Exponential exponential_parts(F32 x) {
-  x = min(splat(88.0f), max(splat(-87.0f), x));  // the second operand if it is NaN
+  x = min(splat(88.0f), max(splat(-87.0f), x));  // min and max return the second operand if it is NaN
   const F32 shifted = fma(x, splat(1.44269504f), splat(kRound));
   const F32 n = shifted - splat(kRound);
   F32 r = fma(n, splat(-0.693145752f), x);
@@ -97,15 +99,15 @@ VN_INLINE F32 exponential(F32 x) {
   return fma(e.scale, e.p, e.scale);
 }
 
-// e^x - 1, accurate around 0.
+// Returns e^x - 1, accurate around 0.
 VN_INLINE F32 exponential_minus_one(F32 x) {
   const Exponential e = exponential_parts(x);
   return fma(e.scale, e.p, e.scale - splat(1.0f));
 }
 
-// log(1 + e^x) = max(x, 0) + log1p(t), t = e^-|x|, and log1p(t) = 2 atanh(t / (2 + t)), whose series is short for t
-// <= 1. Numbers too small for all digits, which take the processor ten times as long, are kept out: t from e^-80 on,
-// u from 1e-20 on.
+// Returns log(1 + e^x) = max(x, 0) + log1p(t) with t = e^-|x| and log1p(t) = 2 atanh(t / (2 + t)), whose series is
+// short for t <= 1. Denormals, which take the processor ten times as long, are avoided: t is at least e^-80, u at least
+// 1e-20.
 VN_INLINE F32 softplus(F32 x) {
   const F32 size = x < splat(0.0f) ? x : splat(0.0f) - x;
   const F32 t = exponential(size < splat(-80.0f) ? splat(-80.0f) : size);
@@ -124,7 +126,7 @@ VN_INLINE F32 softplus(F32 x) {
 
 VN_INLINE F32 sigmoid(F32 x) { return splat(1.0f) / (splat(1.0f) + exponential(splat(0.0f) - x)); }
 
-// Whether a lane is too large for `sine`, or not finite.
+// Returns whether a lane is too large for `sine`, or not finite.
 VN_INLINE bool beyond_sine(F32 angle) { return bits(less(abs(angle), splat(kLargestAngle))) != (1u << kLanes) - 1u; }
 
 }  // namespace

@@ -1,4 +1,4 @@
-// Random numbers as hashes of what they are for: the same for any number of threads, in any order.
+// Random numbers as hashes of a seed, a ray and a place: they do not depend on the number of threads or the order.
 #pragma once
 
 #include <cstdint>
@@ -7,14 +7,14 @@
 
 namespace voronerf {
 
-// Chris Wellons' lowbias32.
+// Returns a hash of x: Chris Wellons' lowbias32.
 VN_HD uint32_t mixed(uint32_t x) {
   x = (x ^ x >> 16) * 0x7feb352du;
   x = (x ^ x >> 15) * 0x846ca68bu;
   return x ^ x >> 16;
 }
 
-// The key of a ray, and the numbers of that ray in [0, 1), one for each place.
+// hash_key returns the key of a ray. hashed returns a random number in [0, 1) for a key and a place.
 VN_HD uint32_t hash_key(int32_t seed, int64_t ray) {
   return mixed(static_cast<uint32_t>(seed) + static_cast<uint32_t>(ray));
 }

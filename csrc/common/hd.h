@@ -1,5 +1,5 @@
-// VN_HD marks arithmetic shared by CPU and CUDA: one formula for both worlds, so that the CPU's tests exercise the
-// GPU's. Internal linkage, because the files compiled per instruction set must not share inline functions (see simd.h).
+// VN_HD marks functions shared by the CPU and CUDA, so that the tests on the CPU cover the formulas of the GPU. They
+// have internal linkage, because the files compiled per instruction set must not share inline functions (see simd.h).
 #pragma once
 
 #ifdef __CUDACC__

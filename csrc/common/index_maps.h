@@ -1,6 +1,6 @@
-// Index maps of the CUDA kernels that do not depend on data, and the bisection of those that do, as plain functions:
-// tests/cuda_emulation/test_index_maps.py goes through all of their arguments and compares with brute force, that every
-// element is met once and none out of range. Lanes are unsigned: a signed number cannot be divided by a shift alone.
+// Index maps and searches of the CUDA kernels, as plain functions. tests/cuda_emulation/test_index_maps.py goes through
+// all of their arguments and compares with brute force: every element is visited once and none is out of range. Lanes
+// are unsigned, because a signed number cannot be divided by a shift alone.
 #pragma once
 
 #include <cstdint>
@@ -13,13 +13,14 @@ struct MapPlace {
   int row, column;
 };
 
-// Sum i of a lane, 0..3, in a tile [16][8] of mma.sync.
+// Returns the place of a lane's accumulator i (0..3) in a tile [16][8] of mma.sync.
 VN_HD constexpr MapPlace accumulator_place(unsigned lane, int i) {
   return {static_cast<int>(lane / 4) + 8 * (i / 2), static_cast<int>(2 * (lane % 4)) + i % 2};
 }
 
-// Where the last of some values is that do not fall and are not above another one: 32 probes at a time, of which as
-// many were not above it as there are votes. The first value is taken for one that is not.
+// The range of a warp's search in non-decreasing values for the last one that is not above a bound. The 32 lanes probe
+// 32 values at a time (probed); `votes` counts the probes that are not above the bound (narrowed). The first value is
+// assumed not to be above it.
 struct MapSpan {
   int64_t first, last;
 };
@@ -31,7 +32,7 @@ VN_HD constexpr MapSpan narrowed(const MapSpan& span, int votes) {
   return {first, last < span.last ? last : span.last};
 }
 
-// The first of n values, which do not fall, that is above `value`; n where none is.
+// Returns the index of the first of n non-decreasing values that is above `value`; n if none is.
 template <typename T>
 VN_HD constexpr int64_t first_above(const T* values, int64_t n, int64_t value) {
   int64_t low = 0, high = n;
@@ -46,7 +47,7 @@ VN_HD constexpr int64_t first_above(const T* values, int64_t n, int64_t value) {
   return low;
 }
 
-// The bucket of a cell that is one of k, or none: those below 0 come first, those from k on last.
+// Returns the bucket of a cell: 0 for cells below 0, cell + 1 for the k valid cells, k + 1 for cells from k on.
 VN_HD constexpr int64_t bucket_of_cell(int32_t cell, int64_t k) {
   return cell < 0 ? 0 : cell >= k ? k + 1 : static_cast<int64_t>(cell) + 1;
 }

@@ -1,5 +1,5 @@
-// Vectors of int32: arithmetic, look-ups in tables, and the view of a float's bits as a number. Floats that are not
-// negative are in the order of their bits.
+// Vectors of int32: arithmetic, table look-ups (gather), and the bits of a float as an integer. Non-negative floats are
+// ordered like their bits.
 #pragma once
 
 #include "common/simd.h"
@@ -25,7 +25,7 @@ VN_INLINE I32 add(I32 a, I32 b) { return _mm512_add_epi32(a, b); }
 VN_INLINE I32 both(I32 a, I32 b) { return _mm512_and_si512(a, b); }
 VN_INLINE I32 min(I32 a, I32 b) { return _mm512_maskz_min_epi32(0xffff, a, b); }
 VN_INLINE I32 max(I32 a, I32 b) { return _mm512_maskz_max_epi32(0xffff, a, b); }
-// (a & mask) | b
+// Returns (a & mask) | b.
 VN_INLINE I32 tag(I32 a, I32 mask, I32 b) { return _mm512_ternarylogic_epi32(a, mask, b, 0xea); }
 VN_INLINE I32 subtract(I32 a, I32 b) { return _mm512_sub_epi32(a, b); }
 VN_INLINE I32 left(I32 a, int bits) { return _mm512_maskz_sll_epi32(0xffff, a, _mm_cvtsi32_si128(bits)); }
@@ -37,7 +37,7 @@ VN_INLINE int32_t smallest(I32 a) {
       _mm256_min_epi32(_mm512_maskz_extracti64x4_epi64(0xf, a, 0), _mm512_maskz_extracti64x4_epi64(0xf, a, 1));
   return smallest_of_eight(half);
 }
-// Towards zero; of a number that an int32 holds.
+// Rounds towards zero. The number must fit an int32.
 VN_INLINE I32 truncate(F32 a) { return _mm512_maskz_cvttps_epi32(0xffff, a); }
 VN_INLINE I32 gather(const int32_t* table, I32 rows) {
   return _mm512_mask_i32gather_epi32(_mm512_setzero_si512(), 0xffff, rows, table, 4);
@@ -76,7 +76,7 @@ VN_INLINE I32 max(I32 a, I32 b) { return a > b ? a : b; }
 VN_INLINE I32 tag(I32 a, I32 mask, I32 b) { return (a & mask) | b; }
 VN_INLINE I32 subtract(I32 a, I32 b) { return a - b; }
 VN_INLINE I32 left(I32 a, int bits) { return a << bits; }
-// Of numbers that are not negative.
+// Only for non-negative numbers.
 VN_INLINE I32 right(I32 a, int bits) { return a >> bits; }
 VN_INLINE Mask less(I32 a, I32 b) { return a < b; }
 VN_INLINE F32 divide(F32 a, F32 b) { return a / b; }

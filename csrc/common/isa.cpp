@@ -11,8 +11,8 @@ namespace voronerf {
 namespace {
 
 #if VN_HAS_TILES
-// Whether the processor has tile registers and products of bfloat16 in them, and Linux lets this process use them: it
-// is asked once, for all threads, and a child process inherits the answer.
+// Returns whether the processor has tile registers with bfloat16 products, and Linux permits this process to use them.
+// Linux is asked once for all threads, and a child process inherits the permission.
 bool tiles_allowed() {
   constexpr unsigned kFeatures = 7, kBfloat16 = 1u << 22, kTiles = 1u << 24;
   constexpr long kAskFor = 0x1023, kTileData = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
@@ -46,7 +46,7 @@ bool isa_supported(Isa isa) {
       return isa == Isa::portable;
   }
 #elif defined(__aarch64__)
-  return isa == Isa::portable || isa == Isa::neon;  // which every such processor has
+  return isa == Isa::portable || isa == Isa::neon;  // every aarch64 processor has NEON
 #else
   return isa == Isa::portable;
 #endif

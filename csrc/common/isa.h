@@ -1,34 +1,34 @@
-// Instruction sets of the CPU paths. Every file *_isa.cpp is compiled once for each, with its own flags and VN_ISA set;
-// the caller names one at run time, so one build runs on any processor of its architecture.
+// Instruction sets of the CPU paths. Every file *_isa.cpp is compiled once per instruction set, with its flags and
+// VN_ISA. The caller chooses one at run time, so one build runs on any processor of its architecture.
 #pragma once
 
 namespace voronerf {
 
-// avx512_bf16 is avx512 whose networks multiply pairs of bfloat16 where they may, amx one that does so in tile
-// registers; the others multiply floats.
+// The instruction sets. With avx512_bf16, networks multiply pairs of bfloat16 where this is allowed, and with amx they
+// do so in tile registers. Otherwise both are the same as avx512. The other instruction sets multiply float32.
 enum class Isa : int { portable = 0, neon, avx2, avx512, avx512_bf16, amx };
 
-// Whether this build has it, and this processor and its operating system can run it.
+// Returns whether this build has the instruction set, and the processor and the operating system can run it.
 bool isa_supported(Isa isa);
 
 }  // namespace voronerf
 
-// Whether the build has bfloat16 products: gcc's target pragma and attribute give them to one file or function, from
-// version 10 on.
+// VN_HAS_HALF: the build has bfloat16 products. From version 10 on, gcc's target pragma and attribute enable them for
+// one file or function.
 #if defined(__x86_64__) && defined(__GNUC__) && __GNUC__ >= 10 && !defined(__clang__)
 #define VN_HAS_HALF 1
 #else
 #define VN_HAS_HALF 0
 #endif
 
-// Whether it has them in tile registers, for which Linux is to be asked.
+// VN_HAS_TILES: the build has bfloat16 products in tile registers. A process must ask Linux for permission to use them.
 #if VN_HAS_HALF && defined(__linux__) && defined(__LP64__)
 #define VN_HAS_TILES 1
 #else
 #define VN_HAS_TILES 0
 #endif
 
-// The paths that exist in a build: those of its architecture, and the portable one.
+// A build has the code paths of its architecture, and the portable one. VN_FOR_ISA dispatches a call to one of them.
 #define VN_DECLARE_IN(isa, declaration) \
   namespace isa {                       \
   declaration;                          \

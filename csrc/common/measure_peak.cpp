@@ -15,7 +15,7 @@ namespace voronerf {
 namespace {
 
 constexpr double kBurst = 1.5e-3, kSeconds = 0.1;
-constexpr int64_t kCopied = int64_t{1} << 24;  // floats: 64 MiB to 64 MiB
+constexpr int64_t kCopied = int64_t{1} << 24;  // floats in each of two buffers of 64 MiB
 constexpr int64_t kLine = 64;
 
 double now() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
@@ -50,9 +50,9 @@ double measure_multiply_adds(Peak kind, Isa isa, int threads) {
     std::atomic<int> members{0};
     const double begin = now();
     parallel(threads, [&](int) {
-      alignas(kLine) float own[16] = {};
+      alignas(kLine) float sums[16] = {};
       ++members;
-      multiply_adds(kind, isa, turns, own);
+      multiply_adds(kind, isa, turns, sums);
     });
     best = std::max(best, members * flops_a_turn * static_cast<double>(turns) / (now() - begin));
   } while (now() - start < kSeconds);
@@ -70,7 +70,7 @@ double measure_copy(Isa isa, int threads) {
   std::atomic<int64_t> copied{0};
   const auto copy = [&](bool streaming) {
     copied = 0;
-    // The same pieces for the same thread each time, as the pages were first touched.
+    // Each thread copies the same pieces every time: the pages that it has touched first.
     parallel(threads, [&](int thread) {
       for (int64_t at = thread * kPiece; at < kCopied; at += threads * kPiece, copied += kPiece) {
         if (streaming) {
@@ -89,7 +89,7 @@ double measure_copy(Isa isa, int threads) {
   do {
     const double begin = now();
     copy(streaming);
-    // Of a smaller team than was asked for some pieces are nobody's.
+    // A team smaller than `threads` copies only some of the pieces.
     best = std::max(best, 2.0 * static_cast<double>(copied) * sizeof(float) / (now() - begin));
     streaming = !streaming;
   } while (now() - start < kSeconds);
@@ -104,7 +104,7 @@ double bfloat16_gain() {
   constexpr Peak kKinds[] = {Peak::float32, Peak::bfloat16};
   alignas(kLine) float sink[16] = {};
   double most[2] = {};
-  // In turns, and the best of each: a clock that rises and other processes meet both.
+  // The two kinds alternate, so that a rising clock and other processes affect both. The best round of each counts.
   for (int64_t round = 0; round < kRounds; ++round) {
     for (int i = 0; i < 2; ++i) {
       const double begin = now();

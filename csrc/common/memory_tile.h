@@ -1,4 +1,4 @@
-// A vector of floats from and to memory, anywhere.
+// Unaligned vector loads and stores.
 #pragma once
 
 #include "common/simd.h"

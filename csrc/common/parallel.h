@@ -1,7 +1,6 @@
-// Teams of threads. The kernels share their work out through `parallel` and `Items` rather than through loops of
-// OpenMP, so that one macro, VN_STD_THREADS, runs all of it on std::thread: ThreadSanitizer knows nothing of libgomp's
-// barriers and would report every result of a region as a race (tests/cpp/sanitize.sh). What a region does with its
-// data is the same in both builds.
+// Teams of threads. The kernels distribute their work by `parallel` and `Items` instead of OpenMP loops, so that one
+// macro, VN_STD_THREADS, runs them on std::thread. ThreadSanitizer does not know libgomp's barriers and would report
+// every result of a region as a race (tests/cpp/sanitize.sh). The body of a region is the same in both builds.
 #pragma once
 
 #include <algorithm>
@@ -22,8 +21,9 @@
 
 namespace voronerf {
 
-// body(thread) once for each thread of a team of at most `threads`, numbered from 0; returns when all have. One thread
-// is the caller's own, with no team, which is what a forked child can run. Nothing may be thrown out of body.
+// Calls body(thread) once on each thread of a team of at most `threads`, numbered from 0, and returns when all calls
+// have returned. With one thread there is no team: the calling thread runs the body, as a forked child must. The body
+// must not throw.
 template <typename Body>
 void parallel(int threads, const Body& body) {
   if (threads <= 1) {
@@ -46,8 +46,8 @@ void parallel(int threads, const Body& body) {
 #endif
 }
 
-// body() on the calling thread, beside up to `threads` - 1 others that run its regions and wait for the next of them
-// without ending: what would be many teams, each woken anew, is one.
+// Calls body() on the calling thread. Up to `threads` - 1 other threads run its parallel regions with it and wait
+// between them, so that one team serves all regions of the body.
 template <typename Body>
 void with_team(int threads, const Body& body) {
   if (threads <= 1) return body();
@@ -55,9 +55,9 @@ void with_team(int threads, const Body& body) {
   parallel(threads, [&](int thread) { thread == 0 ? team.lead(body) : team.follow(); });
 }
 
-// Items 0 to count - 1 in runs of `run`. Every thread of a team has a part of them, neighbours that it takes one after
-// the other, and what is left of the others' when its own is done. So of the same items in call after call a thread
-// takes much the same, and finds in its own cache what it wrote before.
+// Distributes items 0 to count - 1 among the threads of a team, in runs of `run`. Every thread has a contiguous part of
+// the items and takes its runs in order; then it steals runs from the other parts. So a thread takes mostly the same
+// items in every call, and its cache still holds the results of the previous call.
 class Items {
  public:
   Items(int64_t count, int64_t run, int threads) : run_(run) {
@@ -69,7 +69,7 @@ class Items {
     }
   }
 
-  // Takes the next run of a thread, items [begin, end); false if none is left.
+  // Takes the next run of a thread, items [begin, end). Returns false if no run is left.
   bool take(int thread, int64_t& begin, int64_t& end) {
     if (trace != nullptr) trace->run();
     for (int i = 0; i < parts_; ++i) {
@@ -93,8 +93,8 @@ class Items {
   const int64_t run_;
 };
 
-// body(item) for every item, on at most `threads` threads, no more than there are runs. What is thrown out of body, as
-// where memory has run out, ends the loop and is thrown again to the caller.
+// Calls body(item) for every item, on at most `threads` threads and at most one per run. An exception of the body, such
+// as std::bad_alloc, ends the loop and is rethrown to the caller.
 template <typename Body>
 void parallel_for(int64_t count, int64_t run, int threads, const Body& body) {
   const int64_t runs = (count + run - 1) / run;
@@ -113,7 +113,7 @@ void parallel_for(int64_t count, int64_t run, int threads, const Body& body) {
   if (failure) std::rethrow_exception(failure);
 }
 
-// body(begin, end) for blocks of `block` items.
+// Calls body(begin, end) for blocks of `block` items.
 template <typename Body>
 void parallel_blocks(int64_t count, int64_t block, int threads, const Body& body) {
   parallel_for((count + block - 1) / block, 1, threads,

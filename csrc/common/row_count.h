@@ -1,5 +1,5 @@
-// A number of rows, such as samples or rays of a step: what a recorded call reads again from memory each time that it
-// is replayed (bindings/bind.cpp).
+// A number of rows, such as the samples or rays of a step. A recorded call reads it again from memory at every replay
+// (bindings/bind.cpp).
 #pragma once
 
 #include <cstdint>

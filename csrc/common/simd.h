@@ -1,9 +1,9 @@
-// The one place that knows instruction sets: a vector of float32 and the operations the kernels need, for the
-// instruction set of the including file (VN_ISA: 0 portable, 1 AVX2 + FMA, 2 AVX-512, 3 NEON; see isa.h). Kernels take
-// the size of a vector from kLanes and the size of the register file from kRegisters.
+// A vector of float32 and the operations that the kernels need, for the instruction set of the including file (VN_ISA:
+// 0 portable, 1 AVX2 + FMA, 2 AVX-512, 3 NEON; see isa.h). kLanes is the number of lanes of a vector, kRegisters the
+// number of vector registers.
 //
-// Everything here has internal linkage. A file compiled for AVX-512 must not leave an inline function behind that the
-// linker could pick for a processor without it, so *_isa.cpp files include no standard header but <cstdint> and
+// Everything here has internal linkage. A file compiled for AVX-512 must not emit an inline function that the linker
+// could pick for a processor without AVX-512. So *_isa.cpp files include no standard headers except <cstdint> and
 // <cstddef>.
 #pragma once
 
@@ -45,8 +45,8 @@ VN_INLINE F32 sub(F32 a, F32 b) { return _mm512_sub_ps(a, b); }
 VN_INLINE F32 mul(F32 a, F32 b) { return _mm512_mul_ps(a, b); }
 VN_INLINE F32 add(F32 a, F32 b) { return _mm512_add_ps(a, b); }
 VN_INLINE F32 fma(F32 a, F32 b, F32 c) { return _mm512_fmadd_ps(a, b, c); }
-// With a full mask these are the plain instructions; gcc 12 warns of an uninitialised operand in its unmasked ones (its
-// bug 105593).
+// The full mask gives the plain instructions. The unmasked intrinsics of gcc 12 cause warnings about an uninitialised
+// operand (gcc bug 105593).
 VN_INLINE F32 min(F32 a, F32 b) { return _mm512_maskz_min_ps(0xffff, a, b); }
 VN_INLINE F32 max(F32 a, F32 b) { return _mm512_maskz_max_ps(0xffff, a, b); }
 VN_INLINE F32 abs(F32 a) { return _mm512_abs_ps(a); }
@@ -56,11 +56,11 @@ VN_INLINE I32 select(Mask m, I32 a, I32 b) { return _mm512_mask_mov_epi32(b, m, 
 VN_INLINE unsigned bits(Mask m) { return m; }
 VN_INLINE void store(int32_t* to, I32 a) { _mm512_storeu_si512(to, a); }
 
-// Sixteen points [16,3] to their three coordinates.
+// Loads sixteen points [16,3] as vectors of their three coordinates.
 VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
   const F32 a = _mm512_loadu_ps(p), b = _mm512_loadu_ps(p + 16), c = _mm512_loadu_ps(p + 32);
-  // Lanes 0-10 of x, y and the first ten of z come from a and b, the rest from c; index 16 + i takes lane i of the
-  // second.
+  // Lanes 0-10 of x and y, and lanes 0-9 of z, come from a and b, the other lanes from c. Index 16 + i selects lane i
+  // of the second operand.
   const I32 x_ab = _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0);
   const I32 y_ab = _mm512_setr_epi32(1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0);
   const I32 z_ab = _mm512_setr_epi32(2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0);
@@ -72,7 +72,8 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
   z = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, z_ab, b), z_c, c);
 }
 
-// The lanes of a and b in turns: a[0], b[0], a[1], b[1], ... in `low`, from the middle on in `high`.
+// Interleaves the lanes of a and b: a[0], b[0], a[1], b[1], ... The first half of the result is `low`, the second half
+// `high`.
 VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
   const I32 first = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
   const I32 second = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
@@ -80,9 +81,9 @@ VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
   high = _mm512_permutex2var_ps(a, second, b);
 }
 
-// Lane i: the sum of v[i]'s lanes, every one added up in the same order.
+// Returns a vector whose lane i is the sum of v[i]'s lanes. All sums use the same order.
 VN_INLINE F32 lane_sums(const F32* v) {
-  F32 four[4];  // lane 4 j + i of the g-th: what v[4 g + i] has in its j-th quarter
+  F32 four[4];  // lane 4 j + i of four[g]: the sum of the j-th quarter of v[4 g + i]
   for (int g = 0; g < 4; ++g) {
     const F32 *a = v + 4 * g,
               ab = add(_mm512_maskz_unpacklo_ps(0xffff, a[0], a[1]), _mm512_maskz_unpackhi_ps(0xffff, a[0], a[1]));
@@ -142,7 +143,7 @@ VN_INLINE __m256 load_halves(const float* low, const float* high) {
   return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(low)), _mm_loadu_ps(high), 1);
 }
 
-// Eight points [8,3] to their three coordinates; the shuffles work on points 0-3 and 4-7 side by side.
+// Loads eight points [8,3] as vectors of their three coordinates. The shuffles process points 0-3 and 4-7 side by side.
 VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
   const __m256 a = load_halves(p, p + 12);                             // x0 y0 z0 x1
   const __m256 b = load_halves(p + 4, p + 16);                         // y1 z1 x2 y2
@@ -156,8 +157,8 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
 
 #else
 
-// Four lanes of the compiler's own vectors. They are those of NEON too, whose intrinsics are here what operators do not
-// say.
+// Vectors of four lanes by the compiler's vector extension, for NEON too. NEON intrinsics are used only where the
+// extension has no operator.
 constexpr int kLanes = 4, kRegisters = VN_ISA == 3 ? 32 : 16;
 typedef float F32 __attribute__((vector_size(16)));
 typedef int32_t I32 __attribute__((vector_size(16)));
@@ -220,8 +221,8 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
 #endif
 #endif
 
-// Vector i gets lane i of all kLanes vectors. A step turns the bits of an element's number, vector and lane together,
-// by one place to the left; as many of them as a lane's number has bits swap the two.
+// Transposes kLanes vectors in place: vector i gets lane i of all vectors. Each step rotates the bits of an element's
+// index (vector, lane) left by one; after log2(kLanes) steps vector and lane are swapped.
 VN_INLINE void transpose(F32* v) {
   for (int step = 1; step < kLanes; step *= 2) {
     F32 turned[kLanes];
@@ -230,8 +231,8 @@ VN_INLINE void transpose(F32* v) {
   }
 }
 
-// Float64 needs no more than operators: the compiler's own vectors, of this instruction set's width. A comparison gives
-// an I64 of ones and zeros, to be used as `mask ? a : b`.
+// Vectors of float64 by the compiler's vector extension, of this instruction set's width: the kernels need only
+// operators. A comparison gives an I64 mask for `mask ? a : b`.
 constexpr int kDoubles = kLanes / 2;
 typedef double F64 __attribute__((vector_size(4 * kLanes)));
 typedef int64_t I64 __attribute__((vector_size(4 * kLanes)));

@@ -1,4 +1,5 @@
-// Threads that wait for the regions of one of them, its leader (common/parallel.h): a recording is replayed by a team.
+// A team of threads that run the parallel regions of their leader (common/parallel.h). A recording is replayed by a
+// team.
 #pragma once
 
 #include <atomic>
@@ -17,13 +18,13 @@ namespace voronerf {
 
 class Team {
  public:
-  // Of the calling thread, while it leads one and is in no region; else null.
+  // Returns the team that the calling thread leads; null inside a region, or if it leads no team.
   static Team*& current() {
     static thread_local Team* team = nullptr;
     return team;
   }
 
-  // body() as the leader, and the end of the team. Nothing may be thrown out of body.
+  // Runs body() as the leader, then ends the team. The body must not throw.
   template <typename Body>
   void lead(const Body& body) {
     current() = this;
@@ -32,24 +33,24 @@ class Team {
     post(kEnd);
   }
 
-  // What every other thread does: regions, until the team ends. Who comes late takes part from the next region on.
+  // Runs regions as a follower until the team ends. A thread that joins late takes part from the next region on.
   void follow() {
     uint64_t seen = job_.load();
-    const uint64_t own = followers_.fetch_add(1) + 1;
+    const uint64_t thread = followers_.fetch_add(1) + 1;
     while (seen != kEnd) {
       wait([&] { return job_.load() != seen; });
       seen = job_.load();
-      if (seen == kEnd || seen % kMost < own) continue;  // a region of fewer threads, or from before this one came
-      call_(body_, static_cast<int>(own));
+      if (seen == kEnd || seen % kMost < thread) continue;  // this thread has no part in the region, or joined too late
+      call_(body_, static_cast<int>(thread));
       if (working_.fetch_sub(1) == 1) wake();
     }
   }
 
-  // body(thread) once for each thread of the leader and at most `threads` - 1 of those that are there.
+  // Runs a region: body(thread) once on the leader and on at most `threads` - 1 of the followers present.
   template <typename Body>
   void run(int threads, const Body& body) {
     const uint64_t others = std::min({static_cast<uint64_t>(threads) - 1, followers_.load(), kMost - 1});
-    Team* const own = std::exchange(current(), nullptr);  // regions of body are run by one thread
+    Team* const team = std::exchange(current(), nullptr);  // nested regions run on one thread
     if (others != 0) {
       body_ = &body;
       call_ = [](const void* of, int thread) { (*static_cast<const Body*>(of))(thread); };
@@ -58,14 +59,14 @@ class Team {
     }
     body(0);
     if (others != 0) wait([&] { return working_.load() == 0; });
-    current() = own;
+    current() = team;
   }
 
  private:
   static constexpr uint64_t kMost = 1024, kEnd = ~uint64_t{0};
-  // A thread that waits looks again and again for about as long as it takes to sleep and to be woken, then it sleeps:
-  // so it loses at most half of its time. In between it yields to whoever wants the core.
-  static constexpr std::chrono::microseconds kLook{200};
+  // A waiting thread spins for about as long as falling asleep and waking take, then it sleeps: so it loses at most
+  // half of its time. While it spins, it yields its core to other threads.
+  static constexpr std::chrono::microseconds kSpin{200};
 
   void post(uint64_t job) {
     job_.store(job);
@@ -78,7 +79,7 @@ class Team {
   }
   template <typename Done>
   void wait(const Done& done) {
-    const auto until = std::chrono::steady_clock::now() + kLook;
+    const auto until = std::chrono::steady_clock::now() + kSpin;
     do {
       for (int i = 0; i < 32; ++i) {
         if (done()) return;
@@ -94,7 +95,7 @@ class Team {
     sleepers_.fetch_sub(1);
   }
 
-  // The number of a region times kMost, and how many threads it has beside the leader.
+  // The number of the current region times kMost, plus its number of followers.
   std::atomic<uint64_t> job_{0};
   std::atomic<uint64_t> followers_{0}, working_{0}, sleepers_{0};
   const void* body_ = nullptr;

@@ -1,5 +1,6 @@
-// What the regions of a call would take on more threads, found on one: the time that each run of items takes is given
-// to the thread that would be free first, as Items does it. benchmarks/cores.py makes its table of that.
+// An estimate of the time of a call's parallel regions on more threads, from a trace on one thread. The time of each
+// run of items is added to the thread that would be free first, as in Items. benchmarks/cores.py prints the estimates
+// as a table.
 #pragma once
 
 #include <algorithm>
@@ -17,30 +18,30 @@ class Trace {
     ++regions;
     last_ = now();
   }
-  // A run has ended, or the first one begins.
+  // Ends a run, or begins the first one.
   void run() {
     const double time = now(), taken = time - last_;
     last_ = time;
     inside += taken;
-    for (std::vector<double>& each : busy_) *std::min_element(each.begin(), each.end()) += taken;
+    for (std::vector<double>& thread : busy_) *std::min_element(thread.begin(), thread.end()) += taken;
   }
   void end() {
     run();
     for (int team = 0; team < 4; ++team) shared[team] += *std::max_element(busy_[team].begin(), busy_[team].end());
   }
-  // Processor time, which other processes on the machine do not stretch.
+  // Returns the processor time in seconds, which does not depend on other processes.
   static double now() { return static_cast<double>(std::clock()) / CLOCKS_PER_SEC; }
 
   int regions = 0;
   double inside = 0.0;    // seconds in regions
-  double shared[4] = {};  // what these would take on kTeams threads
+  double shared[4] = {};  // estimated seconds of the regions on kTeams threads
 
  private:
   std::vector<double> busy_[4];
   double last_ = 0.0;
 };
 
-// Of the calling thread; null but for a call that is traced on one thread.
+// The trace of the calling thread; null unless its call is being traced.
 inline thread_local Trace* trace = nullptr;
 
 }  // namespace voronerf

@@ -1,4 +1,5 @@
-// Blocks of entries over threads. An entry depends on itself alone, so results do not depend on the threads.
+// Adam on the CPU: threads share blocks of entries. Entries are independent, so results do not depend on the number of
+// threads.
 #include "encoding/adam.h"
 
 #include <algorithm>
@@ -11,7 +12,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kBlock = 1 << 14;  // entries of a task, 64 KiB of the gradient
+constexpr int64_t kBlock = 1 << 14;  // entries of one task, 64 KiB of the gradient
 
 void run_block(Isa isa, const AdamStep& rule, const float* gradient, float* parameter, float* mean, float* square,
                int64_t begin, int64_t end) {
@@ -22,9 +23,9 @@ bool all_below(Isa isa, float limit, const float* gradient, int64_t n) {
   VN_FOR_ISA(isa, adam_all_below(limit, gradient, n))
 }
 
-// Whether a step is left out, which is counted.
-bool left_out(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
-              const std::vector<int64_t>& sizes, Isa isa) {
+// Returns whether the step is skipped, and counts skipped steps.
+bool is_skipped(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
+                const std::vector<int64_t>& sizes, Isa isa) {
   if (guard.loss != nullptr) {
     bool fine = std::fabs(*guard.loss) < guard.limit;
     for (size_t i = 0; i < sizes.size() && fine; ++i) {
@@ -37,8 +38,8 @@ bool left_out(const std::vector<AdamRule>& rules, const AdamGuard& guard, const 
   return guard.found != nullptr && *guard.found != 0.0f;
 }
 
-// What a step of a rule is, which is counted.
-AdamStep corrected(const AdamRule& rule) {
+// Increments the rule's step and returns its bias-corrected constants.
+AdamStep next_step(const AdamRule& rule) {
   const double step = static_cast<double>(*rule.step += 1.0f);
   const double root = std::pow(1.0 - std::pow(rule.decay_sq, step), 0.5);
   const double rate = rule.rate_at == nullptr ? rule.rate : *rule.rate_at;
@@ -46,7 +47,7 @@ AdamStep corrected(const AdamRule& rule) {
           static_cast<float>(rule.decay_sq), static_cast<float>(rule.epsilon * root), rule.every};
 }
 
-// body(tensor, begin, end) for blocks of all tensors.
+// Calls body(tensor, begin, end) for the blocks of all tensors.
 template <typename Body>
 void for_blocks(const std::vector<int64_t>& sizes, int threads, const Body& body) {
   struct Block {
@@ -68,9 +69,9 @@ void for_blocks(const std::vector<int64_t>& sizes, int threads, const Body& body
 void adam_cpu(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,
               float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,
               Isa isa, int threads) {
-  if (left_out(rules, guard, gradients, sizes, isa)) return;
+  if (is_skipped(rules, guard, gradients, sizes, isa)) return;
   std::vector<AdamStep> steps;
-  for (const AdamRule& rule : rules) steps.push_back(corrected(rule));
+  for (const AdamRule& rule : rules) steps.push_back(next_step(rule));
   for_blocks(sizes, threads, [&](size_t i, int64_t begin, int64_t end) {
     run_block(isa, steps[i], gradients[i], parameters[i], means[i], squares[i], begin, end);
   });

@@ -1,12 +1,12 @@
-// Adam on CUDA, a thread an entry. Neighbouring threads have neighbouring entries: a warp reads its whole line of
-// gradients, and of the other three arrays only the sectors that have one.
+// Adam on CUDA: one thread per entry. Neighbouring threads have neighbouring entries, so that a warp reads a whole line
+// of gradients and, in the other three arrays, only the sectors with a nonzero gradient.
 //
-// A step of a training is two launches for 36 parameters, and reads nothing on the host. In the first, blocks look at
-// runs of the gradients of the networks, and each of them writes one vote: whether it has found a number that is too
-// large, or none. One more block votes on the loss, and corrects the rates. In the second, a block updates a run of one
-// parameter, unless a vote says that the step is left out; one thread writes the guard. A vote has one writer and is
-// read in a later launch alone, so that no operation is atomic, and no memory has to be cleared. With more parameters
-// there are as many launches of the first kind, whose votes add up, before those of the second.
+// A training step is two launches per 36 parameters and reads nothing on the host. In the first launch, blocks check
+// runs of the networks' gradients, and each writes one vote: whether it has found NaN or a number that is too large.
+// Block 0 votes on the loss and computes the bias-corrected rates. In the second launch, each block updates a run of
+// one parameter, unless a vote says that the step is skipped; one thread writes the guard. A vote has one writer and is
+// read only in a later launch, so that no operation is atomic and no memory needs clearing. With more parameters, all
+// launches of the first kind come before all launches of the second kind, and their votes accumulate.
 #include <algorithm>
 
 #include "common/cuda_wrappers.h"
@@ -17,11 +17,11 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kRun = 4 * kThreads;  // entries of a block
+constexpr int kRun = 4 * kThreads;  // entries that a block updates
 constexpr int kJudgeThreads = 1024;
-constexpr int kJudgedRun = 4 * kJudgeThreads;  // entries that a block looks at before it goes on
-constexpr int kVotes = 128;                    // blocks that vote at most: each warp of the update reads all votes
-constexpr int kMost = 36;  // parameters of a launch: their pointers are its arguments, of which 4 KB fit
+constexpr int kJudgedRun = 4 * kJudgeThreads;  // entries that a block checks at a time
+constexpr int kVotes = 128;                    // most voting blocks: each warp of the update reads all votes
+constexpr int kMost = 36;                      // parameters of a launch: their pointers must fit its 4 KB of arguments
 
 __device__ __forceinline__ void update_entry(const AdamStep& rule, float g, float* parameter, float* mean,
                                              float* square, int64_t i) {
@@ -37,18 +37,18 @@ struct AdamTensor {
   float *parameter, *mean, *square;
   int64_t n;
   AdamRule rule;
-  unsigned first;   // block of the update
-  unsigned judged;  // first run that is looked at; of a table there is none
+  unsigned first;   // first block of the update
+  unsigned judged;  // first run to check; tables have no such runs
 };
 struct AdamTensors {
   AdamTensor of[kMost];
   int count;
-  unsigned judged;  // runs of all of them
+  unsigned judged;  // runs to check, of all tensors
 };
 static_assert(sizeof(AdamTensors) <= 3900, "arguments of a launch");
 
-// Block 0 corrects the rates and looks at the loss; the threads of another block look at a run of one parameter, then
-// at another run. A launch that is not the `first` keeps the votes of the launches before.
+// Block 0 computes the bias-corrected rates and checks the loss; every other block checks runs of parameters, one after
+// another. A launch that is not the `first` keeps the votes of earlier launches.
 __global__ void __launch_bounds__(kJudgeThreads)
     adam_judge_kernel(AdamTensors tensors, AdamGuard guard, float* corrected, float* votes, bool first) {
   const int thread = static_cast<int>(threadIdx.x);
@@ -80,30 +80,30 @@ __global__ void __launch_bounds__(kJudgeThreads)
   __syncthreads();
   if (thread != 0) return;
   float vote = first ? 0.0f : votes[blockIdx.x];
-  for (unsigned each : of_warps) vote = each != 0 ? 1.0f : vote;
+  for (unsigned lanes : of_warps) vote = lanes != 0 ? 1.0f : vote;
   votes[blockIdx.x] = vote;
 }
 
-// Whether the step is left out, which `count` votes say where there is a loss; the same for all threads.
-__device__ __forceinline__ bool is_left_out(const AdamGuard& guard, const float* votes, int count) {
+// Returns whether the step is skipped: with a loss, by `count` votes. The result is the same for all threads.
+__device__ __forceinline__ bool is_skipped(const AdamGuard& guard, const float* votes, int count) {
   if (guard.loss == nullptr) return guard.found != nullptr && *guard.found != 0.0f;
-  bool found = false;
-  for (int i = static_cast<int>(threadIdx.x) % 32; i < count; i += 32) found |= votes[i] != 0.0f;
-  return __ballot_sync(kAllLanes, found) != 0;
+  bool voted = false;
+  for (int i = static_cast<int>(threadIdx.x) % 32; i < count; i += 32) voted |= votes[i] != 0.0f;
+  return __ballot_sync(kAllLanes, voted) != 0;
 }
 
-// The `last` of the launches for all parameters writes the guard, which other blocks do not read where there is a loss.
+// The `last` launch of a step writes the guard. With a loss no other block reads the guard.
 __global__ void __launch_bounds__(kThreads)
     adam_kernel(AdamTensors tensors, AdamGuard guard, const float* __restrict__ corrected,
                 const float* __restrict__ votes, int count, bool last) {
-  const bool left_out = is_left_out(guard, votes, count);
+  const bool skipped_step = is_skipped(guard, votes, count);
   if (last && guard.loss != nullptr && blockIdx.x == 0 && threadIdx.x == 0) {
-    const float found = left_out ? 1.0f : 0.0f;
-    *guard.found = found;
-    *guard.skipped += found;
-    *guard.in_a_row = (*guard.in_a_row + 1.0f) * found;
+    const float flag = skipped_step ? 1.0f : 0.0f;
+    *guard.found = flag;
+    *guard.skipped += flag;
+    *guard.in_a_row = (*guard.in_a_row + 1.0f) * flag;
   }
-  if (left_out) return;
+  if (skipped_step) return;
   int number = 0;
   while (number + 1 < tensors.count && blockIdx.x >= tensors.of[number + 1].first) ++number;
   const AdamTensor& tensor = tensors.of[number];
@@ -117,7 +117,7 @@ __global__ void __launch_bounds__(kThreads)
     const float g = tensor.gradient[i];
     if (rule.every || g != 0.0f) update_entry(rule, g / scale, tensor.parameter, tensor.mean, tensor.square, i);
   }
-  // What this step is was read in the launch before.
+  // adam_judge_kernel has read this step count already.
   if (block == 0 && threadIdx.x == 0) *tensor.rule.step += 1.0f;
 }
 
@@ -129,7 +129,7 @@ void adam_cuda(const std::vector<AdamRule>& rules, float* const* parameters, con
                float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,
                float* workspace, void* stream) {
   const size_t count = rules.size();
-  const auto each = [&](const auto& run) {
+  const auto for_each_launch = [&](const auto& run) {
     for (size_t begin = 0; begin < count; begin += kMost) {
       const size_t end = std::min<size_t>(count, begin + kMost);
       AdamTensors tensors{};
@@ -145,13 +145,13 @@ void adam_cuda(const std::vector<AdamRule>& rules, float* const* parameters, con
       run(tensors, blocks, workspace + kVotes + 2 * begin, begin == 0, end == count);
     }
   };
-  unsigned judged = 0;  // the most of a launch: all of them have the same votes
-  each([&](const AdamTensors& tensors, auto...) { judged = std::max(judged, tensors.judged); });
+  unsigned judged = 0;  // the most of any launch: all launches have the same number of votes
+  for_each_launch([&](const AdamTensors& tensors, auto...) { judged = std::max(judged, tensors.judged); });
   const unsigned votes = 1 + std::min<unsigned>(judged, kVotes - 1);
-  each([&](const AdamTensors& tensors, unsigned, float* corrected, bool first, bool) {
+  for_each_launch([&](const AdamTensors& tensors, unsigned, float* corrected, bool first, bool) {
     VN_LAUNCH(adam_judge_kernel, votes, kJudgeThreads, 0, stream, tensors, guard, corrected, workspace, first);
   });
-  each([&](const AdamTensors& tensors, unsigned blocks, float* corrected, bool, bool last) {
+  for_each_launch([&](const AdamTensors& tensors, unsigned blocks, float* corrected, bool, bool last) {
     VN_LAUNCH(adam_kernel, blocks, kThreads, 0, stream, tensors, guard, corrected, workspace, static_cast<int>(votes),
               last);
   });

@@ -1,4 +1,4 @@
-// A step of Adam of several parameters in one call; the formula is in voronerf/ops/adam.
+// One Adam step of several parameters in one call; the formula is in voronerf/ops/adam.
 #pragma once
 
 #include <cstdint>
@@ -8,37 +8,38 @@
 
 namespace voronerf {
 
-// The rule of a parameter. Its step is on the device, and its rate may be: on CUDA no host reads them.
+// The update rule of a parameter. Its step is on the device, and its rate may be: CUDA never reads them on the host.
 struct AdamRule {
-  double rate;           // the learning rate, where rate_at is null
-  const float* rate_at;  // [1], or null
-  float* step;           // [1], steps done; goes up by one unless the step is left out
+  double rate;           // the learning rate if rate_at is null
+  const float* rate_at;  // [1], the learning rate, or null
+  float* step;           // [1], completed steps; goes up by one unless the step is skipped
   double decay, decay_sq, epsilon;
-  bool every;  // as of AdamStep
+  bool every;  // as in AdamStep
 };
 
-// When a step is left out: where `found` is not 0. With a loss, it is set first: to whether the loss or a gradient of a
-// parameter with `every` is not below `limit`, NaN included.
+// A NaN guard: the step is skipped if `found` is not 0. With a loss, the step first sets `found` to whether the loss or
+// a gradient of a parameter with `every` reaches `limit` or is NaN.
 struct AdamGuard {
   const float* loss;  // [1], or null
   float limit;
-  float* found;               // [1], or null for never
-  float *skipped, *in_a_row;  // [1], how many steps were left out, and of the last ones; null without a loss
-  const float* scale;         // [1], of which the gradients are multiples, or null; on CUDA
+  float* found;               // [1], or null to never skip
+  float *skipped, *in_a_row;  // [1], skipped steps in total, and in a row until this step; null without a loss
+  const float* scale;         // [1], the loss scale that gradients are divided by, or null; CUDA only
 };
 
 void adam_cpu(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,
               float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,
               Isa isa, int threads);
 
-// Averages go a share [1] of the way to parameters, or to 0 where there are none.
+// Moves averages by a share [1] of the way to the parameters, or to 0 if `parameters` is null.
 void average_cpu(float* const* averages, const float* const* parameters, const float* share,
                  const std::vector<int64_t>& sizes, int threads);
 
-// Gradients are added to totals.
+// Adds gradients to totals.
 void add_cpu(const float* const* gradients, float* const* totals, const std::vector<int64_t>& sizes, int threads);
 
-// A step on CUDA, in two launches for 36 parameters. The floats of its workspace, for so many parameters.
+// A step on CUDA, in two launches per 36 parameters. adam_workspace_cuda returns the floats of its workspace for
+// `count` parameters.
 int64_t adam_workspace_cuda(int64_t count);
 void adam_cuda(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,
                float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,

@@ -1,8 +1,7 @@
-// A step reads the whole gradient, and of the other three arrays only the cache lines that have one: most of a large
-// table's lines have none. A line is 16 floats, whatever an entry's number of features. Its update has no branches: an
-// entry of the line without a gradient is written back as it was. A rule of all entries goes straight through the
-// arrays, which the processor foresees. Each operation is rounded on its own (the build has contraction off), so that
-// all instruction sets give the same bits.
+// A step reads the whole gradient, but of the other three arrays only cache lines with a nonzero gradient: in a large
+// table most lines have none. A line is 16 floats. Its update has no branches, and entries with zero gradient are
+// written back unchanged. A rule with `every` streams through all arrays, which the hardware prefetches. Each operation
+// is rounded separately (the build turns contraction off), so that all instruction sets give the same bits.
 #include "encoding/adam_isa.h"
 
 #include "common/memory_tile.h"
@@ -12,11 +11,11 @@ namespace VN_ISA_NAMESPACE {
 namespace {
 
 constexpr int kLine = 16;
-constexpr int kLines = 256;  // of which those with a gradient are listed first, so that no branch is guessed wrong
-constexpr int kAhead = 8;    // lines whose memory is asked for ahead
+constexpr int kLines = 256;  // lines per pass: listing their nonzero lines first avoids mispredicted branches
+constexpr int kAhead = 8;    // lines to prefetch ahead
 
-// Any bit but the sign: a gradient of -0 is none, NaN is one.
-VN_INLINE int any(const float* gradient) {
+// Returns whether a line has a nonzero gradient: any bit but the sign, so that -0 counts as zero and NaN does not.
+VN_INLINE int is_nonzero(const float* gradient) {
 #if VN_ISA == 2
   return _mm512_test_epi32_mask(_mm512_loadu_si512(gradient), _mm512_set1_epi32(0x7fffffff)) != 0;
 #elif VN_ISA == 1
@@ -31,7 +30,7 @@ VN_INLINE int any(const float* gradient) {
 #endif
 }
 
-// kLanes entries.
+// Updates kLanes entries.
 VN_INLINE void update(const AdamStep& rule, const float* gradient, float* parameter, float* mean, float* square) {
   const F32 g = load(gradient), p = load(parameter), m = load(mean), v = load(square);
   const auto present = (g != F32{}) | (rule.every ? -1 : 0);
@@ -53,22 +52,22 @@ void adam_block(const AdamStep& rule, const float* gradient, float* parameter, f
       update(rule, gradient + line + j, parameter + line + j, mean + line + j, square + line + j);
     }
   }
-  int32_t found[kLines];
+  int32_t nonzero[kLines];
   while (line + kLine <= end) {
     const int64_t lines = (end - line) / kLine < kLines ? (end - line) / kLine : kLines;
     int count = 0;
     for (int64_t i = 0; i < lines; ++i) {
-      found[count] = static_cast<int32_t>(i * kLine);
-      count += any(gradient + line + i * kLine);
+      nonzero[count] = static_cast<int32_t>(i * kLine);
+      count += is_nonzero(gradient + line + i * kLine);
     }
     for (int i = 0; i < count; ++i) {
       if (i + kAhead < count) {
-        const int64_t later = line + found[i + kAhead];
+        const int64_t later = line + nonzero[i + kAhead];
         __builtin_prefetch(parameter + later, 1);
         __builtin_prefetch(mean + later, 1);
         __builtin_prefetch(square + later, 1);
       }
-      const int64_t at = line + found[i];
+      const int64_t at = line + nonzero[i];
       for (int j = 0; j < kLine; j += kLanes) {
         update(rule, gradient + at + j, parameter + at + j, mean + at + j, square + at + j);
       }

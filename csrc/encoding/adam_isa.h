@@ -1,5 +1,5 @@
-// The kernels of adam, once for each instruction set: a step of entries [begin, end), and whether the magnitudes of a
-// gradient [n] are all below a limit.
+// The CPU kernels of Adam, compiled once per instruction set. adam_block updates entries [begin, end); adam_all_below
+// returns whether all magnitudes of a gradient [n] are below a limit.
 #pragma once
 
 #include <cstdint>
@@ -8,12 +8,12 @@
 
 namespace voronerf {
 
-// A step of one parameter.
+// The constants of a step of one parameter.
 struct AdamStep {
   float step_size;        // the learning rate, corrected for the moments' start at zero
-  float decay, decay_sq;  // of the moments
-  float epsilon;          // corrected likewise
-  bool every;             // entries without a gradient move on by their moments, which decay, as torch's do
+  float decay, decay_sq;  // decay rates of the moments
+  float epsilon;          // with the same correction
+  bool every;             // also update entries with zero gradient, as torch does
 };
 
 VN_DECLARE_FOR_ISA(void adam_block(const AdamStep& rule, const float* gradient, float* parameter, float* mean,

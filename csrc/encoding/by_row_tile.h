@@ -1,10 +1,10 @@
-// Encodings of the rows of a tile by the formula of a row (encodings.h), a vector of rows at a time: it gives columns,
-// which are turned into rows where they lie.
+// Encodes the rows of a tile by a row formula (encodings.h), a vector of rows at a time. The formula yields columns,
+// which are then transposed in place.
 #pragma once
 
 #include "network/cpu/functions_tile.h"
 #include "network/cpu/program_rows_tile.h"
-// behind the words
+// after functions_tile.h, which defines VN_WORDS
 #include "encoding/encodings.h"
 
 namespace voronerf {
@@ -15,7 +15,7 @@ template <typename Formula>
 struct ByRow {
   static constexpr int64_t kColumns = (Formula::kMost + kLanes - 1) / kLanes * kLanes;
 
-  // Columns of x [rows][stride] from `row` on. Behind the last row it stands again.
+  // Columns of x [rows][stride] from `row` on. Lanes behind the last row repeat it.
   struct Of {
     const float* x;
     int64_t stride, row, rows;
@@ -39,8 +39,8 @@ struct ByRow {
     }
   };
 
-  // x [rows][x_stride], `raw` columns of each -> out [rows, rounded up to whole vectors][stride], with 0 behind the
-  // columns of the encoding. Where x_stride is 3, x is read as so many rows too.
+  // Encodes x [rows][x_stride], `raw` columns of each row -> out [rows, rounded up to whole vectors][stride], with 0
+  // behind the columns of the encoding. If raw and x_stride are 3, x must be readable for the rounded number of rows.
   static void values(const float* x, int64_t x_stride, int64_t raw, int64_t size, int64_t rows, float* out,
                      int64_t stride) {
     for (int64_t row = 0; row < rows; row += kLanes) {
@@ -55,35 +55,35 @@ struct ByRow {
     }
   }
 
-  // Gradients g [rows][g_stride] to gradients of x, out [rows][stride].
+  // Turns gradients g [rows][g_stride] into gradients of x, out [rows][stride].
   static void gradient(const float* x, int64_t x_stride, int64_t raw, int64_t size, const float* g, int64_t g_stride,
                        int64_t rows, float* out, int64_t stride) {
     for (int64_t row = 0; row < rows; row += kLanes) {
       const int64_t count = smaller(kLanes, rows - row);
       const float* const from = g + row * g_stride;
-      F32 given[kColumns];
-      for (F32& column : given) column = splat(0.0f);
+      F32 gradients[kColumns];
+      for (F32& column : gradients) column = splat(0.0f);
       for (int64_t column = 0; column < kColumns && column < g_stride; column += kLanes) {
         for (int64_t lane = 0; lane < kLanes; ++lane) {
-          given[column + lane] = load(from + smaller(lane, count - 1) * g_stride + column);
+          gradients[column + lane] = load(from + smaller(lane, count - 1) * g_stride + column);
         }
-        transpose(given + column);
+        transpose(gradients + column);
       }
       const Of of(x, x_stride, raw, row, rows);
-      F32 found[3] = {splat(0.0f), splat(0.0f), splat(0.0f)};  // written together
+      F32 first[3] = {splat(0.0f), splat(0.0f), splat(0.0f)};  // the first three columns, written together
       float* const to = out + row * stride;
       const auto put = [&](int i, F32 v) __attribute__((always_inline)) {
         if (i < 3) {
-          found[i] = v;
+          first[i] = v;
           return;
         }
         float lanes[kLanes];
         store(lanes, v);
         for (int64_t lane = 0; lane < count; ++lane) to[lane * stride + i] = lanes[lane];
       };
-      Formula::gradient(of, static_cast<int>(raw), static_cast<int>(size), [&](int c) { return given[c]; }, put);
+      Formula::gradient(of, static_cast<int>(raw), static_cast<int>(size), [&](int c) { return gradients[c]; }, put);
       float lanes[3][kLanes];
-      for (int i = 0; i < 3; ++i) store(lanes[i], found[i]);
+      for (int i = 0; i < 3; ++i) store(lanes[i], first[i]);
       for (int64_t lane = 0; lane < count; ++lane) {
         for (int i = 0; i < 3 && i < raw; ++i) to[lane * stride + i] = lanes[i][lane];
       }

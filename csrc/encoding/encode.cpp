@@ -1,5 +1,5 @@
-// The encodings on the CPU: ranges of whole tiles for each thread. A row's encoding depends on that row alone, so the
-// result does not depend on the number of threads.
+// The encodings on the CPU. Each thread encodes a range of whole tiles. A row's encoding depends on this row alone, so
+// the result does not depend on the number of threads.
 #include "encoding/encode.h"
 
 #include <algorithm>
@@ -22,7 +22,7 @@ void backward_rows(const Encoding& in, const float* gradient, float* grad_x, flo
   VN_FOR_ISA(isa, encode_rows_backward(in, gradient, grad_x, grad_variances, workspace, stride, begin, end))
 }
 
-// run(workspace, stride of rows there, begin, end) for a range of rows of each thread.
+// Calls run(workspace, stride of encoded rows in it, begin, end) for each thread's range of rows.
 template <typename Run>
 void over_ranges(const Encoding& in, int threads, const Run& run) {
   if (in.n == 0 || in.d == 0) return;
@@ -32,11 +32,11 @@ void over_ranges(const Encoding& in, int threads, const Run& run) {
   struct alignas(64) Line {
     float floats[kEncodeLanes];
   };
-  // Of each: a table, encoded rows, staged rows with a vector to spare, staged variances.
-  const int64_t own = ceil_div((3 + kEncodeRows) * stride + 2 * (kEncodeRows * in.d + kEncodeLanes), kEncodeLanes);
-  const std::unique_ptr<Line[]> workspace(new Line[static_cast<size_t>(ranges * own)]);
+  // Each range has a table, encoded rows, staged rows with one spare vector, and staged variances.
+  const int64_t lines = ceil_div((3 + kEncodeRows) * stride + 2 * (kEncodeRows * in.d + kEncodeLanes), kEncodeLanes);
+  const std::unique_ptr<Line[]> workspace(new Line[static_cast<size_t>(ranges * lines)]);
   parallel_for(ranges, 1, threads, [&](int64_t i) {
-    run(workspace[i * own].floats, stride, std::min(in.n, i * rows), std::min(in.n, (i + 1) * rows));
+    run(workspace[i * lines].floats, stride, std::min(in.n, i * rows), std::min(in.n, (i + 1) * rows));
   });
 }
 

@@ -1,15 +1,15 @@
-// The encodings on CUDA. Octaves: forward a thread an element of the result, each written once, side by side, because
-// computing sine and cosine apart costs less than passing one of them through shared memory; backward a thread a
-// feature of a point, which computes its sines and cosines again and shares the cache lines of its gradients with the
-// neighbouring threads. By the formula of a row: a thread a row; rows pass through shared memory, so that neighbouring
-// threads read and write neighbouring numbers, and a column more than a row has keeps them off each other's banks.
+// The encodings on CUDA. Octaves, forward: one thread per element of the result. Computing sine and cosine separately
+// costs less than passing one of them through shared memory. Octaves, backward: one thread per feature of a point; it
+// recomputes its sines and cosines and shares the cache lines of its gradients with neighbouring threads. ByRow: one
+// thread per row. Rows pass through shared memory, so that global accesses are coalesced; one padding column avoids
+// bank conflicts.
 #include <algorithm>
 
 #include "common/cuda_wrappers.h"
 #include "encoding/encode.h"
 #include "encoding/encode_math.h"
 #include "network/cuda/words_device.h"
-// behind the words
+// after words_device.h, which defines VN_WORDS
 #include "encoding/encodings.h"
 
 namespace voronerf {
@@ -17,8 +17,8 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kRows = 64;             // of a block, forward
-constexpr int64_t kBlocks = 1 << 16;  // of a grid, whose threads then take several elements
+constexpr int kRows = 64;             // rows of a block in the forward pass
+constexpr int64_t kBlocks = 1 << 16;  // most blocks of a grid; a thread then takes several elements
 constexpr int kFormulaThreads = 128;
 
 __global__ void __launch_bounds__(kThreads)
@@ -27,7 +27,7 @@ __global__ void __launch_bounds__(kThreads)
   const int width = d * (2 * octaves + include_input);
   const int64_t first = static_cast<int64_t>(blockIdx.x) * kRows;
   const int rows = n - first < kRows ? static_cast<int>(n - first) : kRows;
-  // Rows of a block are numbered in 32 bits, in which division is cheap.
+  // Elements of a block have 32-bit numbers, because 32-bit division is cheap.
   for (int j = threadIdx.x; j < rows * width; j += kThreads) {
     const int64_t row = first + j / width, i = first * width + j;
     int column = j % width;
@@ -98,7 +98,7 @@ __global__ void __launch_bounds__(kFormulaThreads)
   __syncthreads();
   if (row >= n) return;
   Formula::gradient([&](int i) { return x[d * row + i]; }, d, size, [&](int c) { return rows[threadIdx.x * kRow + c]; },
-                    [&](int i, float found) { grad_x[d * row + i] = found; });
+                    [&](int i, float value) { grad_x[d * row + i] = value; });
 }
 
 unsigned blocks_of(int64_t size, int threads) { return static_cast<unsigned>(ceil_div<int64_t>(size, threads)); }
@@ -129,7 +129,7 @@ struct ByRow {
 
 template <typename Run>
 void with_kernel(const Encoding& in, const Run& run) {
-  using namespace device;  // the formulas
+  using namespace device;  // for the formulas
   switch (in.encoding) {
 #define VN_CASE(NAME, ...)    \
   case ProgramEncoding::NAME: \

@@ -1,5 +1,5 @@
-// The encodings without parameters (encodings.h) and their gradients: x [n,d] -> [n, width], by the kernels of rows
-// that programs use. As in ENCODINGS of voronerf/ops/_core/encodings.py. n, d and width may be 0.
+// The encodings without parameters (encodings.h) and their gradients: x [n,d] -> [n, width]. They use the row kernels
+// of programs and agree with ENCODINGS in voronerf/ops/_core/encodings.py. n, d and width may be 0.
 #pragma once
 
 #include <cstdint>
@@ -10,13 +10,13 @@
 namespace voronerf {
 
 struct Encoding {
-  ProgramEncoding encoding;  // all but hash
+  ProgramEncoding encoding;  // any but hash
   int64_t n;
-  int32_t width;           // of a row of the result
+  int32_t width;           // columns of the result
   const float* x;          // [n,d]
-  const float* variances;  // [n,d] of the integrated encoding; null for others
-  int32_t d, size;         // size: octaves, or the degree of spherical harmonics
-  bool include_input;      // of sines and cosines: whether x itself comes first
+  const float* variances;  // [n,d] for the integrated encoding, else null
+  int32_t d, size;         // size: number of octaves, or degree of the spherical harmonics
+  bool include_input;      // x itself precedes the sines and cosines
 };
 
 void encode_cpu(const Encoding& in, float* out, Isa isa, int threads);
@@ -29,10 +29,10 @@ void encode_cuda(const Encoding& in, float* out, void* stream);
 void encode_backward_cuda(const Encoding& in, const float* gradient, float* grad_x, float* grad_variances,
                           void* stream);
 
-constexpr int64_t kEncodeRows = 32;   // in cache at a time
-constexpr int64_t kEncodeLanes = 16;  // the widest vector
+constexpr int64_t kEncodeRows = 32;   // rows of a tile, which stays in cache
+constexpr int64_t kEncodeLanes = 16;  // lanes of the widest vector
 
-// Rows `begin` to `end` on the calling thread. stride: floats of a row of the encoding in the workspace.
+// Encode rows `begin` to `end` on the calling thread. stride: floats between encoded rows in the workspace.
 VN_DECLARE_FOR_ISA(void encode_rows(const Encoding& in, float* out, float* workspace, int64_t stride, int64_t begin,
                                     int64_t end))
 VN_DECLARE_FOR_ISA(void encode_rows_backward(const Encoding& in, const float* gradient, float* grad_x,

@@ -1,8 +1,8 @@
-// The CPU kernels of the encodings, once for each instruction set.
+// The CPU kernels of the encodings, compiled once per instruction set.
 //
-// Tiles of rows are encoded where they belong if rows are whole vectors, else in cache, and copied from there.
-// Backward, sines and cosines are computed again: they are each other's derivatives, and computing them costs less than
-// reading back what is twenty times as large as the input.
+// A tile is encoded directly into the result if its rows are whole vectors, else into a buffer in cache that is then
+// copied. The backward pass recomputes sines and cosines, which are each other's derivatives: this costs less than
+// reading back the encoding, which is twenty times as large as the input.
 #define VN_HALF 0
 #include "encoding/by_row_tile.h"
 #include "encoding/encode.h"
@@ -12,15 +12,15 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// The rows in hand, and the workspace of the thread.
+// The current rows, and the thread's workspace.
 struct Tile {
   const Encoding& in;
-  const int64_t stride;  // of rows encoded in cache
+  const int64_t stride;  // of encoded rows in the workspace
   float *const table, *const encoded, *const staged, *const staged_variances;
   const float *x, *variances;  // [rows][d]
   int64_t rows;
-  bool by_row = false;  // whether the kernel is of the formula of a row
-  bool in_place;        // x and gradients are read there: so many rows follow that vectors may reach beyond the last
+  bool by_row = false;  // whether the kernel is ByRow
+  bool in_place;        // read x and gradients without staging: enough rows follow for vectors to overrun
 
   Tile(const Encoding& in, float* workspace, int64_t stride)
       : in(in),
@@ -47,7 +47,7 @@ struct Tile {
     from = to;
   }
 
-  // run(kernel) for the one of the encoding.
+  // Calls run(kernel) with the kernel of the encoding.
   template <typename Run>
   void with_kernel(const Run& run) const {
     switch (in.encoding) {
@@ -61,7 +61,7 @@ struct Tile {
     }
   }
 
-  // What a kernel needs for all rows.
+  // Prepares data that a kernel shares between all rows.
   template <typename Formula>
   void prepare(ByRow<Formula>) {
     by_row = true;
@@ -71,7 +71,7 @@ struct Tile {
     encode_table(table, stride, columns());
   }
 
-  // Encodings, to rows of `stride` floats. Formulas are inlined for points, whose strides are then constants.
+  // Writes encodings to rows of `stride` floats. Formulas are inlined for d = 3, so that their strides are constants.
   template <typename Formula>
   __attribute__((flatten)) void values(ByRow<Formula>, float* out) const {
     if (in.d == 3) return ByRow<Formula>::values(x, 3, 3, in.size, rows, out, stride);
@@ -83,7 +83,7 @@ struct Tile {
     if (kBlurred) blur(variances, in.d, table, rows, out, stride);
   }
 
-  // Gradients g [rows][width] to those of x and of the variances, [rows][d].
+  // Turns gradients g [rows][width] into gradients of x and of the variances, [rows][d].
   template <typename Formula>
   __attribute__((flatten)) void gradient(ByRow<Formula>, const float* g, float* of_x, float*) const {
     int64_t g_stride = in.width;
@@ -116,9 +116,9 @@ void encode_rows(const Encoding& in, float* out, float* workspace, int64_t strid
     for (int64_t first = begin; first < end; first += kEncodeRows) {
       tile.take(first, end);
       float* const to = out + first * width;
-      const bool there = width == stride && tile.rows == kEncodeRows;
-      tile.values(kernel, there ? to : tile.encoded);
-      if (there) continue;
+      const bool direct = width == stride && tile.rows == kEncodeRows;
+      tile.values(kernel, direct ? to : tile.encoded);
+      if (direct) continue;
       const float* const encoded = tile.encoded;
       for (int64_t row = 0, rows = tile.rows; row < rows; ++row)
         copy_row(encoded + row * stride, width, to + row * width);

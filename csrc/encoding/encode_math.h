@@ -1,5 +1,4 @@
-// Arithmetic of the encodings on CUDA, which the CPU's tests exercise as well. On the CPU vectors of it are in
-// elementwise_math.h.
+// Arithmetic of the encodings on CUDA; the CPU tests exercise it too. The CPU's vector form is in elementwise_math.h.
 #pragma once
 
 #include <cmath>
@@ -10,9 +9,10 @@
 
 namespace voronerf {
 
-// sin(angle + half pi): half 0 or 0.5, the cosine. With angle = (m - half) pi + r, |r| <= pi / 2, it is (-1)^m sin r.
-// pi in two parts and fused multiply-adds make r exact to rounding up to the largest angle; the polynomial's own error
-// is 5e-9. Beyond, and for NaN, the library's own function with its long reduction.
+// Returns sin(angle + half pi): the sine for half = 0, the cosine for half = 0.5. With angle = (m - half) pi + r and
+// |r| <= pi / 2 it is (-1)^m sin r. Splitting pi into two floats and fused multiply-adds keep r exact to rounding up to
+// kLargestDeviceAngle; the polynomial's error is 5e-9. Larger angles and NaN use the library's function with its full
+// range reduction.
 constexpr float kLargestDeviceAngle = 65536.0f;
 
 VN_HD float sine_of_octave(float angle, float half) {
@@ -30,7 +30,7 @@ VN_HD float sine_of_octave(float angle, float half) {
   return (parity & 1) != 0 ? -value : value;
 }
 
-// 2^octave, for octaves below 128; products with it are exact.
+// Returns 2^octave, for octaves below 128; products with it are exact.
 VN_HD float octave_scale(int octave) {
   const int32_t bits = (octave + 127) << 23;
   float scale;
@@ -38,7 +38,7 @@ VN_HD float octave_scale(int octave) {
   return scale;
 }
 
-// The factor on an octave for a Gaussian of this variance.
+// Returns the damping factor of an octave for a Gaussian with this variance.
 VN_HD float octave_blur(float scale, float variance) { return expf(-0.5f * scale * scale * variance); }
 
 }  // namespace voronerf

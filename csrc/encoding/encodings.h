@@ -1,18 +1,18 @@
-// The encodings without parameters: DO(name, kernel), a row each. Python knows them by their names
-// (ENCODINGS in voronerf/ops/_core/encodings.py). A kernel is of
+// The encodings without parameters: one DO(name, kernel) for each. Python uses the same names (ENCODINGS in
+// voronerf/ops/_core/encodings.py). The kernels:
 //
-//   ByRow<Formula>      a formula of one row: of a vector of rows on the CPU, of one row of a thread on CUDA
-//   Octaves<kBlurred>   sines and cosines, of a table that is packed; kBlurred: by the variances beside x
+//   ByRow<Formula>      a formula for one row; the CPU evaluates it for a vector of rows, a CUDA thread for one row
+//   Octaves<kBlurred>   sines and cosines; kBlurred: damped by the variances of x
 //
-// in by_row_tile.h and frequency_encode_tile.h on the CPU; on CUDA in program_cuda_encoding.h, and in encode.cu for the
-// ops that are encodings.
+// The CPU kernels are in by_row_tile.h and frequency_encode_tile.h. On CUDA programs have theirs in
+// program_cuda_encoding.h, and the separate ops in encode.cu.
 //
-// A formula is a struct in a header of its own, in F32 and the words of network/functions.h: it is there where they are
-// (VN_WORDS), on both devices; who wants the names alone has none. of(i) is a column of x, g(c) the gradient to a
-// column of its encoding. kMost: columns that it has at most.
+// A formula is a struct in its own header, written with F32 and the functions that network/functions.h requires, so
+// that both devices share it. It is included only if these functions are defined (VN_WORDS). of(i) is column i of x,
+// g(c) the gradient with respect to column c of the encoding. kMost is the largest number of columns.
 //
-//   values(of, columns of x, size, put)        put(c, value) for each column of the encoding
-//   gradient(of, columns of x, size, g, put)   put(i, value) for each column of x
+//   values(of, columns of x, size, put)        calls put(c, value) for each column of the encoding
+//   gradient(of, columns of x, size, g, put)   calls put(i, value) for each column of x
 #define VN_ENCODINGS(DO)        \
   DO(frequency, Octaves<false>) \
   DO(integrated, Octaves<true>) \

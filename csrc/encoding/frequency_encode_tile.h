@@ -1,10 +1,10 @@
-// The encodings of the rows of a tile, and their gradients: [x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...], each a
-// block of d features, with or without x, as in voronerf/ops/frequency_encode/reference.py; and for a Gaussian of mean
-// x each value times exp(-4^l variance / 2), as in integrated_encode beside it.
+// The frequency encoding of the rows of a tile, and its gradient: [x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...], each
+// a block of d features, with or without x, as in voronerf/ops/frequency_encode/reference.py. For a Gaussian with mean
+// x each value is multiplied by exp(-4^l variance / 2), as in integrated_encode beside it.
 //
-// A lane is a column of the encoding: a permutation brings it its feature, a table its octave and phase, and one sine
-// with one range reduction does the rest. So rows come out in the layout the products read, with no transposition. What
-// goes into tile registers is made otherwise (encode_turned).
+// A lane is a column of the encoding. A permutation selects its feature, a table gives its octave and phase, and one
+// sine with one range reduction computes it. So rows have the layout that the products read, without a transposition.
+// Encodings for tile registers are computed by encode_turned.
 #pragma once
 
 #include "common/elementwise_math.h"
@@ -19,7 +19,7 @@ namespace {
 VN_INLINE F32 permute(F32 x, Bits index) {
 #if VN_ISA == 2
   return _mm512_maskz_permutexvar_ps(0xffff, reinterpret_cast<__m512i>(index),
-                                     x);  // maskz: gcc 12 warns of the other
+                                     x);  // maskz: gcc 12 warns about the plain intrinsic
 #elif VN_ISA == 1
   return _mm256_permutevar8x32_ps(x, reinterpret_cast<__m256i>(index));
 #elif VN_ISA == 3
@@ -30,20 +30,20 @@ VN_INLINE F32 permute(F32 x, Bits index) {
 #endif
 }
 
-// The columns of an encoded row: d features of x themselves, where they are included, then 2d for each octave.
+// The columns of an encoded row: the d features of x if `input` is set, then 2d columns for each octave.
 struct Columns {
   int64_t d, octaves;
   bool input;
 
-  int64_t first() const { return input ? d : 0; }  // sine
+  int64_t first() const { return input ? d : 0; }  // column of the first sine
   int64_t width() const { return first() + 2 * d * octaves; }
 };
 
-// The kernel's name among those of encodings.h.
+// The tag of this kernel in encodings.h.
 template <bool kBlurred>
 struct Octaves {};
 
-// table [3][stride]: source feature (as an integer), scale and phase of each column.
+// Fills table [3][stride]: source feature (as an integer), scale and phase of each column.
 VN_INLINE void encode_table(float* table, int64_t stride, const Columns& columns) {
   const int64_t d = columns.d, first = columns.first();
   for (int64_t column = 0; column < stride; ++column) {
@@ -62,7 +62,7 @@ VN_INLINE void encode_table(float* table, int64_t stride, const Columns& columns
   }
 }
 
-// Angles too large for the vector sine, and what is not finite: the C library's functions.
+// Encodes a row with angles that are too large for the vector sine or not finite, by the C library's functions.
 void encode_row_exactly(const float* x, const float* table, int64_t stride, const Columns& columns, float* out) {
   for (int64_t column = columns.first(); column < columns.width(); ++column) {
     int32_t feature;
@@ -72,7 +72,7 @@ void encode_row_exactly(const float* x, const float* table, int64_t stride, cons
   }
 }
 
-// The work of the lanes of a vector of columns. `raw`: the lanes that hold x itself.
+// The per-lane constants of a vector of columns. `raw` masks the lanes that hold x itself.
 struct Lanes {
   Bits index, raw;
   F32 scale, phase;
@@ -84,8 +84,8 @@ struct Lanes {
   }
 };
 
-// A vector of columns of R rows from `row` on: d <= kLanes, all angles small. Side by side, so that the steps of one
-// fill the time in which another waits. kRaw: some lanes are raw.
+// Encodes a vector of columns of R rows from `row` on, for d <= kLanes and small angles. Interleaving R rows hides
+// latency. kRaw: some lanes hold x itself.
 template <int R, bool kRaw>
 VN_INLINE void encode_block(const float* x, int64_t x_stride, int64_t row, const Lanes& lanes, float* out,
                             int64_t stride) {
@@ -113,35 +113,35 @@ VN_INLINE void encode_strip(const float* x, int64_t x_stride, int64_t rows, cons
 
 constexpr int64_t kMostTurned = 128;  // columns of `encode_turned`
 
-// Up to kTurned rows as pairs alone, all angles small. Lanes are rows: sine and cosine of a feature share a range
-// reduction, and octaves follow from the one before by the double-angle formulas, each of which doubles the error. So
-// every fifth is exact again, which leaves 2e-6 where rounding to bfloat16 makes 2e-3. All columns are transposed at
-// the end.
+// Encodes up to kTurned rows with small angles, as pairs only. Lanes are rows. Sine and cosine of a feature share a
+// range reduction, and each octave follows from the previous one by the double-angle formulas, which double the error.
+// So every fifth octave is computed directly: the error stays at 2e-6, while rounding to bfloat16 causes 2e-3. All
+// columns are transposed at the end.
 void encode_turned(const float* x, int64_t x_stride, int64_t rows, const Columns& columns, float* pairs,
                    int64_t pairs_stride) {
   constexpr int kVectors = kTurned / kLanes;
   constexpr int64_t kRow = kTurned / 2, kOctavesOfOne = 5;
   const int64_t d = columns.d;
-  alignas(64) float made[kMostTurned][kRow];
-  const auto keep = [&](int64_t column, const F32* values) {
-    for (int v = 0; v < kVectors; v += 2) store(made[column] + v * kLanes / 2, joined(values[v], values[v + 1]));
+  alignas(64) float encoded[kMostTurned][kRow];
+  const auto put = [&](int64_t column, const F32* values) {
+    for (int v = 0; v < kVectors; v += 2) store(encoded[column] + v * kLanes / 2, joined(values[v], values[v + 1]));
   };
   F32 points[3][kVectors];
-  const bool whole = d == 3 && x_stride == 3 && rows == kTurned;
-  for (int v = 0; whole && v < kVectors; ++v) {
+  const bool direct = d == 3 && x_stride == 3 && rows == kTurned;
+  for (int v = 0; direct && v < kVectors; ++v) {
     load_points(x + 3 * v * kLanes, points[0][v], points[1][v], points[2][v]);
   }
   for (int64_t f = 0; f < d; ++f) {
-    F32 given[kVectors], sine[kVectors], cosine[kVectors];
+    F32 values_of_x[kVectors], sine[kVectors], cosine[kVectors];
     float lanes[kTurned];
-    for (int64_t row = 0; !whole && row < kTurned; ++row) lanes[row] = x[smaller(row, rows - 1) * x_stride + f];
-    for (int v = 0; v < kVectors; ++v) given[v] = whole ? points[f][v] : load(lanes + v * kLanes);
-    if (columns.input) keep(f, given);
+    for (int64_t row = 0; !direct && row < kTurned; ++row) lanes[row] = x[smaller(row, rows - 1) * x_stride + f];
+    for (int v = 0; v < kVectors; ++v) values_of_x[v] = direct ? points[f][v] : load(lanes + v * kLanes);
+    if (columns.input) put(f, values_of_x);
     float scale = 1.0f;
     for (int64_t octave = 0, at = columns.first() + f; octave < columns.octaves; ++octave, at += 2 * d, scale *= 2.0f) {
       if (octave % kOctavesOfOne == 0) {
         F32 angle[kVectors];
-        for (int v = 0; v < kVectors; ++v) angle[v] = given[v] * splat(scale);
+        for (int v = 0; v < kVectors; ++v) angle[v] = values_of_x[v] * splat(scale);
         sines_and_cosines<kVectors>(angle, sine, cosine);
       } else {
         for (int v = 0; v < kVectors; ++v) {
@@ -151,20 +151,20 @@ void encode_turned(const float* x, int64_t x_stride, int64_t rows, const Columns
           sine[v] = next;
         }
       }
-      keep(at, sine);
-      keep(at + d, cosine);
+      put(at, sine);
+      put(at + d, cosine);
     }
   }
   const int64_t width = columns.width();
-  for (int64_t c = width; c % kTurned != 0; ++c) __builtin_memset(made[c], 0, sizeof made[c]);
+  for (int64_t c = width; c % kTurned != 0; ++c) __builtin_memset(encoded[c], 0, sizeof encoded[c]);
   for (int64_t c = 0; c < width; c += kTurned) {
-    turn_pairs({made[c], kRow, false}, kTurned, kTurned, pairs + c / 2, pairs_stride);
+    turn_pairs({encoded[c], kRow, false}, kTurned, kTurned, pairs + c / 2, pairs_stride);
   }
 }
 
 #endif
 
-// Any number of features.
+// Encodes a row with any number of features.
 void encode_row_slowly(const float* x, const float* table, int64_t stride, int64_t d, float* out) {
   for (int64_t column = 0; column < stride; column += kLanes) {
     float features[kLanes];
@@ -186,16 +186,16 @@ VN_INLINE bool all_small(const float* x, int64_t count, float largest) {
   return rest;
 }
 
-// Rows x, `x_stride` floats apart and with kLanes readable floats from every row's start -> out [rows][stride].
+// Encodes rows x, `x_stride` floats apart and with kLanes readable floats from every row's start -> out [rows][stride].
 VN_INLINE void encode_floats(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns,
                              bool lanes, float largest, float* out, int64_t stride) {
   if (lanes) {
     for (int64_t column = 0; column < stride; column += kLanes) {
-      const Lanes own(table, stride, column, columns);
+      const Lanes vector(table, stride, column, columns);
       if (column < columns.first()) {
-        encode_strip<true>(x, x_stride, rows, own, out + column, stride);
+        encode_strip<true>(x, x_stride, rows, vector, out + column, stride);
       } else {
-        encode_strip<false>(x, x_stride, rows, own, out + column, stride);
+        encode_strip<false>(x, x_stride, rows, vector, out + column, stride);
       }
     }
     return;
@@ -212,8 +212,9 @@ VN_INLINE void encode_floats(const float* x, int64_t x_stride, const float* tabl
   }
 }
 
-// In tile registers also as `pairs` [rows][pairs_stride], whole vectors, if not null, with what rounding has left so
-// many floats behind them unless `left` is 0; then out only where it is `kept`.
+// Encodes rows as encode_floats does. For tile registers, `pairs` [rows][pairs_stride] is written too unless it is
+// null; its rows are whole vectors. If `left` is not 0, the rounding remainders follow `left` floats behind the pairs.
+// With pairs and without `kept`, `out` may stay unwritten.
 void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns, float* out,
             int64_t stride, [[maybe_unused]] float* pairs = nullptr, [[maybe_unused]] int64_t pairs_stride = 0,
             [[maybe_unused]] int64_t left = 0, [[maybe_unused]] bool kept = true) {
@@ -232,7 +233,7 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
       encode_turned(x + row * x_stride, x_stride, smaller(kTurned, rows - row), columns, pairs + row * pairs_stride,
                     pairs_stride);
     }
-    for (int64_t row = 0; !small && row < rows; ++row) {  // which leaves the rows beside them as they are
+    for (int64_t row = 0; !small && row < rows; ++row) {  // corrects only rows with large angles
       const float* const from = x + row * x_stride;
       if (all_small(from, d, largest)) continue;
       encode_floats(from, x_stride, table, 1, columns, false, largest, out, stride);
@@ -247,8 +248,8 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
 #endif
 }
 
-// Multiplies encoded rows by the factors of the variances: d <= kLanes, no input among the columns, rows as in
-// `encode`.
+// Multiplies encoded rows by the damping factors of the variances, for d <= kLanes and columns without x. Rows are as
+// in `encode`.
 void blur(const float* variances, int64_t x_stride, const float* table, int64_t rows, float* out, int64_t stride) {
   for (int64_t column = 0; column < stride; column += kLanes) {
     Bits index;
@@ -263,8 +264,8 @@ void blur(const float* variances, int64_t x_stride, const float* table, int64_t 
   }
 }
 
-// Gradient to the features of a row, from that of its encoding and the encoding itself, whose sines and cosines are
-// each other's derivatives; what variances have left of them is a factor of both.
+// Computes the gradient of a row's features from its encoding `value` and the encoding's gradient. Sines and cosines
+// are each other's derivatives, and both contain the damping factor.
 VN_INLINE void encode_row_backward(const float* value, const float* gradient, const float* table, int64_t stride,
                                    const Columns& columns, float* out) {
   const int64_t d = columns.d;
@@ -278,7 +279,7 @@ VN_INLINE void encode_row_backward(const float* value, const float* gradient, co
   }
 }
 
-// ... and to its variances: the derivative of exp(-4^l variance / 2) is -4^l / 2 times itself.
+// Computes the gradient of a row's variances: the derivative of exp(-4^l variance / 2) is -4^l / 2 times itself.
 VN_INLINE void blur_row_backward(const float* value, const float* gradient, const float* table, int64_t stride,
                                  const Columns& columns, float* out) {
   const int64_t d = columns.d;

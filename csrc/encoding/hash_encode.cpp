@@ -1,5 +1,5 @@
-// The hash encoding on the CPU. Features and gradients of positions by runs of points; the table's gradient by levels,
-// each added up in the order of the points, so that results do not depend on the number of threads.
+// The hash encoding on the CPU. A task computes features or gradients of positions for a run of points, or the table's
+// gradient for one level. It sums in the order of the points, so that results do not depend on the number of threads.
 #include "encoding/hash_encode.h"
 
 #include <algorithm>
@@ -15,7 +15,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kRun = 16 * kHashBlock;  // points of a task
+constexpr int64_t kRun = 16 * kHashBlock;  // points of one task
 
 int64_t width_of(const HashEncoding& in) { return int64_t{in.count} * in.features; }
 
@@ -55,8 +55,8 @@ void for_points(int64_t n, int threads, const Run& run) {
 
 void hash_encode_cpu(const HashInputs& in, const HashGrid& grid, float* out, Isa isa, int threads) {
   check(in);
-  const HashEncoding given = hash_encoding(in, grid);
-  for_points(in.n, threads, [&](int64_t begin, int64_t end) { encode_rows(isa, given, out, begin, end); });
+  const HashEncoding call = hash_encoding(in, grid);
+  for_points(in.n, threads, [&](int64_t begin, int64_t end) { encode_rows(isa, call, out, begin, end); });
 }
 
 void hash_level_cpu(const HashEncoding& in, int64_t level, float* out, int64_t stride, int64_t begin, int64_t end,
@@ -66,10 +66,10 @@ void hash_level_cpu(const HashEncoding& in, int64_t level, float* out, int64_t s
 
 void hash_level_backward_cpu(const HashEncoding& in, int64_t level, const float* gradient, int64_t stride,
                              int64_t begin, int64_t end, float* of_table, Isa isa) {
-  const GridLevel& own = in.levels[level];
+  const GridLevel& grid_level = in.levels[level];
   for (int64_t table = 0; table < in.in.tables; ++table) {
-    std::memset(of_table + (table * in.in.entries + own.offset) * in.features, 0,
-                sizeof(float) * static_cast<size_t>(own.entries * in.features));
+    std::memset(of_table + (table * in.in.entries + grid_level.offset) * in.features, 0,
+                sizeof(float) * static_cast<size_t>(grid_level.entries * in.features));
   }
   level_rows(isa, in, level, gradient, stride, begin, end, of_table);
 }
@@ -77,14 +77,14 @@ void hash_level_backward_cpu(const HashEncoding& in, int64_t level, const float*
 void hash_encode_backward_cpu(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
                               float* of_positions, Isa isa, int threads) {
   check(in);
-  const HashEncoding given = hash_encoding(in, grid);
+  const HashEncoding call = hash_encoding(in, grid);
   if (of_positions != nullptr) {
     for_points(in.n, threads,
-               [&](int64_t begin, int64_t end) { positions_backward(isa, given, gradient, of_positions, begin, end); });
+               [&](int64_t begin, int64_t end) { positions_backward(isa, call, gradient, of_positions, begin, end); });
   }
   if (of_table == nullptr) return;
-  parallel_for(given.count, 1, threads, [&](int64_t level) {
-    hash_level_backward_cpu(given, level, gradient, width_of(given), 0, in.n, of_table, isa);
+  parallel_for(call.count, 1, threads, [&](int64_t level) {
+    hash_level_backward_cpu(call, level, gradient, width_of(call), 0, in.n, of_table, isa);
   });
 }
 

@@ -1,9 +1,10 @@
-// The hash encoding on CUDA: a thread a point and a few levels, these one after the other along the grid, so that what
-// is read at a time fits the second-level cache, as Mueller et al. 2022 do it in section 4 level by level. A thread's
-// levels have eight features together: it writes, and backward reads, a whole sector of 32 bytes.
+// The hash encoding on CUDA. A thread handles one point and a few levels. The y axis of the grid runs over groups of
+// levels, so that the entries read at a time fit the L2 cache (Mueller et al. 2022, section 4, do this level by level).
+// A thread's levels have eight features together: it writes a whole sector of 32 bytes, and reads one in the backward
+// pass.
 //
-// The table's gradient is added up by atomic operations, in any order. The gradient of the positions is a thread a
-// point, which sums over its levels.
+// The table's gradient is summed by atomic operations, in no fixed order. For the gradient of the positions, one thread
+// per point sums over the levels.
 #include "common/cuda_wrappers.h"
 #include "encoding/hash_encode.h"
 #include "encoding/hash_encode_device.h"
@@ -13,9 +14,9 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kSector = 8;  // features of the levels of a thread
+constexpr int kSector = 8;  // features of a thread's levels, 32 bytes
 
-// A point in the eyes of one level.
+// The corners around a point on one level.
 struct Corners {
   HashAxis axes[3];
   float along[3];
@@ -31,17 +32,18 @@ __device__ __forceinline__ void place_of(const HashEncoding& in, int64_t point, 
 
 __device__ __forceinline__ Corners corners_of(const HashEncoding& in, int64_t point, const GridLevel& level,
                                               const HashPlace (&places)[3]) {
-  Corners found;
-  found.directed = in.in.direction != nullptr;
+  Corners corners;
+  corners.directed = in.in.direction != nullptr;
 #pragma unroll
   for (int axis = 0; axis < 3; ++axis) {
-    found.axes[axis] = hash_axis(places[axis].place, level, in.smooth);
-    found.along[axis] = found.directed ? places[axis].slope * in.in.direction[3 * point + axis] : 0.0f;
+    corners.axes[axis] = hash_axis(places[axis].place, level, in.smooth);
+    corners.along[axis] = corners.directed ? places[axis].slope * in.in.direction[3 * point + axis] : 0.0f;
   }
-  return found;
+  return corners;
 }
 
-// First number of the level's part of the table that a point reads; negative if its cell has none.
+// Returns the index of the first number of the level's part of the table that a point reads; negative if its cell has
+// no table.
 template <int kFeatures>
 __device__ __forceinline__ int64_t first_of(const HashEncoding& in, const GridLevel& level, int64_t point) {
   const int64_t table = in.in.cells == nullptr ? 0 : in.in.cells[point];
@@ -67,10 +69,10 @@ __global__ void __launch_bounds__(kThreads, 4) hash_encode_kernel(HashEncoding i
     if (first >= 0) {
       hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
         const float weight = hash_weight(at.axes, at.directed, at.along, x, y, z);
-        float found[kFeatures];
-        hash_load<kType>(table + entry, found);
+        float values[kFeatures];
+        hash_load<kType>(table + entry, values);
 #pragma unroll
-        for (int f = 0; f < kFeatures; ++f) sums[f] += weight * found[f];
+        for (int f = 0; f < kFeatures; ++f) sums[f] += weight * values[f];
       });
     }
     hash_store(out + (point * in.count + number) * kFeatures, sums);
@@ -123,10 +125,10 @@ __global__ void __launch_bounds__(kThreads, 3)
     float arriving[kFeatures];
     hash_load<TableType::float32>(gradient + (point * in.count + number) * kFeatures, arriving);
     hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
-      float product = 0.0f, found[kFeatures];
-      hash_load<kType>(table + entry, found);
+      float product = 0.0f, values[kFeatures];
+      hash_load<kType>(table + entry, values);
 #pragma unroll
-      for (int f = 0; f < kFeatures; ++f) product += arriving[f] * found[f];
+      for (int f = 0; f < kFeatures; ++f) product += arriving[f] * values[f];
       const int corner[3] = {x, y, z};
 #pragma unroll
       for (int axis = 0; axis < 3; ++axis) {
@@ -190,11 +192,11 @@ void hash_encode_cuda(const HashInputs& in, const HashGrid& grid, float* out, vo
   if (in.n == 0) return;
   VN_CHECK(reinterpret_cast<std::uintptr_t>(in.table) % 16 == 0,
            "hash_encode: the table must begin at a multiple of 16 bytes");
-  const HashEncoding given = hash_encoding(in, grid);
-  const dim3 blocks = blocks_of(given);
-  for_table(given, [&](auto features, auto type) {
+  const HashEncoding call = hash_encoding(in, grid);
+  const dim3 blocks = blocks_of(call);
+  for_table(call, [&](auto features, auto type) {
     const auto kernel = hash_encode_kernel<decltype(features)::value, decltype(type)::value>;
-    VN_LAUNCH(kernel, blocks, kThreads, 0, stream, given, out);
+    VN_LAUNCH(kernel, blocks, kThreads, 0, stream, call, out);
   });
 }
 
@@ -204,23 +206,23 @@ void hash_encode_backward_cuda(const HashInputs& in, const HashGrid& grid, const
            "hash_encode: the table must begin at a multiple of 16 bytes");
   VN_CHECK(reinterpret_cast<std::uintptr_t>(gradient) % 16 == 0,
            "hash_encode: the gradient must begin at a multiple of 16 bytes");
-  const HashEncoding given = hash_encoding(in, grid);
+  const HashEncoding call = hash_encoding(in, grid);
   if (of_table != nullptr) {
     const size_t bytes = sizeof(float) * static_cast<size_t>(in.tables * in.entries * grid.features);
     VN_CUDA_CHECK(cudaMemsetAsync(of_table, 0, bytes, static_cast<cudaStream_t>(stream)));
   }
   if (in.n == 0) return;
-  const dim3 blocks = blocks_of(given);
+  const dim3 blocks = blocks_of(call);
   if (of_table != nullptr) {
-    for_width(given.features, [&](auto features) {
+    for_width(call.features, [&](auto features) {
       const auto kernel = hash_encode_table_backward_kernel<decltype(features)::value>;
-      VN_LAUNCH(kernel, blocks, kThreads, 0, stream, given, gradient, of_table);
+      VN_LAUNCH(kernel, blocks, kThreads, 0, stream, call, gradient, of_table);
     });
   }
   if (of_positions != nullptr) {
-    for_table(given, [&](auto features, auto type) {
+    for_table(call, [&](auto features, auto type) {
       const auto kernel = hash_encode_positions_backward_kernel<decltype(features)::value, decltype(type)::value>;
-      VN_LAUNCH(kernel, blocks_of(in.n), kThreads, 0, stream, given, gradient, of_positions);
+      VN_LAUNCH(kernel, blocks_of(in.n), kThreads, 0, stream, call, gradient, of_positions);
     });
   }
 }

@@ -1,7 +1,6 @@
-// hash_encode (Mueller et al. 2022) with its gradients: positions [n,3] and a table [tables, entries, features] ->
-// [n, levels x features], as in voronerf/ops/hash_encode/reference.py. With a direction for each point everything is of
-// the derivative along it, with which second derivatives are made of the same kernels
-// (voronerf/ops/hash_encode/autograd.py).
+// hash_encode (Mueller et al. 2022) and its gradients: positions [n,3] and a table [tables, entries, features] -> [n,
+// levels x features], as in voronerf/ops/hash_encode/reference.py. If each point has a direction, the kernels compute
+// the derivative along it instead of the value. Second derivatives use this (voronerf/ops/hash_encode/autograd.py).
 #pragma once
 
 #include <cstddef>
@@ -13,7 +12,7 @@
 
 namespace voronerf {
 
-// As in voronerf/ops/_core/grids.py; the table's shape without its number of tables.
+// A grid as in voronerf/ops/_core/grids.py.
 struct HashGrid {
   std::vector<GridLevel> levels;
   std::vector<float> low, high;
@@ -22,38 +21,39 @@ struct HashGrid {
 };
 
 inline HashEncoding hash_encoding(const HashInputs& in, const HashGrid& grid) {
-  HashEncoding made{};
-  made.in = in;
-  made.count = static_cast<int32_t>(grid.levels.size());
-  made.features = static_cast<int32_t>(grid.features);
-  made.smooth = grid.smooth;
-  for (int32_t i = 0; i < made.count; ++i) made.levels[i] = grid.levels[static_cast<std::size_t>(i)];
+  HashEncoding result{};
+  result.in = in;
+  result.count = static_cast<int32_t>(grid.levels.size());
+  result.features = static_cast<int32_t>(grid.features);
+  result.smooth = grid.smooth;
+  for (int32_t i = 0; i < result.count; ++i) result.levels[i] = grid.levels[static_cast<std::size_t>(i)];
   for (std::size_t axis = 0; axis < 3; ++axis) {
-    made.low[axis] = grid.low[axis];
-    made.inverse[axis] = 1.0f / (grid.high[axis] - grid.low[axis]);
+    result.low[axis] = grid.low[axis];
+    result.inverse[axis] = 1.0f / (grid.high[axis] - grid.low[axis]);
   }
-  return made;
+  return result;
 }
 
-// Throw std::invalid_argument for a cell without a table.
+// Both CPU functions throw std::invalid_argument for a cell without a table.
 void hash_encode_cpu(const HashInputs& in, const HashGrid& grid, float* out, Isa isa, int threads);
 
-// gradient [n, levels x features] -> of_table, in float32 whatever the type of the table, and of_positions [n,3]; null
-// where not wanted. Every element is written.
+// gradient [n, levels x features] -> of_table and of_positions [n,3]; either may be null. of_table is float32 for any
+// type of table. Every element is written.
 void hash_encode_backward_cpu(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
                               float* of_positions, Isa isa, int threads);
 
-// Features of one level for points `begin` to `end` of a result whose rows are `stride` floats apart. A part of
+// Writes the features of one level for points `begin` to `end`; rows of the result are `stride` floats apart. A part of
 // hash_encode_cpu, on the calling thread.
 void hash_level_cpu(const HashEncoding& in, int64_t level, float* out, int64_t stride, int64_t begin, int64_t end,
                     Isa isa);
 
-// Gradient of one level's entries, zero before: what points `begin` to `end` give, in their order, of a gradient whose
-// rows are `stride` floats apart. A part of hash_encode_backward_cpu, on the calling thread.
+// Sets the gradient of one level's entries to the sum over points `begin` to `end`, in their order; rows of `gradient`
+// are `stride` floats apart. A part of hash_encode_backward_cpu, on the calling thread.
 void hash_level_backward_cpu(const HashEncoding& in, int64_t level, const float* gradient, int64_t stride,
                              int64_t begin, int64_t end, float* of_table, Isa isa);
 
-// Points whose cell has no table get zeros and give nothing. The table's gradient is added up in any order.
+// Points whose cell has no table get zeros and contribute no gradient. The table's gradient is summed in no fixed
+// order.
 void hash_encode_cuda(const HashInputs& in, const HashGrid& grid, float* out, void* stream);
 void hash_encode_backward_cuda(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
                                float* of_positions, void* stream);

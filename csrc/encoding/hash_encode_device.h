@@ -1,7 +1,8 @@
-// What the CUDA kernels share that look hash grids up: the numbers of a table, and the corners around a point.
+// Device functions for hash grid look-ups, shared by the CUDA kernels: the numbers of a table, and the corners around a
+// point.
 //
-// The features of an entry are loaded, added and stored at once, in pieces of at most 16 bytes. Tables and what else
-// has rows of features begin at multiples of 16 bytes; the caller sees to that.
+// The features of an entry are loaded, added and stored together, in pieces of at most 16 bytes. The caller aligns
+// tables and other arrays of features to 16 bytes.
 #pragma once
 
 #include "common/cuda_wrappers.h"
@@ -18,7 +19,7 @@ struct HashElement<TableType::float32> {
   using Type = float;
 };
 
-// Numbers that are moved together.
+// The features that one load or store moves.
 template <typename Type, int kFeatures>
 struct alignas(kFeatures * sizeof(Type) < 16 ? kFeatures * sizeof(Type) : 16) HashPiece {
   static constexpr int kCount = kFeatures * sizeof(Type) < 16 ? kFeatures : 16 / sizeof(Type);
@@ -54,7 +55,7 @@ __device__ __forceinline__ void hash_store(float* to, const float (&values)[kFea
   }
 }
 
-// Adds to the gradient of an entry by atomic operations, which take several features from sm_90 on.
+// Adds to the gradient of an entry atomically. From sm_90 on one atomic operation takes several features.
 template <int kFeatures>
 __device__ __forceinline__ void hash_add(float* to, const float (&values)[kFeatures]) {
   constexpr int kCount = kFeatures < 4 ? kFeatures : 4;
@@ -62,7 +63,7 @@ __device__ __forceinline__ void hash_add(float* to, const float (&values)[kFeatu
   for (int f = 0; f < kFeatures; f += kCount) add_in_global<kCount>(to + f, values + f);
 }
 
-// run(number of the first feature, x, y, z) for each corner.
+// Calls run(index of the first feature, x, y, z) for each corner.
 template <int kFeatures, typename Run>
 __device__ __forceinline__ void hash_corners(const HashAxis (&axes)[3], const GridLevel& level, int64_t first,
                                              const Run& run) {

@@ -1,7 +1,8 @@
-// The CPU kernels of the hash encoding, once for each instruction set: blocks of points, and the levels of each.
+// The CPU kernels of the hash encoding, compiled once per instruction set. They loop over blocks of points, and over
+// the levels of each block.
 //
-// The gradient of the table goes the other way around, all points for one level: a level is the work of one thread,
-// which adds up in the order of the points, and its entries stay in the second-level cache.
+// The gradient of the table has the loops the other way around: one thread handles all points of a level. It sums in
+// the order of the points, and the level's entries stay in the L2 cache.
 #include "encoding/hash_encode_tile.h"
 
 namespace voronerf {
@@ -45,7 +46,7 @@ VN_INLINE void for_table(const HashEncoding& in, const Run& run) {
   });
 }
 
-// run(first, rows, places) for each block of points `begin` to `end`.
+// Calls run(first, rows, places) for each block of points `begin` to `end`.
 template <typename Run>
 VN_INLINE void for_blocks(const HashEncoding& in, int64_t begin, int64_t end, const Run& run) {
   HashPlaces places;
@@ -124,7 +125,7 @@ void hash_encode_positions_backward(const HashEncoding& in, const float* gradien
         for (int axis = 0; axis < 3; ++axis) {
           const Four sum = sums[axis][i];
           const float slope = places.slope[axis][i];
-          // Outside of the box there is no gradient, not even of NaN.
+          // Outside the box the gradient is 0, even where a sum is NaN.
           of_positions[3 * (first + i) + axis] = slope == 0.0f ? 0.0f : slope * ((sum[0] + sum[1]) + (sum[2] + sum[3]));
         }
       }

@@ -8,21 +8,22 @@
 
 namespace voronerf {
 
-constexpr int64_t kHashBlock = 64;  // points whose corners are in cache at a time
+constexpr int64_t kHashBlock = 64;  // points of a block, whose corners stay in cache
 
-// Points `begin` to `end` of a result [n, levels x features] or a gradient of that, rows `stride` floats apart.
+// The kernels process points `begin` to `end`. Rows of the result [n, levels x features] and of its gradient are
+// `stride` floats apart.
 VN_DECLARE_FOR_ISA(void hash_encode_rows(const HashEncoding& in, float* out, int64_t stride, int64_t begin,
                                          int64_t end))
 
-// The same of one level: its features are the first of a row.
+// The same for one level; its features are the first of a row.
 VN_DECLARE_FOR_ISA(void hash_encode_level(const HashEncoding& in, int64_t level, float* out, int64_t stride,
                                           int64_t begin, int64_t end))
 
-// Adds what those points give to the entries of one level to of_table.
+// Adds the points' gradients of one level's entries to of_table.
 VN_DECLARE_FOR_ISA(void hash_encode_level_backward(const HashEncoding& in, int64_t level, const float* gradient,
                                                    int64_t stride, int64_t begin, int64_t end, float* of_table))
 
-// Gradients to their positions. These may take the place of the positions themselves.
+// Writes the gradients of the positions. of_positions may be the memory of the positions.
 VN_DECLARE_FOR_ISA(void hash_encode_positions_backward(const HashEncoding& in, const float* gradient, int64_t stride,
                                                        float* of_positions, int64_t begin, int64_t end))
 

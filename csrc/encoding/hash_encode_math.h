@@ -1,9 +1,8 @@
-// Arithmetic of the hash encoding, one point and one level at a time, and what a call is described by. The CPU has
-// vectors of the same formulas in hash_encode_tile.h.
+// Arithmetic of the hash encoding for one point and one level, and the structs that describe a call. The CPU's vector
+// form is in hash_encode_tile.h.
 //
 // The weights of the eight corners around a point are products of one factor for each axis: w(t) or 1 - w(t), t being
-// the distance from the lower corner, w(t) = t or t^2 (3 - 2 t). All that derivatives need is other factors with the
-// same corners.
+// the distance from the lower corner, w(t) = t or t^2 (3 - 2 t). Derivatives have the same corners and other factors.
 #pragma once
 
 #include <cstdint>
@@ -15,7 +14,7 @@ namespace voronerf {
 constexpr int kMaxHashLevels = 24;
 constexpr uint32_t kHashPrimeY = 2654435761u, kHashPrimeZ = 805459861u;
 
-// As in voronerf/ops/_core/grids.py.
+// A level as in voronerf/ops/_core/grids.py.
 struct GridLevel {
   float scale, shift;
   int32_t side;     // stride of the second axis
@@ -28,14 +27,14 @@ enum class TableType : int { float32 = 0, bfloat16 = 1, float16 = 2 };
 
 struct HashInputs {
   const float* positions;  // [n,3]
-  const float* direction;  // [n,3]: the derivative along it is encoded instead; or null
+  const float* direction;  // [n,3], or null; if set, the result is the derivative along it
   const void* table;       // [tables, entries, features]
   TableType type;
-  const int32_t* cells;  // [n], the table of each point; null where there is one
+  const int32_t* cells;  // [n], the table of each point; null if there is only one
   int64_t n, tables, entries;
 };
 
-// A call: the levels, and the box by its lower corner and the inverse of its size.
+// A call: its inputs, its levels, and the box as its lower corner and inverse size.
 struct HashEncoding {
   HashInputs in;
   GridLevel levels[kMaxHashLevels];
@@ -44,7 +43,7 @@ struct HashEncoding {
   float low[3], inverse[3];
 };
 
-// Where a coordinate lies in 0..1, and the derivative: none outside of the box. NaN stays NaN.
+// A coordinate scaled to 0..1, and its derivative, which is 0 outside the box. NaN stays NaN.
 struct HashPlace {
   float place, slope;
 };
@@ -55,21 +54,21 @@ VN_HD HashPlace hash_place(float x, float low, float inverse) {
   return {place, place == place ? inverse : 0.0f};
 }
 
-// One axis of a level: the lower corner, and of the lower and the upper one the factor of a weight, its first and its
-// second derivative by the place.
+// One axis of a level: the lower corner, then for the lower and the upper corner the weight's factor and its first and
+// second derivative with respect to the place.
 struct HashAxis {
   uint32_t corner;
   float at[2], slope[2], bend[2];
 };
 VN_HD HashAxis hash_axis(float place, const GridLevel& level, bool smooth) {
-  // Rounded twice, as in the reference: both then choose the same corners.
+  // Rounded twice, as in the reference, so that both choose the same corners.
 #ifdef __CUDA_ARCH__
   const float where = __fadd_rn(__fmul_rn(place, level.scale), level.shift);
 #else
   const float where = place * level.scale + level.shift;
 #endif
   HashAxis axis;
-  axis.corner = where == where ? static_cast<uint32_t>(where) : 0u;  // it is not negative
+  axis.corner = where == where ? static_cast<uint32_t>(where) : 0u;  // never negative
   const float t = where - static_cast<float>(axis.corner);
   const float w = smooth ? t * t * (3.0f - 2.0f * t) : t;
   const float d = smooth ? level.scale * (6.0f * t * (1.0f - t)) : level.scale;
@@ -80,8 +79,8 @@ VN_HD HashAxis hash_axis(float place, const GridLevel& level, bool smooth) {
   return axis;
 }
 
-// The entry of a corner within its level. A dense index is below twice the entries: the last corners of an axis may
-// stand one past its stride.
+// Returns the entry of a corner within its level. A dense index is below twice the entries, because the last corners of
+// an axis may lie one past its stride.
 VN_HD uint32_t hash_entry(const GridLevel& level, uint32_t x, uint32_t y, uint32_t z) {
   const uint32_t entries = static_cast<uint32_t>(level.entries);
   if (level.hashed) return (x ^ y * kHashPrimeY ^ z * kHashPrimeZ) & (entries - 1u);
@@ -90,8 +89,8 @@ VN_HD uint32_t hash_entry(const GridLevel& level, uint32_t x, uint32_t y, uint32
   return entry < entries ? entry : entry - entries;
 }
 
-// What multiplies the entry of a corner: the weight or, where it is directed, the weight's derivative along a
-// direction, of which `along` has each axis.
+// Returns the factor of a corner's entry: the weight or, if `directed`, the weight's derivative along the direction
+// `along` [3].
 VN_HD float hash_weight(const HashAxis* axes, bool directed, const float* along, int x, int y, int z) {
   const HashAxis &a = axes[0], &b = axes[1], &c = axes[2];
   if (!directed) return a.at[x] * (b.at[y] * c.at[z]);
@@ -99,7 +98,7 @@ VN_HD float hash_weight(const HashAxis* axes, bool directed, const float* along,
          a.at[x] * (along[1] * b.slope[y] * c.at[z] + b.at[y] * (along[2] * c.slope[z]));
 }
 
-// The derivative of that by the place on axis i.
+// Returns the derivative of hash_weight with respect to the place on axis i.
 VN_HD float hash_weight_slope(const HashAxis* axes, bool directed, const float* along, int i, const int* corner) {
   const int j = (i + 1) % 3, k = (i + 2) % 3;
   const HashAxis &a = axes[i], &b = axes[j], &c = axes[k];

@@ -1,10 +1,10 @@
 // The hash encoding of a block of points, level by level: corners and weights in vectors of points, entries one point
 // at a time.
 //
-// Eight entries for each point and level are eight loads at random addresses. What else there is must not cost more
-// than these: index and weights, some 60 operations for a whole vector, go through the first-level cache, and an entry
-// of two features is one load, one broadcast of its weight and one multiply-add. Gathers take half as long again on
-// Zen 5, because they are loads behind microcode. The arithmetic of one point is in hash_encode_math.h.
+// Each point and level needs eight loads at random addresses. The other work must not cost more than these loads.
+// Indices and weights, some 60 operations for a whole vector, pass through the L1 cache, and an entry of two features
+// takes one load, one broadcast of its weight and one multiply-add. Gathers are 50 % slower on Zen 5, where they are
+// microcoded. The arithmetic of one point is in hash_encode_math.h.
 #pragma once
 
 #include "common/memory_tile.h"
@@ -17,19 +17,20 @@ namespace {
 typedef int32_t HashInts __attribute__((vector_size(4 * kLanes)));
 typedef uint32_t HashWords __attribute__((vector_size(4 * kLanes)));
 
-// Points of a block, by axis: places in 0..1, their derivative by the coordinate, and that times the direction.
+// Points of a block, by axis: places in 0..1, their derivatives with respect to the coordinate, and these derivatives
+// times the direction.
 struct HashPlaces {
   alignas(64) float place[3][kHashBlock], slope[3][kHashBlock], along[3][kHashBlock];
 };
 
-// Of one level: the entries of the corners, x first, then y and z, and what multiplies them: one set of weights, or
-// three, the derivatives by each place.
+// The entries of the corners on one level (x varies fastest, then y and z) and their factors: one set of weights, or
+// three sets for the derivatives with respect to each place.
 struct HashCorners {
   alignas(64) int32_t entry[8][kHashBlock];
   alignas(64) float weight[3][8][kHashBlock];
 };
 
-// Points [rows,3], filled up with zeros where there are fewer than a block.
+// Returns points [rows,3], padded with zeros to a whole block.
 VN_INLINE const float* whole_block(const float* from, int64_t rows, float* padded) {
   if (rows == kHashBlock) return from;
   __builtin_memset(padded, 0, 3 * sizeof(float) * kHashBlock);
@@ -37,7 +38,7 @@ VN_INLINE const float* whole_block(const float* from, int64_t rows, float* padde
   return padded;
 }
 
-// Points `first` to `first + rows`, at most a block.
+// Computes the places of points `first` to `first + rows`, at most a block.
 VN_INLINE void hash_places(const HashEncoding& in, int64_t first, int64_t rows, HashPlaces& to) {
   alignas(64) float padded[3 * kHashBlock], padded_direction[3 * kHashBlock];
   const float* points = whole_block(in.in.positions + 3 * first, rows, padded);
@@ -51,14 +52,15 @@ VN_INLINE void hash_places(const HashEncoding& in, int64_t first, int64_t rows, 
       const F32 inverse = splat(in.inverse[axis]), place = (x[axis] - splat(in.low[axis])) * inverse;
       const HashInts inside = (place >= splat(0.0f)) & (place <= splat(1.0f));
       const F32 slope = reinterpret_cast<F32>(reinterpret_cast<HashInts>(inverse) & inside);
-      store(to.place[axis] + i, min(splat(1.0f), max(splat(0.0f), place)));  // the second operand if it is NaN
+      store(to.place[axis] + i, min(splat(1.0f), max(splat(0.0f), place)));  // keeps NaN, the second operand
       store(to.slope[axis] + i, slope);
       store(to.along[axis] + i, slope * v[axis]);
     }
   }
 }
 
-// The vector form of HashAxis; `along` and `bend` are those times the direction.
+// The vector form of HashAxis. `along` is the slope times the direction, `bend` the second derivative times the
+// direction.
 struct HashVectorAxis {
   HashWords corner;
   F32 at[2], slope[2], along[2], bend[2];
@@ -67,7 +69,7 @@ struct HashVectorAxis {
 VN_INLINE HashVectorAxis hash_vector_axis(F32 place, F32 along, const GridLevel& level, bool smooth) {
   const F32 one = splat(1.0f), zero = splat(0.0f), scale = splat(level.scale);
   const F32 where = place * scale + splat(level.shift);
-  // Places are not negative, so this rounds down; NaN becomes the smallest number.
+  // Places are not negative, so the conversion rounds down. NaN converts to the smallest integer.
   HashInts below = __builtin_convertvector(where, HashInts);
   below = below & ~(below >> 31);
   const F32 t = where - __builtin_convertvector(below, F32);
@@ -104,7 +106,8 @@ VN_INLINE void hash_entries(const HashVectorAxis* axes, const GridLevel& level, 
   }
 }
 
-// Corners of a level: kAlong, of the derivative along the direction; kSlopes, of the derivatives by each place.
+// Computes the corners of a level. kAlong: weights of the derivative along the direction. kSlopes: weights of the
+// derivatives with respect to each place.
 template <bool kAlong, bool kSlopes>
 VN_INLINE void hash_corners(const HashEncoding& in, const GridLevel& level, const HashPlaces& places, int64_t rows,
                             HashCorners& to) {
@@ -135,7 +138,7 @@ VN_INLINE void hash_corners(const HashEncoding& in, const GridLevel& level, cons
   }
 }
 
-// The features of an entry, four to a vector; lanes that have none are 0.
+// The features of an entry, four to a vector; lanes without a feature are 0.
 typedef float Four __attribute__((vector_size(16)));
 typedef uint32_t FourWords __attribute__((vector_size(16)));
 typedef uint16_t FourHalves __attribute__((vector_size(8)));
@@ -143,7 +146,7 @@ typedef double TwoDoubles __attribute__((vector_size(16)));
 template <int kFeatures>
 struct Features {
   static constexpr int kParts = kFeatures == 8 ? 2 : 1;
-  static constexpr int kLoaded = kFeatures < 4 ? kFeatures : 4;  // of a part
+  static constexpr int kLoaded = kFeatures < 4 ? kFeatures : 4;  // features in a part
   Four part[kParts];
 };
 struct Bfloat16 {
@@ -158,7 +161,7 @@ VN_INLINE Four widen(FourWords bits, Float16) {
 #if VN_ISA == 2
   return _mm_maskz_cvtph_ps(0xf, _mm_cvtepi32_epi16(reinterpret_cast<__m128i>(bits)));
 #else
-  // The exponent is moved by a product, which makes normal numbers of small ones; all ones in it stay that.
+  // A multiplication shifts the exponent, so that subnormals become normal. An exponent of all ones stays all ones.
   const FourWords size = (bits & 0x7fffu) << 13;
   const FourWords scaled = reinterpret_cast<FourWords>(reinterpret_cast<Four>(size) * 0x1p112f);
   const FourWords infinite = reinterpret_cast<FourWords>(size >= 0x0f800000u) & 0x7f800000u;
@@ -166,8 +169,8 @@ VN_INLINE Four widen(FourWords bits, Float16) {
 #endif
 }
 
-// Part of an entry: one, two or four numbers, then zeros. Through a double, as two floats written into a vector in
-// memory would have to wait there to be read.
+// Loads a part of an entry: one, two or four numbers, then zeros. Two floats pass through a double, because writing
+// them to memory and reading a vector back would stall on store forwarding.
 template <int kLoaded>
 VN_INLINE Four load_part(const float* from) {
   if (kLoaded == 1) return Four{*from, 0.0f, 0.0f, 0.0f};
@@ -221,41 +224,41 @@ VN_INLINE Four multiply_add(Four a, float b, Four c) {
 #endif
 }
 
-// The level's part of the table that a point reads.
+// Returns the level's part of the table that a point reads.
 template <int kFeatures, typename T>
 VN_INLINE T* table_of(const HashEncoding& in, T* level, int64_t point) {
   return in.in.cells == nullptr ? level : level + in.in.cells[point] * in.in.entries * kFeatures;
 }
 
-// Bytes of a level that a second-level cache does not hold beside the others: asking for entries ahead pays.
+// Bytes from which a level does not fit in the L2 cache beside the others, so that prefetching pays.
 constexpr int64_t kFetchedLevel = 1 << 20;
 
-// Entries of a level on their way to the cache, of all points before the first is computed: a processor that waits for
-// those of one point looks no more than a few points ahead. Corners that differ in x alone mostly share a line.
+// Prefetches the entries of all points of a block on one level, since out-of-order execution reaches only a few points
+// ahead. Corners that differ in x alone mostly share a cache line.
 template <int kFeatures, typename T>
 VN_INLINE void hash_fetch(const HashEncoding& in, const GridLevel& level, const HashCorners& corners, int64_t first,
                           int64_t rows) {
   const T* table = static_cast<const T*>(in.in.table) + level.offset * kFeatures;
   for (int64_t i = 0; i < rows; ++i) {
-    const T* own = table_of<kFeatures>(in, table, first + i);
+    const T* entries_of_point = table_of<kFeatures>(in, table, first + i);
     for (int corner = 0; corner < 8; corner += 2) {
-      __builtin_prefetch(own + int64_t{corners.entry[corner][i]} * kFeatures);
+      __builtin_prefetch(entries_of_point + int64_t{corners.entry[corner][i]} * kFeatures);
     }
   }
 }
 
-// Features of one level, for points `first` to `first + rows`, rows of the result `stride` apart.
+// Writes the features of one level for points `first` to `first + rows`; rows of the result are `stride` apart.
 template <int kFeatures, typename T>
 VN_INLINE void hash_interpolate(const HashEncoding& in, const GridLevel& level, const HashCorners& corners,
                                 int64_t first, int64_t rows, float* out, int64_t stride) {
   const T* table = static_cast<const T*>(in.in.table) + level.offset * kFeatures;
   for (int64_t i = 0; i < rows; ++i) {
-    const T* own = table_of<kFeatures>(in, table, first + i);
-    Features<kFeatures> even{}, odd{};  // two sums, so that one does not wait for itself at every corner
+    const T* entries_of_point = table_of<kFeatures>(in, table, first + i);
+    Features<kFeatures> even{}, odd{};  // two sums halve the dependency chain
 #pragma GCC unroll 4
     for (int corner = 0; corner < 8; corner += 2) {
-      const auto a = load_entry<kFeatures>(own + int64_t{corners.entry[corner][i]} * kFeatures);
-      const auto b = load_entry<kFeatures>(own + int64_t{corners.entry[corner + 1][i]} * kFeatures);
+      const auto a = load_entry<kFeatures>(entries_of_point + int64_t{corners.entry[corner][i]} * kFeatures);
+      const auto b = load_entry<kFeatures>(entries_of_point + int64_t{corners.entry[corner + 1][i]} * kFeatures);
 #pragma GCC unroll 2
       for (int p = 0; p < a.kParts; ++p) {
         even.part[p] = multiply_add(a.part[p], corners.weight[0][corner][i], even.part[p]);
@@ -267,16 +270,16 @@ VN_INLINE void hash_interpolate(const HashEncoding& in, const GridLevel& level, 
   }
 }
 
-// Adds weights times gradients, of which rows are `stride` apart, to the entries of one level.
+// Adds weights times gradients to the entries of one level; rows of `gradient` are `stride` apart.
 template <int kFeatures>
 VN_INLINE void hash_scatter(const HashEncoding& in, const GridLevel& level, const HashCorners& corners, int64_t first,
                             int64_t rows, const float* gradient, int64_t stride, float* of_table) {
   float* table = of_table + level.offset * kFeatures;
   for (int64_t i = 0; i < rows; ++i) {
-    float* own = table_of<kFeatures>(in, table, first + i);
+    float* entries_of_point = table_of<kFeatures>(in, table, first + i);
     const auto arriving = load_entry<kFeatures>(gradient + i * stride);
     for (int corner = 0; corner < 8; ++corner) {
-      float* at = own + int64_t{corners.entry[corner][i]} * kFeatures;
+      float* at = entries_of_point + int64_t{corners.entry[corner][i]} * kFeatures;
       auto entry = load_entry<kFeatures>(at);
       for (int p = 0; p < entry.kParts; ++p) entry.part[p] += arriving.part[p] * corners.weight[0][corner][i];
       store_entry(at, entry);
@@ -284,24 +287,24 @@ VN_INLINE void hash_scatter(const HashEncoding& in, const GridLevel& level, cons
   }
 }
 
-// Adds to sums [3][block]: what the features of one level give to the places, before a sum over lanes.
+// Adds the gradients of the places from one level to sums [3][block]; the lanes are still to be summed.
 template <int kFeatures, typename T>
 VN_INLINE void hash_slopes(const HashEncoding& in, const GridLevel& level, const HashCorners& corners, int64_t first,
                            int64_t rows, const float* gradient, int64_t stride, Four (*sums)[kHashBlock]) {
   const T* table = static_cast<const T*>(in.in.table) + level.offset * kFeatures;
   for (int64_t i = 0; i < rows; ++i) {
-    const T* own = table_of<kFeatures>(in, table, first + i);
+    const T* entries_of_point = table_of<kFeatures>(in, table, first + i);
     const auto arriving = load_entry<kFeatures>(gradient + i * stride);
-    Four found[3] = {};
+    Four slopes[3] = {};
     for (int corner = 0; corner < 8; ++corner) {
-      const auto entry = load_entry<kFeatures>(own + int64_t{corners.entry[corner][i]} * kFeatures);
+      const auto entry = load_entry<kFeatures>(entries_of_point + int64_t{corners.entry[corner][i]} * kFeatures);
       Four product = entry.part[0] * arriving.part[0];
       for (int p = 1; p < entry.kParts; ++p) product += entry.part[p] * arriving.part[p];
       for (int axis = 0; axis < 3; ++axis) {
-        found[axis] = multiply_add(product, corners.weight[axis][corner][i], found[axis]);
+        slopes[axis] = multiply_add(product, corners.weight[axis][corner][i], slopes[axis]);
       }
     }
-    for (int axis = 0; axis < 3; ++axis) sums[axis][i] += found[axis];
+    for (int axis = 0; axis < 3; ++axis) sums[axis][i] += slopes[axis];
   }
 }
 

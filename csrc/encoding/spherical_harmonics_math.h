@@ -7,7 +7,7 @@ namespace VN_ISA_NAMESPACE {
 namespace {
 
 struct SphericalHarmonics {
-  static constexpr int kMost = 16;  // of degree 4
+  static constexpr int kMost = 16;  // columns at degree 4
 
   template <typename X, typename Put>
   VN_INLINE void values(const X& of, int, int degree, const Put& put) {

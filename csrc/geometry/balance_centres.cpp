@@ -1,7 +1,7 @@
-// All steps in one call: a step at the usual size, ten thousand samples and sixteen cells, is a few tens of
-// microseconds, less than the calls it would be made of. The cells are found by nearest_centre; masses are added in the
-// order of the samples, and everything about centres, which are few, is float64 on one thread: the result depends
-// neither on the number of threads nor on the instruction set.
+// balance_centres on the CPU, with all steps in one call: a step of the usual size (ten thousand samples, sixteen
+// cells) takes a few tens of microseconds, less than separate calls would. nearest_centre finds the cells. Masses are
+// added in the order of the samples, and all computation on the few centres is float64 on one thread. So the result
+// depends neither on the number of threads nor on the instruction set.
 #include "geometry/balance_centres.h"
 
 #include <algorithm>
@@ -12,7 +12,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kSerial = 1 << 20;  // pairs of sample and centre below which waking threads costs more than it gives
+constexpr int64_t kSerial = 1 << 20;  // pairs of sample and centre below which threads do not pay
 
 void weigh(const BalanceInputs& in, const float* centres, double* weights, int32_t* cells, Isa isa, int threads) {
   const int team = in.m * in.k < kSerial ? 1 : threads;
@@ -30,14 +30,15 @@ double squared_distance(const float* a, const float* b) {
   return sum;
 }
 
-// The closest centres to centre i, nearest first, ties in the order of the centres: an insertion into a short list.
+// Finds the closest centres to centre i, nearest first, ties in the order of the centres, by insertion into a short
+// list.
 void find_neighbours(const BalanceInputs& in, const float* centres, int64_t i, double* distances, double* others) {
-  int64_t held = 0;
+  int64_t count = 0;
   for (int64_t j = 0; j < in.k; ++j) {
     if (j == i) continue;
     const double d = squared_distance(centres + 3 * i, centres + 3 * j);
-    if (held == in.neighbours && !(d < distances[held - 1])) continue;
-    int64_t at = held < in.neighbours ? held++ : held - 1;
+    if (count == in.neighbours && !(d < distances[count - 1])) continue;
+    int64_t at = count < in.neighbours ? count++ : count - 1;
     for (; at > 0 && d < distances[at - 1]; --at) {
       distances[at] = distances[at - 1];
       others[at] = others[at - 1];
@@ -67,7 +68,7 @@ void balance_centres_cpu(const BalanceInputs& in, float* centres, double* weight
           shift[axis] += way * (weights[j] - weights[i]);
         }
       }
-      // A neighbourhood without any weight has only zero differences.
+      // In a neighbourhood without weight all differences are zero.
       const double scale = heaviest > 0.0 ? in.alpha / (heaviest * static_cast<double>(in.neighbours)) : 0.0;
       for (int axis = 0; axis < 3; ++axis) moved[3 * i + axis] = centres[3 * i + axis] + scale * shift[axis];
     }

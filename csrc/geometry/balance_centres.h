@@ -1,4 +1,4 @@
-// Moving centres until their cells hold equal importance: m samples, k centres. What it computes is said in
+// Moves k centres until their cells hold equal importance, given by m samples. The algorithm is described in
 // voronerf/ops/balance_centres.
 #pragma once
 
@@ -17,7 +17,7 @@ struct BalanceInputs {
   int64_t neighbours;  // 1 <= neighbours < k, or k == 1
 };
 
-// Doubles of workspace.
+// Returns the workspace's size in doubles.
 int64_t balance_centres_workspace(int64_t k);
 
 // centres [k,3] in and out; weights [k] receives the mass of each cell at the end; cells [m] is workspace.

@@ -1,9 +1,10 @@
-// Stable sort on the CPU, by counting: a histogram a chunk, one scan over (cell, chunk), a scatter a chunk. Every row
-// has one possible place in a stable order, so neither the chunks nor the threads can change the result.
+// Stable sort on the CPU by counting: a histogram per chunk, one scan over (cell, chunk), a scatter per chunk. A stable
+// order is unique, so neither the chunks nor the threads change the result.
 //
-// The last chunk counts in `offsets`, and its scatter leaves them as they should be: a single chunk takes no memory. A
-// thread has two chunks if their counters fit into the first-level cache, and scatters their rows in turn: a row behind
-// one of the same cell waits seven cycles for the counter (sorted rows take 1.5 ns each, not 2.7).
+// The last chunk counts in `offsets`, and its scatter leaves the final offsets there, so a single chunk needs no
+// memory. A thread has two chunks if their counters fit in the L1 cache, and scatters their rows alternately: a row
+// waits seven cycles for the counter if the previous row has the same cell. For sorted rows this takes 1.5 ns per row,
+// not 2.7.
 #include "geometry/cell_sort.h"
 
 #include <algorithm>
@@ -16,17 +17,17 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kSparse = 64;       // cells a row from which rows are sorted by digits
-constexpr int64_t kChunkRows = 2048;  // rows of a chunk at least, and four times as many as cells
-constexpr int64_t kTwoChunks = 4096;  // cells whose counters fit into the first-level cache twice
-constexpr int64_t kNear = 1 << 17;    // rows whose order stays in the second-level cache
+constexpr int64_t kSparse = 64;       // cells per row from which rows are sorted by digits
+constexpr int64_t kChunkRows = 2048;  // minimum rows of a chunk, which also has at least four per cell
+constexpr int64_t kTwoChunks = 4096;  // cells for which two sets of counters fit in the L1 cache
+constexpr int64_t kNear = 1 << 17;    // rows whose order stays in the L2 cache
 constexpr int64_t kLine = 16;         // int32 of a cache line
 
-// As unsigned, a negative cell is above k as well.
+// Returns whether a cell lies in 0..k-1. As unsigned, a negative cell is above k too.
 bool inside(int32_t cell, int64_t k) { return static_cast<uint32_t>(cell) < static_cast<uint32_t>(k); }
 
-// Counts become places of first rows. Two cells at a time: the loop over one takes 0.31 to 0.55 ns a cell, as it
-// happens to be aligned, and this one 0.28.
+// Turns counts into the places of first rows. Two cells at a time take 0.28 ns a cell; one at a time takes 0.31 to 0.55
+// ns, depending on the loop's alignment.
 void first_places(int32_t* counts, int64_t k) {
   int32_t start = 0;
   int64_t c = 0;
@@ -39,8 +40,8 @@ void first_places(int32_t* counts, int64_t k) {
   if (c < k) counts[c] = start;
 }
 
-// Few rows in many cells: sorts by the lower half of a cell's bits, then by the upper half, with as many counters as
-// the root of k, and writes offsets once, in order.
+// Sorts few rows into many cells: by the lower half of a cell's bits, then by the upper half, with about sqrt(k)
+// counters each. Writes offsets once, in order.
 bool sort_sparse(const int32_t* cells, int32_t* order, int32_t* offsets, int64_t n, int64_t k) {
   int bits = 0;
   while ((k - 1) >> 2 * bits != 0) ++bits;
@@ -69,15 +70,16 @@ bool sort_sparse(const int32_t* cells, int32_t* order, int32_t* offsets, int64_t
 
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCount n, int64_t k, int threads) {
   if (kSparse * n <= k) return sort_sparse(cells, order, offsets, n, k);
-  // A thread has a part, and a part one chunk or two.
+  // Each thread has one part, which consists of one or two chunks.
   const int64_t sides = k <= kTwoChunks && n >= 8 * k ? 2 : 1;
   const int64_t parts = std::clamp<int64_t>(n / (sides * std::max(kChunkRows, 4 * k)), 1, threads);
   const int64_t chunks = sides * parts, rows = ceil_div<int64_t>(n, chunks);
-  const int64_t stride = (ceil_div(k, kLine) + 1) * kLine;  // threads share no line of counters
+  const int64_t stride = (ceil_div(k, kLine) + 1) * kLine;  // avoids false sharing of counters
   const std::unique_ptr<int32_t[]> memory(new int32_t[static_cast<size_t>((chunks - 1) * stride)]);
   const auto counters = [&](int64_t chunk) { return chunk < chunks - 1 ? memory.get() + chunk * stride : offsets + 1; };
   const auto start = [&](int64_t chunk) { return std::min<int64_t>(n, chunk * rows); };
-  // take(row, counters) for the rows of a part, of both chunks in turn; the second chunk has no more rows.
+  // Calls take(row, counters) for the rows of a part, alternately from both chunks. The second chunk has at most as
+  // many rows as the first.
   const auto walk = [&](int64_t part, const auto& take) {
     const int64_t chunk = sides * part, middle = start(chunk + 1), half = middle - start(chunk);
     int32_t *const first = counters(chunk), *const second = counters(chunk + sides - 1);
@@ -106,9 +108,9 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCo
   });
   if (!valid) return false;
 
-  // In place, a count becomes the first place of that cell's rows of that chunk: walk the chunks once for the cells'
-  // totals, once to hand out the places, both along the memory. The last chunk's counters hold the total, then the next
-  // place to hand out, and in the end the first place of their own.
+  // In place, a count becomes the first place of the cell's rows in the chunk. One pass over the chunks sums the cells'
+  // totals, a second pass assigns places; both read memory in order. The last chunk's counters hold the total, then the
+  // next free place, and in the end that chunk's own first place.
   int32_t* const last = offsets + 1;
   for (int64_t chunk = 0; chunk < chunks - 1; ++chunk) {
     const int32_t* const count = counters(chunk);
@@ -125,7 +127,7 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCo
   }
 
   offsets[0] = 0;
-  // If the order outgrows the cache and a cell has some lines of it, the next line of the cell is asked for.
+  // If the order outgrows the cache and a cell spans several of its lines, the cell's next line is prefetched.
   const bool far = n > kNear + 128 * k;
   parallel_for(parts, 1, threads, [&](int64_t part) {
     walk(part, [cells, order, far](int64_t row, int32_t* places) {

@@ -1,20 +1,21 @@
-// Stable sort by cell on CUDA. Bucket 0 is for cells below 0 and bucket k + 1 for cells from k on. Few cells are
-// counted, in chunks as on the CPU. One warp owns a chunk, so that no counter is shared:
+// Stable sort by cell on CUDA. Bucket 0 is for cells below 0 and bucket k + 1 for cells from k on. Few cells are sorted
+// by counting, in chunks as on the CPU. One warp owns a chunk, so that no counter is shared:
 //
 //   1. cell_sort_chunk    the chunk's histogram, counts[bucket][chunk]
 //   2. scan_*             exclusive scan of counts in that order: the first place of each bucket's rows of each chunk
-//   3. cell_sort_chunk    the rows go to their places, in order
+//   3. cell_sort_chunk    writes the rows to their places, in order
 //
 // A warp takes 32 rows at a time; rows with the same bucket find each other with __match_any_sync, are ranked by lane,
-// and their first lane moves the counter, in shared memory. There are no atomics. Counters of a block's eight chunks
-// lie side by side in global memory, a sector of 32 bytes for a bucket, and pass between there and shared memory so.
+// and their first lane moves the counter, in shared memory. There are no atomics. In global memory the counters of a
+// block's eight chunks are adjacent, one sector of 32 bytes per bucket, and are copied to and from shared memory in
+// this layout.
 //
-// More cells than a warp has counters for go through the toolkit's radix sort, by just the bits that buckets have: in
-// global memory every 32 rows would wait for a counter, and the few chunks that so many counters allow would leave the
-// device idle (256 warps for 4,096 cells of 4 M rows, 16 for 65,536). cell_sort_keys writes buckets and row numbers
-// for it, and cell_sort_offsets finds each cell's first row in what comes out.
+// If a warp has too few counters for the cells, the toolkit's radix sort sorts by the bits of the bucket numbers. With
+// counters in global memory every 32 rows would wait for a counter, and the many counters would allow too few chunks to
+// fill the device (for 4 M rows, 256 warps with 4,096 cells and 16 with 65,536). cell_sort_keys writes buckets and row
+// numbers for it, and cell_sort_offsets finds each cell's first row in the sorted keys.
 //
-// Either way every row has one possible place: the result is that of the CPU, bit for bit.
+// A stable order is unique, so both methods give the CPU's result bit for bit.
 #include "common/cuda_wrappers.h"
 #include "common/index_maps.h"
 #include "geometry/cell_sort.h"
@@ -27,14 +28,14 @@ namespace {
 constexpr int kThreads = 256;
 constexpr unsigned kWarps = kThreads / 32;
 static_assert(kWarps == kCellSortBlock, "the plan has whole blocks of chunks");
-constexpr int kAhead = 4;  // steps of 32 rows that are read before they are counted
+constexpr int kAhead = 4;  // steps of 32 rows that are read ahead
 constexpr int kScanThreads = 1024;
 constexpr int64_t kScanTile = kCellSortScanTile;
 constexpr int kScanItems = static_cast<int>(kScanTile) / kScanThreads;
 
-// Calls place(row, position) for every row of the warp's chunk, where position is the value of the row's counter before
-// it. Counters belong to this warp alone; __syncwarp makes the write of one lane visible to the lane that reads next.
-// While some steps of cells are counted, the next ones are on their way.
+// Calls place(row, position) for every row of the warp's chunk; position is the row's counter before this row. Counters
+// belong to this warp alone; __syncwarp makes the write of one lane visible to the lane that reads next. While kAhead
+// steps of cells are counted, the next steps are being loaded.
 template <typename Place>
 __device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t begin, int64_t end, int64_t k,
                            Place place) {
@@ -54,7 +55,7 @@ __device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t begi
     for (int step = 0; step < kAhead; ++step) {
       const int64_t row = start + 32 * step + lane;
       const bool active = row < end;
-      // Lanes past the end form a group of their own, which counts nothing.
+      // Lanes past the end form a separate group, which counts nothing.
       const int bucket = active ? static_cast<int>(bucket_of_cell(now[step], k)) : -1;
       const unsigned peers = __match_any_sync(kAllLanes, bucket);
       const int leader = __ffs(static_cast<int>(peers)) - 1;
@@ -71,13 +72,14 @@ __device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t begi
   }
 }
 
-// The chunks of a block's warps, with their counters in shared memory: histograms (kScatter false), or the rows to
-// their places. The grid has whole blocks of chunks; the last ones may have no rows.
+// Processes the chunks of a block's warps, with their counters in shared memory: counts rows, or (kScatter) writes rows
+// to their places. The grid has whole blocks of chunks; the last chunks may have no rows.
 template <bool kScatter>
 __global__ void __launch_bounds__(kThreads)
     cell_sort_chunk(const int32_t* __restrict__ cells, int32_t* counts, int32_t* __restrict__ order, int64_t chunks,
                     int64_t rows, int64_t n, int64_t k) {
-  // Four more a warp: neighbouring threads have the counters of one bucket and eight warps, in different banks.
+  // Four padding counters per warp: neighbouring threads access one bucket's counters of eight warps, in different
+  // banks.
   VN_SHARED(counters, int32_t[kWarps][kCellSortBuckets + 4]);
   const unsigned warp = threadIdx.x / 32, size = static_cast<unsigned>(k + 2) * kWarps;
   const int64_t first = static_cast<int64_t>(blockIdx.x) * kWarps;
@@ -98,7 +100,8 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// Exclusive scan over the threads of a block of kScanThreads; `total` is the sum of all. `warp_sums` is shared scratch.
+// Returns the exclusive scan over the kScanThreads threads of a block, and their sum in `total`. `warp_sums` is shared
+// scratch.
 __device__ int32_t scan_block(int32_t value, int32_t* warp_sums, int32_t& total) {
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
   int32_t inclusive = value;
@@ -135,7 +138,7 @@ __global__ void __launch_bounds__(kScanThreads)
   if (threadIdx.x == 0) tile_sums[blockIdx.x] = total;
 }
 
-// One block turns the sums of the tiles into their exclusive scan.
+// Replaces the sums of the tiles by their exclusive scan, in one block.
 __global__ void __launch_bounds__(kScanThreads) scan_tiles(int32_t* tile_sums, int64_t tiles) {
   VN_SHARED(warp_sums, int32_t[32]);
   int32_t carry = 0;
@@ -148,7 +151,7 @@ __global__ void __launch_bounds__(kScanThreads) scan_tiles(int32_t* tile_sums, i
   }
 }
 
-// Counts become places, and the first place of bucket c + 1 is offsets[c].
+// Replaces counts by places; offsets[c] is the first place of bucket c + 1.
 __global__ void __launch_bounds__(kScanThreads)
     scan_places(int32_t* __restrict__ counts, const int32_t* __restrict__ tile_sums, int32_t* __restrict__ offsets,
                 int64_t size, int64_t chunks) {
@@ -178,7 +181,8 @@ __global__ void __launch_bounds__(kThreads) cell_sort_keys(const int32_t* __rest
   rows[row] = static_cast<int32_t>(row);
 }
 
-// A thread a cell looks for its first row by bisection: a few steps, from cache, however the rows are shared out.
+// Finds the first row of each cell by bisection, one thread per cell: a few steps in cache for any distribution of
+// rows.
 template <typename Key>
 __global__ void __launch_bounds__(kThreads)
     cell_sort_offsets(const Key* __restrict__ sorted, int32_t* __restrict__ offsets, int64_t n, int64_t k) {
@@ -189,7 +193,7 @@ __global__ void __launch_bounds__(kThreads)
 
 unsigned blocks_of(int64_t threads) { return static_cast<unsigned>(ceil_div<int64_t>(threads, kThreads)); }
 
-// The plan for the current device.
+// Returns the plan for the current device.
 CellSortPlan plan_of(int64_t n, int64_t k, CellSortWay way) {
   CellSortPlan plan = cell_sort_plan(n, k, way, 0);
   if (!plan.radix || n == 0) return plan;

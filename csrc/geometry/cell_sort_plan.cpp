@@ -4,7 +4,7 @@ namespace voronerf {
 
 namespace {
 
-// Parts of a workspace begin at multiples of this, which the toolkit's sort wants of its own.
+// Rounds up to a multiple of 256 bytes: the alignment of a workspace's parts, which the toolkit's sort requires.
 int64_t aligned(int64_t bytes) { return ceil_div<int64_t>(bytes, 256) * 256; }
 
 }  // namespace
@@ -16,7 +16,7 @@ CellSortPlan cell_sort_plan(int64_t n, int64_t k, CellSortWay way, int64_t tempo
   VN_CHECK(few || way != CellSortWay::counting, "cell_sort: too many cells to be counted in shared memory");
   plan.radix = way == CellSortWay::radix || !few;
   if (!plan.radix) {
-    // Short chunks keep many warps busy, and long ones have few counters: half as many as rows at most.
+    // Short chunks keep many warps busy, while long chunks need fewer counters: at most half as many counters as rows.
     plan.chunk_rows = 2 * plan.buckets < 1024 ? 1024 : 2 * plan.buckets;
     plan.chunks = ceil_div(ceil_div(n, plan.chunk_rows), kCellSortBlock) * kCellSortBlock;
     const int64_t size = plan.chunks * plan.buckets;

@@ -1,5 +1,5 @@
-// Building an index: splits from the root on, each a selection of the middle. Ranges of one size stand side by side, so
-// a range's place tells all about it, and whole subtrees go over threads.
+// Builds an index by splits from the root down; each split selects the median. A range's bounds follow from its depth
+// and number alone, so threads build whole subtrees independently.
 #include "geometry/centre_index.h"
 
 #include <algorithm>
@@ -13,9 +13,9 @@ namespace voronerf {
 
 namespace {
 
-constexpr int kSharedBits = 4;  // splits before subtrees go over threads
-constexpr int kSample = 31;     // of a range, by which the next pivot is chosen
-constexpr int kFew = 200;       // for which a sample costs more than it gives
+constexpr int kSharedBits = 4;  // levels of splits before threads share the subtrees
+constexpr int kSample = 31;     // size of the sample that chooses a pivot
+constexpr int kFew = 200;       // range size up to which sampling does not pay
 
 template <typename T, int D>
 struct Centre {
@@ -29,32 +29,32 @@ struct Pivot {
   int32_t number;
 };
 
-// Whether a centre is before the pivot, ties by their numbers; without a branch.
+// Returns whether a centre is before the pivot, ties by number. It has no branches.
 template <typename T, int D>
 bool is_before(const Centre<T, D>& centre, int axis, const Pivot<T>& pivot) {
   const T value = centre.at[axis];
   return (value < pivot.value) | ((value == pivot.value) & (centre.number < pivot.number));
 }
 
-// Moves centres before and behind the middle to its sides, as Floyd and Rivest's selection does ("Expected time bounds
-// for selection", 1975): a pivot from a sample, at the middle's place in it. Its places are drawn, since centres may
-// come in any regular order.
+// Partitions centres around the one at `middle`, like Floyd and Rivest ("Expected time bounds for selection", 1975).
+// The pivot is the element of a sample at the middle's relative rank. The sample is random, since centres may come in
+// any regular order.
 template <typename T, int D>
 void select_middle(Centre<T, D>* centres, int64_t begin, int64_t end, int64_t middle, int axis) {
   uint64_t state = static_cast<uint64_t>(middle);
   while (end - begin > kFew) {
     Pivot<T> sample[kSample];
-    for (Pivot<T>& each : sample) {
+    for (Pivot<T>& element : sample) {
       state = 6364136223846793005u * state + 1442695040888963407u;  // Knuth's generator
-      const Centre<T, D>& taken =
+      const Centre<T, D>& chosen =
           centres[begin + static_cast<int64_t>((state >> 33) % static_cast<uint64_t>(end - begin))];
-      each = {taken.at[axis], taken.number};
+      element = {chosen.at[axis], chosen.number};
     }
     std::sort(sample, sample + kSample, [](const Pivot<T>& a, const Pivot<T>& b) {
       return (a.value < b.value) | ((a.value == b.value) & (a.number < b.number));
     });
-    const int64_t wanted = (middle - begin) * kSample / (end - begin);
-    const Pivot<T> pivot = sample[std::clamp<int64_t>(wanted, 1, kSample - 2)];
+    const int64_t rank = (middle - begin) * kSample / (end - begin);
+    const Pivot<T> pivot = sample[std::clamp<int64_t>(rank, 1, kSample - 2)];
     int64_t filled = begin;
     for (int64_t i = begin; i < end; ++i) {
       const Centre<T, D> moved = centres[i];
@@ -73,11 +73,11 @@ void select_middle(Centre<T, D>* centres, int64_t begin, int64_t end, int64_t mi
 template <typename T, int D>
 class Builder {
  public:
-  Builder(const T* given, int32_t* index, int64_t k)
+  Builder(const T* input, int32_t* index, int64_t k)
       : shape_(centre_index_shape(k, D, sizeof(T))), index_(index), centres_(new Centre<T, D>[k]) {
     for (int64_t i = 0; i < k; ++i) {
       for (int axis = 0; axis < D; ++axis) {
-        const T value = given[D * i + axis];  // what is not a number has no order, and is near to nothing
+        const T value = input[D * i + axis];  // NaN has no order; as infinity it is never the nearest
         centres_[i].at[axis] = value == value ? value : std::numeric_limits<T>::infinity();
       }
       centres_[i].number = static_cast<int32_t>(i);
@@ -86,7 +86,7 @@ class Builder {
     index[0] = static_cast<int32_t>(k);
     index[1] = D;
     index[2] = sizeof(T);
-    // Boxes of no children, beyond all bounds.
+    // Missing children get empty boxes, which no search enters.
     T* const root = values(0, 0, shape_.node_words);
     for (int i = 0; i < D * kWide && shape_.levels > 0; ++i) {
       root[2 * kWide * (i / kWide) + i % kWide] = std::numeric_limits<T>::infinity();
@@ -107,7 +107,7 @@ class Builder {
     return reinterpret_cast<T*>(index_ + shape_.level_word[level] + i * words);
   }
 
-  // The range with number i of those that `depth` splits make: its own splits until there are `until`.
+  // Splits range i of level `depth` recursively, down to level `until`.
   void split(int depth, int64_t i, int until) {
     const int64_t begin = first(depth, i), end = first(depth, i + 1);
     const int root = root_bits(shape_.bits);
@@ -146,11 +146,11 @@ class Builder {
     T* const leaf = values(shape_.levels, i, shape_.leaf_words);
     auto* const numbers = reinterpret_cast<int32_t*>(leaf + D * kWide);
     for (int j = 0; j < kWide; ++j) {
-      const bool is_there = begin + j < end;
+      const bool exists = begin + j < end;
       for (int axis = 0; axis < D; ++axis) {
-        leaf[axis * kWide + j] = is_there ? centres_[begin + j].at[axis] : std::numeric_limits<T>::infinity();
+        leaf[axis * kWide + j] = exists ? centres_[begin + j].at[axis] : std::numeric_limits<T>::infinity();
       }
-      numbers[j] = is_there ? centres_[begin + j].number : std::numeric_limits<int32_t>::max();
+      numbers[j] = exists ? centres_[begin + j].number : std::numeric_limits<int32_t>::max();
     }
   }
 

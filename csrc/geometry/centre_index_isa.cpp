@@ -1,12 +1,12 @@
-// Searching an index of centres, once for each instruction set: a point at a time, all children of a node or all
-// centres of a leaf in the lanes.
+// Searches an index of centres; compiled once per instruction set. It searches one point at a time, with the children
+// of a node or the centres of a leaf in the lanes.
 //
-// Nearest child first; a box that is farther than the best is left out, with all that it holds. The squared distance of
-// a box is computed by the operations of a centre's, each of which rounds in the order of its operands, so it is never
-// above what the centres in it would get. Float32 leaves out what is beyond nearest_is_certain's margin of the best, so
-// its question at the end is about all centres; where the answer is no, the point is searched for again in float64.
+// The nearest child comes first, and a box that is farther than the best centre is skipped. A box's squared distance
+// uses the same operations as a centre's. Rounding is monotonic, so the box's distance never exceeds the distance of a
+// centre in it. Float32 skips only boxes beyond nearest_is_certain's margin, so the final check covers all centres. If
+// the check fails, the point is searched again in float64.
 //
-// Points come along rays: what was nearest to the point before bounds the way to the next one's.
+// Consecutive points lie along rays, so the previous point's nearest centre bounds the search of the next point.
 #include "common/integer_tile.h"
 #include "geometry/centre_index.h"
 #include "geometry/nearest_centre_math.h"
@@ -16,10 +16,10 @@ namespace VN_ISA_NAMESPACE {
 namespace {
 
 constexpr int kParts = kWide / kLanes;  // vectors of a node's children
-constexpr int32_t kDone = 0x7fffffff;   // in place of a child's key; no number, as a float
+constexpr int32_t kDone = 0x7fffffff;   // key of a visited child; NaN as a float
 constexpr float kHuge = 3.4028235e38f;
 
-// Where the nodes of a level, or the leaves, have their values.
+// Returns the values of node i of a level, or of leaf i.
 template <typename T>
 VN_INLINE const T* values(const int32_t* index, const CentreIndexShape& shape, int level, int64_t i) {
   const int words = level < shape.levels ? shape.node_words : shape.leaf_words;
@@ -45,11 +45,11 @@ VN_INLINE double squared_distance_of_box(const T* low, const double* point) {
   return sum;
 }
 
-// The search in float64, which is exact: a box as far as the best may hold a lower number.
+// Searches exactly, in float64. A box at the best distance is searched too, since it may hold a lower number.
 template <typename T, int D>
-int32_t search_exactly(const T* given, const int32_t* index, const CentreIndexShape& shape) {
+int32_t search_exactly(const T* input, const int32_t* index, const CentreIndexShape& shape) {
   double point[D], distances[kMostLevels][kWide], best = kLargest;
-  for (int axis = 0; axis < D; ++axis) point[axis] = static_cast<double>(given[axis]);
+  for (int axis = 0; axis < D; ++axis) point[axis] = static_cast<double>(input[axis]);
   int64_t node = 0;
   int32_t cell = 0;
   int level = 0;
@@ -71,11 +71,11 @@ int32_t search_exactly(const T* given, const int32_t* index, const CentreIndexSh
       for (int i = 0; i < kWide; ++i) distances[level][i] = squared_distance_of_box<T, D>(low + i, point);
     }
     for (; level >= 0; --level, node >>= 4) {
-      double* const left = distances[level];
+      double* const remaining = distances[level];
       int nearest = 0;
-      for (int i = 1; i < kWide; ++i) nearest = left[i] < left[nearest] ? i : nearest;
-      if (!(left[nearest] <= best)) continue;
-      left[nearest] = __builtin_inf();
+      for (int i = 1; i < kWide; ++i) nearest = remaining[i] < remaining[nearest] ? i : nearest;
+      if (!(remaining[nearest] <= best)) continue;
+      remaining[nearest] = __builtin_inf();
       node = (node << 4) + nearest;
       ++level;
       break;
@@ -127,26 +127,26 @@ VN_INLINE F32 box_distance(const float* low, const F32* point) {
   return sum;
 }
 
-// The answer for one point, and where it lies in the index, if float32 decides; `bound` is a distance within which
-// there is a centre.
+// The nearest centre of one point: its cell, and its address in the index.
 struct Found {
-  const float* at;  // first coordinate of the centre; null where float32 does not decide
+  const float* at;  // first coordinate of the centre; null if float32 does not decide
   int32_t cell;
 };
 
+// Searches in float32. `bound` is a squared distance within which there is a centre.
 template <int D>
-VN_INLINE Found search(const float* given, const int32_t* index, const CentreIndexShape& shape, float bound) {
+VN_INLINE Found search(const float* input, const int32_t* index, const CentreIndexShape& shape, float bound) {
   F32 point[D], near[kParts], next[kParts];
   I32 where[kParts], lanes[kParts];
-  for (int axis = 0; axis < D; ++axis) point[axis] = splat(given[axis]);
+  for (int axis = 0; axis < D; ++axis) point[axis] = splat(input[axis]);
   const F32 infinity = splat(__builtin_inff());
-  const I32 kept = splat(-kWide);
+  const I32 distance_bits = splat(-kWide);
   for (int p = 0; p < kParts; ++p) {
     near[p] = next[p] = infinity;
     where[p] = splat(int32_t{0});
     lanes[p] = numbers_from(p * kLanes);
   }
-  int32_t children[kMostLevels][kWide];  // on the way down: their distances, whose lowest bits number them
+  int32_t children[kMostLevels][kWide];  // distances of the current path's children; the lowest bits number the child
   int level = 0;
   int64_t node = 0;
   while (level >= 0) {
@@ -169,10 +169,10 @@ VN_INLINE Found search(const float* given, const int32_t* index, const CentreInd
       const float* low = values<float>(index, shape, level, node);
       for (int p = 0; p < kParts; ++p) {
         const F32 v = box_distance<D>(low + p * kLanes, point);
-        store(children[level] + p * kLanes, tag(as_integer(v), kept, lanes[p]));
+        store(children[level] + p * kLanes, tag(as_integer(v), distance_bits, lanes[p]));
       }
     }
-    for (; level >= 0; --level, node >>= 4) {  // the nearest child that is left, here or above
+    for (; level >= 0; --level, node >>= 4) {  // go to the nearest unvisited child, here or above
       I32 keys[kParts];
       __builtin_memcpy(keys, children[level], sizeof keys);
       I32 least = keys[0];
@@ -208,7 +208,7 @@ VN_INLINE Found search(const float* given, const int32_t* index, const CentreInd
 
 template <int D>
 void search_all(const float* points, const int32_t* index, int32_t* cells, int64_t n, const CentreIndexShape& shape) {
-  const float* before = nullptr;  // the centre of the point before
+  const float* previous = nullptr;  // the previous point's centre
   for (int64_t i = 0; i < n; ++i) {
     const float* point = points + D * i;
     if (!is_finite<float, D>(point)) {
@@ -216,16 +216,16 @@ void search_all(const float* points, const int32_t* index, int32_t* cells, int64
       continue;
     }
     float bound = kHuge;
-    if (before != nullptr) {
+    if (previous != nullptr) {
       float v = 0.0f;
       for (int axis = 0; axis < D; ++axis)
-        v += (point[axis] - before[axis * kWide]) * (point[axis] - before[axis * kWide]);
+        v += (point[axis] - previous[axis * kWide]) * (point[axis] - previous[axis * kWide]);
       bound = v + 2.0f * (kMargin * v + kFloor);
       bound = bound < kHuge ? bound : kHuge;
     }
-    const Found found = search<D>(point, index, shape, bound);
-    before = found.at;
-    cells[i] = found.at == nullptr ? search_exactly<float, D>(point, index, shape) : found.cell;
+    const Found result = search<D>(point, index, shape, bound);
+    previous = result.at;
+    cells[i] = result.at == nullptr ? search_exactly<float, D>(point, index, shape) : result.cell;
   }
 }
 

@@ -1,5 +1,5 @@
-// The nested query on the CPU: blocks of points go down the tree (tree_descent.h), and every group goes through the
-// vectorised kernel of nearest_centre.
+// The nested query on the CPU: blocks of points go down the tree (tree_descent.h), and the vectorised kernel of
+// nearest_centre handles each group.
 #include "geometry/locate_cell.h"
 
 #include "geometry/nearest_centre.h"
@@ -23,9 +23,9 @@ int64_t locate_cell_workspace(int64_t m, int threads) { return threads * descent
 template <typename T>
 bool locate_cell_cpu(const T* points, const T* centres, const int32_t* child_offsets, const int32_t* child,
                      int32_t* leaves, int32_t* workspace, RowCount n, int64_t m, int depth, Isa isa, int threads) {
-  const auto find = [&](const T* at, const int32_t*, int32_t count, int32_t first, int32_t size, int, int32_t* found,
+  const auto find = [&](const T* at, const int32_t*, int32_t count, int32_t first, int32_t size, int, int32_t* nearest,
                         int64_t, int) {
-    nearest_centre_serial(at, centres + 3 * static_cast<int64_t>(first), found, count, size, isa);
+    nearest_centre_serial(at, centres + 3 * static_cast<int64_t>(first), nearest, count, size, isa);
   };
   return descend({child_offsets, child, depth}, points, leaves, workspace, n, m, threads, find);
 }

@@ -1,6 +1,6 @@
-// The nested query on CUDA: a thread a point walks down the tree. Each level is nearest_centre of one diagram, screened
-// in float32 and decided in float64 where float32 cannot (nearest_centre_math.h). Neighbouring samples of a ray share
-// their diagrams, so that the centres come from the first-level cache.
+// The nested query on CUDA: one thread per point walks down the tree. Each level is nearest_centre for one diagram,
+// screened in float32 and decided in float64 if float32 is not certain (nearest_centre_math.h). Neighbouring samples of
+// a ray share their diagrams, so that the centres come from the L1 cache.
 #include "common/cuda_wrappers.h"
 #include "geometry/locate_cell.h"
 #include "geometry/nearest_centre_math.h"
@@ -43,15 +43,15 @@ __global__ void __launch_bounds__(kThreads)
     leaves[i] = -1;
     return;
   }
-  int32_t state = 0;  // the diagram the point is in, or (negative) the leaf it has reached
+  int32_t state = 0;  // the point's diagram, or a negative number for its leaf
   for (int d = 0; d < depth && state >= 0; ++d) {
     if (state >= g) break;
     const int32_t first = child_offsets[state], end = child_offsets[state + 1];
     if (first < 0 || end <= first || end > m) break;
-    const int32_t found = nearest_in_diagram(points + 3 * i, centres + 3 * static_cast<int64_t>(first), end - first);
-    state = child[first + found];
+    const int32_t centre = nearest_in_diagram(points + 3 * i, centres + 3 * static_cast<int64_t>(first), end - first);
+    state = child[first + centre];
   }
-  leaves[i] = ~state;  // -state - 1, which could overflow; negative where the walk has reached no leaf
+  leaves[i] = ~state;  // -state - 1, which could overflow; negative if the walk has reached no leaf
 }
 
 }  // namespace

@@ -1,5 +1,5 @@
-// Nearest centre on the CPU: blocks of points over threads, by an index or by all centres. A point's answer depends on
-// that point alone, so the result depends neither on the number of threads nor on the way.
+// Nearest centre on the CPU: threads share blocks of points, and search an index or all centres. A point's cell depends
+// on this point alone, so the result depends neither on the number of threads nor on the method.
 #include "geometry/nearest_centre.h"
 
 #include <algorithm>
@@ -13,14 +13,15 @@ namespace voronerf {
 
 namespace {
 
-// Points of a task: a few microseconds of work at small k, small enough to share n = 10,000 between two threads.
+// The points of one task: a few microseconds of work at small k, and few enough to share n = 10,000 between two
+// threads.
 constexpr int64_t kBlock = 2048;
 
-// All of the centres take .11 ns each a point (AVX-512), an index some 100 ns, and to make it 50 to 120 ns a centre. In
-// four coordinates nothing else is fast.
+// Returns whether building an index pays. Searching all centres takes 0.11 ns per point and centre (AVX-512), an index
+// some 100 ns per point and 50 to 120 ns per centre to build. For d = 4 there is no vectorised search of all centres.
 bool index_pays(int64_t n, int64_t k, int64_t d) { return d < 4 ? n >= 1024 && k >= 2048 : n >= 64; }
 
-// Two coordinates or one, as three.
+// Pads one or two coordinates to three.
 template <typename T>
 void pad(const T* from, T* to, int64_t rows, int64_t d) {
   for (int64_t i = 0; i < rows; ++i) {
@@ -48,12 +49,12 @@ bool nearest_centre_cpu(const T* points, const T* centres, const int32_t* index,
   const CentreIndexShape shape = centre_index_shape(k, static_cast<int>(d), sizeof(T));
   if (index != nullptr && (words != shape.words || !is_index_of(index, k, static_cast<int>(d), sizeof(T))))
     return false;
-  std::unique_ptr<int32_t[]> made;
+  std::unique_ptr<int32_t[]> built;
   std::unique_ptr<T[]> padded;
   if (index == nullptr && index_pays(n, k, d)) {
-    made.reset(new int32_t[static_cast<size_t>(shape.words)]);
-    index_centres_cpu(centres, made.get(), k, static_cast<int>(d), threads);
-    index = made.get();
+    built.reset(new int32_t[static_cast<size_t>(shape.words)]);
+    index_centres_cpu(centres, built.get(), k, static_cast<int>(d), threads);
+    index = built.get();
   } else if (index == nullptr && d < 3) {
     padded.reset(new T[static_cast<size_t>(3 * k)]);
     pad(centres, padded.get(), k, d);

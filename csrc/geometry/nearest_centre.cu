@@ -1,8 +1,8 @@
-// Nearest centre on CUDA. By all centres: a thread has two points, centres come through shared memory in tiles that
-// every thread of the block reads at the same address (a broadcast), once for both points. By an index: half of a warp
-// has a point, each of its threads a child of a node or a centre of a leaf, as a lane of the CPU has
-// (centre_index_isa.cpp). Float32 input is screened and, rarely, decided again in float64 by nearest_centre_math.h,
-// with the same answer as on the CPU to the last index.
+// Nearest centre on CUDA. Search of all centres: a thread has two points. Centres pass through shared memory in tiles;
+// all threads of a block read the same address (a broadcast), once for both points. Search of an index: half a warp has
+// one point, and each of its threads has a child of a node or a centre of a leaf, like a lane on the CPU
+// (centre_index_isa.cpp). Float32 input is screened and, rarely, decided again in float64 by nearest_centre_math.h. All
+// indices equal the CPU's.
 #include "common/cuda_wrappers.h"
 #include "geometry/nearest_centre.h"
 #include "geometry/nearest_centre_math.h"
@@ -12,9 +12,9 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kTile = 512;  // centres: 8 KiB of shared memory, 16 bytes each, which are read at once
-constexpr int kPoints = 2;  // of a thread
-constexpr int kRun = 8;     // points of half a warp, one after another
+constexpr int kTile = 512;  // centres: 8 KiB of shared memory, one 16-byte load each
+constexpr int kPoints = 2;  // points of a thread
+constexpr int kRun = 8;     // consecutive points of half a warp
 
 template <int D>
 __global__ void __launch_bounds__(kThreads, D < 3 ? 2 : 4)
@@ -27,7 +27,7 @@ __global__ void __launch_bounds__(kThreads, D < 3 ? 2 : 4)
   int32_t cell[kPoints];
 #pragma unroll
   for (int p = 0; p < kPoints; ++p) {
-    // Threads past the end stay for the barriers, on the last point.
+    // Threads past the end take the last point, since they must reach the barriers.
     const int64_t i = first + p * kThreads < n ? first + p * kThreads : n - 1;
 #pragma unroll
     for (int axis = 0; axis < D; ++axis) at[p][axis] = points[D * i + axis];
@@ -36,7 +36,7 @@ __global__ void __launch_bounds__(kThreads, D < 3 ? 2 : 4)
   }
   for (int64_t start = 0; start < k; start += kTile) {
     const int count = static_cast<int>(k - start < kTile ? k - start : kTile);
-    __syncthreads();  // the tile before is read by all
+    __syncthreads();  // all threads have read the previous tile
     for (int j = threadIdx.x; j < count; j += kThreads) {
       const float* c = centres + D * (start + j);
       tile[j] = make_float4(c[0], D > 1 ? c[1 % D] : 0.0f, D > 2 ? c[2 % D] : 0.0f, D > 3 ? c[3 % D] : 0.0f);
@@ -64,8 +64,8 @@ __global__ void __launch_bounds__(kThreads, D < 3 ? 2 : 4)
     const int64_t i = first + p * kThreads;
     if (i >= n) return;
     const bool screened = nearest_is_certain(best[p], second[p]);
-    const int32_t found = screened ? cell[p] : nearest_by_definition<D>(points + D * i, centres, k);
-    cells[i] = i < counted ? found : -1;
+    const int32_t result = screened ? cell[p] : nearest_by_definition<D>(points + D * i, centres, k);
+    cells[i] = i < counted ? result : -1;
   }
 }
 
@@ -77,7 +77,7 @@ __global__ void __launch_bounds__(kThreads)
   if (i < n) cells[i] = rows == nullptr || i < *rows ? nearest_by_definition<D>(points + D * i, centres, k) : -1;
 }
 
-// The least of half a warp.
+// Returns the minimum over half a warp.
 template <typename T>
 __device__ __forceinline__ T least_of_half(T x) {
 #pragma unroll
@@ -88,7 +88,8 @@ __device__ __forceinline__ T least_of_half(T x) {
   return x;
 }
 
-// The squared distance of a box, in the search's type; that of a centre where low and high are the same.
+// Returns the squared distance of a box in the search's type. With low and high the same it is the distance of a
+// centre.
 template <int D, typename S, typename T>
 __device__ __forceinline__ S box_distance(const S* point, const T* low, const T* high, int apart) {
   S sum = 0;
@@ -106,7 +107,8 @@ __device__ __forceinline__ S box_distance(const S* point, const T* low, const T*
   return sum;
 }
 
-// A distance with the number of its child in the lowest bits, which are in the order of numbers then, and back.
+// key_of stores a child's number in the lowest bits of its distance; as integers, keys have the distances' order.
+// distance_of reads the distance back.
 template <typename Key, typename S>
 __device__ __forceinline__ Key key_of(S v, int child) {
   static_assert(sizeof(Key) == sizeof(S), "the bits of the one are the other");
@@ -122,16 +124,16 @@ __device__ __forceinline__ S distance_of(Key key) {
   return v;
 }
 
-// What the threads of half a warp have found, each among the centres that it has seen.
+// The best and second best distance that a thread has seen among its centres.
 template <typename S>
 struct Seen {
   S best, second;
   int32_t cell;
 };
 
-// Both halves of a warp search in step, each for its point; one that has ended, or has none, waits. Nothing within
-// `bound` is left out. In float64 equals go to the lowest number. `keys`: of a thread's children, 8 bytes in each
-// of the levels, which have those of all threads.
+// Searches in both halves of a warp in lockstep, one point each. A half that has finished, or has no point, waits. No
+// centre within `bound` is skipped. In float64, ties go to the lowest number. `keys` holds the key of the thread's
+// child on each level, 8 bytes each; a level's keys of all threads are adjacent.
 template <int D, typename S, typename Key, typename T>
 __device__ Seen<S> search(const S* point, bool wanted, S bound, const int32_t* index, const CentreIndexShape& shape,
                           Key* keys) {
@@ -163,12 +165,13 @@ __device__ Seen<S> search(const S* point, bool wanted, S bound, const int32_t* i
     }
     const S best = least_of_half(seen.best), reach = exact ? best : best + (kMargin * best + kFloor);
     bound = reach < bound ? reach : bound;
-    // The nearest child that is left, here or above.
+    // Go to the nearest unvisited child, here or above.
     for (bool looking = level >= 0; __ballot_sync(kAllLanes, looking) != 0;) {
-      const Key own = looking ? keys[level * apart] : Key{0}, key = least_of_half(own);
+      const Key own_key = looking ? keys[level * apart] : Key{0}, key = least_of_half(own_key);
       if (!looking) continue;
       if (distance_of<S>(key) <= bound) {
-        if (own == key) keys[level * apart] = exact ? static_cast<Key>(0x7fffffffffffffff) : Key{0x7fffffff};  // NaN
+        if (own_key == key)
+          keys[level * apart] = exact ? static_cast<Key>(0x7fffffffffffffff) : Key{0x7fffffff};  // NaN
         node = (node << 4) + static_cast<int64_t>(key & (kWide - 1));
         ++level;
         looking = false;
@@ -188,12 +191,12 @@ __global__ void __launch_bounds__(kThreads)
                         const int32_t* __restrict__ rows, int32_t* __restrict__ cells, int64_t n,
                         const VN_GRID_CONSTANT CentreIndexShape shape) {
   VN_SHARED(keys, long long[kMostLevels * kThreads]);
-  auto* const own = reinterpret_cast<int32_t*>(keys + threadIdx.x);  // each thread's, in either type
+  auto* const float_keys = reinterpret_cast<int32_t*>(keys + threadIdx.x);  // the same memory for either type
   const int lane = threadIdx.x % kWide, half = threadIdx.x % 32 / kWide * kWide;
   const int64_t counted = rows == nullptr ? n : *rows;
   const int64_t first = (static_cast<int64_t>(blockIdx.x) * (kThreads / kWide) + threadIdx.x / kWide) * kRun;
   const bool fits = is_index_of(index, shape.k, D, sizeof(T));
-  int32_t before = -1;  // the cell of the point before
+  int32_t previous = -1;  // the previous point's cell
   for (int64_t i = first; i < first + kRun; ++i) {
     float near[D];
     double exact[D];
@@ -207,32 +210,32 @@ __global__ void __launch_bounds__(kThreads)
     bool certain = !wanted;
     if constexpr (sizeof(T) == 4) {
       float bound = 3.4028235e38f, v = 0.0f;
-      if (before >= 0) {
+      if (previous >= 0) {
         for (int axis = 0; axis < D; ++axis) {
-          const float d = near[axis] - centres[D * static_cast<int64_t>(before) + axis];
+          const float d = near[axis] - centres[D * static_cast<int64_t>(previous) + axis];
           v = fmaf(d, d, v);
         }
         bound = fminf(v + 2.0f * (kMargin * v + kFloor), bound);
       }
-      const Seen<float> seen = search<D, float, int32_t, T>(near, wanted, bound, index, shape, own);
+      const Seen<float> seen = search<D, float, int32_t, T>(near, wanted, bound, index, shape, float_keys);
       const float best = least_of_half(seen.best);
       const bool owns = seen.best == best;
       const unsigned owners = __ballot_sync(kAllLanes, owns) >> half & 0xffffu;
       const float others = least_of_half(owns ? seen.second : seen.best);
-      const int32_t found = __shfl_sync(kAllLanes, seen.cell, half + __ffs(static_cast<int>(owners)) - 1);
+      const int32_t result = __shfl_sync(kAllLanes, seen.cell, half + __ffs(static_cast<int>(owners)) - 1);
       if (wanted && nearest_is_certain(best, (owners & (owners - 1)) != 0 ? best : others)) {
         certain = true;
-        cell = found;
+        cell = result;
       }
     }
     if (__ballot_sync(kAllLanes, !certain) != 0) {
       const Seen<double> seen =
           search<D, double, long long, T>(exact, !certain, kLargest, index, shape, keys + threadIdx.x);
       const double best = least_of_half(seen.best);
-      const int32_t found = least_of_half(seen.best == best ? seen.cell : INT32_MAX);
-      if (!certain) cell = found;
+      const int32_t result = least_of_half(seen.best == best ? seen.cell : INT32_MAX);
+      if (!certain) cell = result;
     }
-    before = wanted ? cell : -1;
+    previous = wanted ? cell : -1;
     if (lane == 0 && i < n) cells[i] = fits && i < counted ? cell : -1;
   }
 }

@@ -1,9 +1,9 @@
 // Nearest centre: points [n,d], centres [k,d] -> cells [n], d = 1 to 4. Exact, ties to the lowest index, non-finite
 // points to cell 0 (nearest_centre_math.h). k >= 1; n = 0 is legal.
 //
-// index: of these centres (centre_index.h), with `words` entries, or null. Without one the CPU makes one for the call
-// where that pays. False where d is wrong, or the index is of others: of as many words, a GPU finds out by itself, and
-// gives -1.
+// index: an index of the centres (centre_index.h) with `words` entries, or null. Without an index the CPU builds one
+// for the call if it pays. Returns false if d is out of range or the index does not match the centres' shape. On CUDA
+// the host checks only the index's size; if its head does not match, all cells are -1.
 #pragma once
 
 #include <cstdint>
@@ -17,17 +17,17 @@ namespace voronerf {
 template <typename T>
 bool nearest_centre_cpu(const T* points, const T* centres, const int32_t* index, int32_t* cells, RowCount n, int64_t k,
                         int64_t d, int64_t words, Isa isa, int threads);
-// rows: [1], how many points count, the others get -1; null for all.
+// rows: [1], the number of leading points to locate, the other points get -1; null for all points.
 template <typename T>
 bool nearest_centre_cuda(const T* points, const T* centres, const int32_t* index, const int32_t* rows, int32_t* cells,
                          int64_t n, int64_t k, int64_t d, int64_t words, void* stream);
 
-// By an index, on the calling thread.
+// Searches an index on the calling thread.
 template <typename T>
 void search_index_serial(const T* points, const int32_t* index, int32_t* cells, int64_t n,
                          const CentreIndexShape& shape, int d, Isa isa);
 
-// By all of the centres, in three coordinates, on the calling thread.
+// Compares points with all centres, in three coordinates, on the calling thread.
 template <typename T>
 void nearest_centre_serial(const T* points, const T* centres, int32_t* cells, int64_t n, int64_t k, Isa isa);
 

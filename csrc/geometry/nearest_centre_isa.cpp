@@ -1,14 +1,15 @@
-// The CPU kernels of nearest_centre, once for each instruction set.
+// The CPU kernels of nearest_centre, compiled once per instruction set.
 //
-// Points lie in the lanes and every centre is broadcast: no reduction across lanes, and all state of a tile stays in
-// registers while the centres, 12 bytes each, stream from the first-level cache. kTile vectors at a time hide the
-// latency of the chain of minima and share the broadcasts: four with 32 registers, two with 16.
+// Points lie in the lanes and every centre is broadcast: there is no reduction across lanes, and the state of a tile
+// stays in registers while the centres, 12 bytes each, stream from the L1 cache. kTile vectors at a time hide the
+// latency of the minima and share the broadcasts: four with 32 registers, two with 16.
 //
-// A value is not negative, so its bits are in its order as an integer, and its lowest bits can carry the index of its
-// centre: one logical operation and one integer minimum in place of a comparison, a blend and a minimum in floating
-// point, which would wait for the units of the multiplications. The second smallest value costs two operations a centre
-// and proves the answer (nearest_centre_math.h). Chunks of kChunk centres need 8 bits of index, which blur a value by
-// 3e-5; about one point in 10,000 of a generic scene is decided again in float64, of 16 centres one in 100,000.
+// Values are not negative, so their bits have the same order as integers, and the lowest bits can hold the index of the
+// centre. One logical operation and one integer minimum then replace a floating-point comparison, blend and minimum,
+// which would compete with the multiplications for execution units. The second smallest value costs two operations a
+// centre and proves the result (nearest_centre_math.h). Chunks of kChunk centres need 8 bits of index, which change a
+// value by up to 3e-5 of it. In a generic scene about one point in 10,000 is decided again in float64, with 16 centres
+// one in 100,000.
 #include "common/integer_tile.h"
 #include "geometry/nearest_centre_math.h"
 
@@ -19,16 +20,16 @@ namespace {
 constexpr int kTile = kRegisters / 8;
 constexpr int64_t kChunk = 256;
 
-// Bits that number the centres of a chunk.
+// Returns the number of bits that number the centres of a chunk.
 VN_INLINE int index_bits(int64_t k) {
   int bits = 0;
   while ((int64_t{1} << bits) < (k < kChunk ? k : kChunk)) ++bits;
   return bits;
 }
 
-// Smallest and second smallest key of each lane over the centres of a chunk.
+// Finds the smallest and second smallest key of each lane over the centres of a chunk.
 template <int U>
-VN_INLINE void search(const F32* x, const F32* y, const F32* z, const float* centres, I32 kept, int32_t count,
+VN_INLINE void search(const F32* x, const F32* y, const F32* z, const float* centres, I32 distance_bits, int32_t count,
                       I32* near, I32* next) {
   for (int u = 0; u < U; ++u) {
     near[u] = splat(int32_t{0x7fffffff});
@@ -40,7 +41,7 @@ VN_INLINE void search(const F32* x, const F32* y, const F32* z, const float* cen
     const F32 cx = splat(centres[3 * j]), cy = splat(centres[3 * j + 1]), cz = splat(centres[3 * j + 2]);
     for (int u = 0; u < U; ++u) {
       const F32 dx = sub(cx, x[u]), dy = sub(cy, y[u]), dz = sub(cz, z[u]);
-      const I32 key = tag(as_integer(fma(dz, dz, fma(dy, dy, mul(dx, dx)))), kept, index);
+      const I32 key = tag(as_integer(fma(dz, dz, fma(dy, dy, mul(dx, dx)))), distance_bits, index);
       next[u] = min(max(key, near[u]), next[u]);
       near[u] = min(key, near[u]);
     }
@@ -53,22 +54,22 @@ VN_INLINE void tile(const float* points, const float* centres, int bits_taken, i
   F32 x[U], y[U], z[U], best[U], second[U];
   I32 near[U], next[U], cell[U];
   for (int u = 0; u < U; ++u) load_points(points + 3 * kLanes * u, x[u], y[u], z[u]);
-  const I32 taken = splat((1 << bits_taken) - 1), kept = splat(-(1 << bits_taken));
+  const I32 index_mask = splat((1 << bits_taken) - 1), distance_bits = splat(-(1 << bits_taken));
   const int32_t first = static_cast<int32_t>(k < kChunk ? k : kChunk);
-  search<U>(x, y, z, centres, kept, first, near, next);
+  search<U>(x, y, z, centres, distance_bits, first, near, next);
   for (int u = 0; u < U; ++u) {
     best[u] = as_float(near[u]);
     second[u] = as_float(next[u]);
-    cell[u] = both(near[u], taken);
+    cell[u] = both(near[u], index_mask);
   }
   for (int64_t start = kChunk; start < k; start += kChunk) {
     const int32_t count = static_cast<int32_t>(k - start < kChunk ? k - start : kChunk);
-    search<U>(x, y, z, centres + 3 * start, kept, count, near, next);
+    search<U>(x, y, z, centres + 3 * start, distance_bits, count, near, next);
     for (int u = 0; u < U; ++u) {
-      // A best or second value that is NaN or infinite, as an infinity with an index is, leaves the lane to float64.
+      // A best or second value that is NaN or infinite leaves the lane to float64; an infinity with index bits is NaN.
       const F32 v = as_float(near[u]);
       second[u] = min(max(v, best[u]), min(as_float(next[u]), second[u]));
-      cell[u] = select(less(v, best[u]), add(splat(static_cast<int32_t>(start)), both(near[u], taken)), cell[u]);
+      cell[u] = select(less(v, best[u]), add(splat(static_cast<int32_t>(start)), both(near[u], index_mask)), cell[u]);
       best[u] = min(v, best[u]);
     }
   }
@@ -96,14 +97,14 @@ void nearest_centre(const float* points, const float* centres, int32_t* cells, i
   for (; i < n; i += kLanes) {
     const int rest = n - i < kLanes ? static_cast<int>(n - i) : kLanes;
     float padded[3 * kLanes] = {};
-    int32_t found[kLanes];
+    int32_t padded_cells[kLanes];
     __builtin_memcpy(padded, points + 3 * i, sizeof(float) * 3 * rest);
-    tile<1>(padded, centres, bits_taken, found, k);
-    __builtin_memcpy(cells + i, found, sizeof(int32_t) * rest);
+    tile<1>(padded, centres, bits_taken, padded_cells, k);
+    __builtin_memcpy(cells + i, padded_cells, sizeof(int32_t) * rest);
   }
 }
 
-// Float64 is the definition itself (squared_distance, here on vectors), with the same layout.
+// Float64 evaluates the definition itself (squared_distance, on vectors), with the same layout.
 void nearest_centre(const double* points, const double* centres, int32_t* cells, int64_t n, int64_t k) {
   constexpr int kVectors = 2, kRows = kVectors * kDoubles;
   for (int64_t i = 0; i < n; i += kRows) {

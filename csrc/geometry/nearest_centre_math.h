@@ -1,18 +1,18 @@
 // Arithmetic of nearest_centre, shared by its CPU and CUDA kernels.
 //
 // The answer is defined in float64: the lowest index that minimises |x - c|^2, evaluated as (dx^2 + dy^2) + dz^2 (and
-// so on) with every operation rounded on its own (no contraction to fma), so that all backends agree to the last bit.
+// so on) with every operation rounded separately (no contraction to fma), so that all backends agree to the last bit.
 //
-// Float32 input is screened in float32 and decided in float64 only where float32 cannot. Let u = 2^-24 and D the
-// squared distance. A difference, a product and two sums round, so float32 finds D up to g D, where g = 5u + O(u^2)
-// < 3.6e-7; fused multiply-adds only round less. Let b be the index of the smallest computed value. Whatever beats b
-// has D <= D_b (up to 1e-15, float64's own error), hence a computed value of at most D_b + 2 g D_b in terms of the
-// computed D_b. If the second smallest computed value is above D_b + kMargin D_b + kFloor, nothing beats b: kMargin =
-// 2e-6 covers 2g and the roundings of this sum (3u), kFloor the underflow of the squares, flushed to zero or not. NaN
-// and overflow fail the comparison and are decided in float64.
+// Float32 input is screened in float32, and decided in float64 only if float32 is not certain. Let u = 2^-24 and D the
+// squared distance. A difference, a product and two sums round, so float32 computes D up to an error of g D, where g =
+// 5u + O(u^2) < 3.6e-7; fused multiply-adds only reduce the error. Let b be the index of the smallest computed value. A
+// centre nearer than b has D <= D_b (up to 1e-15, float64's own error), hence a computed value of at most D_b + 2 g D_b
+// in terms of the computed D_b. If the second smallest computed value is above D_b + kMargin D_b + kFloor, no centre is
+// nearer than b. kMargin = 2e-6 covers 2g and the roundings of this sum (3u), kFloor the underflow of the squares,
+// flushed to zero or not. NaN and overflow fail the comparison and are decided in float64.
 //
-// The CPU keeps an index in a value's lowest b bits, which changes it by less than t = 2^(b-23) of itself:
-// nearest_margin adds 2.5 t >= (1+t)/(1-t) - 1.
+// The CPU stores an index in a value's lowest b bits, which changes the value by a factor of less than 1 + t, t =
+// 2^(b-23). nearest_margin adds 2.5 t >= (1+t)/(1-t) - 1.
 #pragma once
 
 #include <cstdint>
@@ -25,13 +25,13 @@ constexpr float kMargin = 2e-6f;
 constexpr float kFloor = 1e-36f;
 constexpr double kLargest = 1.7976931348623157e308;
 
-// kMargin for values whose lowest bits are an index.
+// Returns the margin for values whose lowest bits are an index.
 VN_HD float nearest_margin(int index_bits) { return kMargin + 2.5f * static_cast<float>(1 << index_bits) / 8388608.0f; }
 
-// Whether float32 decides: `second` is the smallest computed value except that of the best index.
+// Returns whether float32 decides. `second` is the smallest computed value of all centres but the best one.
 VN_HD bool nearest_is_certain(float best, float second) { return best + (kMargin * best + kFloor) < second; }
 
-// sum + d * d, each rounded. On the host -ffp-contract=off keeps the roundings.
+// Returns sum + d * d with both operations rounded. On the host -ffp-contract=off ensures this.
 VN_HD double add_square(double sum, double d) {
 #ifdef __CUDA_ARCH__
   return __dadd_rn(sum, __dmul_rn(d, d));
@@ -40,7 +40,7 @@ VN_HD double add_square(double sum, double d) {
 #endif
 }
 
-// The defining value for one centre, whose D coordinates lie so far apart.
+// Returns the float64 value that defines the result, for one centre whose D coordinates have stride `apart`.
 template <int D, typename T>
 VN_HD double squared_distance(const double* point, const T* centre, int apart = 1) {
   double sum = 0.0;
@@ -48,8 +48,8 @@ VN_HD double squared_distance(const double* point, const T* centre, int apart = 
   return sum;
 }
 
-// The definition: strict comparison keeps the lowest of equals; NaN and infinity win over nothing, so that a non-finite
-// point gets cell 0.
+// Returns the nearest centre by definition. Strict comparison keeps the lowest of equal centres. NaN and infinity never
+// compare as less, so that a non-finite point gets cell 0.
 template <int D, typename T>
 VN_HD int32_t nearest_by_definition(const T* point, const T* centres, int64_t k) {
   double at[D], best = kLargest;

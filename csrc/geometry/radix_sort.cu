@@ -18,8 +18,8 @@ int64_t radix_sort_bytes(int64_t n, int bits) {
 template <typename Key>
 void radix_sort(void* temporary, int64_t bytes, const Key* keys, Key* sorted, const int32_t* values,
                 int32_t* sorted_values, int64_t n, int bits, void* stream) {
-  size_t given = static_cast<size_t>(bytes);
-  VN_CUDA_CHECK(cub::DeviceRadixSort::SortPairs(temporary, given, keys, sorted, values, sorted_values,
+  size_t size = static_cast<size_t>(bytes);
+  VN_CUDA_CHECK(cub::DeviceRadixSort::SortPairs(temporary, size, keys, sorted, values, sorted_values,
                                                 static_cast<int32_t>(n), 0, bits, static_cast<cudaStream_t>(stream)));
 }
 

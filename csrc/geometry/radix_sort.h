@@ -1,12 +1,12 @@
-// The toolkit's radix sort (CUB) behind functions of plain types, so that one file alone includes it; the emulation of
-// the tests has one of its own. Stable, by the lowest `bits` of the keys.
+// The toolkit's radix sort (CUB) behind functions with plain types, so that only one file includes CUB. The tests'
+// emulation replaces these functions. The sort is stable and uses the lowest `bits` bits of the keys.
 #pragma once
 
 #include <cstdint>
 
 namespace voronerf {
 
-// Bytes of temporary memory for a sort of n keys on the current device, known to the host.
+// Returns the bytes of temporary memory for a sort of n keys on the current device; computed on the host.
 template <typename Key>
 int64_t radix_sort_bytes(int64_t n, int bits);
 

@@ -1,7 +1,7 @@
-// Points that go down a tree of diagrams on the CPU, a block at a time: at each level the block's points lie grouped by
-// the diagram they are in, every group is asked about at once, and a counting sort by the centre found makes the groups
-// of the next level. A point costs the sum of its diagrams' sizes (32 centres for 16 x 16 cells, not 256), and the
-// block stays in the second-level cache throughout. What a centre is found by, the caller says.
+// Points go down a tree of diagrams on the CPU, a block at a time. At each level the block's points are grouped by
+// diagram, and the nearest centres of a group are found together. A counting sort by centre then forms the groups of
+// the next level. A point costs the sum of its diagrams' sizes (32 centres for 16 x 16 cells, not 256), and the block
+// stays in the L2 cache throughout. The caller provides the function that finds a centre.
 #pragma once
 
 #include <algorithm>
@@ -26,7 +26,7 @@ struct DescentGroup {
   int32_t diagram, begin, end;
 };
 
-// The points of a level, their rows in the block, and their groups. Every group has a point, so there are enough.
+// The points of a level, their rows in the block, and their groups. No group is empty, so kDescentBlock groups suffice.
 template <typename T>
 struct DescentLevel {
   T points[3 * kDescentBlock];
@@ -35,28 +35,29 @@ struct DescentLevel {
   int num_groups;
 };
 
-// What a block works on, in the caller's workspace: stacks may be smaller.
+// The working memory of a block, in the caller's workspace because thread stacks may be smaller.
 template <typename T>
 struct DescentBlock {
   DescentLevel<T> levels[2];
-  int32_t found[kDescentBlock];
+  int32_t nearest[kDescentBlock];
 };
 
-// int32 elements of workspace for each thread: a block of either dtype, and m counts.
+// Returns the workspace's size in int32 for each thread: a block of either dtype, and m counts.
 inline int64_t descent_stride(int64_t m) {
   return static_cast<int64_t>(sizeof(DescentBlock<double>) / sizeof(int32_t)) + ceil_div<int64_t>(m, 16) * 16;
 }
 
-// One group: leaves are written, the other points appended to `next`. `place` holds one count a centre of the diagram.
+// Processes one group: writes leaves and appends the other points to `next`. `place` holds one count for each centre of
+// the diagram.
 template <typename T, typename Find>
 void descend_group(const DescentTree& tree, const DescentLevel<T>& level, int depth, const DescentGroup& group,
-                   DescentLevel<T>& next, int32_t& filled, int32_t* found, int32_t* place, int32_t* leaves,
+                   DescentLevel<T>& next, int32_t& filled, int32_t* nearest, int32_t* place, int32_t* leaves,
                    const Find& find) {
   const int32_t first = tree.child_offsets[group.diagram], size = tree.child_offsets[group.diagram + 1] - first;
-  find(level.points + 3 * group.begin, level.rows + group.begin, group.end - group.begin, first, size, depth, found);
+  find(level.points + 3 * group.begin, level.rows + group.begin, group.end - group.begin, first, size, depth, nearest);
   std::fill(place, place + size, 0);
   for (int32_t i = group.begin; i < group.end; ++i) {
-    const int32_t centre = found[i - group.begin], child = tree.child[first + centre];
+    const int32_t centre = nearest[i - group.begin], child = tree.child[first + centre];
     if (child < 0) {
       leaves[level.rows[i]] = ~child;  // -child - 1, which could overflow
     } else {
@@ -71,7 +72,7 @@ void descend_group(const DescentTree& tree, const DescentLevel<T>& level, int de
     filled += count;
   }
   for (int32_t i = group.begin; i < group.end; ++i) {
-    const int32_t centre = found[i - group.begin];
+    const int32_t centre = nearest[i - group.begin];
     if (tree.child[first + centre] < 0) continue;
     const int32_t to = place[centre]++;
     next.rows[to] = level.rows[i];
@@ -79,7 +80,7 @@ void descend_group(const DescentTree& tree, const DescentLevel<T>& level, int de
   }
 }
 
-// False if a point is not at a leaf after the last level.
+// Returns false if a point is not at a leaf after the last level.
 template <typename T, typename Find>
 bool descend_block(const DescentTree& tree, const T* points, int32_t* leaves, int32_t n, DescentBlock<T>& block,
                    int32_t* place, const Find& find) {
@@ -94,17 +95,17 @@ bool descend_block(const DescentTree& tree, const T* points, int32_t* leaves, in
     next.num_groups = 0;
     int32_t filled = 0;
     for (int i = 0; i < level.num_groups; ++i) {
-      descend_group(tree, level, d, level.groups[i], next, filled, block.found, place, leaves, find);
+      descend_group(tree, level, d, level.groups[i], next, filled, block.nearest, place, leaves, find);
     }
     if (filled == 0) return true;
   }
   return false;
 }
 
-// All n points to their leaves, blocks over threads; `workspace` holds descent_stride(m) int32 a thread, from an
-// address that 8 divides. find(points, rows, count, first, size, level, found, start, thread) finds one of `size`
-// centres from row `first` on for each of `count` points, rows `start + rows[i]` of all. False if a point does not
-// arrive at a leaf.
+// Moves all n points to their leaves; threads share the blocks. `workspace` holds descent_stride(m) int32 for each
+// thread and is aligned to 8 bytes. find(points, rows, count, first, size, level, found, start, thread) finds one of
+// `size` centres from row `first` on for each of `count` points. Point i has row `start + rows[i]` among all points.
+// Returns false if a point does not reach a leaf.
 template <typename T, typename Find>
 bool descend(const DescentTree& tree, const T* points, int32_t* leaves, int32_t* workspace, int64_t n, int64_t m,
              int threads, const Find& find) {
@@ -112,15 +113,16 @@ bool descend(const DescentTree& tree, const T* points, int32_t* leaves, int32_t*
   std::atomic<bool> arrived{true};
   Items items(blocks, 1, threads);
   parallel(static_cast<int>(std::min<int64_t>(threads, blocks)), [&](int thread) {
-    int32_t* own = workspace + thread * descent_stride(m);
-    auto& block = *reinterpret_cast<DescentBlock<T>*>(own);
-    int32_t* place = own + sizeof(DescentBlock<double>) / sizeof(int32_t);
+    int32_t* memory = workspace + thread * descent_stride(m);
+    auto& block = *reinterpret_cast<DescentBlock<T>*>(memory);
+    int32_t* place = memory + sizeof(DescentBlock<double>) / sizeof(int32_t);
     for (int64_t b, end; items.take(thread, b, end);) {
       const int64_t start = b * kDescentBlock;
       const int32_t rows = static_cast<int32_t>(std::min<int64_t>(kDescentBlock, n - start));
       const auto in_block = [&](const T* at, const int32_t* which, int32_t count, int32_t first, int32_t size,
-                                int level,
-                                int32_t* found) { find(at, which, count, first, size, level, found, start, thread); };
+                                int level, int32_t* nearest) {
+        find(at, which, count, first, size, level, nearest, start, thread);
+      };
       if (!descend_block(tree, points + 3 * start, leaves + start, rows, block, place, in_block)) {
         arrived.store(false, std::memory_order_relaxed);
       }

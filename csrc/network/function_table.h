@@ -1,5 +1,5 @@
-// The functions of programs: DO(name, f(x), f'(x), f''(x), f'''(x)), in the words of functions.h. Python knows them by
-// their names (FUNCTIONS in voronerf/ops/_core/program.py).
+// The functions of programs, as DO(name, f(x), f'(x), f''(x), f'''(x)) in terms of functions.h. Python refers to them
+// by name (FUNCTIONS in voronerf/ops/_core/program.py).
 #pragma once
 
 #define VN_FUNCTIONS(DO)                                                                                              \

@@ -1,9 +1,9 @@
-// The functions of programs, each with its first three derivatives: a line each. x is the value, a and b are the
-// function's numbers.
+// The functions of programs, each with its first three derivatives. x is the argument, a and b are constants of the
+// function.
 //
-// The same lines are of vectors on the CPU (functions_tile.h) and of floats on CUDA (program_cuda.cu): who includes
-// this defines VN_ISA_NAMESPACE, VN_INLINE and, in that namespace, F32, splat, fma, abs, softplus,
-// exponential_minus_one, any_exponential (e^x), any_sine, logarithm, square_root and rounded_down.
+// F32 is a vector on the CPU (functions_tile.h) and a float on CUDA (program_cuda.cu). The including file defines
+// VN_ISA_NAMESPACE, VN_INLINE and, in that namespace, F32, splat, fma, abs, softplus, exponential_minus_one,
+// any_exponential (e^x), any_sine, logarithm, square_root and rounded_down.
 #pragma once
 
 #include "network/function_table.h"
@@ -14,10 +14,11 @@ namespace {
 
 VN_INLINE F32 constant(float a) { return splat(a); }
 
-// Where x > 0, and where it is not.
+// Selects `yes` in lanes with x > 0 and `no` in the other lanes.
 VN_INLINE F32 positive(F32 x, F32 yes, F32 no) { return x > splat(0.0f) ? yes : no; }
 
-// x^p, times the factors of `order` derivatives of x^(p + order); by products where p is a multiple of 0.5.
+// Returns the derivative of the given order of x^(p + order): x^p times its factors. If p is a multiple of 0.5, the
+// power is computed by multiplications and a square root.
 VN_INLINE F32 raised(F32 x, float p, int order) {
   float factor = 1.0f;
   for (int i = 0; i < order; ++i) factor *= p + static_cast<float>(order - i);
@@ -38,19 +39,20 @@ VN_INLINE F32 hyperbolic_tangent(F32 x) {
   return x < splat(0.0f) ? splat(0.0f) - size : size;
 }
 
-// Its slope, 1 - tanh^2 without cancellation.
+// Returns the derivative of tanh, 1 - tanh^2, without cancellation.
 VN_INLINE F32 tangent_slope(F32 x) {
   const F32 e = any_exponential(splat(-2.0f) * abs(x)), sum = splat(1.0f) + e;
   return splat(4.0f) * e / (sum * sum);
 }
 
-// As far as any density is more than 0, so that 0 times a power of x is not 0 times infinity.
+// Clamps x to the range in which the normal density is not 0, so that 0 times a power of x is never 0 times infinity.
 VN_INLINE F32 nearby(F32 x) { return x > splat(30.0f) ? splat(30.0f) : x < splat(-30.0f) ? splat(-30.0f) : x; }
 
-// The density of the normal distribution.
+// Returns the density of the normal distribution.
 VN_INLINE F32 density(F32 x) { return splat(0.39894228f) * any_exponential(splat(-0.5f) * x * x); }
 
-// Its distribution function, erfc(-x / sqrt 2) / 2; erfc by Numerical Recipes' erfcc, relative error 1.2e-7.
+// Returns the normal distribution function, erfc(-x / sqrt 2) / 2. erfc is Numerical Recipes' erfcc, with a relative
+// error of 1.2e-7.
 VN_INLINE F32 distribution(F32 x) {
   const F32 z = abs(x) * splat(0.70710678f), t = splat(1.0f) / fma(z, splat(0.5f), splat(1.0f));
   constexpr float kSeries[] = {0.17087277f,  -0.82215223f, 1.48851587f, -1.13520398f, 0.27886807f,
@@ -61,7 +63,7 @@ VN_INLINE F32 distribution(F32 x) {
   return x > splat(0.0f) ? splat(1.0f) - tail : tail;
 }
 
-// erf x = 2 Phi(sqrt 2 x) - 1, around 0 by its series.
+// Returns erf x = 2 Phi(sqrt 2 x) - 1, computed by its series around 0.
 VN_INLINE F32 error_function(F32 x) {
   const F32 u = x * x;
   F32 p = fma(u, splat(1.0f / 9360), splat(-1.0f / 1320));
@@ -74,7 +76,7 @@ VN_INLINE F32 error_function(F32 x) {
                               : fma(splat(2.0f), distribution(splat(1.41421356f) * x), splat(-1.0f));
 }
 
-// By the polynomial of Cephes' atanf, for |t| <= tan(pi / 8).
+// Returns the arctangent, by the polynomial of Cephes' atanf for |t| <= tan(pi / 8).
 VN_INLINE F32 arctangent(F32 x) {
   const F32 size = abs(x), one = splat(1.0f), far = splat(2.41421356f), half = splat(0.41421356f);
   const F32 t = size > far ? splat(-1.0f) / size : size > half ? (size - one) / (size + one) : size, u = t * t;
@@ -85,10 +87,10 @@ VN_INLINE F32 arctangent(F32 x) {
   return x < splat(0.0f) ? splat(0.0f) - p : p;
 }
 
-// Its slope.
+// Returns the derivative of the arctangent.
 VN_INLINE F32 arctangent_slope(F32 x) { return splat(1.0f) / fma(x, x, splat(1.0f)); }
 
-// The logistic function and its derivatives.
+// Returns a derivative of the logistic function (order 0: the function).
 template <int Order>
 VN_INLINE F32 logistic(F32 x) {
   const F32 one = splat(1.0f), e = x < splat(-87.0f) ? splat(__builtin_inff()) : any_exponential(splat(0.0f) - x);
@@ -98,7 +100,7 @@ VN_INLINE F32 logistic(F32 x) {
   return slope * (Order == 2 ? one - s - s : one - splat(6.0f) * slope);
 }
 
-// GELU with tanh: x (1 + T) / 2 with T = tanh u, u = c (x + d x^3).
+// Returns a derivative of the tanh approximation of GELU, x (1 + T) / 2 with T = tanh u, u = c (x + d x^3).
 template <int Order>
 VN_INLINE F32 gelu_by_tanh(F32 x) {
   const F32 c = splat(0.79788456f), d = splat(0.044715f), half = splat(0.5f), one = splat(1.0f), xx = x * x;

@@ -1,5 +1,5 @@
-// Rays over threads: each is summed by one thread in the order of its samples, and the gradient of a background that
-// all share on a single one, so results do not depend on their number.
+// composite on the CPU: threads share the rays. One thread sums a ray in the order of its samples, and one thread sums
+// the gradient of a shared background, so results do not depend on the number of threads.
 #include "rays/composite.h"
 
 #include <algorithm>
@@ -12,7 +12,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int kRays = 32;  // of a task
+constexpr int kRays = 32;  // rays of a task
 
 void check(const CompositeInputs& in) {
   if (in.offsets != nullptr) check_ray_offsets("composite", in.offsets, in.r, in.m);
@@ -27,14 +27,14 @@ void for_each_ray(const CompositeInputs& in, int threads, const Run& run) {
   parallel_for(in.r, kRays, threads, [&](int64_t ray) { run(ray, first_sample(in, ray), first_sample(in, ray + 1)); });
 }
 
-// Samples of no ray.
+// Zeros the values of samples without a ray.
 void zero_strays(const CompositeInputs& in, int64_t width, float* values) {
   if (in.offsets == nullptr || values == nullptr) return;
   std::fill(values, values + in.offsets[0] * width, 0.0f);
   std::fill(values + in.offsets[in.r] * width, values + in.m * width, 0.0f);
 }
 
-// The background is seen with the weight that the samples of a ray leave.
+// Computes the gradient of the background, whose weight is a ray's transmittance.
 void background_backward(const CompositeInputs& in, const CompositeGradients& gradients) {
   if (gradients.background == nullptr) return;
   if (gradients.colour == nullptr) {

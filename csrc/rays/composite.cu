@@ -1,8 +1,8 @@
-// Volume rendering on CUDA, a warp a ray and 32 samples at a time: optical depths are scanned across the lanes, and
-// what the chunks before hold is carried in two floats, so that a ray of many samples keeps its digits without float64,
-// which most GPUs have little of. The formulas are those of composite_isa.cpp; like there, the backward pass goes along
-// the ray once, leaving the optical depth in front of each sample where the gradient of sigma is to be, and comes back
-// with the sum of what is behind.
+// Volume rendering on CUDA: one warp per ray, 32 samples at a time. Optical depths are scanned across the lanes. The
+// sum of earlier chunks is carried in two floats, so that long rays stay precise without float64, which is slow on most
+// GPUs. The formulas are in composite_isa.cpp. As there, the backward pass first walks along the ray and stores the
+// optical depth in front of each sample in the memory of sigma's gradient, then walks back with the sum over samples
+// behind.
 #include "common/cuda_wrappers.h"
 #include "rays/composite.h"
 #include "rays/ray_warp.h"
@@ -13,7 +13,7 @@ namespace {
 
 constexpr int kThreads = 128;
 constexpr int kWarps = kThreads / 32;
-constexpr int kChannels = 4;  // summed in one walk along the ray
+constexpr int kChannels = 4;  // channels summed in one walk along the ray
 
 __device__ RayRange samples_of(const CompositeInputs& in, int64_t ray) {
   if (in.offsets == nullptr) return {ray * in.s, (ray + 1) * in.s};
@@ -27,12 +27,12 @@ __device__ const float* background_of(const CompositeInputs& in, int64_t ray) {
 __global__ void __launch_bounds__(kThreads) composite_kernel(CompositeInputs in, CompositeOutputs out) {
   const int lane = threadIdx.x % 32;
   const int64_t ray = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
-  if (ray >= in.r) return;  // a whole warp
+  if (ray >= in.r) return;  // the same for the whole warp
   const RayRange range = samples_of(in, ray);
   const float* background = background_of(in, ray);
   float opacity = 0.0f, depth = 0.0f, left = 0.0f;
   int64_t channel = 0;
-  do {  // four channels a walk; those after the first read the weights back
+  do {  // four channels per walk; later walks read the weights back
     const int channels = static_cast<int>(in.c - channel < kChannels ? in.c - channel : kChannels);
     float colour[kChannels] = {};
     Carry carry;
@@ -50,7 +50,7 @@ __global__ void __launch_bounds__(kThreads) composite_kernel(CompositeInputs in,
           depth = fmaf(weight, in.depths[i], depth);
         }
       } else if (active) {
-        weight = out.weights[i];  // written by this very thread
+        weight = out.weights[i];  // written by the same thread
       }
       for (int k = 0; k < kChannels; ++k) {
         if (active && k < channels) colour[k] = fmaf(weight, in.rgb[i * in.c + channel + k], colour[k]);
@@ -76,7 +76,7 @@ __global__ void __launch_bounds__(kThreads) composite_kernel(CompositeInputs in,
 __global__ void __launch_bounds__(kThreads) composite_backward_kernel(CompositeInputs in, CompositeGradients g) {
   const int lane = threadIdx.x % 32;
   const int64_t ray = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
-  if (ray >= in.r) return;  // a whole warp
+  if (ray >= in.r) return;  // the same for the whole warp
   const RayRange range = samples_of(in, ray);
   const float* colour = g.colour == nullptr ? nullptr : g.colour + ray * in.c;
   const float of_depth = g.depth == nullptr ? 0.0f : g.depth[ray];
@@ -88,7 +88,7 @@ __global__ void __launch_bounds__(kThreads) composite_backward_kernel(CompositeI
     const bool active = i < range.end;
     const float optical = active ? finite_density(in.sigma[i]) * in.deltas[i] : 0.0f;
     const float front = depth_in_front(optical, lane, carry);
-    if (active) g.sigma[i] = front;  // read again below, by this very thread
+    if (active) g.sigma[i] = front;  // read again below, by the same thread
   }
   Carry behind;
   const float* background = background_of(in, ray);
@@ -105,14 +105,15 @@ __global__ void __launch_bounds__(kThreads) composite_backward_kernel(CompositeI
     const float density = finite_density(sigma), optical = density * delta;
     const float light = active ? expf(-g.sigma[i]) : 0.0f;
     const float weight = light * -expm1f(-optical);
-    float own = of_opacity;
+    float of_weight = of_opacity;
     if (active) {
-      if (g.weights != nullptr) own += g.weights[i];
-      own = fmaf(of_depth, in.depths[i], own);
-      for (int64_t k = 0; colour != nullptr && k < in.c; ++k) own = fmaf(colour[k], in.rgb[i * in.c + k], own);
+      if (g.weights != nullptr) of_weight += g.weights[i];
+      of_weight = fmaf(of_depth, in.depths[i], of_weight);
+      for (int64_t k = 0; colour != nullptr && k < in.c; ++k)
+        of_weight = fmaf(colour[k], in.rgb[i * in.c + k], of_weight);
     }
-    const float share = active ? own * weight : 0.0f;
-    const float of_optical = own * (light * expf(-optical)) - share_behind(share, lane, behind);
+    const float share = active ? of_weight * weight : 0.0f;
+    const float of_optical = of_weight * (light * expf(-optical)) - share_behind(share, lane, behind);
     if (!active) continue;
     g.sigma[i] = sigma <= kOpaque ? of_optical * delta : 0.0f;
     if (g.deltas != nullptr) g.deltas[i] = of_optical * density;
@@ -123,7 +124,7 @@ __global__ void __launch_bounds__(kThreads) composite_backward_kernel(CompositeI
   }
 }
 
-// Samples of no ray weigh nothing: [0, offsets[0]) and [offsets[r], m).
+// Zeros the values of samples without a ray: [0, offsets[0]) and [offsets[r], m).
 __global__ void __launch_bounds__(kThreads)
     composite_strays(const int32_t* __restrict__ offsets, int64_t r, int64_t m, int64_t width, float* values) {
   const int64_t first = offsets[0], last = offsets[r];
@@ -134,8 +135,8 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// The background is seen with the weight that the samples of a ray leave. A block a channel of a background that all
-// rays share, summed in an order that does not depend on the device.
+// Computes the gradient of a background that all rays share, whose weight is a ray's transmittance. One block per
+// channel sums in an order that does not depend on the device.
 __global__ void __launch_bounds__(kThreads)
     composite_shared_background(const float* __restrict__ left, const float* __restrict__ colour,
                                 float* __restrict__ background, int64_t r, int64_t c) {

@@ -1,5 +1,5 @@
-// Volume rendering along rays: r rays, m samples, c channels. Samples of a ray lie side by side: ray i owns samples
-// offsets[i] : offsets[i + 1], or without offsets s of them. What it computes is said in voronerf/ops/composite.
+// Volume rendering along rays: r rays, m samples, c channels. The samples of a ray are adjacent: ray i owns samples
+// offsets[i] : offsets[i + 1], or s samples without offsets. The formulas are in voronerf/ops/composite.
 #pragma once
 
 #include <cstdint>
@@ -30,20 +30,21 @@ struct CompositeOutputs {
   float* weights;  // [m]
 };
 
-// The first four are the gradients of CompositeOutputs, null for zero; the rest receive those of the inputs, null where
-// not wanted. That to sigma is always there: it holds intermediate results. Every element is written.
+// The first four members are the gradients of CompositeOutputs, null for zero. The other members receive the gradients
+// of the inputs, null to skip one. `sigma` is never null, because it holds intermediate results. Every element is
+// written.
 struct CompositeGradients {
   const float *colour, *opacity, *depth, *weights;
   float *sigma, *rgb, *depths, *deltas;
   float* background;  // like the input
-  float* left;        // [r], workspace; there if the input has a background
+  float* left;        // [r], workspace; required if the input has a background
 };
 
-// Throw std::invalid_argument for offsets that fall or exceed m.
+// Both CPU functions throw std::invalid_argument for offsets that decrease or exceed m.
 void composite_cpu(const CompositeInputs& in, const CompositeOutputs& out, Isa isa, int threads);
 void composite_backward_cpu(const CompositeInputs& in, const CompositeGradients& gradients, Isa isa, int threads);
 
-// Offsets that fall or exceed m are not refused: samples outside are not touched.
+// The CUDA functions do not reject offsets that decrease or exceed m; they access no memory out of range.
 void composite_cuda(const CompositeInputs& in, const CompositeOutputs& out, void* stream);
 void composite_backward_cuda(const CompositeInputs& in, const CompositeGradients& gradients, void* stream);
 

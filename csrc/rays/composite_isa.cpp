@@ -1,16 +1,16 @@
-// The CPU kernels of composite, once for each instruction set.
+// The CPU kernels of composite, compiled once per instruction set.
 //
-// With o_i = sigma_i delta_i the optical depth of sample i and F_i = o_0 + ... + o_(i-1) that in front of it, its
-// weight is exp(-F_i) (1 - exp(-o_i)). A ray goes by in chunks that stay in the first-level cache. Only the running sum
-// is serial; it is float64, as its digits are the point. Exponentials and everything after them are vectors of samples,
-// colours too if there are three. Summing exponents, rather than multiplying transmittances, spares the slow denormal
-// numbers that a product runs through behind a surface, and keeps what comes after an infinite density at 0.
+// Let o_i = sigma_i delta_i be the optical depth of sample i, and F_i = o_0 + ... + o_(i-1) the optical depth in front
+// of it. Its weight is exp(-F_i) (1 - exp(-o_i)). A ray is processed in chunks that stay in the L1 cache. Only the
+// running sum is serial; it is float64 for precision. Exponentials and later operations are vectors of samples, also
+// colours if there are three channels. Summing exponents, instead of multiplying transmittances, avoids the slow
+// denormal numbers of such a product behind a surface, and gives 0 behind an infinite density.
 //
-// Backward, with G_i the gradient to weight i through all that it feeds,
-//     gradient to o_i = G_i exp(-F_i - o_i) - sum over j > i of G_j w_j:
-// one sweep along the ray leaves F_i where the gradient of sigma is to be, a second one comes back with the sum of what
-// is behind, the background being the last of it. Nothing is kept from the forward pass. The background's weight is
-// exp(-F) over the whole ray rather than 1 - opacity, the same number with fewer digits.
+// In the backward pass let G_i be the gradient with respect to weight i, through all outputs. Then
+//     gradient of o_i = G_i exp(-F_i - o_i) - sum over j > i of G_j w_j.
+// A first sweep along the ray stores F_i in the memory of sigma's gradient. A second sweep runs back with the sum over
+// samples behind, which begins with the background. Nothing is saved in the forward pass. The background's weight is
+// exp(-F) over the whole ray, which is more precise than 1 - opacity.
 #include "rays/composite_isa.h"
 
 #include "common/elementwise_math.h"
@@ -21,17 +21,17 @@ namespace VN_ISA_NAMESPACE {
 namespace {
 
 constexpr int64_t kChunk = 128;
-constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
+constexpr float kOpaque = 1e30f;  // replaces infinite density; just as opaque over any length but 0
 
-// A NaN stays one.
+// NaN stays NaN.
 VN_INLINE float finite_density(float sigma) { return sigma > kOpaque ? kOpaque : sigma; }
 
-// What a vector of samples lets through, of the light in front of it and of its own, and what it takes away.
+// For a vector of samples: transmittance in front, transmittance of the samples themselves, and 1 minus the latter.
 struct Passage {
   F32 front, through, absorbed;
 };
 
-// Transmittances are 0 where float32 has nothing smaller.
+// Transmittances too small for float32 are 0.
 VN_INLINE Passage passage(F32 front, F32 optical) {
   const F32 zero = splat(0.0f), far = splat(-87.0f);
   const F32 x = zero - front, y = zero - optical;
@@ -40,7 +40,7 @@ VN_INLINE Passage passage(F32 front, F32 optical) {
           fma(zero - e.scale, e.p, splat(1.0f) - e.scale)};
 }
 
-// What a whole ray lets through: 1 - opacity, without the digits that the subtraction would cost.
+// Returns the transmittance of a whole ray: 1 - opacity, without cancellation.
 VN_INLINE float left_over(double optical) {
   float lanes[kLanes];
   store(lanes, passage(splat(static_cast<float>(optical)), splat(0.0f)).front);
@@ -51,7 +51,7 @@ VN_INLINE const float* background_of(const CompositeInputs& in, int64_t ray) {
   return in.background == nullptr || !in.background_per_ray ? in.background : in.background + ray * in.c;
 }
 
-// The first `count` lanes, zeros after them.
+// Loads the first `count` lanes, zeros after them.
 VN_INLINE F32 load_first(const float* from, int64_t count) {
   if (count >= kLanes) return load(from);
   float padded[kLanes] = {};
@@ -67,7 +67,7 @@ VN_INLINE void store_first(float* to, F32 a, int64_t count) {
   }
 }
 
-// Three channels of `count` samples.
+// Loads three channels of `count` samples.
 VN_INLINE void load_colours(const float* from, int64_t count, F32& x, F32& y, F32& z) {
   if (count >= kLanes) {
     load_points(from, x, y, z);
@@ -102,7 +102,7 @@ VN_INLINE void forward(const CompositeInputs& in, const CompositeOutputs& out, i
       front[i] = static_cast<float>(before);
       before += static_cast<double>(optical[i]);
     }
-    // Samples of no density, which weigh nothing, fill the last vector.
+    // Samples with density and weight 0 pad the last vector.
     for (int64_t i = count; i % kLanes != 0; ++i) optical[i] = front[i] = 0.0f;
     float* weights = out.weights + first;
     for (int64_t i = 0; i < count; i += kLanes) {
@@ -138,8 +138,8 @@ VN_INLINE void forward(const CompositeInputs& in, const CompositeOutputs& out, i
   for (int64_t k = 0; background != nullptr && k < in.c; ++k) colour[k] += left * background[k];
 }
 
-// Gradients to the weights of samples [first, first + count). Those of the outputs: `colour` [c] or null, `opacity`,
-// `depth`.
+// Computes the gradients of the weights of samples [first, first + count), from the gradients of the outputs: `colour`
+// [c] or null, `opacity`, `depth`.
 template <bool Rgb>
 VN_INLINE void weights_backward(const CompositeInputs& in, const CompositeGradients& gradients, int64_t first,
                                 int64_t count, const float* colour, float opacity, float depth, float* result) {
@@ -184,7 +184,7 @@ VN_INLINE void rgb_backward(const float* weights, const float* colour, int64_t c
 template <bool Rgb>
 VN_INLINE void backward(const CompositeInputs& in, const CompositeGradients& gradients, int64_t ray, int64_t begin,
                         int64_t end) {
-  alignas(64) float optical[kChunk], front[kChunk], weights[kChunk], own[kChunk], share[kChunk];
+  alignas(64) float optical[kChunk], front[kChunk], weights[kChunk], terms[kChunk], share[kChunk];
   const float* colour = gradients.colour == nullptr ? nullptr : gradients.colour + ray * in.c;
   const float depth = gradients.depth == nullptr ? 0.0f : gradients.depth[ray];
   const float opacity = gradients.opacity == nullptr ? 0.0f : gradients.opacity[ray];
@@ -207,23 +207,23 @@ VN_INLINE void backward(const CompositeInputs& in, const CompositeGradients& gra
     for (int64_t i = 0; i < count; ++i) optical[i] = finite_density(sigma[i]) * deltas[i];
     __builtin_memcpy(front, gradients.sigma + first, sizeof(float) * count);
     for (int64_t i = count; i % kLanes != 0; ++i) optical[i] = front[i] = 0.0f;
-    weights_backward<Rgb>(in, gradients, first, count, colour, opacity, depth, own);
+    weights_backward<Rgb>(in, gradients, first, count, colour, opacity, depth, terms);
     for (int64_t i = 0; i < count; i += kLanes) {
       const Passage light = passage(load(front + i), load(optical + i));
-      const F32 weight = light.front * light.absorbed, gradient = load(own + i);
+      const F32 weight = light.front * light.absorbed, gradient = load(terms + i);
       store(weights + i, weight);
       store(share + i, gradient * weight);
-      store(own + i, gradient * (light.front * light.through));
+      store(terms + i, gradient * (light.front * light.through));
     }
     for (int64_t i = count; i-- > 0;) {
-      own[i] = static_cast<float>(static_cast<double>(own[i]) - behind);
+      terms[i] = static_cast<float>(static_cast<double>(terms[i]) - behind);
       behind += static_cast<double>(share[i]);
     }
     for (int64_t i = 0; i < count; ++i) {
-      gradients.sigma[first + i] = sigma[i] <= kOpaque ? own[i] * deltas[i] : 0.0f;
+      gradients.sigma[first + i] = sigma[i] <= kOpaque ? terms[i] * deltas[i] : 0.0f;
     }
     for (int64_t i = 0; gradients.deltas != nullptr && i < count; ++i) {
-      gradients.deltas[first + i] = own[i] * finite_density(sigma[i]);
+      gradients.deltas[first + i] = terms[i] * finite_density(sigma[i]);
     }
     for (int64_t i = 0; gradients.depths != nullptr && i < count; ++i) {
       gradients.depths[first + i] = depth * weights[i];

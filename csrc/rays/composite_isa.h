@@ -1,5 +1,5 @@
-// The kernels of composite, once for each instruction set: one ray with samples [begin, end). The gradient of the
-// background is left to the caller; `left` is the transmittance of each ray.
+// The CPU kernels of composite, compiled once per instruction set. Each call handles one ray with samples [begin, end).
+// The caller computes the gradient of the background from `left`, the transmittance of each ray.
 #pragma once
 
 #include "rays/composite.h"

@@ -1,12 +1,12 @@
-// The derivative of the density to the last of a network's outputs: of a softplus, 1 - exp(-density / scale) times the
-// scale; 1 where that output is the density itself.
+// The derivative of the density with respect to a network's last output. For a softplus it is the scale times 1 -
+// exp(-density / scale). It is 1 if the output is the density itself.
 #pragma once
 
 #include <cmath>
 
 namespace voronerf {
 
-// By its series where it is small, which is three times as fast as expm1.
+// Returns this derivative. Small values use a series, which is three times as fast as expm1.
 inline float density_slope(float density, float scale, bool activated) {
   if (activated) return 1.0f;
   const float x = density / scale;

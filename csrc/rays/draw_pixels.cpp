@@ -1,4 +1,4 @@
-// Blocks of pixels over threads; each is a hash of its number alone.
+// draw_pixels on the CPU: threads share blocks of pixels. Each pixel is a hash of its number alone.
 #include "rays/draw_pixels.h"
 
 #include <algorithm>
@@ -9,7 +9,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kPixels = 64;  // of a task
+constexpr int64_t kPixels = 64;  // pixels of a task
 
 }  // namespace
 

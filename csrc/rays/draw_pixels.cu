@@ -1,4 +1,4 @@
-// The pixels of a training step on CUDA, a thread a pixel.
+// Draws the pixels of a training step on CUDA, one thread per pixel.
 #include "common/cuda_wrappers.h"
 #include "rays/draw_pixels.h"
 

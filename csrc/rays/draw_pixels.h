@@ -1,5 +1,5 @@
-// The pixels of a training step, drawn from runs of pixels: n runs, p known pixels, b pixels. What it computes is said
-// in voronerf/ops/draw_pixels/reference.py.
+// Draws the b pixels of a training step from n runs of pixels and from p known pixels. The formulas are in
+// voronerf/ops/draw_pixels/reference.py.
 #pragma once
 
 #include <cstdint>
@@ -11,20 +11,21 @@ namespace voronerf {
 
 struct DrawPixelsInputs {
   const int32_t* seed;   // [1]
-  const int64_t* ends;   // [n], how many pixels the runs up to each have; or null, for all of 0 to below - 1
-  const int64_t* shift;  // [n], added to a place in a run
-  const int32_t* first;  // the first run that ends behind place 0, 2^bits, 2 * 2^bits, ...
-  int64_t n, places;     // entries of ends and shift, and of first
+  const int64_t* ends;   // [n], running sums of the runs' lengths; or null for all pixels 0 to below - 1
+  const int64_t* shift;  // [n], turns a place in a run into a pixel by addition
+  const int32_t* first;  // the first run that ends behind place 0, 2^bits, 2 * 2^bits, ...; speeds up the search
+  int64_t n, places;     // n: entries of ends and shift; places: entries of first
   int64_t bits;
-  int64_t below;  // places of all runs
+  int64_t below;  // the total number of places in all runs
   RowCount b;
-  const int64_t* known;    // [p], which the first of all pixels are drawn from; or null
-  const float* distances;  // [p], of these
+  const int64_t* known;    // [p], the known pixels, from which the first pixels are drawn; or null
+  const float* distances;  // [p], the distances of the known pixels
   int64_t p;
-  RowCount several;  // as many as are drawn from them
+  RowCount several;  // how many leading pixels are drawn from the known pixels
 };
 
-// The run of a place: looked for from the first that can hold it, within the tables whatever they say.
+// Returns the first run that can hold a place, from which run_of finds the run of the place. Both stay within the
+// tables, even if their entries are invalid.
 VN_HD int64_t first_run(const DrawPixelsInputs& in, int64_t place) {
   const int64_t at = place >> in.bits, run = in.first[at < in.places ? at : in.places - 1];
   return run < 0 ? 0 : run < in.n ? run : in.n - 1;
@@ -34,7 +35,7 @@ VN_HD int64_t run_of(const DrawPixelsInputs& in, int64_t run, int64_t place) {
   return run;
 }
 
-// 48 bits of hashes as a place below a number.
+// Returns a random place below `below`, from 48 bits of hashes.
 VN_HD int64_t draw_place(uint32_t key, int64_t below) {
   const double fraction = static_cast<double>(hashed(key, 0)) + static_cast<double>(hashed(key, 1)) * 0x1p-24;
   return static_cast<int64_t>(fraction * static_cast<double>(below));

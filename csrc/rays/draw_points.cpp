@@ -1,4 +1,4 @@
-// Blocks of points over threads; each is a hash of its number alone.
+// draw_points on the CPU: threads share blocks of points. Each point is a hash of its number alone.
 #include "rays/draw_points.h"
 
 #include "common/hashed.h"
@@ -7,7 +7,7 @@
 namespace voronerf {
 
 void draw_points_cpu(const int32_t* seed, const float* box, RowCount n, float* points, int threads) {
-  constexpr int64_t kPoints = 1024;  // of a task
+  constexpr int64_t kPoints = 1024;  // points of a task
   const float extent[3] = {box[3] - box[0], box[4] - box[1], box[5] - box[2]};
   parallel_for(n, kPoints, threads, [&](int64_t i) {
     const uint32_t key = hash_key(*seed, i);

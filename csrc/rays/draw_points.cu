@@ -1,4 +1,4 @@
-// Random points in a box on CUDA, a thread a point.
+// Draws random points in a box on CUDA, one thread per point.
 #include "common/cuda_wrappers.h"
 #include "rays/draw_points.h"
 #include "rays/march_rays_math.h"

@@ -1,4 +1,4 @@
-// Random points in a box: n points. What it computes is said in voronerf/ops/draw_points.
+// Draws n random points in a box. The formulas are in voronerf/ops/draw_points.
 #pragma once
 
 #include <cstdint>

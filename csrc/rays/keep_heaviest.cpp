@@ -1,8 +1,8 @@
-// A sample is one number: the bits of its importance, which have the order of positive floats, above those of its
-// place, negated. So no two are equal, the larger is the one to keep, and which are kept does not depend on who
-// compares them. Parts of the samples collect what is above the least that is to be kept; when one has 2 q, the smaller
-// half goes, and the least of the rest is a bound for all parts, since q are no smaller. Few samples get there: of n in
-// random order about q (1 + ln(n / q)).
+// A sample is encoded as one number: the bits of its importance, which sort like positive floats, above the negated
+// bits of its place. So no two numbers are equal, larger numbers are kept, and the kept samples do not depend on the
+// order of comparisons. Each part of the samples collects entries above a common bound. When a part has 2 q entries, it
+// drops the smaller half, and its smallest entry raises the bound, since q entries are no smaller. Few samples are
+// collected: of n in random order about q (1 + ln(n / q)).
 #include "rays/keep_heaviest.h"
 
 #include <algorithm>
@@ -20,7 +20,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kParts = 8, kRun = 64;  // of a call; samples that are weighed before they are compared
+constexpr int64_t kParts = 8, kRun = 64;  // parts of a call; samples weighed before they are compared
 
 uint64_t entry_of(float importance, int64_t i) {
   uint32_t bits;
@@ -37,25 +37,25 @@ float importance_of(uint64_t entry) {
 
 int64_t place_of(uint64_t entry) { return ~static_cast<uint32_t>(entry); }
 
-// Importances of samples [begin, end); whether all of their rays are there.
+// Computes the importances of samples [begin, end); returns whether all of their rays are in range.
 bool weigh(const WeighedSamples& in, int64_t begin, int64_t end, float* importance) {
   if (in.error == nullptr) {
     std::copy(in.weights + begin, in.weights + end, importance);
     return true;
   }
-  bool there = true;
+  bool valid = true;
   for (int64_t i = begin; i < end; ++i) {
-    const bool known = in.ray_index[i] >= 0 && in.ray_index[i] < in.r;
-    importance[i - begin] = known ? in.weights[i] * in.error[in.ray_index[i]] : 0.0f;
-    there &= known;
+    const bool exists = in.ray_index[i] >= 0 && in.ray_index[i] < in.r;
+    importance[i - begin] = exists ? in.weights[i] * in.error[in.ray_index[i]] : 0.0f;
+    valid &= exists;
   }
-  return there;
+  return valid;
 }
 
-// Those of samples [begin, end) that may be among the q heaviest, at most 2 q, in any order; the count. -1 if one has a
-// ray that is not there. Any `least` has q entries of all samples that are no smaller.
+// Collects the entries of samples [begin, end) that may be among the q heaviest, at most 2 q, in any order. Returns
+// their number, or -1 if a ray is out of range. `least` is raised only to values that q entries reach.
 int64_t find_heaviest(const WeighedSamples& in, int64_t begin, int64_t end, int64_t q, std::atomic<uint64_t>& least,
-                      uint64_t* found) {
+                      uint64_t* entries) {
   float importance[kRun];
   int64_t count = 0;
   for (int64_t first = begin; first < end; first += kRun) {
@@ -63,21 +63,22 @@ int64_t find_heaviest(const WeighedSamples& in, int64_t begin, int64_t end, int6
     if (!weigh(in, first, first + run, importance)) return -1;
     uint64_t bound = least.load(std::memory_order_relaxed);
     const float lowest = importance_of(bound);
-    bool some = false;
-    for (int64_t i = 0; i < run; ++i) some |= importance[i] >= lowest;  // NaN is not
-    if (!some) continue;
+    bool has_candidate = false;
+    for (int64_t i = 0; i < run; ++i) has_candidate |= importance[i] >= lowest;  // false for NaN
+    if (!has_candidate) continue;
     for (int64_t i = 0; i < run; ++i) {
       if (!(importance[i] >= lowest) || importance[i] > std::numeric_limits<float>::max()) continue;
       const uint64_t entry = entry_of(importance[i], first + i);
       if (entry < bound) continue;
-      found[count++] = entry;
+      entries[count++] = entry;
       if (count < 2 * q) continue;
-      std::nth_element(found, found + q - 1, found + count, std::greater<>());
+      std::nth_element(entries, entries + q - 1, entries + count, std::greater<>());
       count = q;
-      uint64_t known = least.load(std::memory_order_relaxed);
-      while (known < found[q - 1] && !least.compare_exchange_weak(known, found[q - 1], std::memory_order_relaxed)) {
+      uint64_t current = least.load(std::memory_order_relaxed);
+      while (current < entries[q - 1] &&
+             !least.compare_exchange_weak(current, entries[q - 1], std::memory_order_relaxed)) {
       }
-      bound = std::max(known, found[q - 1]);
+      bound = std::max(current, entries[q - 1]);
     }
   }
   return count;
@@ -87,10 +88,10 @@ int64_t find_heaviest(const WeighedSamples& in, int64_t begin, int64_t end, int6
 
 int64_t keep_heaviest_workspace(int64_t q) { return kParts * 2 * q; }
 
-void keep_heaviest_cpu(const WeighedSamples& in, const KeptSamples& kept, int64_t* found, int threads) {
-  auto* const entries = reinterpret_cast<uint64_t*>(found);
+void keep_heaviest_cpu(const WeighedSamples& in, const KeptSamples& kept, int64_t* workspace, int threads) {
+  auto* const entries = reinterpret_cast<uint64_t*>(workspace);
   int64_t counts[kParts], q = kept.q;
-  std::atomic<uint64_t> least{entry_of(std::numeric_limits<float>::denorm_min(), in.m)};  // above 0 at least
+  std::atomic<uint64_t> least{entry_of(std::numeric_limits<float>::denorm_min(), in.m)};  // only positive importances
   parallel_for(kParts, 1, threads, [&](int64_t part) {
     counts[part] =
         find_heaviest(in, part * in.m / kParts, (part + 1) * in.m / kParts, q, least, entries + 2 * q * part);

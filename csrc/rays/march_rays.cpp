@@ -1,5 +1,5 @@
-// Blocks of rays over threads; each ray depends on itself alone, and the running sum of the counts is taken in order,
-// so results do not depend on the number of threads.
+// march_rays on the CPU: threads share blocks of rays. Rays are independent, and the running sum of the counts is taken
+// in order, so results do not depend on the number of threads.
 #include "rays/march_rays.h"
 
 #include <algorithm>
@@ -14,19 +14,20 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kRays = 32;  // of a task
+constexpr int64_t kRays = 32;  // rays of a task
 
-// The numbers in `to`, where those in `from`, which lie `away`, are not less: the larger of both is what they count as.
+// Lowers distances `to` [cells] to the distances by way of `from` [cells], which lies `away` cells away: the maximum of
+// from and away.
 void spread(const uint8_t* from, uint8_t* to, int64_t cells, uint8_t away) {
   for (int64_t j = 0; j < cells; ++j) to[j] = std::min(to[j], std::max(from[j], away));
 }
 
-// Slice i of `size` slices of `step` cells, with those before and behind it.
+// Computes slice i of `size` slices of `step` cells from the slices around it.
 void spread_around(const uint8_t* from, uint8_t* to, int64_t i, int64_t size, int64_t step) {
-  uint8_t* own = to + i * step;
-  std::copy_n(from + i * step, step, own);
+  uint8_t* target = to + i * step;
+  std::copy_n(from + i * step, step, target);
   for (int64_t other = std::max<int64_t>(0, i - kMarchRoom + 1); other < std::min(size, i + kMarchRoom); ++other) {
-    spread(from + other * step, own, step, static_cast<uint8_t>(std::abs(other - i)));
+    spread(from + other * step, target, step, static_cast<uint8_t>(std::abs(other - i)));
   }
 }
 
@@ -39,15 +40,15 @@ std::unique_ptr<uint8_t[]> march_rooms(const MarchInputs& in, int threads) {
   std::unique_ptr<uint8_t[]> rooms(new uint8_t[cells]);
   uint8_t *one = memory.get(), *other = rooms.get();
   parallel_for(in.x, 1, threads, [&](int64_t x) {
-    uint8_t *own = one + x * slice, *to = other + x * slice;
-    for (int64_t i = 0; i < slice; ++i) own[i] = to[i] = in.occupied[x * slice + i] != 0 ? 0 : kMarchRoom;
+    uint8_t *from = one + x * slice, *to = other + x * slice;
+    for (int64_t i = 0; i < slice; ++i) from[i] = to[i] = in.occupied[x * slice + i] != 0 ? 0 : kMarchRoom;
     for (int64_t row = 0; row < slice; row += in.z) {
       for (int64_t away = 1; away < std::min<int64_t>(kMarchRoom, in.z); ++away) {
-        spread(own + row + away, to + row, in.z - away, static_cast<uint8_t>(away));
-        spread(own + row, to + row + away, in.z - away, static_cast<uint8_t>(away));
+        spread(from + row + away, to + row, in.z - away, static_cast<uint8_t>(away));
+        spread(from + row, to + row + away, in.z - away, static_cast<uint8_t>(away));
       }
     }
-    for (int64_t y = 0; y < in.y; ++y) spread_around(to, own, y, in.y, in.z);
+    for (int64_t y = 0; y < in.y; ++y) spread_around(to, from, y, in.y, in.z);
   });
   parallel_for(in.x, 1, threads, [&](int64_t x) { spread_around(one, other, x, in.x, slice); });
   return rooms;

@@ -1,9 +1,9 @@
-// Marching on CUDA in three launches: a warp a ray finds the strata that are kept, one block adds up the rays, and a
-// warp a ray writes its samples. A lane has a stratum, so that the votes of a warp are a word of the mask, and the
-// samples of a ray are written side by side. Numbers of strata are small: a ray of 64 is two steps.
+// march_rays on CUDA in three launches: one warp per ray finds the kept strata, one block sums the counts, and one warp
+// per ray writes the samples. Each lane has one stratum, so that a warp's ballot is a word of the mask, and the writes
+// of a ray's samples are coalesced. Numbers of strata are small: 64 strata take two steps.
 //
-// The sum over rays is one block's, 1,024 rays at a time: a step trains on some thousands of rays, and an image that is
-// rendered at once has a million, a thousand rounds beside the milliseconds of its networks.
+// One block sums over the rays, 1,024 at a time: a training step has some thousands of rays. An image rendered at once
+// has a million rays, and its thousand rounds are short beside the milliseconds of its networks.
 #include <algorithm>
 
 #include "common/cuda_wrappers.h"
@@ -36,7 +36,7 @@ VN_HD float sample_of(const MarchInputs& in, const MarchRay& ray, uint32_t key, 
 __global__ void __launch_bounds__(kThreads)
     march_count_kernel(MarchInputs in, uint32_t* __restrict__ mask, int32_t* __restrict__ counts) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
-  if (i >= in.r) return;  // the whole warp
+  if (i >= in.r) return;  // the same for the whole warp
   const int lane = threadIdx.x % 32;
   const int64_t words = march_words(in.s);
   const MarchRay ray = march_ray(in, i);
@@ -44,10 +44,10 @@ __global__ void __launch_bounds__(kThreads)
   const uint32_t key = march_key(in, i);
   float scale[3];
   march_scale(in, scale);
-  int64_t found = 0;
+  int64_t samples = 0;
   for (int64_t w = 0; w < words; ++w) {
     uint32_t word = 0;
-    if (ray.far > ray.near && (w + 1) * kMarchWord > start && found < in.most) {
+    if (ray.far > ray.near && (w + 1) * kMarchWord > start && samples < in.most) {
       const int64_t stratum = w * kMarchWord + lane;
       bool kept = false;
       if (stratum >= start && stratum < in.s) {
@@ -57,16 +57,16 @@ __global__ void __launch_bounds__(kThreads)
         kept = cell >= 0 && in.occupied[cell] != 0;
       }
       word = __ballot_sync(kAllLanes, kept);
-      // The last ones go where there are more than wanted.
-      word = __ballot_sync(kAllLanes, kept && found + __popc(word & lanes_below(lane)) < in.most);
-      found += __popc(word);
+      // Drop the last samples beyond the maximum.
+      word = __ballot_sync(kAllLanes, kept && samples + __popc(word & lanes_below(lane)) < in.most);
+      samples += __popc(word);
     }
     if (lane == 0) mask[i * words + w] = word;
   }
-  if (lane == 0) counts[i] = static_cast<int32_t>(found);
+  if (lane == 0) counts[i] = static_cast<int32_t>(samples);
 }
 
-// offsets[1:] are counts, and become their running sums, none above `capacity`.
+// Replaces the counts in offsets[1:] by their running sums, at most `capacity`.
 __global__ void __launch_bounds__(kScanThreads) march_scan_kernel(int32_t* offsets, int64_t r, int64_t capacity) {
   VN_SHARED(sums, int32_t[32]);
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
@@ -103,13 +103,13 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t words = march_words(in.s), row = offsets[i], room = offsets[i + 1] - row;
   const MarchRay ray = march_ray(in, i);
   const uint32_t key = march_key(in, i);
-  int64_t got = 0;
-  for (int64_t w = 0; w < words && got <= room; ++w) {
+  int64_t rank_of_word = 0;
+  for (int64_t w = 0; w < words && rank_of_word <= room; ++w) {
     const uint32_t word = mask[i * words + w];
-    const int64_t stratum = w * kMarchWord + lane, rank = got + __popc(word & lanes_below(lane));
-    got += __popc(word);
+    const int64_t stratum = w * kMarchWord + lane, rank = rank_of_word + __popc(word & lanes_below(lane));
+    rank_of_word += __popc(word);
     if ((word >> lane & 1u) == 0 || rank > room) continue;
-    if (rank == room) {  // the first that does not fit
+    if (rank == room) {  // the first sample that does not fit
       stop[i] = static_cast<int32_t>(stratum);
       continue;
     }
@@ -118,10 +118,10 @@ __global__ void __launch_bounds__(kThreads)
     deltas[row + rank] = length;
     ray_index[row + rank] = static_cast<int32_t>(i);
     for (int axis = 0; axis < 3; ++axis) positions[3 * (row + rank) + axis] = point[axis];
-    // A ray that has all it may have goes on behind its last sample.
+    // A ray with its maximum of samples continues behind the last one.
     if (rank + 1 == in.most) stop[i] = static_cast<int32_t>(stratum + 1);
   }
-  if (lane == 0 && got <= room && got < in.most) stop[i] = static_cast<int32_t>(in.s);
+  if (lane == 0 && rank_of_word <= room && rank_of_word < in.most) stop[i] = static_cast<int32_t>(in.s);
 }
 
 }  // namespace

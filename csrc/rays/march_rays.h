@@ -1,8 +1,8 @@
-// Samples of rays in the occupied cells of a grid: r rays, s strata each, m samples that are kept. What it computes is
-// said in voronerf/ops/march_rays, operation by operation in voronerf/ops/march_rays/reference.py.
+// Samples rays in the occupied cells of a grid: r rays, s strata each, m kept samples. The formulas are in
+// voronerf/ops/march_rays, and each operation is in voronerf/ops/march_rays/reference.py.
 //
-// Two calls, since the number of samples is known after the first: it leaves a bit for every stratum that is kept,
-// which the second reads instead of looking at the grid again.
+// There are two calls, since the number of samples is known only after the first call. The first call sets a bit for
+// every kept stratum; the second call reads the bits instead of the grid.
 #pragma once
 
 #include <cstdint>
@@ -13,13 +13,13 @@
 
 namespace voronerf {
 
-// The space of the grid: a contracted one, or with neither that of the rays.
+// The space of the grid: contracted by a sphere or a perspective, or if both are null the space of the rays.
 struct MarchSpace {
   const float* sphere;       // [4], centre and radius
   const float* perspective;  // [5,3], centre, right, up, ahead and (near, a, b)
 };
 
-// Rules of depths, each a struct of march_rays_math.h.
+// The spacing of the strata; each has a struct in march_rays_math.h.
 enum class MarchSpacing : int { linear = 0, disparity };
 
 struct MarchInputs {
@@ -28,27 +28,28 @@ struct MarchInputs {
   const uint8_t* occupied;            // [x,y,z], 0 or 1
   const float* box;                   // [2,3]
   const float* uniforms;              // [r,s], or null
-  const int32_t* seed;                // [1], of hashed uniforms, or null; neither: the middles
-  const int32_t* start;               // [r], or null for 0
+  const int32_t* seed;                // [1], the seed of hashed uniforms, or null; middles if uniforms is null too
+  const int32_t* start;               // [r], the first stratum, or null for 0
   RowCount r;
   int64_t s;
   int64_t x, y, z;
   MarchSpacing spacing;
-  int64_t most;  // samples of a ray
+  int64_t most;  // the maximum number of samples of a ray
   MarchSpace space;
 };
 
-// Strata of a word of the mask.
+// The strata in a word of the mask.
 constexpr int64_t kMarchWord = 32;
 
 VN_HD int64_t march_words(int64_t s) { return (s + kMarchWord - 1) / kMarchWord; }
 
-// mask: [r, march_words(s)], bit i of word w for stratum 32 w + i. offsets: [r+1], none above capacity.
+// mask: [r, march_words(s)], bit i of word w for stratum 32 w + i. offsets: [r+1], at most capacity.
 void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t* total, int64_t capacity,
                           Isa isa, int threads);
 void march_rays_count_cuda(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, void* stream);
 
-// rows: length of ray_index, depths, deltas and positions [rows,3], at least offsets[r]; what is beyond that becomes 0.
+// rows: length of ray_index, depths, deltas and positions [rows,3], at least offsets[r]; rows from offsets[r] on become
+// 0.
 void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, RowCount rows,
                          int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
                          int threads);

@@ -1,11 +1,11 @@
-// The CPU kernels of march_rays, once for each instruction set.
+// The CPU kernels of march_rays, compiled once per instruction set.
 //
-// Strata go by in words of 32. Where they lie is arithmetic without branches, which the compiler turns into vectors;
-// looking up their cells is a byte load each. Rays that only want a few samples leave after the word that has them.
+// Strata are processed in words of 32. Their positions are computed without branches, which the compiler vectorises;
+// each cell is looked up by a byte load. A ray that has its maximum of samples stops after the current word.
 //
-// Of pictures, whose strata are many and whose samples are middles, most strata are empty. There a vector holds rays
-// instead, and each goes on to the next stratum that may not be empty: `leap`. It looks at the same middles with the
-// same arithmetic, so that the samples are the same bits.
+// Whole images have many strata, most of them empty, and their samples are middles. There a vector holds rays instead,
+// and each ray leaps to the next stratum that may be occupied (`leap`). It tests the same middles with the same
+// arithmetic, so that the samples have the same bits.
 #include "rays/march_rays_isa.h"
 
 #include "common/memory_tile.h"
@@ -18,16 +18,16 @@ namespace {
 
 typedef int32_t Ints __attribute__((vector_size(4 * kLanes)));
 
-constexpr int64_t kUnit = 16;      // samples that are filled in together
-constexpr int64_t kTogether = 32;  // rays that leap together: of 16, each vector waits for the one before
+constexpr int64_t kUnit = 16;      // samples that are written together
+constexpr int64_t kTogether = 32;  // rays that leap together; 16 would not hide the latency of a step
 
-// The space of the grid as a type.
+// The kind of the grid's space, as a type.
 template <MarchWhere W>
 struct Space {
   static constexpr MarchWhere kWhere = W;
 };
 
-// Cells of 32 strata from `first`, -1 outside the box.
+// Computes the cells of 32 strata from `first` on, -1 outside the box.
 template <MarchWhere W, typename Rule>
 VN_INLINE void cells_of(const MarchInputs& in, const MarchRay& ray, const float* origin, const float* direction,
                         const float* scale, const float* uniforms, int64_t first, int32_t* cells) {
@@ -50,58 +50,58 @@ void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin
   march_scale(in, scale);
   for (int64_t i = begin; i < end; ++i) {
     const MarchRay ray = march_ray(in, i);
-    uint32_t* own = mask + i * words;
-    for (int64_t w = 0; w < words; ++w) own[w] = 0;
+    uint32_t* ray_mask = mask + i * words;
+    for (int64_t w = 0; w < words; ++w) ray_mask[w] = 0;
     const int64_t start = in.start == nullptr || in.start[i] < 0 ? 0 : in.start[i];
     const uint32_t key = march_key(in, i);
-    int64_t found = 0;
-    for (int64_t w = start / kMarchWord; ray.far > ray.near && w < words && found < in.most; ++w) {
+    int64_t samples = 0;
+    for (int64_t w = start / kMarchWord; ray.far > ray.near && w < words && samples < in.most; ++w) {
       const int64_t first = w * kMarchWord, left = in.s - first;
       int32_t cells[kMarchWord];
       float uniforms[kMarchWord];
       if (in.seed != nullptr) {
         for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = hashed(key, static_cast<uint32_t>(first + j));
       } else {
-        const int64_t there = left < kMarchWord ? left : kMarchWord;
+        const int64_t size = left < kMarchWord ? left : kMarchWord;
         for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = 0.5f;
-        if (in.uniforms != nullptr) __builtin_memcpy(uniforms, in.uniforms + i * in.s + first, sizeof(float) * there);
+        if (in.uniforms != nullptr) __builtin_memcpy(uniforms, in.uniforms + i * in.s + first, sizeof(float) * size);
       }
       cells_of<W, Rule>(in, ray, in.origins + 3 * i, in.directions + 3 * i, scale, uniforms, first, cells);
       uint32_t word = 0;
       for (int64_t j = 0; j < kMarchWord; ++j) {
-        // Without a branch, which nothing could predict.
-        const uint32_t inside = cells[j] >= 0, taken = in.occupied[inside ? cells[j] : 0];
-        word |= (taken & inside) << j;
+        // No branch, since it would be unpredictable.
+        const uint32_t inside = cells[j] >= 0, occupied = in.occupied[inside ? cells[j] : 0];
+        word |= (occupied & inside) << j;
       }
       if (left < kMarchWord) word &= (uint32_t{1} << left) - 1;
       if (start > first) word &= ~uint32_t{0} << (start - first);
-      // The last bits go where there are more than wanted.
-      while (found + bits_of(word) > in.most) word &= ~(uint32_t{1} << (31 - __builtin_clz(word)));
-      own[w] = word;
-      found += bits_of(word);
+      // Drop the last bits beyond the maximum.
+      while (samples + bits_of(word) > in.most) word &= ~(uint32_t{1} << (31 - __builtin_clz(word)));
+      ray_mask[w] = word;
+      samples += bits_of(word);
     }
-    counts[i] = static_cast<int32_t>(found);
+    counts[i] = static_cast<int32_t>(samples);
   }
 }
 
-// Whether the middles of strata lie between their edges whatever is rounded, and whether a depth tells its stratum:
-// strata are wide against the digits of their depths.
+// Returns whether strata are wide compared with the rounding of their depths. Then middles lie between their edges, and
+// a depth determines its stratum.
 template <typename Rule>
 VN_INLINE bool wide(const MarchRay& ray) {
   const float largest = __builtin_fmaxf(__builtin_fabsf(ray.near), __builtin_fabsf(ray.far));
   return Rule::has_inverse(ray) && ray.far - ray.near >= 1e-5f * ray.count * largest;
 }
 
-// Cells that a ray's point passes in the grid, at most, while the ray goes on by 1: for all of the way to `kMarchRoom`
-// cells, each of which is `width` of the grid's space.
+// Returns an upper bound on the cells that a ray crosses per unit of distance, valid for the next kMarchRoom cells.
+// `width` is the size of a cell in the grid's space.
 template <MarchWhere W>
 VN_INLINE float pace_of(const MarchInputs& in, float width, const float* origin, const float* direction, float length,
                         float at, const float* point) {
   const float room = kMarchRoom * width;
   if (W == MarchWhere::kSphere) {
-    // At a distance of r >= 1 radii the contraction shortens what lies along the radius to 1 / r^2, and what lies
-    // across to (2 - 1 / r) / r. Both fall with r, and so does the angle between a ray that goes outwards and the
-    // radius. Of another the nearest place counts that it can reach.
+    // At a distance of r >= 1 radii the contraction scales lengths along the radius by 1 / r^2, and lengths across it
+    // by (2 - 1 / r) / r. Both factors decrease with r, and so does the angle between an outward ray and the radius.
+    // For any other ray the bound uses the smallest r that it can reach.
     const float *centre = in.space.sphere, inverse = 1.0f / centre[3];
     float square = 0.0f, outwards = 0.0f;
     for (int axis = 0; axis < 3; ++axis) {
@@ -109,17 +109,18 @@ VN_INLINE float pace_of(const MarchInputs& in, float width, const float* origin,
       square += offset * offset;
       outwards += offset * direction[axis];
     }
-    const float r = __builtin_sqrtf(square), here = 1.0f / (r < 1.0f ? 1.0f : r), across = (2.0f - here) * here;
+    const float r = __builtin_sqrtf(square), inverse_r = 1.0f / (r < 1.0f ? 1.0f : r),
+                across = (2.0f - inverse_r) * inverse_r;
     const float nearest = r - room * inverse / across, share = 1.0f / (nearest < 1.0f ? 1.0f : nearest);
-    const float along = here * here, part = outwards * here, parts = part * part;
+    const float along = inverse_r * inverse_r, part = outwards * inverse_r, parts = part * part;
     const float leaving = across * across * (length * length - parts) + along * along * parts;
     const float falling = 1.001f * __builtin_sqrtf(leaving < 0.0f ? 0.0f : leaving);
     const float any = (2.0f - share) * share * length;
     return ((outwards > 0.0f) & (r > 1.0f) ? falling : any) / width;
   }
   if (W == MarchWhere::kPerspective) {
-    // Lines stay lines, on which a point at depth z moves as fast as 1 / z^2: to three quarters of the depth here.
-    // Nothing is known of where depths are bounded.
+    // Lines stay lines, on which a point at depth z moves at a speed proportional to 1 / z^2. The bound holds down to
+    // three quarters of the current depth. Where depths are clamped there is no bound.
     const float *axes = in.space.perspective + 3, *slopes = in.space.perspective + 12;
     float forwards[3] = {};
     for (int axis = 0; axis < 3; ++axis) {
@@ -130,20 +131,20 @@ VN_INLINE float pace_of(const MarchInputs& in, float width, const float* origin,
     const float y = __builtin_fabsf(forwards[1] / slopes[2] - point[1] * forwards[2]) * inverse;
     const float z = 2.0f * slopes[0] * __builtin_fabsf(forwards[2]) * inverse * inverse;
     const float sideways = x < y ? y : x, most = sideways < z ? z : sideways, nearing = (4.0f / 3.0f) * most;
-    // Towards the camera: no farther than a quarter of the depth.
+    // Towards the camera, a leap is at most a quarter of the depth.
     const float back = -forwards[2] * (4.0f * kMarchRoom) * inverse * width;
-    const float known = forwards[2] < 0.0f ? nearing : most;
-    const float found = 1.001f * (known < back ? back : known) / width;
-    return 0.75f * depth > 0.5f * slopes[0] ? found : __builtin_huge_valf();
+    const float speed = forwards[2] < 0.0f ? nearing : most;
+    const float pace = 1.001f * (speed < back ? back : speed) / width;
+    return 0.75f * depth > 0.5f * slopes[0] ? pace : __builtin_huge_valf();
   }
   return length / width;
 }
 
-constexpr int32_t kToWalk = -1;  // in the place of a ray's count
+constexpr int32_t kToWalk = -1;  // marks a ray whose count is not yet known
 
-// Rays that walk together, a lane each: which ray it is, and at which stratum.
+// The rays that leap together, one per lane: each ray's number, current stratum and state.
 struct Walk {
-  int32_t ray[kTogether], stratum[kTogether], found[kTogether];
+  int32_t ray[kTogether], stratum[kTogether], samples[kTogether];
   float near[kTogether], far[kTogether], from[3][kTogether], along[3][kTogether], length[kTogether], slack[kTogether],
       share[kTogether];
 };
@@ -157,16 +158,16 @@ VN_INLINE void enter(const MarchInputs& in, float width, int64_t i, int64_t j, W
     away += __builtin_fabsf(walk.from[axis][j]);
     square += walk.along[axis][j] * walk.along[axis][j];
   }
-  walk.ray[j] = static_cast<int32_t>(i), walk.found[j] = 0;
+  walk.ray[j] = static_cast<int32_t>(i), walk.samples[j] = 0;
   walk.stratum[j] = in.start == nullptr || in.start[i] < 0 ? 0 : in.start[i];
   walk.near[j] = ray.near, walk.far[j] = ray.far, walk.length[j] = __builtin_sqrtf(square);
-  // What may be rounded of a place, in cells; and strata in a unit of progress.
+  // slack: the rounding error of a place, in cells. share: strata per unit of progress.
   walk.slack[j] = 1e-3f + 1e-6f * (away + __builtin_fabsf(ray.far) * walk.length[j]) / width;
   walk.share[j] = Rule::rate(ray) * ray.count;
 }
 
-// Middles of strata of the rays of [begin, end) whose count is kToWalk, from empty cell to empty cell: a ray goes on by
-// as much as no occupied cell can be near. A lane whose ray has ended takes the next one.
+// Marches the rays of [begin, end) whose count is kToWalk, through the middles of strata. From an empty cell a ray
+// leaps as far as no occupied cell can lie. A lane whose ray has ended takes the next ray.
 template <MarchWhere W, typename Rule>
 VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* scale, uint32_t* mask, int32_t* counts,
                     int64_t begin, int64_t end) {
@@ -174,28 +175,29 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
   const int32_t strata = static_cast<int32_t>(in.s);
   const float width = 1.0f / __builtin_fmaxf(scale[0], __builtin_fmaxf(scale[1], scale[2]));
   const float sides[3] = {static_cast<float>(in.x), static_cast<float>(in.y), static_cast<float>(in.z)};
-  // What lies this far behind a stratum's middle is rounded to it or to what is behind.
+  // Truncating a place in strata plus `before` gives the first stratum whose middle is not in front of the place, with
+  // a tolerance of 0.01 strata and rounding.
   const float count = static_cast<float>(in.s), before = 0.5f - (0.01f + 2e-6f * count);
-  const MarchRay any = march_ray(in, begin);  // all have as many strata
+  const MarchRay any = march_ray(in, begin);  // all rays have the same number of strata
   Walk walk;
   int64_t next_ray = begin;
-  // Lanes whose ray has ended, and lanes that have one.
-  uint32_t ended = ~uint32_t{0} >> (32 - kTogether), there = ended;
+  // Lanes whose ray has ended, and lanes that have a ray.
+  uint32_t ended = ~uint32_t{0} >> (32 - kTogether), active = ended;
   for (int64_t j = 0; j < kTogether; ++j) walk.ray[j] = -1;
   while (true) {
     for (; ended != 0; ended &= ended - 1) {
       const int64_t j = __builtin_ctz(ended);
-      if (walk.ray[j] >= 0) counts[walk.ray[j]] = walk.found[j];
+      if (walk.ray[j] >= 0) counts[walk.ray[j]] = walk.samples[j];
       while (next_ray < end && counts[next_ray] != kToWalk) ++next_ray;
       if (next_ray < end) {
         enter<Rule>(in, width, next_ray++, j, walk);
         continue;
       }
-      enter<Rule>(in, width, begin, j, walk);  // anything: it is not looked at
+      enter<Rule>(in, width, begin, j, walk);  // any ray: the lane's results are ignored
       walk.ray[j] = -1, walk.stratum[j] = strata;
-      there &= ~(1u << j);
+      active &= ~(1u << j);
     }
-    if (there == 0) break;
+    if (active == 0) break;
     int32_t cells[kTogether], rooms[kTogether], next[kTogether];
     float places[3][kTogether], free[kTogether], depth[kTogether], pace[kTogether];
     for (int64_t j = 0; j < kTogether; ++j) {
@@ -225,24 +227,24 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
     for (int64_t j = 0; j < kTogether; ++j) {
       const float cellwise = static_cast<float>(rooms[j] - 1) + free[j];
       const float to = depth[j] + (cellwise < 0.0f ? 0.0f : cellwise) / pace[j];
-      const float whole = Rule::progress(walk.near[j], to) * walk.share[j] + before;
-      const float ahead = whole < count ? whole : count;
-      const int32_t far = static_cast<int32_t>(whole >= 0.0f ? ahead : 0.0f), one = walk.stratum[j] + 1;
+      const float place = Rule::progress(walk.near[j], to) * walk.share[j] + before;
+      const float ahead = place < count ? place : count;
+      const int32_t far = static_cast<int32_t>(place >= 0.0f ? ahead : 0.0f), one = walk.stratum[j] + 1;
       next[j] = far < one ? one : far;
     }
     uint32_t hits = 0;
     for (int j = 0; j < kTogether; ++j) hits |= (rooms[j] == 0 ? 1u : 0u) << j;
-    hits &= there;
+    hits &= active;
     for (; hits != 0; hits &= hits - 1) {
       const int64_t j = __builtin_ctz(hits);
       mask[walk.ray[j] * words + walk.stratum[j] / kMarchWord] |= uint32_t{1} << (walk.stratum[j] % kMarchWord);
-      if (++walk.found[j] == in.most) next[j] = strata;
+      if (++walk.samples[j] == in.most) next[j] = strata;
     }
     for (int64_t j = 0; j < kTogether; ++j) {
       walk.stratum[j] = next[j];
       ended |= static_cast<uint32_t>(next[j] >= strata) << j;
     }
-    ended &= there;
+    ended &= active;
   }
 }
 
@@ -264,10 +266,10 @@ VN_INLINE void count_by_leaps(const MarchInputs& in, const uint8_t* room, uint32
   leap<W, Rule>(in, room, scale, mask, counts, begin, end);
 }
 
-// Samples in `strata`, at most kUnit of one ray, to rows from `row`.
+// Writes the samples in `strata`, at most kUnit of one ray, to the rows from `row` on.
 template <MarchWhere W, typename Rule>
 __attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i,
-                                         const int32_t* strata, int64_t many, int64_t row, int32_t* ray_index,
+                                         const int32_t* strata, int64_t size, int64_t row, int32_t* ray_index,
                                          float* depths, float* deltas, float* positions) {
   const float *origin = in.origins + 3 * i, *direction = in.directions + 3 * i;
   float inside[kUnit], at[kUnit], length[kUnit], x[kUnit], y[kUnit], z[kUnit];
@@ -275,7 +277,7 @@ __attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& 
     for (int64_t j = 0; j < kUnit; ++j) inside[j] = hashed(key, static_cast<uint32_t>(strata[j]));
   } else {
     for (int64_t j = 0; j < kUnit; ++j) inside[j] = 0.5f;
-    for (int64_t j = 0; in.uniforms != nullptr && j < many; ++j) inside[j] = in.uniforms[i * in.s + strata[j]];
+    for (int64_t j = 0; in.uniforms != nullptr && j < size; ++j) inside[j] = in.uniforms[i * in.s + strata[j]];
   }
   for (int64_t j = 0; j < kUnit; ++j) {
     const float first = march_edge<Rule>(ray, strata[j]), last = march_edge<Rule>(ray, strata[j] + 1);
@@ -285,7 +287,7 @@ __attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& 
     march_point(in, W, origin, direction, at[j], point);
     x[j] = point[0], y[j] = point[1], z[j] = point[2];
   }
-  for (int64_t j = 0; j < many; ++j, ++row) {
+  for (int64_t j = 0; j < size; ++j, ++row) {
     ray_index[row] = static_cast<int32_t>(i);
     depths[row] = at[j];
     deltas[row] = length[j];
@@ -299,16 +301,16 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
   const int64_t words = march_words(in.s);
   for (int64_t i = begin; i < end; ++i) {
     const MarchRay ray = march_ray(in, i);
-    const uint32_t* own = mask + i * words;
+    const uint32_t* ray_mask = mask + i * words;
     const uint32_t key = march_key(in, i);
     const int64_t room = offsets[i + 1] - offsets[i];
-    int64_t got = 0, next = in.s, row = offsets[i], waiting = 0;
+    int64_t filled = 0, next = in.s, row = offsets[i], waiting = 0;
     int32_t strata[kUnit] = {};
     bool cut = false;
     for (int64_t w = 0; w < words && !cut; ++w) {
-      for (uint32_t word = own[w]; word != 0; word &= word - 1) {
+      for (uint32_t word = ray_mask[w]; word != 0; word &= word - 1) {
         const int64_t stratum = w * kMarchWord + __builtin_ctz(word);
-        if (got == room) {
+        if (filled == room) {
           next = stratum;
           cut = true;
           break;
@@ -319,7 +321,7 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
           waiting = 0;
         }
         strata[waiting++] = static_cast<int32_t>(stratum);
-        if (++got == in.most) next = stratum + 1;
+        if (++filled == in.most) next = stratum + 1;
       }
     }
     if (waiting > 0) {
@@ -329,7 +331,7 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
   }
 }
 
-// Calls `run` with the space of the grid and the rule of depths.
+// Calls `run` with the types of the grid's space and of the spacing.
 template <typename Run>
 VN_INLINE void specialised(const MarchInputs& in, const Run& run) {
   march_by_rule(in.spacing, [&](auto rule) {

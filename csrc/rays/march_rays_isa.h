@@ -1,15 +1,16 @@
-// The kernels of march_rays, once for each instruction set: rays [begin, end).
+// The CPU kernels of march_rays, compiled once per instruction set. Each call handles rays [begin, end).
 #pragma once
 
 #include "rays/march_rays.h"
 
 namespace voronerf {
 
-// The most that `room` says.
+// The largest value in `room`.
 constexpr int kMarchRoom = 4;
 
-// Leaves the number of samples of ray i in counts[i]. room: for each cell of the grid, how many cells away along any
-// axis an occupied one may be: 0 for its own, kMarchRoom for that or more; or null. For middles alone.
+// Writes the number of samples of ray i to counts[i]. room: for each cell of the grid, the Chebyshev distance in cells
+// to the nearest occupied cell, at most kMarchRoom (0 if the cell itself is occupied); or null. Only middles may use
+// it.
 VN_DECLARE_FOR_ISA(void march_count(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts,
                                     int64_t begin, int64_t end))
 VN_DECLARE_FOR_ISA(void march_fill(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets,

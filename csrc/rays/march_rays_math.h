@@ -1,6 +1,6 @@
-// Arithmetic of march_rays, one stratum at a time, for the CPU and for CUDA. Each operation is rounded on its own, as
-// the reference does it: a sample lies in the same cell on every path. The C++ of the build has contraction off; nvcc
-// contracts, but not the products that are written as march_product.
+// Arithmetic of march_rays for one stratum, on the CPU and on CUDA. Each operation is rounded separately, as in the
+// reference, so that a sample lies in the same cell on every device. The build turns contraction off for C++; nvcc
+// contracts, but not products written as march_product.
 #pragma once
 
 #include "common/hashed.h"
@@ -25,7 +25,7 @@ VN_HD float march_root(float a) {
 }
 
 struct MarchRay {
-  float near, far, count, share;  // share: 1 / count where that is exact, else 0
+  float near, far, count, share;  // share: 1 / count if that is exact, else 0
 };
 
 VN_HD MarchRay march_ray(const MarchInputs& in, int64_t i) {
@@ -33,13 +33,13 @@ VN_HD MarchRay march_ray(const MarchInputs& in, int64_t i) {
   return {in.near[i], in.far[i], count, (in.s & (in.s - 1)) == 0 ? 1.0f / count : 0.0f};
 }
 
-// The fraction of the way that is a number of strata. A product with an exact reciprocal is the quotient.
+// Returns the fraction of the ray that `strata` strata cover. A product with an exact reciprocal equals the quotient.
 VN_HD float march_fraction(const MarchRay& ray, float strata) {
   return ray.share > 0.0f ? march_product(strata, ray.share) : strata / ray.count;
 }
 
-// A rule of depths: the depth at a fraction of the way, and its inverse, the fraction at a depth, which is `progress`
-// times `rate` where there is one.
+// A spacing: the depth at a fraction of the ray, and its inverse. The fraction at a depth is `progress` times `rate` if
+// has_inverse returns true.
 struct MarchLinear {
   VN_HD float depth(const MarchRay& ray, float fraction) {
     return ray.near + march_product(ray.far - ray.near, fraction);
@@ -59,7 +59,7 @@ struct MarchDisparity {
   VN_HD bool has_inverse(const MarchRay& ray) { return ray.near > 0.0f; }
 };
 
-// Calls `run` with the rule.
+// Calls `run` with the struct of the spacing.
 template <typename Run>
 VN_HD auto march_by_rule(MarchSpacing spacing, const Run& run) {
   return spacing == MarchSpacing::disparity ? run(MarchDisparity()) : run(MarchLinear());
@@ -80,7 +80,7 @@ VN_HD float march_sample(const MarchRay& ray, int64_t i, float inside, float fir
 
 VN_HD uint32_t march_key(const MarchInputs& in, int64_t i) { return in.seed == nullptr ? 0 : hash_key(*in.seed, i); }
 
-// The place of a sample in its stratum.
+// Returns the place of a sample in its stratum, in 0..1.
 VN_HD float march_inside(const MarchInputs& in, uint32_t key, int64_t i, int64_t stratum) {
   if (in.seed != nullptr) return hashed(key, static_cast<uint32_t>(stratum));
   return in.uniforms != nullptr ? in.uniforms[i * in.s + stratum] : 0.5f;
@@ -93,16 +93,16 @@ VN_HD MarchWhere march_where(const MarchInputs& in) {
   return in.space.perspective != nullptr ? MarchWhere::kPerspective : MarchWhere::kWorld;
 }
 
-// The point at a distance along a ray, in the space of the grid.
+// Computes the point at a distance along a ray, in the space of the grid.
 VN_HD void march_point(const MarchInputs& in, MarchWhere where, const float* origin, const float* direction, float at,
                        float* point) {
   for (int axis = 0; axis < 3; ++axis) point[axis] = origin[axis] + march_product(at, direction[axis]);
   if (where == MarchWhere::kSphere) {
     const float *centre = in.space.sphere, radius = in.space.sphere[3], scale = 1.0f / radius;
     for (int axis = 0; axis < 3; ++axis) point[axis] = march_product(point[axis] - centre[axis], scale);
-    const float whole = march_root(march_product(point[0], point[0]) + march_product(point[1], point[1]) +
-                                   march_product(point[2], point[2]));
-    const float inverse = 1.0f / (whole < 1.0f ? 1.0f : whole);
+    const float distance = march_root(march_product(point[0], point[0]) + march_product(point[1], point[1]) +
+                                      march_product(point[2], point[2]));
+    const float inverse = 1.0f / (distance < 1.0f ? 1.0f : distance);
     const float factor = march_product(2.0f - inverse, inverse);
     for (int axis = 0; axis < 3; ++axis) {
       point[axis] = centre[axis] + march_product(march_product(radius, point[axis]), factor);
@@ -123,17 +123,17 @@ VN_HD void march_point(const MarchInputs& in, MarchWhere where, const float* ori
   }
 }
 
-// The cell of the grid at a point, -1 outside the box; scale: cells in a unit of length along each axis.
+// Returns the grid cell at a point, -1 outside the box. scale: cells per unit of length along each axis.
 VN_HD int32_t march_cell(const MarchInputs& in, const float* scale, const float* point) {
   const int64_t size[3] = {in.x, in.y, in.z};
   int32_t cell = 0;
   int inside = 1;
   for (int axis = 0; axis < 3; ++axis) {
     const float place = march_product(point[axis] - in.box[axis], scale[axis]);
-    const int here = (place >= 0.0f) & (place <= static_cast<float>(size[axis]));
-    const int32_t count = static_cast<int32_t>(size[axis]), whole = static_cast<int32_t>(here ? place : 0.0f);
-    cell = cell * count + (whole < count ? whole : count - 1);
-    inside &= here;
+    const int is_inside = (place >= 0.0f) & (place <= static_cast<float>(size[axis]));
+    const int32_t count = static_cast<int32_t>(size[axis]), index = static_cast<int32_t>(is_inside ? place : 0.0f);
+    cell = cell * count + (index < count ? index : count - 1);
+    inside &= is_inside;
   }
   return inside ? cell : -1;
 }

@@ -1,4 +1,4 @@
-// How far away occupied cells are, so that rays leap over empty ones; for march_rays and render_opaque on the CPU.
+// Distances to occupied cells, which let rays leap over empty cells; for march_rays and render_opaque on the CPU.
 #pragma once
 
 #include <memory>
@@ -7,8 +7,8 @@
 
 namespace voronerf {
 
-// What march_count (march_rays_isa.h) takes as `room`; null where rays do not leap over empty cells. To look at all
-// cells pays where strata are many more, as in a picture of a photograph; in a step they are not.
+// Returns the `room` of march_count (march_rays_isa.h), or null if rays shall not leap over empty cells. Visiting all
+// cells pays if there are many more strata, as for a whole image; a training step has too few strata.
 std::unique_ptr<uint8_t[]> march_rooms(const MarchInputs& in, int threads);
 
 }  // namespace voronerf

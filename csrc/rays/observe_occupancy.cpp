@@ -1,6 +1,7 @@
-// Only the cells of the samples are touched; a step has some thousands of them, and the grid a quarter of a million
-// cells. First the threads find the cells of samples and what these make of them. A cell may be named more than once,
-// so then the grid is cut into a part for each thread, to which the samples of a run were sorted before.
+// observe_occupancy on the CPU. Only cells with samples are touched: a step has some thousands of samples, the grid a
+// quarter of a million cells. First the threads compute each sample's cell and its new density. Several samples may
+// share a cell, so each thread then updates its own part of the grid; the samples of a run are sorted by part in the
+// first phase.
 #include "rays/observe_occupancy.h"
 
 #include <algorithm>
@@ -16,46 +17,46 @@ void observe_occupancy_cpu(const ObservedSamples& in, float* density, uint8_t* o
   constexpr int64_t kRun = 1024;
   const int64_t runs = (in.m + kRun - 1) / kRun, all = in.x * in.y * in.z;
   const int64_t parts = std::max<int64_t>(1, std::min<int64_t>(threads, all));
-  std::vector<int64_t> ends(static_cast<size_t>(runs * parts));  // of the samples of a run in a part
+  std::vector<int64_t> ends(static_cast<size_t>(runs * parts));  // ends of the samples of each run and part
   parallel_for(runs, 1, threads, [&](int64_t run) {
     const int64_t begin = run * kRun, end = std::min<int64_t>(in.m, begin + kRun);
-    int32_t found[kRun];
-    float made[kRun];
+    int32_t cell_of[kRun];
+    float value_of[kRun];
     int64_t count = 0;
     for (int64_t i = begin; i < end; ++i) {
       const int64_t cell = observed_cell(in, i);
       if (!observes(in, i, cell)) continue;
       __builtin_prefetch(density + cell, 1);
-      found[count] = static_cast<int32_t>(cell);
-      made[count++] = observed_density(in, i);
+      cell_of[count] = static_cast<int32_t>(cell);
+      value_of[count++] = observed_density(in, i);
     }
-    for (int64_t i = 0; i < count; ++i) made[i] = std::max(density[found[i]] * in.decay, made[i]);
+    for (int64_t i = 0; i < count; ++i) value_of[i] = std::max(density[cell_of[i]] * in.decay, value_of[i]);
     int64_t place = begin;
     for (int64_t part = 0; part < parts; ++part) {
       const auto first = static_cast<uint32_t>(all * part / parts),
                  size = static_cast<uint32_t>(all * (part + 1) / parts) - first;
       for (int64_t i = 0; i < count; ++i) {
         if (place == end) break;
-        cells[place] = found[i];
-        values[place] = made[i];
-        place += static_cast<uint32_t>(found[i]) - first < size;  // without a branch, which nothing could predict
+        cells[place] = cell_of[i];
+        values[place] = value_of[i];
+        place += static_cast<uint32_t>(cell_of[i]) - first < size;  // no branch, since it would be unpredictable
       }
       ends[static_cast<size_t>(run * parts + part)] = place;
     }
   });
   parallel_for(parts, 1, threads, [&](int64_t part) {
-    const auto each = [&](const auto& body) {
+    const auto for_each_sample = [&](const auto& body) {
       for (int64_t run = 0; run < runs; ++run) {
-        const auto own = static_cast<size_t>(run * parts + part);
-        for (int64_t i = part == 0 ? run * kRun : ends[own - 1]; i < ends[own]; ++i) body(cells[i], values[i]);
+        const auto index = static_cast<size_t>(run * parts + part);
+        for (int64_t i = part == 0 ? run * kRun : ends[index - 1]; i < ends[index]; ++i) body(cells[i], values[i]);
       }
     };
-    // A cell gets what one of its samples makes of it, and then the most.
-    each([&](int32_t cell, float value) { density[cell] = value; });
-    each([&](int32_t cell, float value) {
+    // First set each cell to the value of any of its samples, then raise it to their maximum.
+    for_each_sample([&](int32_t cell, float value) { density[cell] = value; });
+    for_each_sample([&](int32_t cell, float value) {
       density[cell] = std::max(density[cell], value);
-      // Other threads read the lines of cells that stay as they are.
-      if (const bool now = density[cell] >= in.threshold; now != (occupied[cell] != 0)) occupied[cell] = now;
+      // Write only on a change, because other threads read the same cache lines.
+      if (const bool filled = density[cell] >= in.threshold; filled != (occupied[cell] != 0)) occupied[cell] = filled;
     });
   });
 }

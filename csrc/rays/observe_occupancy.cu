@@ -1,7 +1,7 @@
-// What samples teach an occupancy grid on CUDA, a thread a sample, in three launches: every cell finds one sample that
-// speaks for it, fades, and is raised by all of its samples. Densities are 0 or more, so that their bits have their
-// order and their signs are free: the sample that sets the sign of a cell first is the one that speaks for it. No two
-// threads store to the same place.
+// Updates an occupancy grid from samples on CUDA, one thread per sample, in three launches: one sample claims each
+// cell, the cell's density decays, and all of its samples raise it. Densities are not negative, so their bits sort like
+// integers and their sign bits are free: the first sample to set a cell's sign bit claims the cell. No two threads
+// store to the same place.
 #include "common/cuda_wrappers.h"
 #include "rays/observe_occupancy_math.h"
 
@@ -14,7 +14,7 @@ constexpr unsigned kSign = 0x80000000u;
 
 __device__ __forceinline__ int64_t this_sample() { return static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; }
 
-// cells: -1 for samples that say nothing. before: the density of the cell that one speaks for, -1 for the others.
+// cells: -1 for samples that update no cell. before: the old density of a claimed cell, -1 for samples that claim none.
 __global__ void __launch_bounds__(kThreads)
     claim_kernel(ObservedSamples in, unsigned* density, int32_t* __restrict__ cells, float* __restrict__ before) {
   const int64_t i = this_sample();
@@ -23,9 +23,9 @@ __global__ void __launch_bounds__(kThreads)
   cells[i] = observes(in, i, cell) ? static_cast<int32_t>(cell) : -1;
   if (cells[i] < 0) return;
   const unsigned bits = atomicOr(density + cell, kSign);
-  float kept;
-  memcpy(&kept, &bits, sizeof kept);
-  before[i] = (bits & kSign) != 0 ? -1.0f : kept;
+  float previous;
+  memcpy(&previous, &bits, sizeof previous);
+  before[i] = (bits & kSign) != 0 ? -1.0f : previous;
 }
 
 __global__ void __launch_bounds__(kThreads)
@@ -46,9 +46,10 @@ __global__ void __launch_bounds__(kThreads)
   int bits;
   memcpy(&bits, &seen, sizeof bits);
   const int old = atomicMax(density + cells[i], bits);
-  float kept;
-  memcpy(&kept, &old, sizeof kept);
-  if (seen >= in.threshold && !(kept >= in.threshold)) occupied[cells[i]] = 1;  // of the samples of a cell one at most
+  float previous;
+  memcpy(&previous, &old, sizeof previous);
+  // At most one sample of a cell writes here.
+  if (seen >= in.threshold && !(previous >= in.threshold)) occupied[cells[i]] = 1;
 }
 
 }  // namespace

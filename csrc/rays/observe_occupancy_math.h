@@ -1,4 +1,4 @@
-// Arithmetic of observe_occupancy, one sample at a time, for the CPU and for CUDA.
+// Arithmetic of observe_occupancy for one sample, on the CPU and on CUDA.
 #pragma once
 
 #include <cmath>
@@ -9,7 +9,7 @@
 
 namespace voronerf {
 
-// The cell of a sample; NaN is in the first of its axis.
+// Returns the cell of a sample. A NaN coordinate is in the first cell of its axis.
 VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {
   const int64_t size[3] = {in.x, in.y, in.z};
   int64_t cell = 0;
@@ -22,12 +22,12 @@ VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {
   return cell;
 }
 
-// Whether a sample says anything of its cell: not if it stands for no part of its ray, or if the cell stays as it is.
+// Returns whether a sample updates its cell. It does not if its delta is 0 or the cell is fixed.
 VN_HD bool observes(const ObservedSamples& in, int64_t i, int64_t cell) {
   return (in.deltas == nullptr || in.deltas[i] != 0.0f) && (in.fixed == nullptr || in.fixed[cell] == 0);
 }
 
-// World length of a unit of length of the space, at a sample; see voronerf/nerf/contraction.py.
+// Returns the world length of a unit of grid space at a sample; see voronerf/nerf/contraction.py.
 VN_HD float observed_stretch(const ObservedSamples& in, int64_t i) {
   const float* point = in.positions + 3 * i;
   if (in.space.sphere != nullptr) {
@@ -44,12 +44,13 @@ VN_HD float observed_stretch(const ObservedSamples& in, int64_t i) {
   return 1.0f;
 }
 
-// What a sample says of its cell: its density, or 0 if less than the share `hidden` of the light reaches it.
+// Returns the density that a sample observes in its cell: its own density, or 0 if no more than the share `hidden` of
+// the light reaches it.
 VN_HD float observed_density(const ObservedSamples& in, int64_t i) {
   const float density = in.sigma[i] == in.sigma[i] ? in.sigma[i] : INFINITY;
   if (in.weights == nullptr) return density * observed_stretch(in, i);
   const float thickness = density * in.deltas[i];
-  // 1 - exp(-t) <= min(t, 1), which spares most samples the function.
+  // 1 - exp(-t) <= min(t, 1), so that most samples skip expm1f.
   const bool seen = in.weights[i] > in.hidden * (thickness < 1.0f ? thickness : 1.0f) ||
                     in.weights[i] > in.hidden * -expm1f(-thickness);
   return seen ? density * observed_stretch(in, i) : 0.0f;

@@ -1,5 +1,5 @@
-// Blocks of rays over threads; each ray depends on itself alone. The pixels lie anywhere in the images, so a block asks
-// for all of its own before it computes with the first.
+// pixel_rays on the CPU: threads share blocks of rays, and rays are independent. Pixels lie anywhere in the images, so
+// a block prefetches all of its pixels before it computes the first ray.
 #include "rays/pixel_rays.h"
 
 #include <atomic>
@@ -11,7 +11,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kRays = 32;  // of a task
+constexpr int64_t kRays = 32;  // rays of a task
 
 }  // namespace
 
@@ -25,9 +25,9 @@ bool pixel_rays_cpu(const PixelRaysInputs& in, const PixelRaysOutputs& out, int 
         return;
       }
       __builtin_prefetch(in.images + in.channels * in.pixels[i]);
-      if (in.tables == nullptr) continue;  // spares a division for each ray
-      const int64_t each = in.h * in.w, camera = in.pixels[i] / each;
-      __builtin_prefetch(table_entry(in, camera, in.pixels[i] - camera * each));
+      if (in.tables == nullptr) continue;  // saves a division for each ray
+      const int64_t pixels_per_image = in.h * in.w, camera = in.pixels[i] / pixels_per_image;
+      __builtin_prefetch(table_entry(in, camera, in.pixels[i] - camera * pixels_per_image));
     }
     for (int64_t i = begin; i < end; ++i) pixel_ray(in, out, i);
   });

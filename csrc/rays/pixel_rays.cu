@@ -1,4 +1,4 @@
-// Rays through pixels on CUDA, one thread a ray: the arithmetic of the CPU.
+// Rays through pixels on CUDA, one thread per ray, with the CPU's arithmetic.
 #include "common/cuda_wrappers.h"
 #include "rays/pixel_rays_math.h"
 

@@ -1,4 +1,4 @@
-// Arithmetic of pixel_rays, one ray at a time, for the CPU and for CUDA.
+// Arithmetic of pixel_rays for one ray, on the CPU and on CUDA.
 #pragma once
 
 #include <cmath>
@@ -9,7 +9,7 @@
 
 namespace voronerf {
 
-// What the table of a lens has of a pixel; null for a camera without distortion.
+// Returns a pixel's entry in the lens table; null for a camera without distortion.
 VN_HD const float* table_entry(const PixelRaysInputs& in, int64_t camera, int64_t pixel) {
   if (in.tables == nullptr) return nullptr;
   const int64_t table = in.lens[camera];
@@ -36,16 +36,16 @@ VN_HD void pixel_direction(const PixelRaysInputs& in, int64_t camera, int64_t x,
   for (int axis = 0; axis < 3; ++axis) direction[axis] /= length;
 }
 
-// The first where they do not compare, as with std::min and std::max, which CUDA has not.
+// As std::min and std::max, which CUDA lacks: they return the first argument if one is NaN.
 VN_HD float smaller(float a, float b) { return b < a ? b : a; }
 VN_HD float larger(float a, float b) { return a < b ? b : a; }
 
-// The slab method; a ray that misses has no extent.
+// Intersects a ray with the box by the slab method. A ray that misses gets near = far.
 VN_HD void meet_box(const PixelRaysInputs& in, const float* origin, const float* direction, float& near, float& far) {
   float enter = -INFINITY, leave = INFINITY;
   for (int axis = 0; axis < 3; ++axis) {
     const float bottom = in.box[axis], top = in.box[3 + axis];
-    if (direction[axis] == 0.0f) {  // inside at all distances, or at none
+    if (direction[axis] == 0.0f) {  // inside the slab everywhere or nowhere
       if (origin[axis] < bottom || origin[axis] > top) enter = INFINITY, leave = -INFINITY;
       continue;
     }
@@ -67,11 +67,11 @@ VN_HD void pixel_colour(const PixelRaysInputs& in, const uint8_t* pixel, int64_t
   }
 }
 
-// Ray number `ray`. A pixel that there is not, which the CPU has refused before, counts as the nearest.
+// Computes ray number `ray`. A pixel index out of range, which the CPU has already rejected, is clamped.
 VN_HD void pixel_ray(const PixelRaysInputs& in, const PixelRaysOutputs& out, int64_t ray) {
-  const int64_t each = in.h * in.w, last = in.c * each - 1, given = in.pixels[ray];
-  const int64_t number = given < 0 ? 0 : given < last ? given : last;
-  const int64_t camera = number / each, pixel = number - camera * each, y = pixel / in.w;
+  const int64_t pixels_per_image = in.h * in.w, last = in.c * pixels_per_image - 1, index = in.pixels[ray];
+  const int64_t number = index < 0 ? 0 : index < last ? index : last;
+  const int64_t camera = number / pixels_per_image, pixel = number - camera * pixels_per_image, y = pixel / in.w;
   float *origin = out.origins + 3 * ray, *direction = out.directions + 3 * ray;
   for (int axis = 0; axis < 3; ++axis) origin[axis] = in.poses[16 * camera + 4 * axis + 3];
   pixel_direction(in, camera, pixel - y * in.w, y, direction);

@@ -1,4 +1,4 @@
-// Where the samples of rays begin: the check, and what the samples of a ray let through.
+// Offsets of the rays' samples: their check, and the light that a ray's samples let through.
 #pragma once
 
 #include <cstdint>
@@ -7,7 +7,7 @@
 
 namespace voronerf {
 
-// Throws std::invalid_argument unless offsets [r+1] rise from 0 or more to at most m.
+// Throws std::invalid_argument unless offsets [r+1] never decrease and lie in 0..m.
 inline void check_ray_offsets(const std::string& op, const int32_t* offsets, int64_t r, int64_t m) {
   int64_t before = 0;
   for (int64_t i = 0; i <= r; ++i) {
@@ -20,7 +20,7 @@ inline void check_ray_offsets(const std::string& op, const int32_t* offsets, int
   }
 }
 
-// What no sample of a ray has taken of the light.
+// Returns the share of the light that no sample of a ray has absorbed.
 template <typename In>
 double light_left(const In& in, int64_t ray) {
   double left = 1.0;

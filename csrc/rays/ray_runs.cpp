@@ -1,4 +1,4 @@
-// One pass each, on one thread: a step has some thousands of samples and some hundreds of runs.
+// Both functions run on one thread: a step has only some thousands of samples and some hundreds of runs.
 #include "rays/ray_runs.h"
 
 #include <algorithm>
@@ -21,7 +21,7 @@ int64_t own_samples_cpu(const KnownSamples& in, const OwnSamples& out, int) {
     const int32_t ray = in.ray_index[i];
     bool begins = i - before != 1 || ray != out.ray_index[count - 1];
     if (!begins) {
-      // Less than the stratum between would be long: none lies there.
+      // The distance is less than the shorter delta, so no stratum lies in between.
       const bool near = in.depths[i] - out.depths[count - 1] < std::min(in.deltas[i], out.deltas[count - 1]);
       begins = !near && (in.bent || cell != out.cells[count - 1]);
     }
@@ -43,7 +43,7 @@ float compose_runs_cpu(const RunsOfRays& in, float* answers, int) {
   const double least = static_cast<double>(in.first), beyond = static_cast<double>(in.first + in.r);
   for (int64_t run = 0; run < in.q; ++run) {
     const double number = in.sums[6 * run + 5];
-    if (!(number >= least && number < beyond)) {  // NaN, too, which is no integer
+    if (!(number >= least && number < beyond)) {  // also rejects NaN, which must not be converted
       char text[32];
       std::snprintf(text, sizeof(text), "%g", number);
       throw std::invalid_argument("compose_runs: rays must be " + std::to_string(in.first) + " to " +
@@ -52,7 +52,8 @@ float compose_runs_cpu(const RunsOfRays& in, float* answers, int) {
     ++ends[ray_of(run)];
   }
   for (int64_t ray = 0, sum = 0; ray <= in.r; ++ray) sum += std::exchange(ends[ray], sum);
-  for (int64_t run = 0; run < in.q; ++run) order[ends[ray_of(run)]++] = run;  // now each is the end of its ray
+  // Each entry of `ends` becomes the end of its ray.
+  for (int64_t run = 0; run < in.q; ++run) order[ends[ray_of(run)]++] = run;
   const float share = 2.0f / (3.0f * static_cast<float>(in.rays));
   double loss = 0.0;
   for (int64_t ray = 0, begin = 0; ray < in.r; begin = ends[ray++]) {

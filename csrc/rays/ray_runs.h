@@ -1,48 +1,48 @@
-// Rays that pass through the cells of several ranks: which samples are a rank's own, which of them make a run, and rays
-// put together from the partial sums of runs (render_loss.h). What a run is, is said in
-// voronerf/ops/ray_runs/__init__.py.
+// Rays that pass through the cells of several ranks: selects a rank's own samples, splits them into runs, and composes
+// rays from the partial sums of runs (render_loss.h). Runs are defined in voronerf/ops/ray_runs/__init__.py.
 #pragma once
 
 #include <cstdint>
 
 namespace voronerf {
 
-// Samples in the order of their rays, near to far, some of other ranks.
+// The samples in the order of their rays, near to far; some belong to other ranks.
 struct KnownSamples {
   const float* positions;    // [n,3]
   const int32_t* ray_index;  // [n]
   const float* depths;       // [n]
   const float* deltas;       // [n]
   const int32_t* cells;      // [n]
-  const int32_t* own;        // [k], the number of each cell among a rank's own, or -1
+  const int32_t* own;        // [k], the number of each cell among the rank's own cells, or -1
   int64_t n;
-  bool bent;  // rays are, by a contraction
+  bool bent;  // rays are curved by a contraction
 };
 
-// Room for all of them.
+// The rank's own samples. Each array has room for n samples.
 struct OwnSamples {
   float* positions;
   int32_t* ray_index;
   float* depths;
   float* deltas;
-  int32_t* cells;    // among the own ones
-  int32_t* offsets;  // [n+1], where each run begins, and the end of the last
+  int32_t* cells;    // numbers among the rank's own cells
+  int32_t* offsets;  // [n+1], the start of each run, then the end of the last run
 };
 
-// Keeps own samples; returns how many runs they make.
+// Copies the rank's own samples to `out`; returns the number of their runs.
 int64_t own_samples_cpu(const KnownSamples& in, const OwnSamples& out, int threads);
 
 struct RunsOfRays {
-  const float* sums;        // [q,6], of any order
+  const float* sums;        // [q,6], the runs' partial sums in any order
   const float* target;      // [r,3], the colours of rays `first` to `first + r`
   const float* background;  // [r,3], or [3], or null
   bool background_per_ray;
   int64_t q, first, r;
-  int64_t rays;  // of all ranks
-  float robust;  // as of RenderLossInputs
+  int64_t rays;  // the number of rays of all ranks
+  float robust;  // as in RenderLossInputs
 };
 
-// Answers [q,6] to the sums; returns what these rays add to the loss. Throws std::invalid_argument for other rays.
+// Writes an answer to each sum, answers [q,6], and returns these rays' part of the loss. Throws std::invalid_argument
+// for a run of another ray.
 float compose_runs_cpu(const RunsOfRays& in, float* answers, int threads);
 
 }  // namespace voronerf

@@ -1,16 +1,16 @@
-// What the CUDA kernels share that give a ray to a warp: its samples, 32 at a time, and sums over them.
+// Device functions for CUDA kernels with one warp per ray: its samples, 32 at a time, and sums over them.
 #pragma once
 
 #include "common/cuda_wrappers.h"
 
 namespace voronerf {
 
-constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
+constexpr float kOpaque = 1e30f;  // replaces infinite density; just as opaque over any length but 0
 
-// A NaN stays one.
+// NaN stays NaN.
 __device__ inline float finite_density(float sigma) { return sigma > kOpaque ? kOpaque : sigma; }
 
-// A sum in two floats.
+// A compensated sum in two floats.
 struct Carry {
   float high = 0.0f, low = 0.0f;
 
@@ -19,7 +19,7 @@ struct Carry {
     const float sum = high + x, part = sum - high;
     const float lost = (high - (sum - part)) + (x - part);
     high = sum;
-    // What is infinite or no number has no digits to lose.
+    // Infinity and NaN have no rounding error to keep.
     if (lost == lost && fabsf(lost) < INFINITY) low += lost;
   }
 };
@@ -29,7 +29,7 @@ __device__ inline float sum_of_lanes(float x) {
   return x;
 }
 
-// Sum over this lane and those before it (after it, backwards).
+// Returns the sum over this lane and the lanes before it; running_sum_back, over the lanes after it.
 template <typename T>
 __device__ T running_sum(T x, int lane) {
   for (int step = 1; step < 32; step *= 2) {
@@ -47,7 +47,7 @@ __device__ inline float running_sum_back(float x, int lane) {
   return x;
 }
 
-// Sum over the threads of a block, of all of which `sums` has room for one; for the first thread.
+// Returns the sum over the threads of a block to thread 0. `sums` is shared, one entry per thread.
 template <int kThreads>
 __device__ double sum_of_block(double sum, double* sums) {
   sums[threadIdx.x] = sum;
@@ -58,7 +58,7 @@ __device__ double sum_of_block(double sum, double* sums) {
   return sums[threadIdx.x];
 }
 
-// Optical depth in front of each lane's sample; the carry moves to the end of the chunk.
+// Returns the optical depth in front of each lane's sample; the carry moves to the end of the chunk.
 __device__ inline float depth_in_front(float optical, int lane, Carry& carry) {
   const float through = running_sum(optical, lane);
   float before = __shfl_up_sync(kAllLanes, through, 1);
@@ -68,8 +68,8 @@ __device__ inline float depth_in_front(float optical, int lane, Carry& carry) {
   return front;
 }
 
-// Of a gradient to the optical depth of each lane's sample what those behind it take: the sum of their shares, which
-// are 0 where there is no sample. The carry moves to the front of the chunk.
+// Returns the sum of `share` over the samples behind each lane's sample, which its gradient of the optical depth loses.
+// Lanes without a sample have share 0. The carry moves to the front of the chunk.
 __device__ inline float share_behind(float share, int lane, Carry& carry) {
   const float rest = running_sum_back(share, lane);
   float after = __shfl_down_sync(kAllLanes, rest, 1);
@@ -83,7 +83,8 @@ struct RayRange {
   int64_t begin, end;
 };
 
-// Samples of a ray. Offsets that fall or exceed m cannot be refused without a host read: nothing outside is touched.
+// Returns the samples of a ray. Offsets that decrease or exceed m cannot be rejected without a host read; they are
+// clamped, so that no access is out of range.
 __device__ inline RayRange ray_range(const int32_t* offsets, int64_t ray, int64_t m) {
   const int64_t first = offsets[ray], last = offsets[ray + 1];
   const int64_t begin = first < 0 ? 0 : first > m ? m : first;

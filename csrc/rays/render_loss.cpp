@@ -1,5 +1,5 @@
-// Blocks of rays over threads. Each ray depends on itself alone, and one thread sums their errors, so results do not
-// depend on the number of threads.
+// render_loss on the CPU: threads share blocks of rays. Rays are independent, and one thread sums their errors, so
+// results do not depend on the number of threads.
 #include "rays/render_loss.h"
 
 #include <algorithm>

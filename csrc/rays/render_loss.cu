@@ -1,8 +1,8 @@
-// The loss of rendered rays and its gradient on CUDA, a warp a ray and 32 samples at a time, as in composite.cu; the
-// formulas are those of render_loss_isa.cpp. A ray goes by twice in one launch: forwards until its colour is known, and
-// back. The last samples stay in registers between the two, which with an occupancy grid are mostly all; of those
-// before them the raw outputs are read again, and their optical depth waits where the gradient of the density is to be.
-// For a sample 20 bytes are read and 24 written.
+// The loss of rendered rays and its gradient on CUDA: one warp per ray, 32 samples at a time, as in composite.cu. The
+// formulas are in render_loss_isa.cpp. One launch walks along a ray until its colour is known, and then back. The last
+// chunk of samples stays in registers in between; with an occupancy grid this is mostly the whole ray. For earlier
+// chunks the raw outputs are read again, and the optical depth is stored in the memory of the density's gradient. A
+// sample takes 20 bytes of reads and 24 bytes of writes.
 #include "common/cuda_wrappers.h"
 #include "rays/ray_warp.h"
 #include "rays/render_loss.h"
@@ -28,10 +28,10 @@ __device__ void store_row(float* gradient, int64_t i, float4 row) {
   *reinterpret_cast<float4*>(gradient + 4 * i) = row;
 }
 
-// A sample after its activations, if it needs any; of no extent and no colour where a lane has none.
+// A sample after activation. A lane without a sample has delta 0 and a black colour.
 struct Sample {
   float rgb[3] = {};
-  float density = 0.0f, slope = 0.0f, delta = 0.0f, optical = 0.0f;  // slope: of the density to the number given
+  float density = 0.0f, slope = 0.0f, delta = 0.0f, optical = 0.0f;  // slope: derivative of density by raw
 };
 
 template <bool Activated>
@@ -57,7 +57,7 @@ template <bool Activated>
 __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs in, RenderLossOutputs out) {
   const int lane = threadIdx.x % 32;
   const int64_t ray = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
-  if (ray >= in.r) return;  // a whole warp
+  if (ray >= in.r) return;  // the same for the whole warp
   const RayRange range = ray_range(in.offsets, ray, in.m);
   const bool aligned = reinterpret_cast<uintptr_t>(in.raw) % 16 == 0;
   Sample sample;
@@ -73,7 +73,7 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
     if (!active) continue;
     out.weights[i] = weight;
     out.density[i] = sample.density;
-    if (start + 32 < range.end) out.gradient[4 * i + 3] = front;  // read again below, by this very thread
+    if (start + 32 < range.end) out.gradient[4 * i + 3] = front;  // read again below, by the same thread
   }
   const float* background = in.background;
   if (background != nullptr && in.background_per_ray) background += 3 * ray;
@@ -88,7 +88,7 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
   }
   const bool has_target = ray < in.r - 3 * in.triples;
   if (lane == 0) out.error[ray] = has_target ? error : 0.0f;
-  if (!has_target) {  // a whole warp
+  if (!has_target) {  // the same for the whole warp
     for (int64_t i = range.begin + lane; i < range.end; i += 32) store_row(out.gradient, i, {});
     return;
   }
@@ -102,19 +102,19 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
   for (int64_t chunk = chunks; chunk-- > 0;) {
     const int64_t i = range.begin + 32 * chunk + lane;
     const bool active = i < range.end;
-    if (chunk + 1 < chunks) {  // and full
+    if (chunk + 1 < chunks) {  // an earlier chunk, which is full
       sample = sample_of<Activated>(in, i, true, aligned);
       front = out.gradient[4 * i + 3];
     }
     const float arriving = expf(-front), weight = arriving * -expm1f(-sample.optical);
-    float own = 0.0f, of_raw[3];
+    float of_weight = 0.0f, of_raw[3];
     for (int k = 0; k < 3; ++k) {
-      own = fmaf(slopes[k], sample.rgb[k], own);
+      of_weight = fmaf(slopes[k], sample.rgb[k], of_weight);
       of_raw[k] = weight * slopes[k];
       if (!Activated) of_raw[k] *= sample.rgb[k] * (1.0f - sample.rgb[k]);
     }
-    const float taken = share_behind(active ? own * weight : 0.0f, lane, behind);
-    const float of_optical = own * (arriving * expf(-sample.optical)) - taken;
+    const float shares_behind = share_behind(active ? of_weight * weight : 0.0f, lane, behind);
+    const float of_optical = of_weight * (arriving * expf(-sample.optical)) - shares_behind;
     if (!active) continue;
     float4 row = make_float4(of_raw[0], of_raw[1], of_raw[2], of_optical * sample.delta * sample.slope);
     if (arriving <= in.hidden) row = {};
@@ -122,7 +122,8 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
   }
 }
 
-// Samples of no ray, [0, offsets[0]) and [offsets[r], m): only their density is of interest.
+// Handles samples without a ray, [0, offsets[0]) and [offsets[r], m): computes their density, and zeros their weights
+// and gradient.
 __global__ void __launch_bounds__(kThreads) render_loss_strays(RenderLossInputs in, RenderLossOutputs out) {
   const int64_t first = in.offsets[0], last = in.offsets[in.r], step = static_cast<int64_t>(gridDim.x) * kThreads;
   for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < in.m; i += step) {
@@ -133,7 +134,7 @@ __global__ void __launch_bounds__(kThreads) render_loss_strays(RenderLossInputs 
   }
 }
 
-// One block: the losses of the rays summed in an order that does not depend on the device.
+// Computes the mean loss of the rays in one block, summed in an order that does not depend on the device.
 __global__ void __launch_bounds__(kThreads)
     render_loss_mean(const float* __restrict__ error, float robust, int64_t r, float* loss) {
   VN_SHARED(sums, double[kThreads]);

@@ -1,11 +1,12 @@
-// The CPU kernels of render_loss, once for each instruction set.
+// The CPU kernels of render_loss, compiled once per instruction set.
 //
-// The arithmetic is that of composite (composite_isa.cpp) between the activations of the networks' outputs and the
-// squared error of the colour. With an occupancy grid a ray has few samples, fewer than a vector: so those of several
-// rays go by together, forwards in chunks that stay in the first-level cache, until the colours and so the gradients to
-// them are known, and backwards with the sum of what is behind. Only sums along a ray are taken one by one. Rays of one
-// chunk are activated once. The samples of a longer ray are activated again on the way back; the optical depth in front
-// of them waits where the gradient of the density is to be. Rays without a colour to learn go by forwards alone.
+// They compute activations, volume rendering as in composite_isa.cpp, and the squared error of the colour. With an
+// occupancy grid a ray has fewer samples than a vector has lanes, so the samples of several rays are processed
+// together. The forward pass runs over chunks that stay in the L1 cache, until the colours and their gradients are
+// known. The backward pass runs back with the sum over samples behind. Only sums along a ray are serial. Rays that fit
+// in one chunk are activated once. The samples of a longer ray are activated again in the backward pass; the optical
+// depth in front of them is stored in the memory of the density's gradient. Rays without a target have no backward
+// pass.
 #include "rays/render_loss_isa.h"
 
 #include "rays/render_loss_math.h"
@@ -15,9 +16,9 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-constexpr int64_t kRunSums = 6;  // numbers of a partial sum, and of an answer
+constexpr int64_t kRunSums = 6;  // size of a partial sum, and of an answer
 
-// What is summed along the rays of a task.
+// The sums along the rays of a task.
 struct Sums {
   double front[kRenderLossRays], behind[kRenderLossRays], light[3][kRenderLossRays];
   float slopes[3][kRenderLossRays];
@@ -45,10 +46,10 @@ VN_INLINE void forward(const RenderLossInputs& in, const RenderLossOutputs& out,
   for (int64_t i = 0; !together && i < count; ++i) out.gradient[4 * (first + i) + 3] = chunk.front[i];
 }
 
-// Whether a ray has a colour to learn.
+// Returns whether a ray has a target colour.
 VN_INLINE bool has_target(const RenderLossInputs& in, int64_t ray) { return ray < in.r - 3 * in.triples; }
 
-// The colours of rays, their errors, and the gradients to them.
+// Computes the colours of rays, their errors, and the gradients of the colours.
 VN_INLINE void compare(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to, Sums& sums) {
   const float share = 2.0f / (3.0f * static_cast<float>(in.r));
   for (int64_t ray = from; ray < to; ++ray) {
@@ -77,7 +78,7 @@ VN_INLINE void compare(const RenderLossInputs& in, const RenderLossOutputs& out,
   }
 }
 
-// What runs are told of their rays.
+// Reads the answers of whole rays to runs.
 VN_INLINE void hear(const float* answers, int64_t from, int64_t to, Sums& sums) {
   for (int64_t run = from; run < to; ++run) {
     for (int k = 0; k < 3; ++k) sums.slopes[k][run - from] = answers[kRunSums * run + k];
@@ -85,13 +86,13 @@ VN_INLINE void hear(const float* answers, int64_t from, int64_t to, Sums& sums) 
   }
 }
 
-// From the gradients to the colours of rays: those to the colours of samples, which take their place, and what is in
-// those to their optical depths without the samples behind.
+// Turns the gradients of the rays' colours into gradients of the samples' colours, which replace the colours, and into
+// the gradients of the optical depths without the terms of samples behind.
 template <bool Activated>
 VN_INLINE void slopes(float hidden, int64_t count, Chunk& chunk) {
   for (int64_t i = 0; i < count; i += kLanes) {
     const F32 light = load(chunk.light + i), weight = load(chunk.weights + i);
-    const Bits seen = ~(light <= splat(hidden));  // as is NaN
+    const Bits seen = ~(light <= splat(hidden));  // true for NaN
     F32 gradient = splat(0.0f);
     for (int k = 0; k < 3; ++k) {
       const F32 value = load(chunk.rgb[k] + i), shade = load(chunk.shade[k] + i);
@@ -100,7 +101,7 @@ VN_INLINE void slopes(float hidden, int64_t count, Chunk& chunk) {
       store(chunk.rgb[k] + i, only(seen, Activated ? of_colour : of_colour * (value * (splat(1.0f) - value))));
     }
     store(chunk.part + i, gradient * weight);
-    store(chunk.own + i, gradient * (light * transmittance(load(chunk.optical + i))));
+    store(chunk.of_optical + i, gradient * (light * transmittance(load(chunk.optical + i))));
     store(chunk.slope + i, only(seen, load(chunk.slope + i)));
   }
 }
@@ -128,18 +129,18 @@ VN_INLINE void backward(const RenderLossInputs& in, const RenderLossOutputs& out
   each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
     double behind = sums.behind[ray];
     for (int64_t i = end; i-- > begin;) {
-      chunk.own[i] = static_cast<float>(static_cast<double>(chunk.own[i]) - behind);
+      chunk.of_optical[i] = static_cast<float>(static_cast<double>(chunk.of_optical[i]) - behind);
       behind += static_cast<double>(chunk.part[i]);
     }
     sums.behind[ray] = behind;
   });
   for (int64_t i = 0; i < count; i += kLanes) {
-    store(chunk.own + i, load(chunk.own + i) * load(chunk.deltas + i) * load(chunk.slope + i));
+    store(chunk.of_optical + i, load(chunk.of_optical + i) * load(chunk.deltas + i) * load(chunk.slope + i));
   }
   float* gradient = out.gradient + 4 * first;
   for (int64_t i = 0; i < count; ++i) {
     for (int k = 0; k < 3; ++k) gradient[4 * i + k] = chunk.rgb[k][i];
-    gradient[4 * i + 3] = chunk.own[i];
+    gradient[4 * i + 3] = chunk.of_optical[i];
   }
 }
 
@@ -150,7 +151,7 @@ VN_INLINE void reset(int64_t rays, Sums& sums) {
   }
 }
 
-// Rays of `each_chunk`, or runs, where there are answers.
+// Renders the rays of one call of each_chunk. With answers these are runs.
 VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& out, const float* answers, int64_t from,
                            int64_t to, Chunk& chunk, Sums& sums) {
   const int64_t begin = in.offsets[from], end = in.offsets[to];

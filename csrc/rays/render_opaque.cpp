@@ -1,7 +1,7 @@
-// Rays over threads. Each thread has a pool of rays that are under way, and takes a wave of samples of all of them at a
-// time: through the grid, to their cells, through the networks, and to the colours. A ray that has ended makes room for
-// the next one of the picture, so that the waves are as large to the end. What a ray sees does not depend on which rays
-// are beside it, nor on the number of threads.
+// render_opaque on the CPU. Each thread has a pool of active rays and processes a wave of their samples at a time: it
+// marches through the grid, sorts samples by cell, evaluates the networks and adds to the colours. The image's next ray
+// replaces a ray that has ended, so that waves stay large. A ray's result depends neither on the other rays in the pool
+// nor on the number of threads.
 #include "rays/render_opaque.h"
 
 #include <algorithm>
@@ -25,11 +25,11 @@ namespace voronerf {
 
 namespace {
 
-// Samples of a wave, about. A quarter as many lie in the second-level cache, but weights of a cell are packed for each
-// wave, and its rows leave tiles half empty: it takes longer.
+// The approximate number of samples in a wave. A quarter of it would fit in the L2 cache but is slower, because the
+// weights of a cell are packed for each wave and the last tile of its rows is half empty.
 constexpr int64_t kSamples = 32768;
-constexpr int64_t kShare = 8;  // pools of a thread in a picture, at least, so that all threads have work to the end
-constexpr int64_t kRun = 32;   // rays of the picture that a thread takes at once
+constexpr int64_t kShare = 8;  // minimum number of pools per thread in an image, for load balance
+constexpr int64_t kRun = 32;   // rays of the image that a thread takes at once
 
 void count_strata(Isa isa, const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts) {
   VN_FOR_ISA(isa, march_count(in, room, mask, counts, 0, in.r))
@@ -40,7 +40,7 @@ void fill_samples(Isa isa, const MarchInputs& in, const uint32_t* mask, const in
 }
 void add_wave(Isa isa, const SeenWave& in, int64_t r) { VN_FOR_ISA(isa, see_wave(in, r)) }
 
-// One call, as its threads read it.
+// The arguments of one call, which its threads read.
 struct Call {
   const ProgramInputs& network;
   const ProgramRows& rows;
@@ -49,7 +49,7 @@ struct Call {
   const SeeCells& cells;
   const SeeRule& rule;
   const SeeOutputs& out;
-  int64_t directions;  // q
+  int64_t directions;  // q, the columns of the directions
   Isa isa;
   int threads;
 };
@@ -78,7 +78,7 @@ class Pool {
         descent_(call.cells.child == nullptr ? 0 : locate_cell_workspace(call.cells.m, 1)),
         cell_offsets_(call.network.k + 1) {}
 
-  // False if a place is at no leaf.
+  // Returns false if a position is not at a leaf.
   bool run(Items& items, int thread) {
     while (refill(items, thread) > 0) {
       if (!wave()) return false;
@@ -155,7 +155,7 @@ class Pool {
     return true;
   }
 
-  // The samples by their cells.
+  // Sorts the samples by cell. Returns false if a position is not at a leaf.
   bool sort(ProgramInputs& in) {
     const SeeCells& cells = call_.cells;
     in.offsets = cell_offsets_.data();
@@ -178,7 +178,7 @@ class Pool {
     return cell_sort_cpu(cell, order, cell_offsets_.data(), in.n, in.k, 1);
   }
 
-  // Rays that have ended.
+  // Finishes the rays that have ended, and keeps the others.
   void drop() {
     int64_t kept = 0;
     for (int64_t i = 0; i < count_; ++i) {
@@ -197,7 +197,7 @@ class Pool {
     count_ = kept;
   }
 
-  // The sums of a ray become what it sees: one that is opaque has the colour of what it has met.
+  // Turns the sums of a ray into its outputs. The colour of an opaque ray is divided by its opacity.
   void finish(int64_t ray, float far) const {
     const SeeOutputs& out = call_.out;
     const SeeRule& rule = call_.rule;
@@ -243,13 +243,13 @@ bool render_opaque_cpu(const Program& program, const ProgramInputs& network, con
                   isa,     std::max(threads, 1)};
   const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div<int64_t>(march.r, kRun)));
   Items items(march.r, kRun, team);
-  std::vector<std::unique_ptr<Pool>> pools;  // made here, as nothing may be thrown in a team
+  std::vector<std::unique_ptr<Pool>> pools;  // allocated here, because code on the team's threads must not throw
   for (int thread = 0; thread < team; ++thread) {
     pools.push_back(std::make_unique<Pool>(call, workspace.data() + thread * rows.workspace()));
   }
   std::atomic<bool> sound{true};
   parallel(team, [&](int thread) {
-    const FlushDenormals flush;  // in networks
+    const FlushDenormals flush;  // for the networks
     if (!pools[static_cast<size_t>(thread)]->run(items, thread)) sound = false;
   });
   return sound;

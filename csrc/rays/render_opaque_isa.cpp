@@ -1,5 +1,5 @@
-// The kernel of render_opaque, once for each instruction set: the samples of a wave are weighed as in render_loss, and
-// added to their rays.
+// The CPU kernel of render_opaque, compiled once per instruction set. It computes the samples' weights as in
+// render_loss, and adds the samples to their rays.
 #include "rays/render_opaque_isa.h"
 
 #include "rays/render_tile.h"

@@ -1,4 +1,4 @@
-// The kernel of render_opaque, once for each instruction set.
+// The CPU kernel of render_opaque, compiled once per instruction set.
 #pragma once
 
 #include <cstdint>
@@ -7,7 +7,7 @@
 
 namespace voronerf {
 
-// Samples of a wave, and the rays [r] that they belong to, by their numbers in the picture.
+// The samples of a wave, and the numbers [r] of their rays in the image.
 struct SeenWave {
   const float* raw;                 // [m,4]
   const float *depths, *deltas;     // [m]
@@ -16,8 +16,8 @@ struct SeenWave {
   bool activated;
   double* front;                   // [r], the optical depth so far
   float* most;                     // [r], the largest weight so far, or null
-  float* colour;                   // of the picture's rays, as in render_opaque.h
-  float *opacity, *depth, *light;  // light: what is left behind the wave
+  float* colour;                   // of the image's rays, as in render_opaque.h
+  float *opacity, *depth, *light;  // light: the remaining light behind the wave
   float* heaviest;
 };
 

@@ -1,5 +1,5 @@
-// Samples of several rays at once, from the networks' outputs to their weights: what render_loss and render_opaque
-// share.
+// Computes the weights of several rays' samples at once from the networks' outputs; shared by render_loss and
+// render_opaque.
 //
 // `In` has raw [m,4], deltas [m], offsets [r+1], density_scale and activated.
 #pragma once
@@ -12,19 +12,19 @@ namespace VN_ISA_NAMESPACE {
 namespace {
 
 constexpr int64_t kChunk = 128;
-constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
+constexpr float kOpaque = 1e30f;  // replaces infinite density; just as opaque over any length but 0
 
-// Samples [first, first + count), in the order of their rays, filled up to whole vectors by samples of no extent.
+// Samples [first, first + count) in the order of their rays, padded to whole vectors by samples with delta 0.
 struct Chunk {
-  alignas(64) float rgb[3][kChunk], shade[3][kChunk];  // shade: the gradient to the colour of the ray
-  alignas(64) float density[kChunk], slope[kChunk];    // slope: of the density to the number given for it
+  alignas(64) float rgb[3][kChunk], shade[3][kChunk];  // shade: gradient of the ray's colour
+  alignas(64) float density[kChunk], slope[kChunk];    // slope: derivative of density by raw
   alignas(64) float deltas[kChunk], optical[kChunk], front[kChunk];
-  alignas(64) float light[kChunk], weights[kChunk];  // the share of the light that reaches a sample
-  alignas(64) float part[kChunk], own[kChunk];
+  alignas(64) float light[kChunk], weights[kChunk];    // light: share that reaches a sample
+  alignas(64) float part[kChunk], of_optical[kChunk];  // terms in the gradient of the optical depth
 };
 
 VN_INLINE F32 finite(F32 density) {
-  return density > splat(kOpaque) ? splat(kOpaque) : density;  // a NaN stays one
+  return density > splat(kOpaque) ? splat(kOpaque) : density;  // NaN stays NaN
 }
 
 template <typename In>
@@ -57,13 +57,13 @@ VN_INLINE void activate(const In& in, int64_t first, int64_t count, Chunk& chunk
   }
 }
 
-// exp(-x), 0 where float32 has nothing smaller.
+// Returns exp(-x), 0 for values too small for float32.
 VN_INLINE F32 transmittance(F32 x) {
   const F32 minus = splat(0.0f) - x;
   return minus < splat(-87.0f) ? splat(0.0f) : exponential(minus);
 }
 
-// Light and weights from the optical depth in front of samples and their own.
+// Computes light and weights from the samples' optical depths and the optical depths in front of them.
 VN_INLINE void weigh(int64_t count, Chunk& chunk) {
   for (int64_t i = count; i % kLanes != 0; ++i) chunk.front[i] = 0.0f;
   for (int64_t i = 0; i < count; i += kLanes) {
@@ -73,7 +73,7 @@ VN_INLINE void weigh(int64_t count, Chunk& chunk) {
   }
 }
 
-// run(ray, begin, end) for the rays from `from` to `to`, with their samples of a chunk by their places in it.
+// Calls run(ray, begin, end) for each of the rays `from` to `to`, with the range of the ray's samples in the chunk.
 template <typename In, typename Run>
 VN_INLINE void each_ray(const In& in, int64_t from, int64_t to, int64_t first, int64_t count, const Run& run) {
   for (int64_t ray = from; ray < to; ++ray) {
@@ -82,7 +82,7 @@ VN_INLINE void each_ray(const In& in, int64_t from, int64_t to, int64_t first, i
   }
 }
 
-// Optical depths in front of samples; those of the rays so far, `front`, go on.
+// Computes the optical depth in front of each sample, and advances `front`, the rays' optical depths so far.
 template <typename In>
 VN_INLINE void pass(const In& in, int64_t from, int64_t to, int64_t first, int64_t count, double* front, Chunk& chunk) {
   each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
@@ -95,7 +95,7 @@ VN_INLINE void pass(const In& in, int64_t from, int64_t to, int64_t first, int64
   });
 }
 
-// `run(from, to)` for rays whose samples fill a chunk at most, or one longer ray.
+// Calls run(from, to) for groups of rays whose samples fit in one chunk, or for one longer ray.
 template <typename In, typename Run>
 VN_INLINE void each_chunk(const In& in, int64_t begin, int64_t end, const Run& run) {
   for (int64_t from = begin, to; from < end; from = to) {

@@ -1,6 +1,6 @@
-// One walk along each ray from its end: the weights say how much light is left behind a sample, and what its loss is
-// worth adds up, so that no exponential of an optical depth is taken again. Rays are independent, so results do not
-// depend on the threads. Colours are activated only where something depends on them. The slope of the softplus is a
+// Walks along each ray once, from its end. The weights give the light behind a sample, and the losses of the weights
+// behind it are summed, so no exponential of an optical depth is recomputed. Rays are independent, so results do not
+// depend on the number of threads. Colours are activated only if a gradient needs them. The slope of the softplus is a
 // sigmoid, whose exp takes half the time of the expm1 of density_slope.h.
 #include "rays/rendered_gradient.h"
 
@@ -19,7 +19,7 @@ float entry(const float* values, int64_t i) { return values == nullptr ? 0.0f : 
 
 void learn_ray(const RenderedGradient& in, int64_t ray, float* gradient) {
   const bool coloured = in.of_colour != nullptr || in.of_rgb != nullptr;
-  float of_colour[3], of_light = entry(in.of_opacity, ray);  // of each unit of weight
+  float of_colour[3], of_light = entry(in.of_opacity, ray);  // gradients per unit of weight
   for (int k = 0; k < 3; ++k) {
     of_colour[k] = entry(in.of_colour, 3 * ray + k);
     of_light -= of_colour[k] * entry(in.background, in.background_per_ray ? 3 * ray + k : k);
@@ -36,7 +36,7 @@ void learn_ray(const RenderedGradient& in, int64_t ray, float* gradient) {
     }
     const double weight = static_cast<double>(in.weights[i]), worth = static_cast<double>(of_weight);
     if (!(through + weight <= hidden)) {
-      const float of_depth = static_cast<float>(through * worth - behind);  // the optical one
+      const float of_depth = static_cast<float>(through * worth - behind);  // of the optical depth
       const float of_density = in.deltas[i] * of_depth + entry(in.of_density, i);
       gradient[4 * i + 3] += of_density * (in.activated ? 1.0f : in.density_scale * sigmoid(in.raw[4 * i + 3]));
       for (int k = 0; coloured && k < 3; ++k) {
@@ -52,7 +52,7 @@ void learn_ray(const RenderedGradient& in, int64_t ray, float* gradient) {
 }  // namespace
 
 void rendered_gradient_cpu(const RenderedGradient& in, float* gradient, int threads) {
-  constexpr int64_t kRays = 64;  // of a task
+  constexpr int64_t kRays = 64;  // rays of a task
   check_ray_offsets("rendered_gradient", in.offsets, in.r, in.m);
   parallel_for(in.r, kRays, threads, [&](int64_t ray) { learn_ray(in, ray, gradient); });
 }

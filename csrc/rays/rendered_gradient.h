@@ -1,5 +1,5 @@
-// From gradients of a loss to what rays show, those to what the networks have put out: r rays, m samples. Ray i owns
-// samples offsets[i] : offsets[i + 1]. The formulas are in voronerf/ops/rendered_gradient.
+// Turns gradients of rendered rays into gradients of the networks' outputs: r rays, m samples. Ray i owns samples
+// offsets[i] : offsets[i + 1]. The formulas are in voronerf/ops/rendered_gradient.
 #pragma once
 
 #include <cstdint>
@@ -14,15 +14,15 @@ struct RenderedGradient {
   const int32_t* offsets;                  // [r+1]
   const float* background;                 // [r,3], or [3], or null
   bool background_per_ray;
-  const float *of_colour, *of_opacity, *of_depth;  // [r,3], [r], [r], and below [m], [m,3], [m]; null for zero
-  const float *of_weights, *of_rgb, *of_density;
-  float hidden;  // if positive, samples that no more light reaches have no gradient
+  const float *of_colour, *of_opacity, *of_depth;  // [r,3], [r], [r]; null for zero
+  const float *of_weights, *of_rgb, *of_density;   // [m], [m,3], [m]; null for zero
+  float hidden;  // if positive, samples that at most this share of the light reaches have no gradient
   float density_scale;
-  bool activated;  // the gradient is to colours and densities themselves, else to what comes before their activations
+  bool activated;  // raw holds colours and densities themselves, else their values before activation
   RowCount r, m;
 };
 
-// Adds to gradient: [m,4]. Throws std::invalid_argument for offsets that fall or exceed m, and adds nothing then.
+// Adds to gradient [m,4]. Throws std::invalid_argument for offsets that decrease or exceed m, and then adds nothing.
 void rendered_gradient_cpu(const RenderedGradient& in, float* gradient, int threads);
 
 }  // namespace voronerf

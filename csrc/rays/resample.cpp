@@ -1,6 +1,5 @@
-// Inverse of the cumulative distribution on the CPU. Sorted targets and bins are walked side by side, so a ray costs
-// s + count steps and no table of its running mass, which is kept in float64. Rays are spread over threads; each
-// depends on itself alone.
+// Inverse-CDF sampling on the CPU. Sorted targets and bins are merged, so a ray takes s + count steps and no table of
+// its running mass, which is float64. Threads share the rays, which are independent.
 #include "rays/resample.h"
 
 #include <algorithm>
@@ -12,7 +11,7 @@ namespace voronerf {
 
 namespace {
 
-// Bins and depths of a task.
+// The number of bins and depths of a task.
 constexpr int64_t kBlock = 4096;
 
 void resample_ray(const float* weights, const float* edges, const float* uniforms, float* depths, int64_t s,
@@ -32,7 +31,7 @@ void resample_ray(const float* weights, const float* edges, const float* uniform
   const auto mass = [&](int64_t i) { return even ? 1.0 : static_cast<double>(weight(i)); };
   if (uniforms != nullptr) {
     std::copy(uniforms, uniforms + count, depths);
-    // NaN goes last.
+    // NaN sorts last.
     std::sort(depths, std::partition(depths, depths + count, [](float u) { return !std::isnan(u); }));
   }
 
@@ -42,8 +41,8 @@ void resample_ray(const float* weights, const float* edges, const float* uniform
     double u = (static_cast<double>(j) + 0.5) / static_cast<double>(count);
     if (uniforms != nullptr) u = depths[j] < 0.0f ? 0.0 : depths[j] > 1.0f ? 1.0 : depths[j];
     const double target = u * total;
-    // A target on the edge of two bins belongs to the later one, so a bin of no mass is never drawn; the last bin that
-    // has mass takes what rounds to the very end.
+    // A target on the edge of two bins belongs to the later bin, so a bin without mass is never drawn. The last bin
+    // with mass takes targets that round to the end.
     while (bin < last && target >= upper) {
       lower = upper;
       upper += mass(++bin);

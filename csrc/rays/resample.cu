@@ -1,7 +1,7 @@
-// Inverse-CDF sampling on CUDA, a warp a ray. The running mass of a ray's bins, in float64 as on the CPU, goes to the
-// workspace [r,s]; then every lane looks its targets up by bisection. Uniforms in any order: a depth's place is its
-// uniform's rank, counted by walking over the ray's uniforms (count^2 / 32 steps a lane, from cache), which needs no
-// scratch memory and leaves equal ones in their order.
+// Inverse-CDF sampling on CUDA, one warp per ray. The running mass of a ray's bins, float64 as on the CPU, goes to the
+// workspace [r,s]; then every lane finds the bins of its targets by bisection. Uniforms may have any order: a depth's
+// place is the rank of its uniform. A lane counts ranks by walking over the ray's uniforms (count^2 / 32 steps, in
+// cache). This needs no scratch memory and is stable.
 #include "common/cuda_wrappers.h"
 #include "rays/ray_warp.h"
 #include "rays/resample.h"
@@ -13,12 +13,12 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kWarps = kThreads / 32;
 
-// What is not finite or negative weighs nothing.
+// Returns the mass of a bin, 0 for a weight that is not finite or is negative.
 __device__ double mass_of(float weight) {
   return weight > 0.0f && weight <= 3.402823466e38f ? static_cast<double>(weight) : 0.0;
 }
 
-// Before another in the order of depths: by value, NaN last.
+// Returns whether a uniform sorts before another: by value, NaN last.
 __device__ bool is_before(float a, float b) { return a < b || (b != b && a == a); }
 
 __global__ void __launch_bounds__(kThreads)
@@ -27,12 +27,12 @@ __global__ void __launch_bounds__(kThreads)
                     int64_t s, int64_t count) {
   const int lane = threadIdx.x % 32;
   const int64_t ray = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
-  if (ray >= r) return;  // a whole warp
+  if (ray >= r) return;  // the same for the whole warp
   const float* weight = weights + ray * s;
   double* upper = workspace + ray * s;
 
   double total = 0.0;
-  int64_t last = -1;  // the last bin that has mass
+  int64_t last = -1;  // the last bin with mass
   for (int64_t start = 0; start < s; start += 32) {
     const int64_t i = start + lane;
     const double mass = i < s ? mass_of(weight[i]) : 0.0;
@@ -50,20 +50,20 @@ __global__ void __launch_bounds__(kThreads)
   __syncwarp();
 
   for (int64_t j = lane; j < count; j += 32) {
-    const float given = uniforms == nullptr ? 0.0f : uniforms[ray * count + j];
+    const float uniform = uniforms == nullptr ? 0.0f : uniforms[ray * count + j];
     double u = (static_cast<double>(j) + 0.5) / static_cast<double>(count);
     int64_t place = j;
     if (uniforms != nullptr) {
-      u = given < 0.0f ? 0.0 : given > 1.0f ? 1.0 : static_cast<double>(given);
+      u = uniform < 0.0f ? 0.0 : uniform > 1.0f ? 1.0 : static_cast<double>(uniform);
       place = 0;
       for (int64_t i = 0; i < count; ++i) {
         const float other = uniforms[ray * count + i];
-        place += is_before(other, given) || (i < j && !is_before(given, other)) ? 1 : 0;
+        place += is_before(other, uniform) || (i < j && !is_before(uniform, other)) ? 1 : 0;
       }
     }
     const double target = u * total;
-    // The first bin whose end lies beyond the target: on the edge of two bins it is the later one, so a bin of no mass
-    // is never drawn; the last bin that has mass takes what rounds to the very end.
+    // Find the first bin whose end lies beyond the target. On the edge of two bins this is the later bin, so a bin
+    // without mass is never drawn. The last bin with mass takes targets that round to the end.
     int64_t low = 0, high = last;
     while (low < high) {
       const int64_t middle = (low + high) / 2;
@@ -74,7 +74,7 @@ __global__ void __launch_bounds__(kThreads)
         low = middle + 1;
       }
     }
-    // A NaN target comes out as the last bin, with a NaN depth.
+    // A NaN target gets the last bin, with a NaN depth.
     const double mass = even ? 1.0 : mass_of(weight[low]);
     const double lower = even ? static_cast<double>(low) : (low == 0 ? 0.0 : upper[low - 1]);
     double inside = (target - lower) / mass;

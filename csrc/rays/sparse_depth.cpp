@@ -1,4 +1,4 @@
-// Each ray depends on itself alone, and one thread sums their losses, so results do not depend on the threads.
+// Rays are independent, and one thread sums their losses, so results do not depend on the number of threads.
 #include "rays/sparse_depth.h"
 
 #include <cmath>
@@ -11,7 +11,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr float kLeast = 1e-3f;  // light of a ray whose loss has a gradient
+constexpr float kLeast = 1e-3f;  // minimum light near the point for a gradient
 
 bool near_point(const SparseDepth& in, int64_t i, float distance) {
   return std::fabs(in.depths[i] - distance) <= in.nearby * distance + in.deltas[i];
@@ -24,10 +24,10 @@ float learn_ray(const SparseDepth& in, float share, int64_t begin, int64_t end, 
   if (!(total > kLeast)) return total == total ? -std::log(kLeast) : total;
   double optical = 0.0, light = 0.0;
   for (int64_t i = begin; i < end; ++i) {
-    const bool there = near_point(in, i, distance);
+    const bool is_near = near_point(in, i, distance);
     optical += static_cast<double>(in.density[i] * in.deltas[i]);
-    light += there ? static_cast<double>(in.weights[i]) : 0.0;
-    const float through = there ? std::exp(-static_cast<float>(optical)) : 0.0f;
+    light += is_near ? static_cast<double>(in.weights[i]) : 0.0;
+    const float through = is_near ? std::exp(-static_cast<float>(optical)) : 0.0f;
     const float to_density = -in.deltas[i] / total * (through - (total - static_cast<float>(light)));
     gradient[4 * i + 3] += share * to_density * density_slope(in.density[i], in.density_scale, in.activated);
   }
@@ -37,7 +37,7 @@ float learn_ray(const SparseDepth& in, float share, int64_t begin, int64_t end, 
 }  // namespace
 
 void sparse_depth_gradient_cpu(const SparseDepth& in, float* loss, float* gradient, float* of_rays, int threads) {
-  constexpr int64_t kRays = 64;  // of a task
+  constexpr int64_t kRays = 64;  // rays of a task
   check_ray_offsets("sparse_depth_gradient", in.offsets, in.r, in.m);
   if (in.s == 0) return;
   const float share = in.factor / static_cast<float>(in.s);

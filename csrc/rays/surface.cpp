@@ -1,4 +1,4 @@
-// Each ray depends on itself alone, and one thread sums their losses, so results do not depend on the threads.
+// Rays are independent, and one thread sums their losses, so results do not depend on the number of threads.
 #include "rays/surface.h"
 
 #include <algorithm>
@@ -11,14 +11,14 @@ namespace voronerf {
 
 namespace {
 
-// By how much the opacity falls from a sample to the next, where this lies right behind it.
+// Returns the decrease of the opacity from a sample to the next, 0 unless the next sample lies right behind it.
 float fall(const Surface& in, int64_t i, float opacity, float next) {
   const bool beside = in.depths[i + 1] - in.depths[i] < in.deltas[i] + in.deltas[i + 1];
   return beside ? std::max(opacity - next, 0.0f) : 0.0f;
 }
 
-// The loss of a ray, whose gradient is added to that of its samples. Places are disparities: what is behind a sample
-// has smaller ones, and adds up from the end. Samples behind the last one that light reaches count nowhere.
+// Returns the loss of a ray, and adds its gradient to the gradient of the samples. Places are disparities, which
+// decrease along the ray, so sums over samples behind run from the end. Samples without light are ignored.
 float learn_ray(const Surface& in, int64_t ray, float share, float* gradient) {
   const int64_t begin = in.offsets[ray];
   int64_t end = begin;
@@ -64,7 +64,7 @@ float learn_ray(const Surface& in, int64_t ray, float share, float* gradient) {
 }  // namespace
 
 void surface_gradient_cpu(const Surface& in, float* loss, float* gradient, float* of_rays, int threads) {
-  constexpr int64_t kRays = 32;  // of a task
+  constexpr int64_t kRays = 32;  // rays of a task
   check_ray_offsets("surface_gradient", in.offsets, in.r, in.m);
   if (in.r == 0) return;
   const float share = 1.0f / static_cast<float>(in.r);

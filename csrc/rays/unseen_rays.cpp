@@ -1,4 +1,5 @@
-// Each triple is a hash of the number of its middle ray, so that results do not depend on the threads.
+// unseen_rays on the CPU. Each triple is a hash of the number of its middle ray, so that results do not depend on the
+// number of threads.
 #include "rays/unseen_rays.h"
 
 #include <cmath>
@@ -8,11 +9,11 @@
 
 namespace voronerf {
 
-constexpr uint32_t kBefore = 5;   // numbers of a ray that draw_pixels makes of the same seed
-constexpr float kOctaves = 4.0f;  // of the distances between neighbours
+constexpr uint32_t kBefore = 5;   // hashes of a ray that draw_pixels takes from the same seed
+constexpr float kOctaves = 4.0f;  // range of the distances between neighbours
 
 void unseen_rays_cpu(const UnseenRays& in, float* origins, float* directions, int threads) {
-  constexpr int64_t kTriples = 128;  // of a task
+  constexpr int64_t kTriples = 128;  // triples of a task
   const int64_t triples = in.triples;
   parallel_for(triples, kTriples, threads, [&](int64_t triple) {
     const int64_t middle = in.r - 3 * triples + triple;

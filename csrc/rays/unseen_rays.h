@@ -1,4 +1,4 @@
-// Triples of neighbouring rays from where no camera was: the last of r rays. What it computes is said in
+// Triples of neighbouring rays from unseen places; they are the last of r rays. The formulas are in
 // voronerf/ops/unseen_rays.
 #pragma once
 
@@ -14,7 +14,7 @@ struct UnseenRays {
   RowCount triples, r;
 };
 
-// Changes origins and directions: [r,3].
+// Changes origins and directions [r,3] in place.
 void unseen_rays_cpu(const UnseenRays& in, float* origins, float* directions, int threads);
 
 }  // namespace voronerf

@@ -5,5 +5,5 @@ from voronerf.app.web import page
 
 @pytest.fixture(autouse=True)
 def small_turntables(monkeypatch):
-    """The still of a page, which has 24 frames, is small."""
+    """Makes the still pictures of a page small, since a page has 24."""
     monkeypatch.setattr(page, "SIDE", 40)

@@ -1,4 +1,4 @@
-"""A trained run, opened again."""
+"""Tests of `open_run`: a trained run is opened again."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ def test_any_camera_is_rendered(folder, scene) -> None:
 
 
 def mappings(folder):
-    """Start, end and bytes in memory of their own (not pages of the file) of each mapped file in a folder."""
+    """Returns a list of (start, end, anonymous bytes), a row for each mapping of a file in the folder."""
     if sys.platform != "linux":
         pytest.skip("asks Linux what memory holds")
     lines = Path("/proc/self/smaps").read_text()
-    found = re.findall(r"^(\w+)-(\w+) .*?(/\S+)?$((?:\n[A-Z]\w+:.*)+)", lines, re.MULTILINE)
+    rows = re.findall(r"^(\w+)-(\w+) .*?(/\S+)?$((?:\n[A-Z]\w+:.*)+)", lines, re.MULTILINE)
     return [
         (int(start, 16), int(end, 16), 1024 * int(re.search(r"Anonymous:\s+(\d+)", rest)[1]))
-        for start, end, path, rest in found
+        for start, end, path, rest in rows
         if path.startswith(str(folder))
     ]
 
@@ -76,7 +76,8 @@ def test_networks_stay_in_their_file(scene, tmp_path) -> None:
     assert run.diagram.num_cells == 8
     run.render(0)
     mapped = mappings(tmp_path)
-    assert mapped and sum(copied for _, _, copied in mapped) < 2 * summary["parameters"]  # half of the networks' bytes
+    # less than half of the networks' bytes
+    assert mapped and sum(copied for _, _, copied in mapped) < 2 * summary["parameters"]
     for parameter in run.router.parameters():
         assert any(start <= parameter.data_ptr() < end for start, end, _ in mapped)
 

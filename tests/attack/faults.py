@@ -83,8 +83,8 @@ FAULTS = (
         "nearest_centre",
         "an index leaves out boxes as far as the best",
         "geometry/centre_index_isa.cpp",
-        "if (!(left[nearest] <= best)) continue;",
-        "if (!(left[nearest] < best)) continue;",
+        "if (!(remaining[nearest] <= best)) continue;",
+        "if (!(remaining[nearest] < best)) continue;",
     ),
     _kernel(
         "locate_cell",
@@ -104,8 +104,8 @@ FAULTS = (
         "march_rays",
         "a ray that has all its samples goes on at the last of them",
         "rays/march_rays_isa.cpp",
-        "if (++got == in.most) next = stratum + 1;",
-        "if (++got == in.most) next = stratum;",
+        "if (++filled == in.most) next = stratum + 1;",
+        "if (++filled == in.most) next = stratum;",
     ),
     _kernel(
         "composite",
@@ -237,8 +237,8 @@ FAULTS = (
         "grouped_program",
         "a row with a gradient goes to the cell before",
         "network/cpu/program.cpp",
-        "std::lower_bound(found.rows.begin()",
-        "std::upper_bound(found.rows.begin()",
+        "std::lower_bound(result.rows.begin()",
+        "std::upper_bound(result.rows.begin()",
     ),
     _kernel(
         "grouped_program",
@@ -320,14 +320,14 @@ FAULTS = (
     _step(
         "gradients are cleared in another segment than they are made in",
         "nerf/step.py",
-        "[draw, *look, clear, learn,",
-        "[draw, clear, *look, learn,",
+        "[draw, *evaluate, clear, learn,",
+        "[draw, clear, *evaluate, learn,",
     ),
     _step(
         "a segment is recorded with the rows of an earlier step",
         "nerf/segment.py",
-        "yield each.value if each.recording is None else each.recording.counted_now(each.value)",
-        "yield each.value",
+        "yield argument.value if argument.recording is None else argument.recording.counted_now(argument.value)",
+        "yield argument.value",
     ),
     _step(
         "what a term reads may have another name",
@@ -338,19 +338,19 @@ FAULTS = (
     _step(
         "what a hook calls may be overridden",
         "nerf/segment.py",
-        "return hook in others or any(",
-        "return hook in others or False and any(",
+        "return hook in overridden or any(",
+        "return hook in overridden or False and any(",
     ),
     _step(
         "nothing that it depends on is noted",
         "nerf/step.py",
-        "            self._guard()  # before hooks, whose changes count from the next step on\n",
+        "            self._note_dependencies()  # before the hooks, whose changes the next step uses\n",
         "",
     ),
     _step(
         "attributes of a subclass of one's own are not followed",
         "nerf/segment.py",
-        "return [name for name in vars(part) if name not in known]",
+        "return [name for name in vars(part) if name not in names_read]",
         "return [*vars(part)]",
     ),
     Fault(
@@ -384,15 +384,15 @@ FAULTS = (
     _python(
         "One slow measurement ends the fused way",
         "router/dispatch.py",
-        "first = 0 if fused and not (loses and lost == _LOOKS) else first",
-        "first = 0 if fused and not loses else first",
+        "first = 0 if fused and not (is_slower and losses == _LOOKS) else first",
+        "first = 0 if fused and not is_slower else first",
         "tests/router/test_dispatch.py",
     ),
     _python(
         "Samples of frozen cells are grouped within a transform",
         "router/dispatch.py",
-        "with outside():  # within",
-        "with torch.no_grad():  # within",
+        "with outside():  # a torch",
+        "with torch.no_grad():  # a torch",
         "tests/router/test_router_transforms.py",
         "tests/router/test_router_freeze.py",
     ),
@@ -420,8 +420,8 @@ FAULTS = (
     _python(
         "A tensor that was one for all samples is one for each",
         "router/dispatch.py",
-        "several, *call.kinds.items()]",
-        "several]",
+        "has_rays, *call.kinds.items()]",
+        "has_rays]",
         "tests/router/test_known.py",
     ),
     _python(
@@ -533,8 +533,8 @@ FAULTS = (
     _python(
         "Pages of other sites may use the viewer",
         "app/viewer/door.py",
-        "if site is not None and site != asked:",
-        "if site is not None and not asked:",
+        "if site is not None and site != requested:",
+        "if site is not None and not requested:",
         "tests/app/viewer",
     ),
     _python(

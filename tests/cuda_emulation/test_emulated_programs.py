@@ -54,7 +54,7 @@ def outcome(program: Program, tensors: list[Tensor], offsets: Tensor, products: 
             )
         rows = plans.Rows(leaves[:count], leaves[count:], offsets, given.get("order"), given.get("ray_index"))
         name = "float32" if products == "tf32" else products
-        return plans.run_program(rows, plans.How(program.text, products=name))
+        return plans.run_program(rows, plans.RunOptions(program.text, products=name))
 
     before, generator = torch.backends.cuda.matmul.fp32_precision, torch.Generator().manual_seed(5)
     leaves = [(tensor if products else tensor.double()).clone().requires_grad_() for tensor in tensors]
@@ -177,7 +177,7 @@ def test_what_must_not_stay_in_registers(make: Callable[[], Program], products: 
     for shared_bytes in TILES:
         rows = plans.Rows(tensors[:count], tensors[count:], offsets, None, None)
         with emulated(shared_bytes=shared_bytes):
-            found = plans.run(rows, plans.How(program.text, products=products))
+            found = plans.run(rows, plans.RunOptions(program.text, products=products))
             close(found, right, 2 * ALLOWED[products])  # rounding moves a few samples across a kink
 
 
@@ -210,7 +210,7 @@ def test_rows_of_no_cell_keep_nothing() -> None:
     x, table = torch.rand(200, 3), torch.randn(2, *GRID.table_shape)
     rows = plans.Rows([x], [table], torch.tensor([30, 90, 150], dtype=torch.int32), None, None)
     with emulated():
-        out, kept = plans.run(rows, plans.How(program.text, keep=True))
+        out, kept = plans.run(rows, plans.RunOptions(program.text, keep=True))
     assert not (kept[:30].any() or kept[150:].any()) and torch.equal(kept[30:150, : e.width], out[30:150])
 
 
@@ -242,11 +242,11 @@ def test_what_was_looked_up_is_not_looked_up_again() -> None:
     x, table, weight = tensors_of(program, [70])
     rows = plans.Rows([x], [table, weight], offsets_of([70]), None, None)
     with emulated():
-        out, kept = plans.run(rows, plans.How(program.text, keep=True))
+        out, kept = plans.run(rows, plans.RunOptions(program.text, keep=True))
         assert kept.shape == (70, 16)
         for parameter in (table, torch.full_like(table, torch.nan)):
             call = rows._replace(inputs=[x, torch.ones_like(out)], parameters=[parameter, weight], kept=[kept])
-            (found,) = plans.run(call, plans.How(own.text))
+            (found,) = plans.run(call, plans.RunOptions(own.text))
             torch.testing.assert_close(found[0], kept[:, : e.width].sum(0).expand(5, -1), rtol=1e-5, atol=1e-5)
 
 
@@ -257,8 +257,8 @@ def test_types_in_memory(dtype: torch.dtype) -> None:
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
     inputs = plans.Rows(rows, [p.float() for p in parameters], offsets, None, None)
     with emulated():
-        found = plans.run_program(inputs, plans.How(program.text))
-        exact = plans.run_program(inputs._replace(inputs=[x.float() for x in rows]), plans.How(program.text))
+        found = plans.run_program(inputs, plans.RunOptions(program.text))
+        exact = plans.run_program(inputs._replace(inputs=[x.float() for x in rows]), plans.RunOptions(program.text))
     assert all(torch.equal(ours, right.to(dtype)) for ours, right in zip(found, exact, strict=True))
 
 
@@ -337,7 +337,8 @@ def test_numbers_that_are_none_stay_in_their_rows() -> None:
     for products in ALLOWED:
         with emulated(), torch.no_grad():
             rows = plans.Rows(tensors[:1], tensors[1:], offsets_of([70]), None, None)
-            _, out = plans.run_program(rows, plans.How(program.text, products=products.replace("tf32", "float32")))
+            options = plans.RunOptions(program.text, products=products.replace("tf32", "float32"))
+            _, out = plans.run_program(rows, options)
         assert (~out.isfinite()).any(1).nonzero().flatten().tolist() in ([5, 9], [5]), products
 
 
@@ -351,7 +352,7 @@ def test_float16_cuts_values_off_and_leaves_gradients() -> None:
     leaves = [leaf.requires_grad_() for leaf in given]
     rows = plans.Rows(leaves[:1], leaves[1:], offsets_of([2]), None, None)
     with emulated():
-        (out,) = plans.run_program(rows, plans.How(program.text, products="float16"))
+        (out,) = plans.run_program(rows, plans.RunOptions(program.text, products="float16"))
         assert out[:, 0].tolist() == [0.25, LARGEST / 4]
         for size, finite in ((1.0, True), (1e6, False)):
             found = torch.autograd.grad(out, leaves, torch.full_like(out, size), retain_graph=True)

@@ -13,7 +13,7 @@ from voronerf.ops.balance_centres.reference import published_step
 
 
 def surface_samples(seed, m=10_000, objects=1, tail=1.0):
-    """Samples near the surfaces of balls that do not touch, with log-normal importance that is larger on one side."""
+    """Returns samples near the surfaces of separate balls, with log-normal importance that is larger on one side."""
     generator = seeded(seed)
     across = math.ceil(objects ** (1 / 3))
     grid = torch.cartesian_prod(*[torch.arange(float(across)) * 2] * 3)
@@ -27,7 +27,7 @@ def surface_samples(seed, m=10_000, objects=1, tail=1.0):
 
 
 def test_one_step_is_the_published_update():
-    """Which tests/ops compares with slow loops."""
+    """One step equals the published update, which tests/ops compares with slow loops."""
     points, importance = surface_samples(1, m=500)
     start, result = (balance(points, importance, 9, steps=steps, generator=seeded(7)) for steps in (0, 1))
     expected = published_step(start.centres, start.after, alpha=0.05, neighbours=8)
@@ -61,7 +61,7 @@ def test_same_generator_same_centres(centres):
     )
     assert torch.equal(first.centres, second.centres)
     assert not torch.equal(first.centres, other.centres)
-    # The global generator serves where none is given, and is left alone where one is.
+    # The global generator serves only where no generator is given.
     torch.manual_seed(3)
     assert torch.equal(balance(points, importance, 12, centres=centres, steps=50).centres, first.centres)
     state = torch.get_rng_state()

@@ -14,7 +14,7 @@ balance_module = sys.modules["voronerf.diagram.balance"]  # the package has a fu
 
 
 def blobs(seed=0, m=2000):
-    """Samples in three clumps, whose importance grows along the x axis."""
+    """Returns samples in three clumps, whose importance grows along the x axis."""
     generator = seeded(seed)
     places = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 4, 1]])
     points = places[torch.randint(3, (m,), generator=generator)] + 0.4 * torch.randn(m, 3, generator=generator)
@@ -22,14 +22,14 @@ def blobs(seed=0, m=2000):
 
 
 def centroids(points, importance, result):
-    """float64 [k, 3], by one loop over the cells."""
+    """Returns the weighted centroids, float64 [k, 3], by one loop over the cells."""
     cells = VoronoiDiagram(result.centres).locate(points)
-    found = []
+    results = []
     for cell in range(result.centres.shape[0]):
         inside = cells == cell
         masses = importance[inside].double()[:, None]
-        found.append((masses * points[inside].double()).sum(0) / masses.sum())
-    return torch.stack(found)
+        results.append((masses * points[inside].double()).sum(0) / masses.sum())
+    return torch.stack(results)
 
 
 def test_lloyd_is_the_plain_loop():
@@ -60,25 +60,25 @@ def test_centres_are_the_weighted_centroids_of_their_cells(k):
 def test_a_cell_without_samples_goes_to_the_sample_that_costs_most():
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [12, 0, 0]])
     centres = torch.tensor([[0.5, 0, 0], [100.0, 0, 0]])
-    found = lloyd(points, torch.tensor([1.0, 1, 1, 1]).double(), centres)
-    assert torch.equal(found, torch.tensor([[0.5, 0, 0], [11, 0, 0]]))
-    # The samples at 0 and 1 cost 400 * 0.25 each, that at 10 only 1 * 90.25.
-    found = lloyd(points[:3], torch.tensor([400.0, 400, 1]).double(), centres)
-    assert torch.equal(torch.sort(found[:, 0]).values[:1], torch.zeros(1))
-    # Two of them go to different places, and one that could gain nothing stays.
-    found = lloyd(points, torch.ones(4).double(), torch.tensor([[0.5, 0, 0], [100.0, 0, 0], [200.0, 0, 0]]))
-    assert len({tuple(row) for row in found.tolist()}) == 3 and float(found.max()) <= 12
-    found = lloyd(torch.zeros(3, 3), torch.ones(3).double(), torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
-    assert torch.equal(found, torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
+    result = lloyd(points, torch.tensor([1.0, 1, 1, 1]).double(), centres)
+    assert torch.equal(result, torch.tensor([[0.5, 0, 0], [11, 0, 0]]))
+    # The samples at 0 and 1 cost 400 * 0.25 each, the sample at 10 only 1 * 90.25.
+    result = lloyd(points[:3], torch.tensor([400.0, 400, 1]).double(), centres)
+    assert torch.equal(torch.sort(result[:, 0]).values[:1], torch.zeros(1))
+    # Two empty cells go to different places, and a cell that could gain nothing stays.
+    result = lloyd(points, torch.ones(4).double(), torch.tensor([[0.5, 0, 0], [100.0, 0, 0], [200.0, 0, 0]]))
+    assert len({tuple(row) for row in result.tolist()}) == 3 and float(result.max()) <= 12
+    result = lloyd(torch.zeros(3, 3), torch.ones(3).double(), torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
+    assert torch.equal(result, torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
 
 
 def test_more_centres_than_samples_of_mass_end_at_once(monkeypatch):
-    """Centres that no sample needs would be looked at in all steps."""
+    """The search does not go on for centres that no sample needs."""
     points, looks = torch.rand(60, 3, generator=seeded(0)), []
     masses = torch.zeros(60).double()
     masses[:5] = 1.0
     find = ops.nearest_centre
-    monkeypatch.setattr(ops, "nearest_centre", lambda *given, **how: looks.append(1) or find(*given, **how))
+    monkeypatch.setattr(ops, "nearest_centre", lambda *arguments, **how: looks.append(1) or find(*arguments, **how))
     assert torch.equal(lloyd(points, masses, points[:30]), points[:30])
     assert len(looks) == 1
 

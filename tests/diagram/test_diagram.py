@@ -12,7 +12,7 @@ from voronerf.diagram import VoronoiDiagram, uniform_centres
 
 
 def slow_locate(diagram, point):
-    """Descends the tables of a diagram with Python numbers; ties to the first centre."""
+    """Descends the tables of a diagram with Python numbers; ties go to the first centre."""
     offsets, child = diagram.child_offsets.tolist(), diagram.child.tolist()
     centres = diagram.centres.double().tolist()
     node = 0
@@ -26,7 +26,7 @@ def slow_locate(diagram, point):
 
 
 def uneven_diagram():
-    """Three levels, 4 + 3 - 1 + 5 - 1 = 10 leaves, integer coordinates so that ties are exact."""
+    """Returns a diagram of three levels with 4 + 3 - 1 + 5 - 1 = 10 leaves; with integer coordinates ties are exact."""
     generator = seeded(3)
 
     def centres(k):
@@ -45,8 +45,8 @@ def test_nested_locate_equals_a_slow_descent():
     diagram, points = uneven_diagram(), integer_points(400)
     assert (diagram.depth, diagram.num_cells) == (3, 10)
     other, _ = VoronoiDiagram(integer_points(4)).refine({1: integer_points(7)[4:]})
-    for each in (diagram, other):
-        assert each.locate(points).tolist() == [slow_locate(each, point) for point in points]
+    for tree in (diagram, other):
+        assert tree.locate(points).tolist() == [slow_locate(tree, point) for point in points]
 
 
 def test_locate_keeps_leading_shapes_and_takes_any_layout_and_dtype():

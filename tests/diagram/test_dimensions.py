@@ -30,9 +30,9 @@ def nearest(points: Tensor, centres: Tensor) -> Tensor:
 def test_locate(d: int, dtype: torch.dtype, k: int, generator: torch.Generator) -> None:
     diagram = VoronoiDiagram(torch.randint(-4, 5, (k, d), generator=generator).float())
     points = torch.randint(-4, 5, (11, 23, d), generator=generator).to(dtype)  # with ties
-    found = diagram.locate(points)
-    assert found.shape == (11, 23)
-    assert torch.equal(found.flatten().long(), nearest(points.reshape(-1, d), diagram.centres))
+    result = diagram.locate(points)
+    assert result.shape == (11, 23)
+    assert torch.equal(result.flatten().long(), nearest(points.reshape(-1, d), diagram.centres))
     assert diagram.locate(points[:0]).shape == (0, 23)
     points[0, 0] = float("nan")
     assert diagram.locate(points)[0, 0] == 0
@@ -48,11 +48,11 @@ def test_many_cells_have_an_index(d: int, generator: torch.Generator) -> None:
 
     assert is_right(diagram)
     index = diagram.index()
-    assert diagram.index() is index  # kept
+    assert diagram.index() is index  # the index is kept
     assert is_right(copy.deepcopy(diagram)) and is_right(pickle.loads(pickle.dumps(diagram)))
-    diagram.centres.neg_()  # in place: the index is of what was there
+    diagram.centres.neg_()  # in place, so that the index is outdated
     assert is_right(diagram)
-    diagram.centres.data.copy_(torch.rand(2500, d, generator=generator))  # no version tells of it
+    diagram.centres.data.copy_(torch.rand(2500, d, generator=generator))  # changes no version counter
     assert is_right(diagram)
     assert torch.equal(diagram.locate(points.double()), diagram.locate(points))
     compiled = torch.compile(diagram.locate, fullgraph=True, backend="eager")
@@ -110,8 +110,8 @@ def test_from_points_takes_as_many_cells_as_distinct_points(generator: torch.Gen
     assert diagram.centres.unique(dim=0).shape == (25_000, 3)
     rare = torch.zeros(50_000, 2)
     rare[:3] = torch.rand(3, 2, generator=generator) + 1
-    found = VoronoiDiagram.from_points(rare, 4, generator=generator).centres
-    assert torch.equal(found.unique(dim=0), rare[:4].unique(dim=0))
+    result = VoronoiDiagram.from_points(rare, 4, generator=generator).centres
+    assert torch.equal(result.unique(dim=0), rare[:4].unique(dim=0))
     with pytest.raises(ValueError, match="k must be at most the number of distinct points, 4, got 5"):
         VoronoiDiagram.from_points(rare, 5, generator=generator)
 

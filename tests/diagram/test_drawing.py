@@ -18,7 +18,7 @@ DEPTH = 3
 
 
 def flat(k, device="cpu"):
-    """The tables of one diagram."""
+    """Returns the tables of one diagram."""
     return (
         torch.tensor([0, k], dtype=torch.int32, device=device),
         -torch.arange(k, dtype=torch.int32, device=device) - 1,
@@ -26,12 +26,12 @@ def flat(k, device="cpu"):
 
 
 def draw(points, centres, uniforms, temperature):
-    """In one diagram, by a number for each point."""
+    """Draws in one diagram, with one uniform number for each point."""
     return draw_cell(points, centres, *flat(centres.shape[0], centres.device), uniforms[:, None], temperature)
 
 
 def slow(points, centres, tables, uniforms, temperature, depth):
-    """Leaves by the formula in float64, a point at a time, and how far each number is from where another is drawn."""
+    """Returns leaves by the formula in float64, and the distance of each number from the border to another leaf."""
     offsets, child = tables
     leaves, margins = [], []
     for point, own in zip(points.double(), uniforms.double()):
@@ -51,19 +51,19 @@ def slow(points, centres, tables, uniforms, temperature, depth):
 
 
 def agree(leaves, expected, margins, tolerance):
-    """Equal wherever the numbers are not within rounding of a border; nearly all are not."""
+    """Checks equality except where numbers are within rounding of a border; nearly all numbers are not."""
     assert leaves.dtype == torch.int32
     clear = [i for i, margin in enumerate(margins) if margin > tolerance]
     assert len(clear) >= 0.95 * len(margins)
-    found = leaves.tolist()
-    assert [found[i] for i in clear] == [expected[i] for i in clear]
+    actual = leaves.tolist()
+    assert [actual[i] for i in clear] == [expected[i] for i in clear]
 
 
 @pytest.mark.parametrize("n", [0, 1, 257])
 def test_uneven_tree_is_the_formula(device, n):
     points, centres, uniforms = torch.randn(n, 3), torch.randn(10, 3), torch.rand(n, DEPTH)
-    given = (tensor.to(device) for tensor in (points, centres, CHILD_OFFSETS, CHILD, uniforms))
-    leaves = draw_cell(*given, temperature=0.4)
+    arguments = (tensor.to(device) for tensor in (points, centres, CHILD_OFFSETS, CHILD, uniforms))
+    leaves = draw_cell(*arguments, temperature=0.4)
     expected = slow(points, centres, (CHILD_OFFSETS, CHILD), uniforms, 0.4, DEPTH)
     agree(leaves.cpu(), *expected, tolerance=1e-5)
 
@@ -78,7 +78,7 @@ def test_many_cells(device, k, temperature):
 
 
 def test_numbers_at_and_beyond_the_ends(device):
-    """0 is the last centre with any mass, what is nearly 1 the first; never one without mass."""
+    """A number of 0 draws the last centre with mass, nearly 1 the first; no centre without mass is drawn."""
     centres = torch.tensor([[50.0, 0, 0], [0, 0, 0], [1, 0, 0], [60, 0, 0]], device=device)
     uniforms = torch.tensor([0.0, -3.0, math.nan, 1 - 2**-24, 1.0, 7.0], device=device)
     leaves = draw(torch.zeros(6, 3, device=device), centres, uniforms, 0.5)
@@ -86,7 +86,7 @@ def test_numbers_at_and_beyond_the_ends(device):
 
 
 def test_the_reference_where_sums_do_not_rise(monkeypatch):
-    """Sums as a GPU takes them, in a tree: the last of all columns is above that of the last centre by rounding."""
+    """With sums in a tree, as on a GPU, rounding puts the last padded column above the last centre."""
 
     def tree(values, dim):
         step = 1
@@ -97,7 +97,7 @@ def test_the_reference_where_sums_do_not_rise(monkeypatch):
 
     monkeypatch.setattr(Tensor, "cumsum", tree)
     points, centres = torch.rand(5000, 3), torch.rand(32, 3)
-    centres[:2] = torch.tensor([[0.0, 0, 0], [1000, 0, 0]])  # the second of which none is near
+    centres[:2] = torch.tensor([[0.0, 0, 0], [1000, 0, 0]])  # no point is near the second one
     offsets = torch.tensor([0, 2, 9, 32], dtype=torch.int32)
     child = torch.cat([torch.tensor([1, 2]), -1 - torch.arange(30)]).to(torch.int32)
     uniforms = torch.zeros(5000, 2)
@@ -106,7 +106,7 @@ def test_the_reference_where_sums_do_not_rise(monkeypatch):
     sums = padded.cumsum(1)
     assert bool((sums[:, -1] > sums[:, 8]).any())
     leaves = draw_cell(points, centres, offsets, child, uniforms, 1.0)
-    # Of the seven the last, or by rounding the one before it.
+    # The last of the seven leaves, or by rounding the one before it.
     assert int(leaves.min()) >= 5 and int(leaves.max()) == 6
 
 

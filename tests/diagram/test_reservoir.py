@@ -109,7 +109,7 @@ def test_samples_of_other_dimensions_decide_a_split(d):
     for half in (slice(0, 200), slice(200, 400)):
         reservoir.add(points[half], importance[half])
     kept, _ = reservoir.samples()
-    assert kept.shape == (99, d) and kept.isfinite().all()  # the heaviest is nowhere
+    assert kept.shape == (99, d) and kept.isfinite().all()  # the heaviest point is NaN
     diagram = VoronoiDiagram(torch.zeros(1, d))
     assert split_diagram(diagram, *reservoir.samples(), 4).diagram.num_cells == 4
 

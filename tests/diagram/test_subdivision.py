@@ -12,7 +12,7 @@ ROOT = VoronoiDiagram(torch.tensor([[-2.0, 0, 0], [0, 0, 0], [2, 0, 0]]))
 
 
 def three_clouds(counts=(600, 300, 5)):
-    """Samples in each of the three cells of ROOT; those of the middle one weigh 4 times as much."""
+    """Returns samples in each of ROOT's three cells; samples of the middle cell weigh 4 times as much."""
     generator = seeded()
     points = torch.randn(sum(counts), 3, generator=generator) * 0.2
     cell = torch.repeat_interleave(torch.arange(3), torch.tensor(counts))
@@ -45,7 +45,7 @@ def test_only_the_worst_cell():
     points, importance = three_clouds()
     split = split_diagram(ROOT, points, importance, 4, cells="worst", generator=seeded(1))
     assert split.parents.tolist() == [0, 1, 1, 1, 1, 2]
-    # The worst of those that hold enough samples: one sample that outweighs everything does not make a cell.
+    # Only cells with enough samples count: one sample that outweighs everything does not make a cell the worst.
     heavy = torch.cat([points, torch.tensor([[2.0, 0, 0]])]), torch.cat([importance, torch.tensor([1e6])])
     split = split_diagram(ROOT, *heavy, 8, cells="worst", generator=seeded(1))
     assert sorted(split.balances) == [1]
@@ -64,7 +64,7 @@ def test_named_cells_and_minimum_of_samples():
 
 
 def test_just_enough_samples_are_enough():
-    """As many distinct samples as children, or as the minimum; one fewer leaves the cell as it is."""
+    """A cell splits with as many distinct samples as children and as the minimum; with one fewer it stays a leaf."""
     root = VoronoiDiagram(torch.tensor([[0.0, 0, 0], [10.0, 0, 0]]))
     points = torch.cat((torch.rand(4, 3, generator=seeded(2)), torch.rand(3, 3, generator=seeded(3)) + root.centres[1]))
     split = split_diagram(root, points, torch.ones(7), 4, generator=seeded(1))

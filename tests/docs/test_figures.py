@@ -1,6 +1,6 @@
-"""The figures of the pages are those of the files in benchmarks/results.
+"""Tests that the figures in the pages are numbers of the files in benchmarks/results.
 
-A line ``<!-- figures of FILE.json -->`` says where those of the next table or paragraph are from.
+A line ``<!-- figures of FILE.json -->`` names the file for the next table or paragraph.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def marked() -> Iterator[Any]:
 
 
 def numbers(value: Any) -> Iterator[float]:
-    """All numbers within a JSON value."""
+    """Yields all numbers within a JSON value."""
     if isinstance(value, dict | list):
         for part in value.values() if isinstance(value, dict) else value:
             yield from numbers(part)
@@ -36,14 +36,14 @@ def numbers(value: Any) -> Iterator[float]:
 
 
 def entries(name: str) -> list[list[float]]:
-    """The numbers of each result in a file."""
+    """Returns the numbers of each result in a file."""
     results = json.loads((RESULTS / name).read_text())["results"]
     groups = results.values() if isinstance(results, dict) else [results]
     return [list(numbers(entry)) for group in groups for entry in group]
 
 
 def holds(entry: list[float], text: str) -> bool:
-    """Whether the figures of a text are numbers of an entry, rounded to the digits shown."""
+    """Returns whether all figures in a text are numbers of an entry, rounded to the digits shown."""
 
     def shown(figure: str) -> bool:
         digits = figure.replace(",", "")
@@ -55,15 +55,15 @@ def holds(entry: list[float], text: str) -> bool:
 
 @pytest.mark.parametrize(("name", "text"), list(marked()))
 def test_figures_are_those_of_the_file(name: str, text: str) -> None:
-    """Of a table, each row or each column is of one result, the first column and the head apart."""
-    found = entries(name)
+    """All figures of a paragraph are in the file; each row, or each column, of a table is from one result."""
+    results = entries(name)
     if not text.startswith("|"):
         decimals = re.findall(r"\d+\.\d+", text)
-        assert decimals and holds([number for entry in found for number in entry], " ".join(decimals))
+        assert decimals and holds([number for entry in results for number in entry], " ".join(decimals))
         return
     rows = [re.findall(r"[^|]+", line.strip())[1:] for line in text.splitlines()[2:]]
     absent = [
-        [cells for cells in parts if not any(holds(entry, " ".join(cells)) for entry in found)]
+        [cells for cells in parts if not any(holds(entry, " ".join(cells)) for entry in results)]
         for parts in (rows, list(zip(*rows)))
     ]
     assert not all(absent), absent
@@ -85,11 +85,11 @@ def test_a_page_or_a_script_names_every_file() -> None:
 )
 def test_tables_of_operations_are_those_of_the_program(page: str, arguments: str) -> None:
     name, *options = arguments.split()
-    made = script(ROOT / "benchmarks" / "table.py", RESULTS / name, *options).splitlines()
-    head = next(line for line in made if line.startswith("|"))
+    printed = script(ROOT / "benchmarks" / "table.py", RESULTS / name, *options).splitlines()
+    head = next(line for line in printed if line.startswith("|"))
     text = (ROOT / "docs" / f"{page}.md").read_text()
     rows = text[text.index(head) :].split("\n\n")[0].splitlines()
-    assert 4 < len(rows) <= 14 and not set(rows) - set(made)
+    assert 4 < len(rows) <= 14 and not set(rows) - set(printed)
 
 
 def test_the_claims_of_the_first_page() -> None:

@@ -1,4 +1,4 @@
-"""The notebook of examples/ runs as it is, in a kernel of its own, and has the outputs of a run."""
+"""Tests that the notebook of examples/ runs unchanged in its own kernel, and is committed with outputs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_the_notebook_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
 
 
 def test_the_notebook_is_committed_with_its_outputs() -> None:
-    """`jupyter nbconvert --execute --inplace examples/quickstart.ipynb` makes them anew."""
+    """The outputs are committed; `jupyter nbconvert --execute --inplace examples/quickstart.ipynb` renews them."""
     path = ROOT / "examples" / "quickstart.ipynb"
     text = path.read_text()
     assert len(text) < 400_000 and str(Path.home()) not in text and str(ROOT) not in text
@@ -32,7 +32,7 @@ def test_the_notebook_is_committed_with_its_outputs() -> None:
 
 
 def check_outputs(notebook: Any) -> None:
-    """That every cell ran without an error, and showed its pictures."""
+    """Fails unless every cell ran without an error and showed its pictures."""
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     assert all(cell.execution_count for cell in notebook.cells if cell.cell_type == "code")
     assert all(output.output_type != "error" and output.get("name") != "stderr" for output in outputs)

@@ -1,4 +1,4 @@
-"""The pages: Python in them runs, the options they name exist, their files are there."""
+"""Tests of the pages: their Python runs, and the options and files that they name exist."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from helpers import script
 
 ROOT = Path(__file__).resolve().parents[2]
 RUNNABLE = ("README.md", "docs/quickstart.md", "docs/method.md", "docs/extend.md", "docs/groups.md")
-GENERATED = {"docs/scene.html"}  # by `make docs`, docs/scripts/scene.py
+GENERATED = {"docs/scene.html"}  # made by docs/scripts/scene.py in `make docs`
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 
 
@@ -22,16 +22,16 @@ def blocks(name: str) -> list[str]:
 
 @pytest.mark.parametrize("name", RUNNABLE)
 def test_python_on_a_page_runs(name: str) -> None:
-    found = [code for code in blocks(name) if "sys.argv" not in code]
-    assert found, f"{name} has no Python"
+    blocks_to_run = [code for code in blocks(name) if "sys.argv" not in code]
+    assert blocks_to_run, f"{name} has no Python"
     names = {"__name__": "__main__"}
-    for number, code in enumerate(found, 1):
+    for number, code in enumerate(blocks_to_run, 1):
         exec(compile(code, f"{name}, block {number}", "exec"), names)
 
 
 @pytest.mark.parametrize("name", PAGES)
 def test_linked_files_are_there(name: str) -> None:
-    # contributing.md and changelog.md show files of the root, which are checked as such by GitHub's readers.
+    # contributing.md and changelog.md include files of the root folder; the links of these files are not checked here.
     for target in re.findall(r"\]\((?!https?:|#)([^)#]+)", (ROOT / name).read_text()):
         file = (ROOT / name).parent / target
         assert file.is_file() or file.relative_to(ROOT).as_posix() in GENERATED, f"{name} links {target}"
@@ -45,7 +45,7 @@ def test_promises_name_tests_that_are_there() -> None:
 
 @functools.cache
 def options() -> dict[str, set[str]]:
-    """The options of each command, as docs/options.md shows them."""
+    """Returns the options of each command, as in docs/options.md."""
     text = script(ROOT / "docs" / "scripts" / "options.py")
     commands = re.findall(r"^## voronerf ([\w-]+)\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
     return {name: set(re.findall(r"--[a-z][a-z-]+", part)) for name, part in commands}
@@ -63,9 +63,9 @@ def test_every_option_is_on_the_page() -> None:
 @pytest.mark.parametrize("name", [name for name in PAGES if "changelog" not in name])
 def test_options_on_a_page_exist(name: str) -> None:
     for command, line in re.findall(r"voronerf ([\w-]+)( [^`\n|#]*)", (ROOT / name).read_text()):
-        known = options().get(command, set()) | (options()["train"] if command == "train-territories" else set())
-        for option in re.findall(r"(?<!\w)--[a-z-]+", line) if known else ():
-            assert option in known, f"{name}: voronerf {command} has no {option}"
+        command_options = options().get(command, set()) | (options()["train"] if command == "train-territories" else set())
+        for option in re.findall(r"(?<!\w)--[a-z-]+", line) if command_options else ():
+            assert option in command_options, f"{name}: voronerf {command} has no {option}"
 
 
 @functools.cache

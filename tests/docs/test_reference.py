@@ -1,4 +1,4 @@
-"""The API reference: every public name is on a page, and has an example that runs."""
+"""Tests of the API reference: every public name is on a page, and has an example that runs."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ PACKAGES += ("voronerf.app", *(f"voronerf.app.{name}" for name in ("scenes", "tr
 
 
 def resolve(path: str) -> Any:
-    """The object of a dotted name, where a module and a function of it may share a name."""
+    """Returns the object of a dotted name; a module and its function may share a name."""
     module, _, name = path.rpartition(".")
     return getattr(importlib.import_module(module), name)
 
 
 def public_objects() -> dict[str, Any]:
-    """Every public class and function by the first name that it has."""
-    found: dict[int, tuple[str, Any]] = {}
+    """Returns every public class and function by its first public name."""
+    objects: dict[int, tuple[str, Any]] = {}
     for package in PACKAGES:
         module = importlib.import_module(package)
         for name in getattr(module, "__all__", ()):
-            found.setdefault(id(getattr(module, name)), (f"{package}.{name}", getattr(module, name)))
-    return dict(found.values())
+            objects.setdefault(id(getattr(module, name)), (f"{package}.{name}", getattr(module, name)))
+    return dict(objects.values())
 
 
 PUBLIC = public_objects()
@@ -61,7 +61,7 @@ def test_example_of_a_public_name_runs(name: str) -> None:
         return
     doc = inspect.getdoc(value) or ""
     if "Examples:\n" not in doc and re.search(rf"(>>>|\.\.\.) .*\b{name.rpartition('.')[2]}\b", EXAMPLES):
-        return  # that of another name uses it
+        return  # another name's example uses it
     assert re.search(r"^Examples:\n\s+>>> ", doc, re.MULTILINE), f"{name} needs an example under 'Examples:'"
     ran = 0
     for test in doctest.DocTestFinder(recurse=True).find(value, name, globs={}):

@@ -1,4 +1,4 @@
-"""The Warp kernels as PyTorch ops: what the tests of every backend (tests/ops) leave open."""
+"""The Warp kernels as PyTorch ops: cases beyond the tests of every backend (tests/ops)."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from torch import Tensor
 from voronerf import MLP, Layer, grouped_mlp
 
 pytestmark = pytest.mark.warp
-ROWS = 64  # of a tile
+ROWS = 64  # the rows of a tile
 
 
 def gradients(width: int, counts: list[int], backend: str) -> list[Tensor]:
-    """Output and gradients of three layers with a skip, of cells with so many rows."""
+    """Returns the output and gradients of three layers with a skip, for cells of ``counts`` rows."""
     generator = torch.Generator().manual_seed(0)
     layers = (Layer(("positions",), width, "relu"), Layer((0, "positions"), width, "softplus"), Layer((1,), 3, "sine"))
     table = MLP(layers, outputs=(2, 0), position_octaves=2)
     n, k = sum(counts), len(counts)
-    given = [torch.rand(n, 3, generator=generator)]
+    arguments = [torch.rand(n, 3, generator=generator)]
     for o, i in table.weight_shapes(3):
-        given += [torch.randn(k, o, i, generator=generator) / i**0.5, torch.randn(k, o, generator=generator)]
-    positions, *parameters = [tensor.requires_grad_() for tensor in given]
+        arguments += [torch.randn(k, o, i, generator=generator) / i**0.5, torch.randn(k, o, generator=generator)]
+    positions, *parameters = [tensor.requires_grad_() for tensor in arguments]
     offsets = torch.tensor([0, *counts], dtype=torch.int32).cumsum(0, dtype=torch.int32)
     out = grouped_mlp(positions, offsets, parameters[::2], parameters[1::2], layers=table, backend=backend)
     return [out, *torch.autograd.grad(out.square().sum(), (positions, *parameters))]
@@ -29,16 +29,16 @@ def gradients(width: int, counts: list[int], backend: str) -> list[Tensor]:
 
 @pytest.mark.parametrize("width", [1, 15, 16, 17, 256, 270])
 def test_a_network_of_any_width(width: int) -> None:
-    for found, right in zip(gradients(width, [70, 3], "warp"), gradients(width, [70, 3], "reference"), strict=True):
-        torch.testing.assert_close(found, right, rtol=1e-4, atol=1e-4 * float(right.detach().abs().max()))
+    for actual, right in zip(gradients(width, [70, 3], "warp"), gradients(width, [70, 3], "reference"), strict=True):
+        torch.testing.assert_close(actual, right, rtol=1e-4, atol=1e-4 * float(right.detach().abs().max()))
 
 
 @pytest.mark.parametrize(
     "counts", [[0, 0], [ROWS], [ROWS + 1, 0, ROWS - 1], [0, 2 * ROWS, 0, 1, 0], [1] * 70, [300, *[0] * 40]], ids=str
 )
 def test_cells_of_any_size(counts: list[int]) -> None:
-    for found, right in zip(gradients(20, counts, "warp"), gradients(20, counts, "reference"), strict=True):
-        torch.testing.assert_close(found, right, rtol=1e-4, atol=1e-5)
+    for actual, right in zip(gradients(20, counts, "warp"), gradients(20, counts, "reference"), strict=True):
+        torch.testing.assert_close(actual, right, rtol=1e-4, atol=1e-5)
 
 
 def test_what_a_step_needs_is_loaded_before_it() -> None:

@@ -1,4 +1,4 @@
-"""What the compiled module says of itself, and what it refuses."""
+"""The compiled module's description of itself, and the arguments that it refuses."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_an_instruction_set_that_is_not_there_is_refused() -> None:
 
 
 def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Names cross the border, not numbers: where the sides differ, nothing is computed by another function."""
+    """Functions are bound by name, not by number, so a function that one side lacks is never confused with another."""
     monkeypatch.setitem(FUNCTIONS, "cube", Function(lambda x, a, b: x**3))
     b = Builder()
     program = b.program([b.apply("cube", b.input(3))])
@@ -69,23 +69,23 @@ def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_product_takes_as_many_sources_as_the_compiled_module_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, most = list[Any](), native.compiled.most_sources
-    monkeypatch.setattr(native.compiled, "make_program", made.append)
+    programs, most = list[Any](), native.compiled.most_sources
+    monkeypatch.setattr(native.compiled, "make_program", programs.append)
     table = MLP((Layer(("positions",) * (2 * most + 3), 5),), (0,))
     lowering.lower.__wrapped__(table.program(3, 0, (5,), (True,), False).text)
-    assert [step.sources for step in made[0].steps if step.op == "linear"] == [most, most, 3]
+    assert [step.sources for step in programs[0].steps if step.op == "linear"] == [most, most, 3]
 
 
 def test_layers_hand_words_and_sums_to_the_next_on_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In registers, where the next product alone needs them; a value that others read has a slot, too."""
-    made, most = list[Any](), native.compiled.most_held
-    monkeypatch.setattr(native.compiled, "make_program", made.append)
+    """A result stays in registers if only the next product needs it; a value with other readers also has a slot."""
+    programs, most = list[Any](), native.compiled.most_held
+    monkeypatch.setattr(native.compiled, "make_program", programs.append)
 
     def linear(*layers: Layer, layout: str = "tiles") -> list[tuple[str, bool, bool]]:
         table = MLP(layers, (len(layers) - 1,))
         text = table.program(3, 0, tuple(layer.width for layer in layers), (True,) * len(layers), False).text
         lowering.lower.__wrapped__(text, layout, True)
-        return [(s.hands, s.from_registers, s.pairs >= 0 or s.floats) for s in made[-1].steps if s.op == "linear"]
+        return [(s.hands, s.from_registers, s.pairs >= 0 or s.floats) for s in programs[-1].steps if s.op == "linear"]
 
     first, positions = Layer(("positions",), most, "relu"), Layer(("positions",), 5)
     assert linear(first, Layer((0,), most, "relu"), Layer((1,), 4)) == [
@@ -93,7 +93,7 @@ def test_layers_hand_words_and_sums_to_the_next_on_cuda(monkeypatch: pytest.Monk
         ("words", True, False),
         ("nothing", True, True),
     ]
-    # The sum of two products goes on in registers, and what is held waits meanwhile.
+    # The sum of two products goes on in registers, and the held words wait meanwhile.
     assert linear(first, Layer(("positions", 0), 5)) == [
         ("words", False, False),
         ("sums", False, False),

@@ -1,4 +1,4 @@
-"""Calls that the compiled module checks and makes by itself (csrc/bindings/signature.cpp)."""
+"""Calls that the compiled module checks and runs by itself (csrc/bindings/signature.cpp)."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ CASES = {name: case for name, case in cases().items() if "native" in backends.im
 
 
 def refused_dtypes(name):
-    """Dtypes that the native implementation does not take."""
+    """Returns the dtypes that the native implementation does not take."""
     reason = backends.why_not(CASES[name].call or name, "native", torch.device("cpu"), torch.bfloat16)
     return () if reason is None else (torch.bfloat16,)
 
 
-def results(name, given):
-    """Results of an op, its arguments, into which it may have written, and the gradients of those that learn."""
-    found = getattr(ops, CASES[name].call or name)(**given, backend="native")
-    leaves = [leaf for leaf in tree_leaves((found, given)) if isinstance(leaf, Tensor)]
-    if hasattr(found, "raw"):
-        found.backward(found.raw.sum(), torch.ones_like(found.raw))
-        leaves.append(found.raw)
-    elif made := [leaf for leaf in tree_leaves(found) if isinstance(leaf, Tensor) and leaf.requires_grad]:
-        torch.autograd.backward([leaf.sum() for leaf in made])
-    gradients = [leaf.grad for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.grad is not None]
+def results(name, arguments):
+    """Returns an op's results, its arguments (it may write into them), and the gradients of arguments that learn."""
+    result = getattr(ops, CASES[name].call or name)(**arguments, backend="native")
+    leaves = [leaf for leaf in tree_leaves((result, arguments)) if isinstance(leaf, Tensor)]
+    if hasattr(result, "raw"):
+        result.backward(result.raw.sum(), torch.ones_like(result.raw))
+        leaves.append(result.raw)
+    elif smooth := [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor) and leaf.requires_grad]:
+        torch.autograd.backward([leaf.sum() for leaf in smooth])
+    gradients = [leaf.grad for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.grad is not None]
     return [leaf.detach().clone() for leaf in (*leaves, *gradients)]
 
 
 @contextlib.contextmanager
 def without_the_exchange():
-    """Torch as before 2.10."""
+    """Makes torch look like a version before 2.10, which has no exchange of tensors."""
     native.compiled.know_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
     yield
     native.know_torch(native.compiled)
@@ -56,20 +56,20 @@ def without_the_exchange():
 @pytest.mark.parametrize("learns", [False, True])
 @pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, case in CASES.items() for kind in case.kinds])
 def test_the_same_bits_as_by_the_methods_of_tensors(name, kind, learns):
-    """Whether torch tells of tensors at once or not: then every call is checked, and made, in Python."""
+    """Without torch's exchange of tensors, every call is checked and actual in Python, with the same bits."""
     case = CASES[name]
     for n, dtype in ((0, torch.float32), (1, torch.float32), (33, torch.float32), (33, torch.bfloat16)):
         if (learns and not case.differentiable) or dtype in refused_dtypes(name):
             continue
         pinned = {"dtype": dtype, **case.kinds[kind]}
-        found, wanted = (case.make(Draw(**pinned), n) for _ in range(2))
-        for leaf in tree_leaves((found, wanted)):
+        arguments, same_arguments = (case.make(Draw(**pinned), n) for _ in range(2))
+        for leaf in tree_leaves((arguments, same_arguments)):
             if learns and isinstance(leaf, Tensor) and leaf.is_floating_point():
                 leaf.requires_grad_()
-        made = results(name, found)
+        actual = results(name, arguments)
         with without_the_exchange():
-            expected = results(name, wanted)
-        for one, other in zip(made, expected, strict=True):
+            expected = results(name, same_arguments)
+        for one, other in zip(actual, expected, strict=True):
             torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
 
 
@@ -107,13 +107,13 @@ def test_calls_keep_nothing():
                 cell_sort(torch.full((3,), 9, dtype=torch.int32), 4)
 
     calls()
-    before = [sys.getrefcount(each) for each in held]
+    before = [sys.getrefcount(value) for value in held]
     calls()
-    assert [sys.getrefcount(each) - was for each, was in zip(held, before)] == pytest.approx([0] * len(held), abs=50)
+    assert [sys.getrefcount(value) - was for value, was in zip(held, before)] == pytest.approx([0] * len(held), abs=50)
 
 
 def test_arguments_of_other_kinds_are_checked_in_python():
-    """Integers of other classes, names that are not interned, numbers beyond a machine's."""
+    """Integers of other classes, names that are not interned and numbers beyond 64 bits are checked in Python."""
     cells = torch.zeros(3, dtype=torch.int32)
     assert cell_sort(**{"".join(["ce", "lls"]): cells, "k": 2})[1].tolist() == [0, 3, 3]
     for k, error in ((True, "must be an integer, got bool"), (2**70, "must be at most 134217728"), (0, "at least 1")):
@@ -122,7 +122,7 @@ def test_arguments_of_other_kinds_are_checked_in_python():
 
 
 def test_freed_memory_is_refused():
-    """Also transposed inputs of programs and the scalars of Adam, whose addresses are taken as they are."""
+    """Transposed inputs of programs and scalars of Adam, whose addresses are taken directly, are refused too."""
     gone = torch.tensor(0.0)
     gone.untyped_storage().resize_(0)
     ones = [torch.ones(3)], [torch.ones(3)], [torch.zeros(3)], [torch.zeros(3)]
@@ -142,10 +142,10 @@ def test_freed_memory_is_refused():
 def test_other_dtypes_are_named():
     b = Builder()
     program = b.program([b.linear(b.input(4), b.parameter(2, 4), 2)])
-    given = torch.ones(3, 4), [torch.rand(1, 2, 4)], torch.tensor([0, 3], dtype=torch.int32)
+    arguments = torch.ones(3, 4), [torch.rand(1, 2, 4)], torch.tensor([0, 3], dtype=torch.int32)
     for dtype in (torch.int16, torch.complex64):
         with pytest.raises(TypeError, match=r"inputs\[0\] must have dtype .*, got " + str(dtype)[6:]):
-            grouped_program([given[0].to(dtype)], *given[1:], program=program)
+            grouped_program([arguments[0].to(dtype)], *arguments[1:], program=program)
 
 
 def test_a_trace_of_torch_sees_the_op():

@@ -26,14 +26,14 @@ if backends.missing("native", torch.device("cpu")) is None:
     from voronerf.ops._core import native as _native
 
 CELLS = (1, 2, 15, 16, 17, 255, 256, 257, 4096)
-# Around the lanes and tiles of every instruction set and the block of a task.
+# Row counts around the lanes and tiles of every instruction set, and around the block of a task.
 ROWS = (0, 1, 3, 7, 8, 9, 15, 17, 31, 33, 63, 64, 65, 129)
 BLOCK = 2048
 DTYPES = (torch.float32, torch.float64)
 
 
 def chosen(points: Tensor, centres: Tensor) -> Tensor:
-    """Cells, checked against the definition: at the float64 minimum, and the reference's very index."""
+    """Returns cells after two checks: at the float64 minimum, and the same index as the reference."""
     cells = nearest_centre(points, centres, backend="native")
     assert cells.dtype == torch.int32
     table = distances(points, centres)
@@ -68,7 +68,7 @@ def test_nearest_breaks_ties_to_the_lowest_index(isa: str, dtype: torch.dtype) -
 
 
 def test_nearest_decides_in_float64_what_float32_cannot(isa: str) -> None:
-    """Two centres whose distances differ by less than float32 resolves, at every lane and either way round."""
+    """Two centres with distances equal in float32 are told apart at every lane, either way round."""
     points = torch.zeros(200, 3)
     near = torch.nextafter(torch.tensor(1.0), torch.tensor(0.0)).item()
     for sign in (1.0, -1.0):
@@ -79,7 +79,7 @@ def test_nearest_decides_in_float64_what_float32_cannot(isa: str) -> None:
 
 @pytest.mark.parametrize("scale", [1.0, 1e-20, 1e-22])
 def test_nearest_on_bisectors(isa: str, scale: float) -> None:
-    """Points as close to a border as float32 can put them; at the small scales the squares underflow in float32."""
+    """Points lie as close to a border as float32 can put them; at the small scales the squares underflow in float32."""
     for _ in range(20):
         centres = 2 * torch.rand(2, 3, dtype=torch.float64) - 1
         along = centres[1] - centres[0]
@@ -123,11 +123,11 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     torch.set_num_threads(before)
 
 
-# By digits up to k / 64 rows; up to 4096 cells with two chunks a thread; of many rows with prefetches.
+# Up to k / 64 rows are sorted by digits, up to 4096 cells with two chunks a thread, many rows with prefetches.
 @pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 4096, 4097, 5000, 100_000])
 @pytest.mark.parametrize("n", [0, 1, 2, 33, 64, 1562, 1563, 2047, 2048, 2049, 8191, 8192, 50_001, 131_329])
 def test_sort(threads: int, n: int, k: int) -> None:
-    # Half of the cells stay empty, one holds half of the rows.
+    # Half of the cells stay empty, and one cell holds half of the rows.
     cells = torch.randint(0, max(1, k // 2), (n,), dtype=torch.int32)
     cells[torch.rand(n) < 0.5] = k - 1
     order, offsets = cell_sort(cells, k, backend="native")
@@ -159,7 +159,7 @@ def test_sort_refuses_cells_out_of_range(threads: int, n: int, k: int, bad: int 
 
 
 def random_tree(sizes: tuple[int, ...], uneven: bool = True) -> dict[str, Tensor | int]:
-    """A tree with `sizes` children at each level, every third centre (if uneven) a leaf already."""
+    """Returns a tree with `sizes` children at each level; if uneven, every third centre is a leaf already."""
     rows: list[list[Tensor]] = [[]]
     child: list[list[int]] = [[]]
     level, leaves = [0], 0
@@ -239,7 +239,7 @@ assert len(loaded) == 1 or (not loaded and not _native.describe()["openmp"]), lo
 
 
 def test_a_trace_says_what_threads_would_share() -> None:
-    """Half of the time on two threads at best, and what is no region is as long on any number of them."""
+    """A parallel region takes half of its time on two threads, at best; a serial one takes as long on any number."""
     compiled, before, points = _native.compiled, torch.get_num_threads(), torch.rand(1 << 18, 3)
     torch.set_num_threads(1)
     try:
@@ -250,7 +250,7 @@ def test_a_trace_says_what_threads_would_share() -> None:
         torch.set_num_threads(before)
         (name, seconds, regions, inside, on), (_, _, _, inside_one, on_one) = compiled.trace(False)
     assert name == "nearest_centre" and regions == 1 and 0 < inside <= seconds
-    # Beside other work a single run may take longer than the others' share of many threads.
+    # On a busy machine a single run may take longer than the average share of a thread.
     assert inside / 2 - 1e-9 <= on[0] <= 0.6 * inside and on[0] > on[1] >= on[2] >= on[3] > 0
     assert on_one == [pytest.approx(inside_one, abs=3e-6)] * 4  # the clock counts microseconds
     nearest_centre(points, points[:64], backend="native")
@@ -333,7 +333,7 @@ def test_peak_errors() -> None:
 
 
 def test_a_driver_older_than_the_toolkit_is_refused(monkeypatch):
-    """Calls of a runtime that the driver does not know would all fail, after "auto" had chosen them."""
+    """With an older driver all calls of the runtime would fail, after "auto" has chosen CUDA."""
     built = SimpleNamespace(cuda=True, cuda_major=13, cuda_architectures="90")
     monkeypatch.setattr(_native, "compiled", built)
     monkeypatch.setattr("torch.cuda.get_device_capability", lambda device: (9, 0))
@@ -350,7 +350,7 @@ def test_a_driver_older_than_the_toolkit_is_refused(monkeypatch):
 @pytest.mark.native
 @pytest.mark.parametrize("threads", [1, 2])
 def test_numbers_below_the_normal_range_are_zero_in_kernels_alone(threads: int) -> None:
-    """They cost some hundred cycles each. The caller's threads, which torch uses too, are as before."""
+    """Denormal numbers cost some hundred cycles each. The caller's threads, which torch uses too, keep them."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

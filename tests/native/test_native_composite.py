@@ -1,4 +1,4 @@
-"""composite of the compiled module: what the tests of every backend (tests/ops/test_composite.py) leave open."""
+"""composite of the compiled module: cases beyond the tests of every backend (tests/ops/test_composite.py)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ pytestmark = pytest.mark.native
 INF = float("inf")
 
 
-def assert_close(given: dict, parts: tuple[str, ...] = PARTS) -> None:
-    exact, plain = (evaluate(given, dtype, "reference", parts) for dtype in (torch.float64, torch.float32))
-    for found, same, right in zip(evaluate(given, torch.float32, "native", parts), plain, exact):
-        assert_as_exact(found, same, right)
+def assert_close(arguments: dict, parts: tuple[str, ...] = PARTS) -> None:
+    exact, plain = (evaluate(arguments, dtype, "reference", parts) for dtype in (torch.float64, torch.float32))
+    for actual, same, right in zip(evaluate(arguments, torch.float32, "native", parts), plain, exact):
+        assert_as_exact(actual, same, right)
 
 
 @pytest.mark.parametrize("background", ["ray", "all", ""])
@@ -42,37 +42,37 @@ def test_any_number_of_rays(isa: str, counts: list[int]) -> None:
 @pytest.mark.parametrize("c", [3, 2])
 def test_same_bits_for_any_number_of_threads(isa: str, c: int) -> None:
     packed = scene([0, 5000, 1, 9000, *[70] * 100], c, "all", outside=(5, 9))
-    many = dense(40_000, 2, c, "all")  # whose shared background has a gradient worth splitting
-    for given in (packed, many):
-        on_any_number_of_threads(lambda given=given: evaluate(given, torch.float32, "native"))
+    many = dense(40_000, 2, c, "all")  # the gradient of its shared background is worth splitting
+    for arguments in (packed, many):
+        on_any_number_of_threads(lambda arguments=arguments: evaluate(arguments, torch.float32, "native"))
 
 
 def test_a_long_ray_keeps_its_digits() -> None:
-    given = scene([100_001])
-    given["sigma"] /= 10_000
-    assert_close(given)
+    arguments = scene([100_001])
+    arguments["sigma"] /= 10_000
+    assert_close(arguments)
 
 
 @pytest.mark.parametrize("density", [50.0, 80.0, 87.0, 90.0, 1e4, 1e30, 3e38, INF])
 def test_huge_densities(isa: str, density: float) -> None:
-    given = dense(3, 40)
-    given["sigma"][:, 5::7] = density
-    given["deltas"][:] = 0.5
-    given["deltas"][:, 5] = 0
-    expected, found = (evaluate(given, torch.float32, backend) for backend in ("reference", "native"))
-    for want, got in zip(expected, found):
+    arguments = dense(3, 40)
+    arguments["sigma"][:, 5::7] = density
+    arguments["deltas"][:] = 0.5
+    arguments["deltas"][:, 5] = 0
+    expected, actual = (evaluate(arguments, torch.float32, backend) for backend in ("reference", "native"))
+    for want, got in zip(expected, actual):
         assert got.isfinite().all()
         torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
-    assert (found[3][:, 13:] < 1e-10).all()
+    assert (actual[3][:, 13:] < 1e-10).all()
 
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
 @pytest.mark.parametrize("parts", [("colour",), ("depth",), PARTS])
 def test_second_derivatives(form: str, parts: tuple[str, ...]) -> None:
-    given = dense(3, 6) if form == "dense" else scene([3, 0, 6], 2, "all", (1, 1))
+    arguments = dense(3, 6) if form == "dense" else scene([3, 0, 6], 2, "all", (1, 1))
     results = {}
     for backend, dtype in (("reference", torch.float64), ("native", torch.float32)):
-        cast, leaves = leaves_of(given, dtype)
+        cast, leaves = leaves_of(arguments, dtype)
         result = composite(**cast, backend=backend)
         total = sum(getattr(result, part).square().sum() for part in parts)
         firsts = torch.autograd.grad(total, leaves, create_graph=True, allow_unused=True, materialize_grads=True)

@@ -18,9 +18,9 @@ from voronerf.ops.grouped_linear import reference as specification
 native = pytest.importorskip("voronerf.ops.grouped_linear.native")
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
-# Rows of every form: pairs or none, whole vectors of 16 or 32 or none, more than a panel; o over and under a granule.
+# Rows with and without pairs, whole vectors of 16 or 32, and more than a panel; o over and under a granule.
 WIDTHS = ((63, 64), (64, 63), (64, 64), (48, 16), (16, 48), (1, 1), (3, 90), (90, 4), (256, 32), (32, 129))
-# Of a tile of 96 rows: none, one, a whole one, one and more; rows of no cell before and after.
+# Cells of 0, 1, 96, 0, 199 and 2 rows, for tiles of 96 rows; rows of no cell lie before and after.
 OFFSETS = (2, 2, 3, 99, 99, 298, 300)
 ROWS = 303
 
@@ -29,12 +29,12 @@ def inputs(i: int, o: int, dtype: torch.dtype, *, seed: int = 0) -> list[Tensor]
     generator = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
     k = len(OFFSETS) - 1
-    made = (draw(ROWS, i), draw(k, o, i) / i**0.5, draw(k, o), draw(ROWS, o))
-    return [tensor.to(dtype) for tensor in made]
+    tensors = (draw(ROWS, i), draw(k, o, i) / i**0.5, draw(k, o), draw(ROWS, o))
+    return [tensor.to(dtype) for tensor in tensors]
 
 
 def evaluate(run, x: Tensor, weight: Tensor, bias: Tensor | None, g: Tensor, activation: str) -> list[Tensor]:  # type: ignore[no-untyped-def]
-    """Output, then the gradients of x, weight and bias."""
+    """Returns the output, then the gradients of x, weight and bias."""
     leaves = [tensor.detach().requires_grad_() for tensor in (x, weight, bias) if tensor is not None]
     offsets = torch.tensor(OFFSETS, dtype=torch.int32)
     y = run(leaves[0], offsets, leaves[1], None if bias is None else leaves[2], activation=activation)
@@ -42,22 +42,22 @@ def evaluate(run, x: Tensor, weight: Tensor, bias: Tensor | None, g: Tensor, act
 
 
 def compare(x: Tensor, weight: Tensor, bias: Tensor | None, g: Tensor, activation: str) -> None:
-    """Within rounding of float64 on the values as stored: the results', and the operands' of products."""
+    """Compares with float64 on the stored values, within the rounding of results and of the operands of products."""
     if activation == "relu":  # off the kink, where two right implementations may differ
         raised = None if bias is None else bias.double()
         y = evaluate(specification.grouped_linear, x.double(), weight.double(), raised, g.double(), "none")[0]
         g = torch.where(y.abs() < 0.05, 0, g)
     wide = [None if tensor is None else tensor.double() for tensor in (x, weight, bias, g)]
     exact = evaluate(specification.grouped_linear, *wide, activation)
-    found = evaluate(native.grouped_linear, x, weight, bias, g, activation)
+    actual = evaluate(native.grouped_linear, x, weight, bias, g, activation)
     step = torch.finfo(x.dtype).eps
-    for got, want in zip(found, exact):
+    for got, want in zip(actual, exact):
         assert got.dtype == x.dtype
         scale = float(want.abs().max())
         torch.testing.assert_close(got.double(), want, rtol=step, atol=(4e-6 if step < 1e-5 else step) * scale)
-    assert not found[0][: OFFSETS[0]].any() and not found[0][OFFSETS[-1] :].any()
-    assert not found[1][: OFFSETS[0]].any() and not found[1][OFFSETS[-1] :].any()
-    assert not found[2][0].any() and not found[2][3].any()  # cells without rows
+    assert not actual[0][: OFFSETS[0]].any() and not actual[0][OFFSETS[-1] :].any()
+    assert not actual[1][: OFFSETS[0]].any() and not actual[1][OFFSETS[-1] :].any()
+    assert not actual[2][0].any() and not actual[2][3].any()  # cells without rows
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
@@ -79,12 +79,12 @@ def test_activations(activation: str, dtype: torch.dtype, isa: str) -> None:
 def test_strided_and_unaligned(dtype: torch.dtype) -> None:
     x, weight, bias, g = inputs(64, 32, dtype)
     expected = evaluate(native.grouped_linear, x, weight, bias, g, "sigmoid")
-    shifted = torch.empty(x.numel() + 1, dtype=dtype)[1:].view_as(x).copy_(x)  # bfloat16: at an odd half of a float
+    shifted = torch.empty(x.numel() + 1, dtype=dtype)[1:].view_as(x).copy_(x)  # bfloat16: not aligned to 4 bytes
     spread = torch.empty(*g.shape, 2, dtype=dtype)[..., 0].copy_(g)
     flipped = weight.transpose(1, 2).contiguous().transpose(1, 2)
     for form in (shifted, x.t().contiguous().t(), x.repeat(1, 2)[:, :64]):
-        found = evaluate(native.grouped_linear, form, flipped, bias, spread, "sigmoid")
-        for got, want in zip(found, expected):
+        actual = evaluate(native.grouped_linear, form, flipped, bias, spread, "sigmoid")
+        for got, want in zip(actual, expected):
             assert torch.equal(got, want)
 
 
@@ -94,29 +94,29 @@ def test_what_is_no_number_stays_in_its_row(dtype: torch.dtype) -> None:
     offsets = torch.tensor(OFFSETS, dtype=torch.int32)
     clean = native.grouped_linear(x, offsets, weight, bias, activation="relu")
     x[50], x[51, 0] = torch.nan, torch.inf
-    found = native.grouped_linear(x, offsets, weight, bias, activation="relu")
-    assert found[50].isnan().all() and not found[51].isfinite().all()
+    result = native.grouped_linear(x, offsets, weight, bias, activation="relu")
+    assert result[50].isnan().all() and not result[51].isfinite().all()
     rest = [row for row in range(ROWS) if row not in (50, 51)]
-    assert torch.equal(found[rest], clean[rest])
+    assert torch.equal(result[rest], clean[rest])
 
 
 def test_calls_past_the_dispatcher_give_what_it_gives() -> None:
-    """A profiler, a mode or a transform is given the custom op; otherwise the compiled function is called at once."""
-    given = *inputs(63, 64, torch.float32), "sine"
-    direct = evaluate(native.grouped_linear, *given)
+    """Under a profiler, a mode or a transform the custom op runs; otherwise the compiled function is called at once."""
+    arguments = *inputs(63, 64, torch.float32), "sine"
+    direct = evaluate(native.grouped_linear, *arguments)
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
-        seen = evaluate(native.grouped_linear, *given)
+        seen = evaluate(native.grouped_linear, *arguments)
     assert all(map(torch.equal, direct, seen))
     names = {event.key for event in profile.key_averages()}
     assert "voronerf::grouped_program_native" in names
-    x, weight, bias, _ = given[:4]
+    x, weight, bias, _ = arguments[:4]
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         fake = native.grouped_linear(mode.from_tensor(x), torch.tensor(OFFSETS, dtype=torch.int32), weight, bias)
     assert type(fake) is not Tensor and fake.shape == (ROWS, 64)
 
 
 def test_large_results_ask_for_huge_pages() -> None:
-    """Of a fresh process, whose allocator has nothing to give again."""
+    """A fresh process has no freed memory that the allocator could give again."""
     if not sys.platform.startswith("linux"):
         pytest.skip("Linux alone has transparent huge pages")
     path = Path("/sys/kernel/mm/transparent_hugepage/enabled")
@@ -132,12 +132,12 @@ on_huge_pages(out)
 out.zero_()
 print(faults() - before, int(out.count_nonzero()))
 """
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
-    assert int(found[0]) < 2000 and found[1] == "0"  # 16,384 small pages
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert int(result[0]) < 2000 and result[1] == "0"  # instead of 16,384 small pages
 
 
 def test_what_a_step_frees_is_kept() -> None:
-    """By the program, in a fresh process: a step finds the memory of an equal one before it."""
+    """In a fresh process, a step reuses the memory that an equal step before it has freed."""
     if platform.libc_ver()[0] != "glibc":
         pytest.skip("glibc alone can be asked")
     program = """
@@ -153,8 +153,8 @@ for _ in range(6):
     found.append(faults() - before)
 print(sorted(found[1:])[2])
 """
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert int(found) < 2000  # of 65,536 pages; the median of five, since the system may reclaim some
+    results = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert int(results) < 2000  # of 65,536 pages; the median of five, since the system may reclaim some
 
 
 def test_large_results_reuse_the_memory_of_those_that_are_gone() -> None:
@@ -167,7 +167,7 @@ def test_large_results_reuse_the_memory_of_those_that_are_gone() -> None:
     assert not torch.equal(first, second) and torch.equal(encode(1.0), kept) and torch.equal(first, kept)
     del first
     third = encode(1.0)
-    del second  # a view of it is still held
+    del second  # `part` is still a view of it
     wanted = part.clone()
     others = [encode(0.5 + i) for i in range(3)]
     assert torch.equal(part, wanted) and torch.equal(third, kept)
@@ -175,7 +175,7 @@ def test_large_results_reuse_the_memory_of_those_that_are_gone() -> None:
 
 
 def test_large_results_of_equal_calls_are_written_to_the_same_pages() -> None:
-    """In a fresh process."""
+    """The calls run in a fresh process."""
     if not sys.platform.startswith("linux"):
         pytest.skip("elsewhere the allocator decides")
     program = """
@@ -190,5 +190,5 @@ for n in (1 << 18, (1 << 18) - 100) * 4:
     found.append(faults() - before)
 print(sorted(found[2:])[3])
 """
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert int(found) < 16  # of 16,128 small pages, or 31 huge ones
+    results = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert int(results) < 16  # instead of 16,128 small pages, or 31 huge ones

@@ -14,7 +14,7 @@ from voronerf.ops._core.tolerances import agree_gradients
 
 pytestmark = pytest.mark.native
 
-# Largest error against float64, in units of the largest value: twice that of the float32 reference, and this.
+# The allowed error against float64 is twice the error of the float32 reference, plus FLOOR times the largest value.
 FLOOR = 3e-6
 
 
@@ -37,7 +37,7 @@ def nerf(width: int, depth: int, activation: str = "softplus") -> MLP:
 
 
 def hashed(layers: MLP, degree: int, **grid) -> MLP:
-    """The layers on a hash grid, and on spherical harmonics of the directions."""
+    """Returns the layers on a hash grid, and on spherical harmonics of the directions."""
     grid = HashGrid(log2_entries=10, base=4, **grid)
     return MLP(layers.layers, layers.outputs, None, None, "hash", grid, "spherical", degree)
 
@@ -59,7 +59,7 @@ NETWORKS = {
     "hashed 256": hashed(nerf(256, 2), 2, levels=5, features=8, finest=30, box=((-1, -1, -1), (0, 1, 2))),
     "sigmoid": chain(20, 2, activation="sigmoid"),
     "sine": chain(20, 2, activation="sine"),
-    # Few outputs of whole vectors of inputs: in one piece and concatenated, read by other layers, with activations.
+    # Few outputs of whole vectors of inputs, in one piece and concatenated, read by other layers, with activations.
     "heads": MLP(
         (
             Layer(("positions",), 64, "softplus"),
@@ -73,7 +73,7 @@ NETWORKS = {
         (6, 2, 5, 4),
         3,
     ),
-    # Sources repeated, more than fit one product, outputs that other layers read, and a layer that nothing reads.
+    # Repeated sources, more than fit one product, outputs that other layers read, and a layer that nothing reads.
     "graph": MLP(
         (
             Layer(("positions", "directions", "positions"), 7, "sine"),
@@ -92,15 +92,15 @@ NETWORKS = {
 def arguments(
     layers: MLP, counts: list[int], rays: int = 0, bias: bool = True, p: int = 3, q: int = 3, own: bool = False
 ) -> dict:
-    """Float64 arguments of grouped_mlp for cells of the given sizes.
+    """Returns float64 arguments of grouped_mlp for cells of ``counts`` rows.
 
-    rays 0: a direction for each sample; own: a hash grid for each cell.
+    With ``rays=0`` each sample has a direction; with ``own`` each cell has a hash grid.
     """
     n, k = sum(counts), len(counts)
     p = 6 if layers.integrated else p
     uniform = torch.distributions.Uniform(torch.tensor(-1.0, dtype=torch.float64), 1.0)
     shapes = layers.weight_shapes(p, q)
-    given = {
+    call = {
         "positions": uniform.sample((n, p)),
         "offsets": torch.tensor([0, *counts]).cumsum(0).int(),
         "weights": [uniform.sample((k, o, i)) * (3 / i) ** 0.5 for o, i in shapes],
@@ -108,42 +108,42 @@ def arguments(
         "layers": layers,
     }
     if layers.integrated:
-        given["positions"][:, 3:].square_()
+        call["positions"][:, 3:].square_()
     if layers.grid is not None:
-        given["features"] = uniform.sample((*([k] if own else []), *layers.grid.table_shape))
+        call["features"] = uniform.sample((*([k] if own else []), *layers.grid.table_shape))
     if layers.uses_directions:
-        given["directions"] = uniform.sample((rays or n, q))
-        given["direction_index"] = torch.randint(rays, (n,), dtype=torch.int32) if rays else None
-    return given
+        call["directions"] = uniform.sample((rays or n, q))
+        call["direction_index"] = torch.randint(rays, (n,), dtype=torch.int32) if rays else None
+    return call
 
 
-def tensors(given: dict) -> list[Tensor]:
-    """The floating-point tensors of arguments, in one order."""
-    found = [given["positions"], given.get("directions"), given.get("features"), *given["weights"], *given["biases"]]
-    return [tensor for tensor in found if tensor is not None]
+def tensors(call: dict) -> list[Tensor]:
+    """Returns the floating-point tensors of the arguments, in a fixed order."""
+    parts = [call["positions"], call.get("directions"), call.get("features"), *call["weights"], *call["biases"]]
+    return [tensor for tensor in parts if tensor is not None]
 
 
-def cast(given: dict, dtype: torch.dtype) -> dict:
+def cast(call: dict, dtype: torch.dtype) -> dict:
     def one(tensor: Tensor | None) -> Tensor | None:
         return None if tensor is None else tensor.detach().to(dtype).requires_grad_()
 
-    changed = {key: one(given[key]) for key in ("positions", "directions", "features") if key in given}
-    lists = {key: [one(tensor) for tensor in given[key]] for key in ("weights", "biases")}
-    return {**given, **changed, **lists}
+    changed = {key: one(call[key]) for key in ("positions", "directions", "features") if key in call}
+    lists = {key: [one(tensor) for tensor in call[key]] for key in ("weights", "biases")}
+    return {**call, **changed, **lists}
 
 
-def evaluate(given: dict, dtype: torch.dtype, backend: str) -> list[Tensor]:
-    """Output and all gradients."""
-    given = cast(given, dtype)
-    out = grouped_mlp(**given, backend=backend)
+def evaluate(call: dict, dtype: torch.dtype, backend: str) -> list[Tensor]:
+    """Returns the output and all gradients."""
+    call = cast(call, dtype)
+    out = grouped_mlp(**call, backend=backend)
     slopes = torch.linspace(-1, 1.5, out.numel(), dtype=torch.float64).view_as(out).to(dtype)
-    return [out.detach(), *torch.autograd.grad(out, tensors(given), slopes, materialize_grads=True)]
+    return [out.detach(), *torch.autograd.grad(out, tensors(call), slopes, materialize_grads=True)]
 
 
-def assert_close(given: dict) -> None:
-    exact = evaluate(given, torch.float64, "reference")
-    plain = evaluate(given, torch.float32, "reference")
-    native = evaluate(given, torch.float32, "native")
+def assert_close(call: dict) -> None:
+    exact = evaluate(call, torch.float64, "reference")
+    plain = evaluate(call, torch.float32, "reference")
+    native = evaluate(call, torch.float32, "native")
     for index, (want, usual, got) in enumerate(zip(exact, plain, native)):
         assert got.shape == want.shape and got.dtype == torch.float32
         scale = float(want.abs().max()) if want.numel() else 1.0
@@ -174,32 +174,32 @@ def test_any_number_of_hashed_rows(rows: int) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("name", ["heads", "nerf 64", "graph", "width 63", "hashed 32"])
 def test_a_row_does_not_depend_on_its_place(name: str, dtype: torch.dtype, isa: str) -> None:
-    given = cast(arguments(NETWORKS[name], [41]), dtype)
-    together = grouped_mlp(**given, backend="native").detach()
+    call = cast(arguments(NETWORKS[name], [41]), dtype)
+    together = grouped_mlp(**call, backend="native").detach()
     for row in (0, 3, 4, 17, 40):
-        one = {**given, "positions": given["positions"][row : row + 1], "offsets": torch.tensor([0, 1]).int()}
-        if "directions" in given:
-            one["directions"] = given["directions"][row : row + 1]
+        one = {**call, "positions": call["positions"][row : row + 1], "offsets": torch.tensor([0, 1]).int()}
+        if "directions" in call:
+            one["directions"] = call["directions"][row : row + 1]
         assert torch.equal(grouped_mlp(**one, backend="native")[0], together[row])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_rows_without_a_gradient_add_nothing_to_weights(dtype: torch.dtype, isa: str) -> None:
-    given = cast(arguments(nerf(17, 2), [900, 3, 0, 70], rays=9), dtype)
+    call = cast(arguments(nerf(17, 2), [900, 3, 0, 70], rays=9), dtype)
     slopes = torch.randn(973, 4).to(dtype)
     slopes[torch.arange(973) % 7 != 0] = -0.0
     slopes[14] = torch.tensor([0.0, -0.0, 0.0, 1e-3]).to(dtype)
-    found = []
+    results = []
     for backend in ("native", "reference"):
-        out = grouped_mlp(**given, backend=backend)
-        found.append(torch.autograd.grad(out, [*given["weights"], *given["biases"]], slopes))
-    assert agree_gradients(*found)
+        out = grouped_mlp(**call, backend=backend)
+        results.append(torch.autograd.grad(out, [*call["weights"], *call["biases"]], slopes))
+    assert agree_gradients(*results)
 
 
 def test_relu_on_few_outputs(isa: str) -> None:
     layers = MLP((Layer(("positions",), 32, "softplus"), Layer((0,), 4, "relu"), Layer((0,), 1, "relu")), (1, 2), 2)
-    given = arguments(layers, [50], bias=False)
-    got, want = (grouped_mlp(**cast(given, torch.float32), backend=backend) for backend in ("native", "reference"))
+    call = arguments(layers, [50], bias=False)
+    got, want = (grouped_mlp(**cast(call, torch.float32), backend=backend) for backend in ("native", "reference"))
     assert 0.2 < float((want > 0).float().mean()) < 0.8
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
 
@@ -227,10 +227,10 @@ def test_linear_of_odd_sizes(i: int, o: int, isa: str) -> None:
 def test_without_biases_and_with_relu_off_the_kink() -> None:
     # A ReLU whose input is within rounding of 0 may differ between two correct implementations; integers are not.
     layers = chain(12, 2, activation="relu", octaves=None)
-    given = arguments(layers, [30, 41], bias=False)
-    given["positions"] = given["positions"].mul(8).round() + 0.5
-    given["weights"] = [weight.mul(8).round() * 2 + 1 for weight in given["weights"]]
-    native, exact = evaluate(given, torch.float32, "native"), evaluate(given, torch.float64, "reference")
+    call = arguments(layers, [30, 41], bias=False)
+    call["positions"] = call["positions"].mul(8).round() + 0.5
+    call["weights"] = [weight.mul(8).round() * 2 + 1 for weight in call["weights"]]
+    native, exact = evaluate(call, torch.float32, "native"), evaluate(call, torch.float64, "reference")
     for got, want in zip(native, exact):
         torch.testing.assert_close(got.double(), want, rtol=1e-6, atol=1e-6 * float(want.abs().max()))
 
@@ -244,7 +244,7 @@ def test_relu_stops_an_infinite_gradient_and_passes_what_is_not_a_number(o: int,
     slopes = torch.tensor([[torch.inf], [1.0], [1.0]])
     heads = torch.ones(1, 1, o)
     active = Layer(("positions",), o, "relu")
-    # ReLU as the last layer, and as one that another reads.
+    # The ReLU is the last layer, or another layer reads it.
     for layers, weights in ((MLP((active,), (0,)), [weight]), (MLP((active, Layer((0,), 1)), (1,)), [weight, heads])):
         results = []
         for backend in ("native", "reference"):
@@ -264,41 +264,41 @@ def test_relu_stops_an_infinite_gradient_and_passes_what_is_not_a_number(o: int,
 @pytest.mark.parametrize("network", ["nerf", "hashed", "own tables"])
 def test_same_bits_for_any_number_of_threads(isa: str, dtype: torch.dtype, network: str) -> None:
     layers = nerf(40, 2) if network == "nerf" else NETWORKS["hashed 32"]
-    given = arguments(layers, [5000, 3, 0, 900], rays=50, own=network == "own tables")
-    on_any_number_of_threads(lambda: evaluate(given, dtype, "native"))
+    call = arguments(layers, [5000, 3, 0, 900], rays=50, own=network == "own tables")
+    on_any_number_of_threads(lambda: evaluate(call, dtype, "native"))
 
 
 @pytest.mark.parametrize("where", ["positions", "weights", "directions"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 3e38])
 def test_what_is_not_finite_stays_where_it_is(where: str, value: float) -> None:
-    given = arguments(nerf(17, 2, activation="relu"), [20, 30, 10], rays=8)
-    plain = grouped_mlp(**cast(given, torch.float32), backend="native")
-    target = given["weights"][0] if where == "weights" else given[where]
+    call = arguments(nerf(17, 2, activation="relu"), [20, 30, 10], rays=8)
+    plain = grouped_mlp(**cast(call, torch.float32), backend="native")
+    target = call["weights"][0] if where == "weights" else call[where]
     target[1].view(-1)[0] = value
-    changed = cast(given, torch.float32)
+    changed = cast(call, torch.float32)
     got, want = (grouped_mlp(**changed, backend=backend) for backend in ("native", "reference"))
     assert torch.equal(got.isnan(), want.isnan()) or value == 3e38
-    untouched = want.isfinite() & ~(want != grouped_mlp(**cast(given, torch.float32), backend="reference"))
+    untouched = want.isfinite() & ~(want != grouped_mlp(**cast(call, torch.float32), backend="reference"))
     assert (got[untouched].isfinite()).all()
     if where == "weights":
         assert torch.equal(got[:20], plain[:20]) and torch.equal(got[50:], plain[50:])
 
 
 def test_large_positions() -> None:
-    given = arguments(chain(8, 1, octaves=10), [40])
-    given["positions"] = (given["positions"] * 1000).float().double()
-    given["positions"][3] = 1e20
-    got, want = (evaluate(given, torch.float32, backend)[0] for backend in ("native", "reference"))
+    call = arguments(chain(8, 1, octaves=10), [40])
+    call["positions"] = (call["positions"] * 1000).float().double()
+    call["positions"][3] = 1e20
+    got, want = (evaluate(call, torch.float32, backend)[0] for backend in ("native", "reference"))
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5 * float(want[:3].abs().max()))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_bfloat16_storage(name: str, isa: str) -> None:
-    """Errors in the Euclidean norm: at most 1.5 times those of the reference with the same storage."""
-    given = arguments(NETWORKS[name], [0, 61, 1, 0, 250, 7, 0])
-    given = {**given, **{key: cast(given, torch.bfloat16)[key] for key in ("weights", "biases")}}
-    exact = evaluate(given, torch.float64, "reference")
-    stored = [evaluate(given, torch.bfloat16, backend) for backend in ("reference", "native")]
+    """Errors in the Euclidean norm are at most 1.5 times the errors of the reference with the same storage."""
+    call = arguments(NETWORKS[name], [0, 61, 1, 0, 250, 7, 0])
+    call = {**call, **{key: cast(call, torch.bfloat16)[key] for key in ("weights", "biases")}}
+    exact = evaluate(call, torch.float64, "reference")
+    stored = [evaluate(call, torch.bfloat16, backend) for backend in ("reference", "native")]
     for index, (want, usual, got) in enumerate(zip(exact, *stored)):
         assert got.shape == want.shape and got.dtype == torch.bfloat16
         error, allowed = float((got - want).norm()), 1.5 * float((usual - want).norm()) + 2e-3 * float(want.norm())
@@ -307,18 +307,18 @@ def test_bfloat16_storage(name: str, isa: str) -> None:
 
 @pytest.mark.parametrize("rows", [0, 1, 2, 5, 47, 48, 95, 96, 97, 501])
 def test_bfloat16_with_any_number_of_rows(rows: int) -> None:
-    given = arguments(nerf(33, 2), [rows], rays=5)
-    want, got = evaluate(given, torch.float32, "native"), evaluate(given, torch.bfloat16, "native")
+    call = arguments(nerf(33, 2), [rows], rays=5)
+    want, got = evaluate(call, torch.float32, "native"), evaluate(call, torch.bfloat16, "native")
     for exact, stored in zip(want, got):
         assert float((stored - exact).norm()) <= 0.2 * float(exact.norm())
 
 
 def test_bfloat16_keeps_what_is_not_finite_in_its_row() -> None:
-    given = arguments(nerf(17, 2), [20, 30], rays=50)
-    given["direction_index"] = torch.arange(50, dtype=torch.int32)
-    given["positions"][3] = float("inf")
-    given["directions"][30] = float("nan")
-    out = grouped_mlp(**cast(given, torch.bfloat16), backend="native")
+    call = arguments(nerf(17, 2), [20, 30], rays=50)
+    call["direction_index"] = torch.arange(50, dtype=torch.int32)
+    call["positions"][3] = float("inf")
+    call["directions"][30] = float("nan")
+    out = grouped_mlp(**cast(call, torch.bfloat16), backend="native")
     spoiled = torch.zeros(50, dtype=torch.bool)
     spoiled[3] = True
     assert torch.equal(out[:, 3].isnan(), spoiled)
@@ -327,19 +327,19 @@ def test_bfloat16_keeps_what_is_not_finite_in_its_row() -> None:
 
 
 def test_float64_positions_are_encoded_in_float64() -> None:
-    given = arguments(chain(8, 1, octaves=10), [40])
-    given["positions"] += 100
-    exact = evaluate(given, torch.float64, "reference")[0]
-    mixed = {**cast(given, torch.float32), "positions": given["positions"]}
+    call = arguments(chain(8, 1, octaves=10), [40])
+    call["positions"] += 100
+    exact = evaluate(call, torch.float64, "reference")[0]
+    mixed = {**cast(call, torch.float32), "positions": call["positions"]}
     got = grouped_mlp(**mixed, backend="native").detach()
     assert float((got - exact).abs().max()) <= 1e-5 * float(exact.abs().max())
 
 
 def test_an_index_of_no_ray_is_refused() -> None:
-    given = cast(arguments(nerf(6, 2), [5, 8], rays=4), torch.float32)
+    call = cast(arguments(nerf(6, 2), [5, 8], rays=4), torch.float32)
     for bad_index in (4, -1):
-        index = given["direction_index"].clone()
+        index = call["direction_index"].clone()
         index[3] = bad_index
         for backend in ("native", "reference"):
             with pytest.raises(ValueError, match=rf"^grouped_mlp: direction_index must be 0 to 3, got {bad_index}$"):
-                grouped_mlp(**{**given, "direction_index": index}, backend=backend)
+                grouped_mlp(**{**call, "direction_index": index}, backend=backend)

@@ -1,4 +1,4 @@
-"""The encodings of the compiled module: what the tests of the operations leave open."""
+"""The encodings of the compiled module: cases beyond the tests of the operations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from voronerf.ops import frequency_encode, integrated_encode, spherical_harmonic
 
 pytestmark = pytest.mark.native
 
-# Around the rows of a tile.
+# Row counts around the rows of a tile.
 ROWS = (0, 1, 2, 31, 32, 33, 100)
 
 
@@ -24,7 +24,7 @@ def points(n: int, d: int = 3) -> Tensor:
 
 
 def encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], list[Tensor]]]:
-    """Both encodings, each with float64 inputs."""
+    """Returns both encodings, each with float64 inputs."""
     return [
         (lambda x, backend: frequency_encode(x, octaves, backend=backend), [points(n)]),
         (lambda x, backend: frequency_encode(x, octaves, include_input=False, backend=backend), [points(n)]),
@@ -36,7 +36,7 @@ def encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], lis
 
 
 def all_encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], list[Tensor]]]:
-    """Those and spherical harmonics, of which a large direction has no small values."""
+    """Returns the encodings and spherical harmonics, which have no small values for large directions."""
 
     def harmonics(degree: int, x: Tensor, backend: str) -> Tensor:
         return spherical_harmonics(x, degree, backend=backend)
@@ -45,7 +45,7 @@ def all_encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor],
 
 
 def evaluate(run: Callable[..., Tensor], inputs: list[Tensor], dtype: torch.dtype, backend: str) -> list[Tensor]:
-    """Result and gradients."""
+    """Returns the result and its gradients."""
     leaves = [tensor.to(dtype).requires_grad_() for tensor in inputs]
     out = run(*leaves, backend=backend)
     slopes = torch.linspace(-1, 1.5, out.numel(), dtype=torch.float64).view_as(out).to(dtype)
@@ -55,8 +55,8 @@ def evaluate(run: Callable[..., Tensor], inputs: list[Tensor], dtype: torch.dtyp
 def assert_close(run: Callable[..., Tensor], inputs: list[Tensor]) -> None:
     inputs = [tensor.float().double() for tensor in inputs]
     exact, plain = (evaluate(run, inputs, dtype, "reference") for dtype in (torch.float64, torch.float32))
-    for found, same, right in zip(evaluate(run, inputs, torch.float32, "native"), plain, exact):
-        assert_as_exact(found, same, right)
+    for actual, same, right in zip(evaluate(run, inputs, torch.float32, "native"), plain, exact):
+        assert_as_exact(actual, same, right)
 
 
 @pytest.mark.parametrize("n", ROWS)

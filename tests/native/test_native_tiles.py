@@ -1,4 +1,4 @@
-"""Products in tile registers: on every machine in their double, and in those of AMX where the processor has them."""
+"""Products in tile registers: in an emulation on every machine, and in AMX where the processor has it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ native = pytest.importorskip("voronerf.ops._core.native")
 programs = pytest.importorskip("voronerf.ops.grouped_program.native")
 
 PRECISIONS = {"highest": 2e-6, "high": 1e-4, "medium": 0.05}
-"""Of ``torch.set_float32_matmul_precision``, with the largest error of results and gradients beside float64."""
+"""Values of ``torch.set_float32_matmul_precision``, and the largest error of results and gradients against float64."""
 
 
 @pytest.fixture(params=["double", "amx"])
@@ -49,7 +49,7 @@ def network(
     seed: int = 0,
     activation: str = "softplus",
 ) -> dict[str, object]:
-    """Layers one after the other, the last of which reads the positions again."""
+    """Returns arguments of layers one after the other; the last layer reads the positions again."""
     layers = [Layer(("positions",), widths[0], activation)]
     layers += [Layer((i,), width, activation) for i, width in enumerate(widths[1:])]
     layers.append(Layer((len(layers) - 1, "positions"), 4))
@@ -66,19 +66,19 @@ def network(
     }
 
 
-def outcome(given: dict[str, object], dtype: torch.dtype, backend: str) -> list[Tensor]:
-    """The result, then the gradients of positions, weights and biases."""
-    leaves = [given["positions"], *given["weights"], *given["biases"]]  # type: ignore[misc]
+def outcome(call: dict[str, object], dtype: torch.dtype, backend: str) -> list[Tensor]:
+    """Returns the result, then the gradients of positions, weights and biases."""
+    leaves = [call["positions"], *call["weights"], *call["biases"]]  # type: ignore[misc]
     leaves = [leaf.to(dtype, copy=True).requires_grad_() for leaf in leaves]
-    count = len(given["weights"])  # type: ignore[arg-type]
+    count = len(call["weights"])  # type: ignore[arg-type]
     x, weights, biases = leaves[0], leaves[1 : 1 + count], leaves[1 + count :]
-    y = grouped_mlp(x, given["offsets"], weights, biases, layers=given["layers"], backend=backend)  # type: ignore[arg-type]
+    y = grouped_mlp(x, call["offsets"], weights, biases, layers=call["layers"], backend=backend)  # type: ignore[arg-type]
     arriving = torch.sin(torch.arange(y.numel(), dtype=torch.float64)).view(y.shape).to(y.dtype)
     return [y.detach(), *torch.autograd.grad(y, leaves, arriving)]
 
 
-def error(found: list[Tensor], exact: list[Tensor]) -> float:
-    distances = [float((a.double() - b).norm() / (b.norm() + 1e-9)) for a, b in zip(found, exact, strict=True)]
+def error(results: list[Tensor], exact: list[Tensor]) -> float:
+    distances = [float((a.double() - b).norm() / (b.norm() + 1e-9)) for a, b in zip(results, exact, strict=True)]
     return max(distances)
 
 
@@ -90,17 +90,17 @@ def error(found: list[Tensor], exact: list[Tensor]) -> float:
 def test_each_precision_is_as_exact_as_it_says(
     widths: tuple[int, ...], p: int, octaves: int | None, asked: str, registers: str, precision: Callable[[str], None]
 ) -> None:
-    given = network(widths, p, octaves, [97, 0, 1, 40])
-    exact, tight = outcome(given, torch.float64, "reference"), outcome(given, torch.float32, "native")
+    arguments = network(widths, p, octaves, [97, 0, 1, 40])
+    exact, tight = outcome(arguments, torch.float64, "reference"), outcome(arguments, torch.float32, "native")
     precision(asked)
-    found = outcome(given, torch.float32, "native")
-    assert error(found, exact) < PRECISIONS[asked]
-    same = all(torch.equal(a, b) for a, b in zip(found, tight))
+    actual = outcome(arguments, torch.float32, "native")
+    assert error(actual, exact) < PRECISIONS[asked]
+    same = all(torch.equal(a, b) for a, b in zip(actual, tight))
     assert same == (asked == "highest")
 
 
 @pytest.mark.parametrize(("asked", "most"), [("high", 1e-5), ("medium", 2.0**-9 + 4e-6)])
-@pytest.mark.parametrize("largest", [1.0, 15.0, 1e5])  # angles of 512, 7,680, and beyond those of the vector sine
+@pytest.mark.parametrize("largest", [1.0, 15.0, 1e5])  # angles of 512, 7,680, and beyond the range of the vector sine
 @pytest.mark.parametrize("d", [1, 3, 5])
 def test_octaves_are_no_less_exact_than_what_they_are_rounded_to(
     d: int, largest: float, asked: str, most: float, registers: str, precision: Callable[[str], None]
@@ -114,53 +114,53 @@ def test_octaves_are_no_less_exact_than_what_they_are_rounded_to(
     def encoded(x: Tensor) -> Tensor:
         return grouped_mlp(x, offsets, weights, [None], layers=table, backend="native")[:, d:]
 
-    found, exact = encoded(x), frequency_encode(x.double(), 10, include_input=False, backend="reference")
-    assert (found - exact).abs().max() < most
+    actual, exact = encoded(x), frequency_encode(x.double(), 10, include_input=False, backend="reference")
+    assert (actual - exact).abs().max() < most
     beside = x.clone()
     beside[40] = 1e7
-    assert torch.equal(encoded(beside)[:40], found[:40])
+    assert torch.equal(encoded(beside)[:40], actual[:40])
 
 
 @pytest.mark.parametrize("asked", ["high", "medium"])
 @pytest.mark.parametrize("rows", [0, 1, 2, 15, 16, 17, 31, 32, 33, 63, 65, 95, 96, 97, 129, 1025])
 def test_any_number_of_rows(rows: int, asked: str, registers: str, precision: Callable[[str], None]) -> None:
-    given = network((40, 64), 3, 4, [rows, 3])
-    exact = outcome(given, torch.float64, "reference")
+    arguments = network((40, 64), 3, 4, [rows, 3])
+    exact = outcome(arguments, torch.float64, "reference")
     precision(asked)
-    assert error(outcome(given, torch.float32, "native"), exact) < PRECISIONS[asked]
+    assert error(outcome(arguments, torch.float32, "native"), exact) < PRECISIONS[asked]
 
 
 def test_layers_with_a_relu_read_nothing_behind_their_columns(registers: str, precision: Callable[[str], None]) -> None:
-    # The 16 columns of a layer take the place of 32 others, which are not 0.
-    given = network((32, 16, 16), 3, 4, [97, 0, 1, 400], activation="relu")
-    exact = outcome(given, torch.float64, "reference")
+    # The 16 columns of a layer take the place of 32 other columns, which are not 0.
+    arguments = network((32, 16, 16), 3, 4, [97, 0, 1, 400], activation="relu")
+    exact = outcome(arguments, torch.float64, "reference")
     precision("high")
-    assert error(outcome(given, torch.float32, "native"), exact) < PRECISIONS["high"]
+    assert error(outcome(arguments, torch.float32, "native"), exact) < PRECISIONS["high"]
 
 
 def test_other_threads_and_forked_children_compute_the_same(precision: Callable[[str], None], registers: str) -> None:
-    given = network((64, 64), 3, 4, [500, 33])
+    call = network((64, 64), 3, 4, [500, 33])
     precision("high")
     before = torch.get_num_threads()
-    torch.set_num_threads(1)  # which a forked child can run
+    torch.set_num_threads(1)  # a forked child can run with one thread
     try:
-        want = outcome(given, torch.float32, "native")
-        found: list[list[Tensor]] = []
+        want = outcome(call, torch.float32, "native")
+        results: list[list[Tensor]] = []
         others = [
-            threading.Thread(target=lambda: found.append(outcome(given, torch.float32, "native"))) for _ in range(3)
+            threading.Thread(target=lambda: results.append(outcome(call, torch.float32, "native"))) for _ in range(3)
         ]
         for other in others:
             other.start()
         for other in others:
             other.join()
-        assert len(found) == 3
-        assert all(torch.equal(a, b) for each in found for a, b in zip(each, want, strict=True))
+        assert len(results) == 3
+        assert all(torch.equal(a, b) for result in results for a, b in zip(result, want, strict=True))
         with torch.no_grad():
             y = want[0]
             child = os.fork()
             if child == 0:
-                arguments = (given["positions"], given["offsets"], given["weights"], given["biases"])
-                same = torch.equal(grouped_mlp(*arguments, layers=given["layers"], backend="native"), y)  # type: ignore[arg-type]
+                arguments = (call["positions"], call["offsets"], call["weights"], call["biases"])
+                same = torch.equal(grouped_mlp(*arguments, layers=call["layers"], backend="native"), y)  # type: ignore[arg-type]
                 os._exit(0 if same else 1)
             _, status = os.waitpid(child, 0)
         assert os.waitstatus_to_exitcode(status) == 0

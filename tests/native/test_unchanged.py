@@ -1,4 +1,4 @@
-"""The guard of routers, fields and steps: whatever is noted and then changed is seen, and nothing else."""
+"""The guard of routers, fields and steps sees every change of a noted object, and nothing else."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ CHANGED = {
 
 @contextlib.contextmanager
 def exchange(there):
-    """With torch's exchange of tensors, or by the methods of Python alone."""
+    """Makes the guard use torch's exchange of tensors, or Python's methods alone."""
     if not there:
         native.compiled.know_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
     try:
@@ -109,7 +109,7 @@ def test_without_the_compiled_module_nothing_is_known():
 
 
 def test_who_asks_is_freed_with_what_is_noted():
-    """A cycle of Python through the guard: it holds what holds it."""
+    """Python frees a cycle through the guard, which holds the object that holds it."""
     thing = Thing()
     thing.guard = unchanged()
     notes(thing.guard, thing, dict.fromkeys(("here", "place", "kind", "read"), thing.made), {})

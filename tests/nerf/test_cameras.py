@@ -59,7 +59,7 @@ def test_project_inverts_rays(distortion):
 
 
 def test_a_camera_that_sees_all_around():
-    """As nerfstudio's: the middle is ahead, a quarter of the width is 90 degrees, and the upper edge is straight up."""
+    """The middle is ahead, a quarter of the width is 90 degrees, and the upper edge is straight up (nerfstudio)."""
     some = Cameras.all_around(orbit_cameras(3, radius=3, elevation=20, width=1, height=1, focal=1).poses, 40)
     one = Cameras.all_around(torch.eye(4)[None], 40)
     seen = one.rays(0, torch.tensor([40.0, 60, 20, 0, 40, 50]), torch.tensor([20.0, 20, 20, 20, 0, 30]))
@@ -96,7 +96,7 @@ def test_undistort_to_a_millionth_of_a_pixel(coefficients):
     again = distort(a, b, k)
     assert float((again[0] - u).abs().max()) * focal < 1e-6
     assert float((again[1] - v).abs().max()) * focal < 1e-6
-    assert float((a - u).abs().max()) * focal > 0.1  # the lens does something
+    assert float((a - u).abs().max()) * focal > 0.1  # the lens bends visibly
 
 
 def test_distort_follows_opencv():
@@ -107,12 +107,12 @@ def test_distort_follows_opencv():
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
     )
-    found = distort(torch.tensor(x), torch.tensor(y), torch.tensor((k1, k2, p1, p2, 0, 0, 0, 0)))
-    assert [float(value) for value in found] == pytest.approx(expected, abs=1e-6)
+    actual = distort(torch.tensor(x), torch.tensor(y), torch.tensor((k1, k2, p1, p2, 0, 0, 0, 0)))
+    assert [float(value) for value in actual] == pytest.approx(expected, abs=1e-6)
 
 
 def mixed():
-    """A fisheye, an FOV lens, one without distortion, the fisheye again and a perspective lens."""
+    """Returns cameras with a fisheye, an FOV lens, no distortion, the fisheye again, and a perspective lens."""
     models = torch.tensor([1, 2, 0, 1, 0], dtype=torch.int32)
     bent = torch.tensor([FOX, (0.9, *7 * (0.0,)), 8 * (0.0,), FOX, STRONG])
     base = cameras(5)
@@ -212,10 +212,10 @@ def test_orbit_and_turntable():
 
 
 def test_how_far_axes_pass_from_a_point():
-    cameras = Cameras(torch.eye(4)[None], torch.ones(1, 4), 1, 1)  # which looks along -z
+    cameras = Cameras(torch.eye(4)[None], torch.ones(1, 4), 1, 1)  # looks along -z
     points = torch.tensor([[0.0, 0, -2], [3.0, 0, -4], [0.0, 1, 0], [0.0, 1, 5], [0.0, 0, 0]])
-    found = torch.cat([axis_misses(cameras, point) for point in points])
-    torch.testing.assert_close(found, torch.tensor((0.0, 0.6, 1.0, 1.0, 1.0)))
+    result = torch.cat([axis_misses(cameras, point) for point in points])
+    torch.testing.assert_close(result, torch.tensor((0.0, 0.6, 1.0, 1.0, 1.0)))
 
 
 def test_no_focus_of_parallel_or_outward_axes():

@@ -14,7 +14,7 @@ ORBIT = {"radius": 2.0, "elevation": 20.0, "width": 4, "height": 4, "focal": 4.0
 
 
 def cone_points(edges, radius, count):
-    """Points spread evenly over a conical frustum: [count, 2], distance along the axis and from it."""
+    """Returns points spread evenly over a conical frustum, [count, 2]: the distances along the axis and from it."""
     generator = seeded(0)
     u = torch.rand(count, 3, generator=generator, dtype=WIDE)
     near, far = edges
@@ -31,7 +31,7 @@ def cone_points(edges, radius, count):
 def test_moments_against_monte_carlo(edges, radius):
     points = cone_points(edges, radius, 400_000)
     mean, along, across = frustum_moments(torch.tensor([edges], dtype=WIDE), torch.tensor([radius], dtype=WIDE))
-    # Errors of a mean and of a variance of 400,000 draws: well below a hundredth of the spread.
+    # The errors of mean and variance over 400,000 draws are well below a hundredth of the spread.
     spread = float(points[:, 0].std())
     assert float(mean) == pytest.approx(float(points[:, 0].mean()), abs=0.01 * spread)
     assert float(along) == pytest.approx(float(points[:, 0].var()), rel=0.02)
@@ -39,7 +39,7 @@ def test_moments_against_monte_carlo(edges, radius):
 
 
 def test_moments_in_float32_of_thin_frustums():
-    """The stable form keeps its digits where t1 - t0 is a thousandth of t0; the plain one loses all of them."""
+    """The stable form keeps its digits where t1 - t0 is a thousandth of t0; the plain form loses all of them."""
     edges = torch.tensor([[4.0, 4.004, 4.008]])
     radii = torch.tensor([0.002])
     exact = frustum_moments(edges.to(WIDE), radii.to(WIDE))
@@ -154,6 +154,6 @@ def test_a_sphere_has_a_centre_and_a_radius(centre, radius):
 )
 def test_contractions_can_be_undone(space):
     points = torch.rand(50, 3, generator=seeded(1)) * 8 - torch.tensor([4.0, 4.0, -1.0])
-    if isinstance(space, Perspective):  # it does not map what lies before half its near plane
+    if isinstance(space, Perspective):  # it maps no point closer than half its near plane
         points = points @ space.axes + space.centre
     torch.testing.assert_close(space.inverse(space.points(points)), points, rtol=1e-3, atol=1e-4)

@@ -44,10 +44,10 @@ def test_cells_with_tables_of_their_own():
     x, d = rays(50)
     with torch.no_grad():
         router.module.features.normal_()
-    found, cells = router(x, d), router.diagram.locate(x)
+    actual, cells = router(x, d), router.diagram.locate(x)
     for cell in range(3):
         expected = router.cell(cell)(x[cells == cell], d[cells == cell])
-        for a, b in zip(found, expected, strict=True):
+        for a, b in zip(actual, expected, strict=True):
             torch.testing.assert_close(a[cells == cell], b)
 
 
@@ -78,9 +78,9 @@ def test_settings_come_from_the_scene():
 
 def test_the_grid_grows_with_the_images():
     box = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    found = [HashGridField.scene_options(1 / pixels, box, False, 480) for pixels in (10, 40, 80, 100, 353)]
-    assert [own["finest"] for own in found] == [32, 80, 160, 200, 706]
-    assert [own["log2_entries"] for own in found] == [14, 14, 15, 15, 18]
+    result = [HashGridField.scene_options(1 / pixels, box, False, 480) for pixels in (10, 40, 80, 100, 353)]
+    assert [own["finest"] for own in result] == [32, 80, 160, 200, 706]
+    assert [own["log2_entries"] for own in result] == [14, 14, 15, 15, 18]
     for seconds, entries in ((15, 17), (60, 19)):
         contracted = HashGridField.scene_options(1 / 353, box, True, seconds)
         assert contracted == {"box": box, "finest": 353, "log2_entries": entries, "density_scale": 40.0}
@@ -128,12 +128,12 @@ def test_a_table_that_does_not_fit_into_memory(monkeypatch):
 def test_large_images_and_long_trainings_get_more_of_both(side, contraction, budget, samples, entries):
     scene = builtin_scene(side, train_views=2, test_views=1)
     config = resolve(TrainConfig(contraction=contraction, budget=budget), scene)
-    given = dict(text.split("=", 1) for text in config.field_options)
-    assert config.samples == (samples,) and given.get("log2_entries") == (entries and str(entries))
+    arguments = dict(text.split("=", 1) for text in config.field_options)
+    assert config.samples == (samples,) and arguments.get("log2_entries") == (entries and str(entries))
     assert resolve(TrainConfig(samples=(7,), contraction=contraction), scene).samples == (7,)
-    # Four times as fast, and in steps on machines of any speed.
-    given = [(TrainConfig(contraction=contraction, budget=budget / 4), 4.0)]
-    given += [(TrainConfig(contraction=contraction, steps=100 * budget), speed) for speed in (0.01, 1.0, 64.0)]
-    for settings, speed in given:
-        found = resolve(settings, scene, speed)
-        assert (found.samples, found.field_options) == (config.samples, config.field_options)
+    # On a machine four times as fast, and with a budget in steps on machines of any speed.
+    arguments = [(TrainConfig(contraction=contraction, budget=budget / 4), 4.0)]
+    arguments += [(TrainConfig(contraction=contraction, steps=100 * budget), speed) for speed in (0.01, 1.0, 64.0)]
+    for settings, speed in arguments:
+        result = resolve(settings, scene, speed)
+        assert (result.samples, result.field_options) == (config.samples, config.field_options)

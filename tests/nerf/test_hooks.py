@@ -1,4 +1,4 @@
-"""Steps with hooks of one's own between recorded segments: samplers, rules of splits, sources of rays and terms."""
+"""Steps with Python hooks between recorded segments: samplers, split rules, ray sources and terms of a user."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.native
 
 
 class Counting(SplitStrategy):
-    """Counts, and calls its base."""
+    """A split rule that counts its calls, and calls its base."""
 
     seen = 0
 
@@ -37,7 +37,7 @@ class Counting(SplitStrategy):
 
 
 class Middle(Occupancy):
-    """Samples by a hook of its own; its grid learns as ever."""
+    """A sampler that overrides only the hook for samples."""
 
     asked = 0
 
@@ -47,7 +47,7 @@ class Middle(Occupancy):
 
 
 class Learning(Occupancy):
-    """Looks at each step, before and after it."""
+    """A sampler that counts the hooks before and after each step."""
 
     before = after = 0
 
@@ -61,17 +61,17 @@ class Learning(Occupancy):
 
 
 class Helper(Occupancy):
-    """Overrides what a hook calls."""
+    """A sampler that overrides a method that its hooks call."""
 
     marched = 0
 
-    def march(self, *given, **more):
+    def march(self, *arguments, **more):
         self.marched += 1
-        return super().march(*given, **more)
+        return super().march(*arguments, **more)
 
 
 class Own:
-    """Rays of a source that knows nothing of this package's."""
+    """A ray source that does not inherit from this package."""
 
     device = torch.device("cpu")
 
@@ -147,7 +147,7 @@ HOOKS = {
 def test_same_bits_as_steps_that_run_as_they_are(name):
     """Each hook runs once a step, also where a step needs more memory, and where a tensor has moved."""
     options, change, count, said = HOOKS[name]
-    found = []
+    results = []
     for as_it_is in (False, True):
         training = Training(cells=3, **options)
         change(training)
@@ -155,22 +155,22 @@ def test_same_bits_as_steps_that_run_as_they_are(name):
         training.router.module.colour.weight.data = training.router.module.colour.weight.data.clone()
         training.sampler.grid.occupied[:] = True
         steps += training.train(6, lambda step: 70 - step, as_it_is=as_it_is)
-        found.append([*steps, *training.everything()])
+        results.append([*steps, *training.everything()])
         explained = training.step.explain()
         spent = rf"recorded and replayed(?s:.*)\nin Python: {re.escape(said)}, \d+\.\d{{3}} ms a call"
         assert as_it_is or re.search(spent, explained), explained
         assert "another segment" not in explained
         assert count is None or count(training) == 12
         assert as_it_is or training.recorded < 10
-    assert same(*found)
+    assert same(*results)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_own_rays_are_taken(threads):
-    """Whatever their number."""
+    """The step takes batches of any size from the source."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
-    found = []
+    results = []
     for as_it_is in (False, True):
         torch.manual_seed(0)
         training = Training(cells=2)
@@ -178,14 +178,14 @@ def test_own_rays_are_taken(threads):
         torch.manual_seed(1)
         steps = training.train(9, lambda step: (64, 50, 79)[step % 3], as_it_is=as_it_is)
         assert training.step.batches.drawn == 9
-        found.append([*steps, *training.everything()])
+        results.append([*steps, *training.everything()])
         assert as_it_is or "in Python: Own.draw" in training.step.explain()
     torch.set_num_threads(before)
-    assert same(*found)
+    assert same(*results)
 
 
 def test_hooks_are_called_in_each_step_of_a_call():
-    """Also the one before a step, which replays ask for only as often as ``steps_alike`` says."""
+    """The hook before a step is called each time, though replays ask for it only as often as ``steps_alike`` says."""
     training = Training(sampler=Learning)
     training.step(64, 40, at=0)
     assert training.sampler.before == training.sampler.after == 40
@@ -195,7 +195,7 @@ def test_hooks_are_called_in_each_step_of_a_call():
 
 
 def test_what_a_hook_sets_is_followed():
-    """It counts from the next step on: other samples of a ray, a robust loss, a parameter that learns no more."""
+    """A change counts from the next step on: another number of samples, a robust loss, a frozen parameter."""
 
     class Changing(Counting):
         def step_post_backward(self, output):
@@ -207,19 +207,19 @@ def test_what_a_hook_sets_is_followed():
             if self.seen == 8:
                 self.routers["field"].module.colour.weight.requires_grad_(False)
 
-    found = []
+    results = []
     for as_it_is in (False, True):
         training = Training(cells=2)
         with_strategy(training, Changing)
         training.step.strategy.sampler, training.step.strategy.loss = training.sampler, training.loss
         steps = training.train(16, as_it_is=as_it_is)
-        found.append([*steps, *(each for each in training.everything() if each is not None)])
+        results.append([*steps, *(tensor for tensor in training.everything() if tensor is not None)])
         assert as_it_is or "recorded and replayed" in training.step.explain()
-    assert same(*found)
+    assert same(*results)
 
 
 def test_what_moves_in_a_hook_is_followed_at_once():
-    """The segment behind it runs as it is, on the new memory, and is recorded anew."""
+    """The segment behind the hook runs eagerly on the new memory, and is recorded anew."""
 
     def moving(training):
         def term(seen, batch):
@@ -231,26 +231,26 @@ def test_what_moves_in_a_hook_is_followed_at_once():
 
         return term
 
-    found = []
+    results = []
     for as_it_is in (False, True):
         training = Training(cells=2)
         training.loss.terms = (moving(training),)
         steps = training.train(12, as_it_is=as_it_is)
-        found.append([*steps, *training.everything()])
+        results.append([*steps, *training.everything()])
         assert training.done == 12 and training.recorded < 8
-    assert same(*found)
+    assert same(*results)
 
 
 def test_a_term_that_begins_later():
-    """Other things are read of the rays than when the step was recorded."""
-    found = []
+    """The term reads other results of the rays than when the step was recorded."""
+    results = []
     for as_it_is in (False, True):
         training = Training(cells=2)
         training.loss.terms = (lambda seen, batch, t=training: late(t, seen, batch),)
         steps = training.train(18, as_it_is=as_it_is)
-        found.append([*steps, *training.everything()])
+        results.append([*steps, *training.everything()])
         assert as_it_is or "recorded and replayed" in training.step.explain()
-    assert same(*found)
+    assert same(*results)
 
 
 def late(training, seen, batch):
@@ -267,14 +267,14 @@ def test_a_class_that_says_so_is_replayed():
             super().step_post_backward(output)
             super().step_post_backward(output)
 
-    found = []
+    results = []
     for as_it_is in (False, True):
         training = Training(cells=2)
         with_strategy(training, Twice)
         steps = training.train(10, as_it_is=as_it_is)
-        found.append([*steps, *training.everything(), *training.step.strategy.state_dict().values()])
+        results.append([*steps, *training.everything(), *training.step.strategy.state_dict().values()])
         assert as_it_is or "Python" not in training.step.explain()
-    assert same(*found)
+    assert same(*results)
 
 
 def test_which_hooks_run_in_python():
@@ -290,23 +290,23 @@ def test_which_hooks_run_in_python():
 
 
 class Scheduled(SparseDepth):
-    """A factor that is a property, in the place of an attribute."""
+    """A term whose factor is a property instead of an attribute."""
 
     factor = property(lambda self: 0.3, lambda self, value: None)
 
 
 class Called(RayLoss):
-    """Overrides the call itself."""
+    """A loss that overrides ``__call__``."""
 
     calls = 0
 
-    def __call__(self, *given, **options):
+    def __call__(self, *arguments, **options):
         self.calls += 1
-        return super().__call__(*given, **options)
+        return super().__call__(*arguments, **options)
 
 
 def test_no_behaviour_of_a_subclass_is_passed_over():
-    """A property, a call, and a hook of a class that comes behind one that is replayed."""
+    """A property, a call, and the hook of a base behind a replayed class all run in Python."""
 
     @replayed
     class Marked(SplitStrategy):
@@ -331,17 +331,17 @@ def test_no_behaviour_of_a_subclass_is_passed_over():
     ],
 )
 def test_what_changes_in_the_grid_is_followed(change):
-    found = []
+    results = []
     for as_it_is in (False, True):
         training = Training(cells=2)
         training.train(5, as_it_is=as_it_is)
         change(training.sampler.grid)
-        found.append([*training.train(5, as_it_is=as_it_is), *training.everything()])
-    assert same(*found)
+        results.append([*training.train(5, as_it_is=as_it_is), *training.everything()])
+    assert same(*results)
 
 
 def test_attributes_of_ones_own_record_nothing_anew():
-    """Counters and tensors that no class of the library reads; one that it reads is followed."""
+    """Counters and tensors that no library class reads cause no new recording; an attribute that one reads does."""
     training = Training(sampler=Learning)
     with_strategy(training)
     training.train(4)

@@ -1,4 +1,4 @@
-"""mip-NeRF: its encoding and heads, and its cells chosen by the mean of a Gaussian."""
+"""mip-NeRF: its encoding, its heads, and its cells, chosen by the mean of a Gaussian."""
 
 import torch
 import torch.nn.functional as F
@@ -31,7 +31,7 @@ def test_mipnerf_layer_by_layer():
 
 
 def test_wide_gaussians_hide_what_is_finer():
-    """Octaves that a Gaussian cannot resolve have no part in the result."""
+    """Octaves that a Gaussian cannot resolve do not change the result."""
     field = MipNeRF(width=16, depth=2, view_directions=False)
     x = gaussians(30)
     x[:, 3:] = 0.5

@@ -1,4 +1,4 @@
-"""The NeRF field: its shapes against the published architecture, its start, its errors."""
+"""The NeRF field: its shapes against the published architecture, its initial state, its errors."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from voronerf.ops import frequency_encode
 
 
 def published_nerf(field, positions, directions):
-    """Figure 7 of the NeRF paper written out with the field's own layers."""
+    """Evaluates figure 7 of the NeRF paper with the field's own layers."""
     x, d = frequency_encode(positions, 10), frequency_encode(directions, 4)
     h = x
     for i, layer in enumerate(field.trunk):
@@ -98,7 +98,7 @@ def test_missing_directions(inputs):
 
 
 def test_kilonerf_has_the_published_size():
-    """Two layers of 32, density, feature, and 32 channels that see the direction: 63 and 27 encoded inputs."""
+    """The network has two layers of 32, density, feature, and 32 view channels, with 63 and 27 encoded inputs."""
     field = KiloNeRF()
     shapes = [tuple(layer.weight.shape) for layer in field.linears()]
     assert shapes == [(32, 63), (32, 32), (1, 32), (32, 32), (32, 59), (3, 32)]

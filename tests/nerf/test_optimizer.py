@@ -1,4 +1,4 @@
-"""The optimiser of tables: few entries have a gradient, moments are inherited and saved."""
+"""The optimiser of tables: few entries have a gradient, and moments are inherited and saved."""
 
 import functools
 
@@ -21,13 +21,13 @@ def test_dense_groups_are_torchs():
             sum((p.square() * torch.randn_like(p)).sum() for p in parameters).backward()
             optimizer.step()
         results.append([*parameters, *(t for p in parameters for t in optimizer.state[p].values())])
-    for found, expected in zip(*results, strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+    for actual, expected in zip(*results, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("option", ["weight_decay", "amsgrad", "maximize", "differentiable"])
 def test_options_that_are_not_there_are_refused(option):
-    """In a group, and where one is set later; nothing has moved then."""
+    """Options are refused in a group, and at a step if they are set later; parameters have not moved then."""
     weight = torch.nn.Parameter(torch.ones(3))
     value = 0.1 if option == "weight_decay" else True
     with pytest.raises(ValueError, match=f"Adam: {option} of a group must be 0 or False, got {value}"):
@@ -84,7 +84,7 @@ def test_frozen_cells_do_not_shrink():
 def test_steps_count_once_for_a_parameter_whose_cells_are_partly_frozen():
     torch.manual_seed(0)
     results, centres, gradients = [], torch.rand(5, 3), torch.randn(3, 5, 2, 3)
-    for frozen in ([], [1, 3]):  # which leave three parts
+    for frozen in ([], [1, 3]):  # the two frozen cells leave three parts
         torch.manual_seed(1)
         router = VoronoiRouter(torch.nn.Linear(3, 2), centres)
         weight = router.module.weight

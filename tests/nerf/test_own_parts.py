@@ -1,4 +1,4 @@
-"""Samplers and rules of splits of one's own take the place of the library's: nothing asks for their class."""
+"""Samplers and split rules of a user replace the library's own; no code asks for their class."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from voronerf.nerf import Batch, Occupancy, RayLoss, Rays, Renderer, Sampler, St
 
 
 class Borrowed(Sampler):
-    """A sampler of its own class that has a grid."""
+    """A sampler of another class that has a grid."""
 
     def __init__(self, other):
         super().__init__(other.samples, space=other.space)
@@ -31,7 +31,7 @@ class Borrowed(Sampler):
 
 
 class Never(Strategy):
-    """Counts what a training asks."""
+    """A split rule that counts its hooks and never splits."""
 
     def __init__(self):
         self.steps = 0
@@ -60,8 +60,8 @@ def test_a_sampler_with_a_grid_is_fused_and_walks_pictures() -> None:
     losses = [RayLoss(Renderer({"field": router}, sampler)) for sampler in (occupancy, Borrowed(occupancy))]
     assert [loss.why_not_fused() for loss in losses] == [None, None]
     assert losses[1].explain().startswith("samples: Borrowed, 16 a ray\nloss: networks, colours, loss and gradients in")
-    found = [loss(batch, torch.Generator().manual_seed(1)) for loss in losses]
-    assert torch.equal(found[0].loss, found[1].loss) and 0 < len(found[0].weights) < 32
+    results = [loss(batch, torch.Generator().manual_seed(1)) for loss in losses]
+    assert torch.equal(results[0].loss, results[1].loss) and 0 < len(results[0].weights) < 32
     pictures = [loss.renderer.see(rays, batch.near, batch.far) for loss in losses]
     assert torch.equal(pictures[0].colour, pictures[1].colour) and losses[1].renderer.sampler.seen == 1
     assert losses[1].renderer.occupancy is grid

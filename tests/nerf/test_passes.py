@@ -1,4 +1,4 @@
-"""Several passes along a ray, against slow loops and pictures that are known."""
+"""Several passes along a ray, against slow loops and known pictures."""
 
 import math
 
@@ -25,7 +25,7 @@ WHITE = torch.ones(3)
 
 
 class Slab:
-    """Red fog of a density between two heights, nothing elsewhere; counts what it is asked."""
+    """Red fog of one density between two heights, which records the queried positions."""
 
     def __init__(self, low=-0.05, high=0.05, density=30.0):
         self.low, self.high, self.density = low, high, density
@@ -38,14 +38,14 @@ class Slab:
 
 
 def rays(count=3):
-    """Straight down from height 2, one beside the other."""
+    """Returns rays straight down from height 2, one beside the other."""
     origins = torch.tensor((0.0, 0.0, 2.0)).repeat(count, 1)
     origins[:, 0] = torch.arange(count)
     return Rays(origins, torch.tensor((0.0, 0.0, -1.0)).repeat(count, 1), torch.full((count,), 0.01))
 
 
 def test_a_second_pass_finds_a_thin_surface():
-    """A slab a fortieth of the ray thick: 16 strata see it with a wrong thickness, the second pass does not."""
+    """16 strata see a slab a fortieth of the ray thick with a wrong thickness; the second pass does not."""
     expected = 1 - math.exp(-30 * 0.1)
     one = renderer_of({"field": Slab()}, samples=17).render(rays(), 0.0, 4.0)
     assert len(one) == 1 and abs(float(one[0].opacity[0]) - expected) > 0.04
@@ -53,7 +53,7 @@ def test_a_second_pass_finds_a_thin_surface():
         passes = renderer_of(fields, samples=17, fine_samples=64, cones=cones).render(rays(), 0.0, 4.0)
         assert len(passes) == 2
         assert abs(float(passes[1].opacity[0]) - expected) < 0.02
-        # Fog of density 30 from 1.95 on, a tenth thick: the mean of an exponential cut off there.
+        # Fog of density 30 begins at 1.95 and is a tenth thick: the mean of an exponential that is cut off there.
         within = 1 / 30 - 0.1 * math.exp(-3) / expected
         assert float(passes[1].depth[0]) == pytest.approx(1.95 + within, abs=0.005)
 
@@ -114,9 +114,9 @@ def test_losses():
         renderer = renderer_of({"field": Slab(), **others}, samples=6, fine_samples=5, cones=cones)
         first, last = renderer.render(rays(), near, far, background=WHITE, jitter=True, generator=seeded(2))
         expected = (last.colour - target).square().mean() + share * (first.colour - target).square().mean()
-        found = RayLoss(renderer)(Batch(rays(), near, far, target, WHITE), seeded(2))
-        torch.testing.assert_close(found.loss, expected)
-        torch.testing.assert_close(found.error, (last.colour - target).square().sum(1))
+        actual = RayLoss(renderer)(Batch(rays(), near, far, target, WHITE), seeded(2))
+        torch.testing.assert_close(actual.loss, expected)
+        torch.testing.assert_close(actual.error, (last.colour - target).square().sum(1))
 
 
 @pytest.mark.parametrize("spacing", ["linear", "disparity"])

@@ -1,4 +1,4 @@
-"""Fields whose program is known: the fast step and pictures give what separate operations give."""
+"""Fields with a known program: the fast step and pictures equal separate operations."""
 
 import math
 import re
@@ -35,7 +35,7 @@ def encoded(x, octaves):
 
 
 class Foreign(nn.Module):
-    """As it stands in other codebases."""
+    """A field as in other codebases."""
 
     activations: ClassVar = {
         "softplus": lambda self, x: F.softplus(x) * self.scale,
@@ -61,7 +61,7 @@ class Foreign(nn.Module):
 
 
 class Own(RadianceField):
-    """A layer table with activations of its own."""
+    """A layer table with its own activations."""
 
     def __init__(self):
         super().__init__()
@@ -109,25 +109,25 @@ def batch_of(rays=64, sparse=0, unseen=0):
 
 
 def losses(field, monkeypatch, backend="auto", **terms):
-    """The fast step and the separate one, both for all samples."""
+    """Returns the losses of the fast step and of separate operations, both over all samples."""
     monkeypatch.setattr("voronerf.nerf.loss.HIDDEN", 0.0)
     grid = OccupancyGrid(BOX, 8, threshold=0.1)
     grid.occupied = torch.rand(8, 8, 8, generator=seeded(5)) < 0.7
     fast, separate = (
         RayLoss(renderer_of({"field": of}, samples=24, occupancy=grid, backend=backend), **terms)
-        for of in (field, lambda *given: field(*given))
+        for of in (field, lambda *arguments: field(*arguments))
     )
     return fast, separate
 
 
 def compare(router, fast, separate, batch):
-    found, gradients = [], []
+    results, gradients = [], []
     for loss in (fast, separate):
         router.zero_grad()
-        found.append(loss(batch, seeded(3), backward=True))
+        results.append(loss(batch, seeded(3), backward=True))
         gradients.append([None if p.grad is None else p.grad.clone() for p in router.parameters()])
     assert fast.why_not_fused() is None and separate.why_not_fused() is not None
-    for part, other in zip((*found[0][:4], found[0].colour), (*found[1][:4], found[1].colour), strict=True):
+    for part, other in zip((*results[0][:4], results[0].colour), (*results[1][:4], results[1].colour), strict=True):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5)
     for part, other in zip(*gradients, strict=True):
         assert part is not None and part.any()
@@ -151,7 +151,7 @@ def test_with_points_of_a_sparse_model(name, monkeypatch):
 
 
 def term_of_all(seen, batch):
-    """A term of all that a ray shows."""
+    """Returns a term of all results of a ray."""
     near = (seen.colour - batch.target).abs().mean() + (seen.depth / batch.far).mean()
     fog = (seen.density / (1 + seen.density) * seen.samples.deltas).mean() + (seen.rgb * seen.weights[:, None]).mean()
     return near + fog + seen.opacity.square().mean() + seen.weights.square().sum() / len(batch.rays)
@@ -159,7 +159,7 @@ def term_of_all(seen, batch):
 
 @pytest.mark.parametrize("name", ["softplus", "relu", "table"])
 def test_with_a_term_in_torch(name, monkeypatch):
-    """The fast step and the separate one carry it through the outputs of the networks."""
+    """Both steps carry the term's gradients through the outputs of the networks."""
     router, field = make(name)
     fast, separate = losses(field, monkeypatch, terms=[SparseDepth(0.3), term_of_all])
     compare(router, fast, separate, batch_of(sparse=20))
@@ -167,17 +167,17 @@ def test_with_a_term_in_torch(name, monkeypatch):
 
 @pytest.mark.parametrize("name", ["relu", "hash"])
 def test_equals_a_rendering_that_torch_differentiates(name, monkeypatch):
-    """The error of the colours and all kinds of terms, each by the formula of its reference."""
+    """The colour error and all kinds of terms equal the formulas of their references."""
     router, field = make(name)
     terms = [SparseDepth(0.3), term_of_all, SmoothDepth(0.2), Surface(distortion=0.4, orientation=0.3)]
     fast, separate = losses(field, monkeypatch, terms=terms, robust=0.05)
-    batch, found = batch_of(sparse=20, unseen=12), []
+    batch, results = batch_of(sparse=20, unseen=12), []
     for loss in (fast, separate):
         router.zero_grad()
-        found.append([loss(batch, seeded(3), backward=True).loss, *(p.grad.clone() for p in router.parameters())])
+        results.append([loss(batch, seeded(3), backward=True).loss, *(p.grad.clone() for p in router.parameters())])
     router.zero_grad()
-    given = {"background": batch.background, "jitter": True, "generator": seeded(3)}
-    seen = separate.renderer.render(batch.rays, batch.near, batch.far, **given)[-1]
+    arguments = {"background": batch.background, "jitter": True, "generator": seeded(3)}
+    seen = separate.renderer.render(batch.rays, batch.near, batch.far, **arguments)[-1]
     samples = seen.samples
     along = seen.weights, samples.depths, samples.deltas, samples.ray_offsets
     error = (seen.colour - batch.target).square().sum(-1)[:28]
@@ -189,7 +189,7 @@ def test_equals_a_rendering_that_torch_differentiates(name, monkeypatch):
     spread, fallen = surface_losses(seen.weights, opacities, *lengths, lit)
     expected = expected + 0.4 * spread.mean() + 0.3 * fallen.mean()
     expected.backward()
-    for own in found:
+    for own in results:
         for part, other in zip(own, [expected.detach(), *(p.grad for p in router.parameters())], strict=True):
             torch.testing.assert_close(part, other, rtol=2e-3, atol=1e-6 + 1e-4 * float(other.abs().max()))
 
@@ -220,15 +220,15 @@ def test_a_term_that_reads_nothing_adds_to_the_loss_alone(monkeypatch):
 
 @pytest.mark.parametrize("name", ["relu", "hash"])
 def test_with_rays_from_where_no_camera_was(name, monkeypatch):
-    """Their depths are learnt from, their colours are not."""
+    """The depths of these rays are learnt from, their colours are not."""
     router, field = make(name)
     fast, separate = losses(field, monkeypatch, terms=[SmoothDepth(0.3), SparseDepth(0.3)], robust=0.05)
     batch = batch_of(sparse=20, unseen=12)
     compare(router, fast, separate, batch)
-    found = fast(batch, seeded(3))
+    result = fast(batch, seeded(3))
     batch.target[28:] = 7.0
-    torch.testing.assert_close(fast(batch, seeded(3)).loss, found.loss, rtol=1e-4, atol=0)
-    assert bool(found.error[:28].all()) and not bool(found.error[28:].any())
+    torch.testing.assert_close(fast(batch, seeded(3)).loss, result.loss, rtol=1e-4, atol=0)
+    assert bool(result.error[:28].all()) and not bool(result.error[28:].any())
 
 
 @pytest.mark.parametrize("name", ["relu", "one shared", "hash"])
@@ -250,19 +250,19 @@ def test_in_a_nested_diagram(name, monkeypatch):
 
 def test_with_cells_that_are_drawn():
     router, field = make("exp", assignment="stochastic", temperature=0.2)
-    found = []
+    results = []
     for _ in range(2):
         router.generator = seeded(7)
         known = radiance_of(field, (torch.rand(20, 3), torch.rand(20, 3)))
-        found.append(known.arguments(torch.rand(50, 3, generator=seeded(1)), torch.rand(4, 3), None)["cells"])
+        results.append(known.arguments(torch.rand(50, 3, generator=seeded(1)), torch.rand(4, 3), None)["cells"])
     router.generator = seeded(7)
-    assert torch.equal(found[0], found[1])
-    assert torch.equal(found[0], router.assign(torch.rand(50, 3, generator=seeded(1))))
+    assert torch.equal(results[0], results[1])
+    assert torch.equal(results[0], router.assign(torch.rand(50, 3, generator=seeded(1))))
 
 
 @pytest.mark.parametrize("name", ["softplus", "relu"])
 def test_a_training_goes_the_same_way(name, monkeypatch):
-    found = []
+    results = []
     for which in (0, 1):
         router, field = make(name)
         loss = losses(field, monkeypatch)[which]
@@ -272,8 +272,8 @@ def test_a_training_goes_the_same_way(name, monkeypatch):
             optimizer.zero_grad()
             steps.append(float(loss(batch_of(), seeded(step), backward=True).loss))
             optimizer.update()
-        found.append(steps)
-    assert found[0] == pytest.approx(found[1], rel=1e-4) and found[0][0] != found[0][-1]
+        results.append(steps)
+    assert results[0] == pytest.approx(results[1], rel=1e-4) and results[0][0] != results[0][-1]
 
 
 def test_an_attribute_that_changes_is_followed(monkeypatch):
@@ -317,12 +317,12 @@ def test_pictures_and_densities_are_those_of_the_field(name):
     batch, points = batch_of(100), torch.rand(60, 3, generator=seeded(2)) * 2 - 1
     seen, densities = [], []
     with torch.no_grad():
-        for of in (field, lambda *given: field(*given)):
+        for of in (field, lambda *arguments: field(*arguments)):
             renderer = renderer_of({"field": of}, samples=40, occupancy=grid)
             seen.append(renderer.see(batch.rays, batch.near, batch.far, torch.ones(3)))
             densities.append(density_of(of, points))
     torch.testing.assert_close(*densities, rtol=1e-4, atol=1e-5)
-    # A ray ends with a wave, and waves are of other lengths: as much light as is left then.
+    # A ray ends with a wave, and the waves have other lengths, so that the light left at the end differs.
     torch.testing.assert_close(seen[0].colour, seen[1].colour, rtol=0, atol=0.06)
     with torch.no_grad():
         assert isinstance(radiance_of(field), Radiance)
@@ -341,24 +341,24 @@ def test_what_keeps_a_field_from_the_fast_step():
             colour, density = super().forward(positions, directions)
             return colour, density + F.embedding(positions[:, 0].long().abs() % 2, self.colour.weight[:, :1])[:, 0]
 
-    centres, given = torch.rand(3, 3), {"coords": "first3", "way": "fused"}
-    assert why(lambda *given: make("table")[1](*given)) == "the field is a function, no router"
+    centres, arguments = torch.rand(3, 3), {"coords": "first3", "way": "fused"}
+    assert why(lambda *arguments: make("table")[1](*arguments)) == "the field is a function, no router"
     router, field = make("relu")
     assert why(field, first=False) == "Foreign.forward is traced at its first call"
     assert why(field) is None
-    hook = router.module.trunk[0].register_forward_hook(lambda module, args, found: found + 1)
+    hook = router.module.trunk[0].register_forward_hook(lambda module, args, output: output + 1)
     assert why(field, first=False) == "Foreign.forward is traced at its next call"
     hook.remove()
-    plain = DirectionPerSample(VoronoiRouter(Foreign(), centres, **given))
+    plain = DirectionPerSample(VoronoiRouter(Foreign(), centres, **arguments))
     assert why(plain) == "Foreign.forward is not traced without fuse=True"
-    looked = why(DirectionPerSample(VoronoiRouter(Looked(), centres, **given, fuse=True)))
+    looked = why(DirectionPerSample(VoronoiRouter(Looked(), centres, **arguments, fuse=True)))
     assert looked.startswith("Looked.forward is not one program: ") and "between them" in looked
     moved = DirectionPerSample(VoronoiRouter(Foreign(), centres, fuse=True, coords=lambda x, d: x + 1))
     assert why(moved) == "other positions than those of the samples decide the cells"
-    shared = DirectionPerSample(VoronoiRouter(Foreign(), centres, **given, fuse=True, share=["*"]))
+    shared = DirectionPerSample(VoronoiRouter(Foreign(), centres, **arguments, fuse=True, share=["*"]))
     assert why(shared) == "all cells share all parameters"
     table, field = make("table")
-    table.module.view.register_forward_hook(lambda module, args, found: found)
+    table.module.view.register_forward_hook(lambda module, args, output: output)
     assert why(field) == "NeRF does more than its program says"
     cones = VoronoiRouter(MipNeRF(width=8, depth=1), centres)
     assert why(cones, first=False) == "the field takes 6 numbers for a sample, and there are 3"
@@ -376,7 +376,7 @@ def test_explains_the_step_in_one_way(monkeypatch):
 
 @pytest.mark.parametrize("name", ["relu", "table", "own table"])
 def test_on_every_backend(name, monkeypatch, device, backend):
-    """Warp has kernels for the layers, whatever activations follow."""
+    """The layers run in Warp kernels, whatever activations follow."""
     if torch.device(device).type != "cpu":
         pytest.skip("the same as on the CPU")
     router, field = make(name, backend=backend if name != "relu" or backend != "warp" else "auto")
@@ -385,7 +385,7 @@ def test_on_every_backend(name, monkeypatch, device, backend):
 
 
 def test_softplus_is_that_of_the_loss():
-    """Another threshold or another slope is not: those values come activated."""
+    """A softplus of another threshold or slope is not fused; the field itself computes it."""
     for density, scale in (
         (lambda x: F.softplus(x), 1.0),
         (lambda x: 2.5 * F.softplus(x - 1.0), 2.5),

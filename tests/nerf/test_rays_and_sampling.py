@@ -1,4 +1,4 @@
-"""Box intersection and stratified sampling, against slow loops and their properties."""
+"""Box intersection and stratified sampling, against slow loops and known properties."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ BOX = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 0.5, 2.0]])
 
 
 def slow_interval(origin, direction, box, near, far):
-    """Scans the ray in small steps."""
+    """Finds the interval in the box by small steps along the ray."""
     steps = torch.linspace(near, far, 20001, dtype=torch.float64)
     points = origin.double() + steps[:, None] * direction.double()
     inside = ((points >= box[0].double()) & (points <= box[1].double())).all(-1)

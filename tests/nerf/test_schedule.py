@@ -1,4 +1,4 @@
-"""What changes over a training: the learning rate and the rays of a step."""
+"""The schedules of a training: the learning rate and the rays of a step."""
 
 import pytest
 
@@ -15,8 +15,8 @@ def test_the_learning_rate_holds_and_falls():
         (0.25, (1, 0.05 ** (1 / 3), 0.05 ** (2 / 3), 0.05)),
         (0.0, (0.05**0.25, 0.05**0.5, 0.05**0.75, 0.05)),
     ):
-        found = [learning_rate(0.5, done, 1_000, hold=hold) / 0.5 for done in (0.25, 0.5, 0.75, 1.0)]
-        assert found == pytest.approx(rates)
+        result = [learning_rate(0.5, done, 1_000, hold=hold) / 0.5 for done in (0.25, 0.5, 0.75, 1.0)]
+        assert result == pytest.approx(rates)
 
 
 def test_steps_on_large_images_keep_more_samples():

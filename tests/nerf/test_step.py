@@ -27,21 +27,21 @@ def threads(request):
 
 @pytest.mark.parametrize(("cells", "photograph"), [(1, False), (6, False), (6, True)])
 def test_same_bits_as_steps_that_run_as_they_are(cells, photograph, threads):
-    """Parameters, moments, grid, and all that a step gives; rays grow beyond what there is memory for, and shrink."""
+    """Parameters, moments, grid and results have the same bits; the rays outgrow the memory, and shrink."""
 
     def rays(step):
         return 64 + 5 * step if step < 30 else 150 - 3 * (step - 30)
 
     one, other = Training(cells, photograph=photograph), Training(cells, photograph=photograph)
-    found, expected = one.train(60, rays), other.train(60, rays, as_it_is=True)
-    assert same(found, expected) and same(one.everything(), other.everything())
+    actual, expected = one.train(60, rays), other.train(60, rays, as_it_is=True)
+    assert same(actual, expected) and same(one.everything(), other.everything())
     assert "replayed" in one.step.explain() and one.recorded < 12, one.recorded
     assert "a test" in other.step.explain()
 
 
 def test_more_samples_than_there_is_memory_for(monkeypatch):
-    """Such a step draws the same numbers again, as it is, and is recorded anew."""
-    found = []
+    """The step runs again eagerly with the same random numbers, and is recorded anew."""
+    results = []
     for as_it_is in (False, True):
         training = Training()
         training.sampler.grid.occupied[:] = False
@@ -53,13 +53,13 @@ def test_more_samples_than_there_is_memory_for(monkeypatch):
         training.sampler.grid.occupied[:] = True
         steps += training.train(5, as_it_is=as_it_is)
         assert as_it_is or training.recorded == before + 1
-        found.append([*steps, *training.everything()])
-    assert same(*found)
+        results.append([*steps, *training.everything()])
+    assert same(*results)
 
 
 def test_more_and_more_samples_and_none():
-    """Step after step beyond the memory, then no samples at all, and some again."""
-    found = []
+    """Step after step outgrows the memory; then steps have no samples, and some again."""
+    results = []
     for as_it_is in (False, True):
         training, steps = Training(), []
         grid = training.sampler.grid
@@ -69,31 +69,31 @@ def test_more_and_more_samples_and_none():
             grid.density[:] = 0
             grid.density[:slices] = 1e3
             steps += training.train(1, as_it_is=as_it_is)
-        found.append([*steps, *training.everything()])
-        counts = [each[1].item() for each in steps[5::6]]
+        results.append([*steps, *training.everything()])
+        counts = [output[1].item() for output in steps[5::6]]
         assert counts[9] == 0 and all(1.25 * before + 64 < now for before, now in pairwise(counts[4:8])), counts
-    assert same(*found)
+    assert same(*results)
 
 
 @pytest.mark.parametrize("cells", [1, 6])
 def test_steps_in_one_call_are_the_same_bits(cells, threads):
-    """With what sampler and optimiser do before and after them; parts of a call may exceed the memory."""
-    found = []
+    """The hooks of sampler and optimiser before and after the steps run too; parts of a call may exceed the memory."""
+    results = []
     for calls in ([16] * 14, [1] * 224, [5, 11, 3, 13] * 7):
         training, done = Training(cells), 0
         training.optimizer.average, grid = 0.9, training.sampler.grid
         for steps in calls:
-            if done == 160:  # many more samples, as a call of 16 goes on
+            if done == 160:  # many more samples, in the middle of calls of 16
                 grid.density[:], grid.occupied[:] = 1e3, True
             training.optimizer.set_learning_rate(0.01 / (1 + done // 16))
-            made = training.step(40 + done // 16, steps, at=done)
+            result = training.step(40 + done // 16, steps, at=done)
             done += steps
         assert "replayed" in training.step.explain() and set(training.step._segments) == {"before", "step 0", "after"}
         assert not any(segment.obstacle for segment in training.step._segments.values())
         with training.optimizer.averaged():
             shown = [p.detach().clone() for p in training.router.parameters()]
-        found.append([made.loss, made.output.weights, *shown, *training.everything()])
-    assert same(found[0], found[1]) and same(found[0], found[2])
+        results.append([result.loss, result.output.weights, *shown, *training.everything()])
+    assert same(results[0], results[1]) and same(results[0], results[2])
 
 
 def test_no_steps_are_refused():
@@ -102,18 +102,18 @@ def test_no_steps_are_refused():
 
 
 def test_a_training_is_freed_with_its_recording():
-    """A recording holds what it is made of, and counts of rows that ask the step: Python finds such cycles."""
+    """A recording and the step refer to each other; Python's garbage collector finds the cycle."""
     training = Training()
     training.train(6)
     assert training.recorded
-    parts = [weakref.ref(each) for each in (training.step, training.router, training.loss, training.optimizer)]
+    parts = [weakref.ref(part) for part in (training.step, training.router, training.loss, training.optimizer)]
     del training
     gc.collect()
-    assert [each() for each in parts] == [None] * 4
+    assert [part() for part in parts] == [None] * 4
 
 
 def test_gradients_are_there_after_each_step():
-    """Also where a loop drops them, or a step in between was not replayed."""
+    """Gradients exist, also if a loop drops them, or a step in between was not replayed."""
     one, other = Training(), Training()
     for training, as_it_is in ((one, False), (other, True)):
         training.train(5, as_it_is=as_it_is)
@@ -127,19 +127,19 @@ def test_gradients_are_there_after_each_step():
 
 
 def test_numbers_of_rows_that_were_the_same():
-    """Two of them are told apart, though they were one number when the calls were recorded."""
+    """Two row counts are told apart, though they were equal when the calls were recorded."""
     centres = torch.rand(5, 3)
     with Recording() as recording:
-        found = [nearest_centre(recording.take(torch.rand(6, 3)), centres) for _ in range(2)]
+        results = [nearest_centre(recording.take(torch.rand(6, 3)), centres) for _ in range(2)]
     for rows in ((4, 7), (7, 6), (6, 6)):
         points = [torch.rand(count, 3) for count in rows]
         assert recording.replay(1, taken=points) == 1
-        for cells, given in zip(recording.now(found), points, strict=True):
-            assert torch.equal(cells, nearest_centre(given, centres))
+        for cells, arguments in zip(recording.now(results), points, strict=True):
+            assert torch.equal(cells, nearest_centre(arguments, centres))
 
 
 def test_a_number_of_rows_that_is_no_count_is_refused():
-    """A call would make the same rows again and again, or write to memory of fewer."""
+    """A replay would make the same rows again and again, or write to memory of fewer rows."""
     points, centres = torch.rand(6, 3), torch.rand(5, 3)
     with Recording() as recording:
         nearest_centre(points, centres)
@@ -154,15 +154,15 @@ def test_a_number_of_rows_that_is_no_count_is_refused():
 
 
 def test_torch_entry_by_entry_is_computed_again():
-    """In place, in new memory, and of a column; what takes rows for columns, or draws, is refused."""
+    """Pointwise operations run again in place, in new memory and on a column; other operations are refused."""
     with Recording() as recording:
         x = recording.take(torch.rand(6, 3))
         y = torch.sigmoid(x[:, 1]) * 2
         x[:, :2].addcmul_(y[:, None], y[:, None], value=3.0)
     for rows in (5, 7, 6):
-        given = torch.rand(rows, 3)
-        assert recording.replay(1, taken=[given]) == 1
-        expected = given.clone()
+        arguments = torch.rand(rows, 3)
+        assert recording.replay(1, taken=[arguments]) == 1
+        expected = arguments.clone()
         own = torch.sigmoid(expected[:, 1]) * 2
         expected[:, :2].addcmul_(own[:, None], own[:, None], value=3.0)
         assert same(recording.now([x, y]), [expected, own])
@@ -173,7 +173,7 @@ def test_torch_entry_by_entry_is_computed_again():
 
 
 def test_a_replay_refuses_what_a_call_finds_wrong():
-    """Cells that came to lie out of range between replays are refused, as by the call itself."""
+    """A replay refuses cells that have come to lie out of range, like the call itself."""
     cells = torch.tensor([0, 2, 1, 2, 0, 1], dtype=torch.int32)
     with Recording() as recording:
         order, _ = cell_sort(recording.take(cells), 3)
@@ -201,7 +201,7 @@ def test_a_replay_refuses_what_a_call_finds_wrong():
         lambda t: t.optimizer.drop_averages(),
         lambda t: t.router.module.colour.weight.requires_grad_(False),
         lambda t: t.router.module.colour.weight.register_hook(lambda gradient: 2 * gradient),
-        lambda t: t.router.module.register_forward_hook(lambda *given: None),
+        lambda t: t.router.module.register_forward_hook(lambda *arguments: None),
         lambda t: setattr(t.router.module, "density_scale", 3.0),
         lambda t: t.router.to(torch.float64).to(torch.float32),
         lambda t: torch.set_num_threads(3),
@@ -209,7 +209,7 @@ def test_a_replay_refuses_what_a_call_finds_wrong():
     ],
 )
 def test_what_changes_is_followed(change):
-    before, found = torch.get_num_threads(), []
+    before, results = torch.get_num_threads(), []
     try:
         for as_it_is in (False, True):
             torch.set_num_threads(before)
@@ -221,26 +221,26 @@ def test_what_changes_is_followed(change):
                 training.step(64, at=15)
             change(training)
             steps = [*training.train(4, as_it_is=as_it_is), training.step(64, at=15).loss]
-            found.append([*steps, *(e for e in training.everything() if e is not None)])
+            results.append([*steps, *(e for e in training.everything() if e is not None)])
     finally:
         torch.set_num_threads(before)
         torch.set_float32_matmul_precision("highest")
-    assert same(*found)
+    assert same(*results)
 
 
 def new_data(*tensors):
-    """Gives tensors other memory with the same values, or for images with others."""
+    """Moves tensors to other memory with the same values; images get other values."""
     for tensor in tensors:
         tensor.data = 255 - tensor.data if tensor.dtype == torch.uint8 else tensor.data.clone()
 
 
 def new_vector(training):
-    """All parameters in one piece of memory."""
+    """Puts all parameters into one piece of memory."""
     parameters = list(training.router.parameters())
     torch.nn.utils.vector_to_parameters(torch.nn.utils.parameters_to_vector(parameters), parameters)
 
 
-#: Ways in which tensors move to other memory, or lie in it otherwise, while the objects stay.
+#: Moves of tensors to other memory or to another layout, while the objects stay.
 MOVES = {
     "gradients": lambda t: new_data(*(p.grad for p in t.router.parameters() if p.grad is not None)),
     "moments": lambda t: new_data(*(state["exp_avg"] for state in t.optimizer.state.values())),
@@ -266,8 +266,8 @@ MOVES = {
 
 
 def test_what_moves_is_followed():
-    """No memory that a tensor has left is written to, and what it now holds is read."""
-    found = []
+    """A step writes to no memory that a tensor has left, and reads the tensor's new memory."""
+    results = []
     for as_it_is in (False, True):
         training, steps = Training(cells=3), {}
         training.router.module.density.bias.requires_grad_(False)
@@ -279,17 +279,17 @@ def test_what_moves_is_followed():
             recorded = training.recorded
             move(training)
             steps[name] = [*training.train(1, as_it_is=as_it_is), training.step(64, 2, at=1023).loss.clone()]
-            still = name in ("averages", "nothing")  # those are of the part after a step
+            still = name in ("averages", "nothing")  # the segment after a step uses the averages
             assert as_it_is or (training.recorded > recorded) != still, name
-            steps[name] += [each.detach().clone() for each in training.everything() if each is not None]
-        found.append(steps)
-    for name, steps in found[0].items():
-        assert same(steps, found[1][name]), name
+            steps[name] += [tensor.detach().clone() for tensor in training.everything() if tensor is not None]
+        results.append(steps)
+    for name, steps in results[0].items():
+        assert same(steps, results[1][name]), name
 
 
 def test_centres_that_have_an_index_are_followed():
-    """Changed in place, moved to other memory, and of another diagram."""
-    found = []
+    """Centres are followed if they change in place, move to other memory, or belong to another diagram."""
+    results = []
     for as_it_is in (False, True):
         training, steps = Training(cells=2100), []
         for change in (
@@ -302,9 +302,9 @@ def test_centres_that_have_an_index_are_followed():
             training.step(64, 2, at=1023)
             change(training)
             steps += training.train(2, as_it_is=as_it_is)
-        found.append([*steps, *training.router.parameters()])
+        results.append([*steps, *training.router.parameters()])
         assert as_it_is or "recorded and replayed" in training.step.explain()
-    assert same(*found)
+    assert same(*results)
 
 
 def test_recordings_that_are_never_replayed_are_made_less_often():
@@ -315,13 +315,13 @@ def test_recordings_that_are_never_replayed_are_made_less_often():
         new_data(training.batches.images)
         training.train(1)
         said.append(training.step.explain())
-    assert training.recorded < 8 and any("runs as it is 3 times more" in each for each in said), said
+    assert training.recorded < 8 and any("runs as it is 3 times more" in text for text in said), said
     training.train(8)
     assert "recorded and replayed" in training.step.explain()
 
 
 def test_gradients_that_were_dropped_are_given_back():
-    """Any of them, also where a loop has put another tensor in its place, or one where there was none."""
+    """Dropped gradients come back, also if a loop has replaced a gradient, or set one where there was none."""
     one, other = Training(), Training()
     for training, as_it_is in ((one, False), (other, True)):
         list(training.router.parameters())[-2].requires_grad_(False)
@@ -332,8 +332,8 @@ def test_gradients_that_were_dropped_are_given_back():
         training.train(1, as_it_is=as_it_is)
         assert as_it_is or training.recorded == recorded
         assert parameters[-2].grad is None
-    given = ([each for each in training.everything() if each is not None] for training in (one, other))
-    assert same(*given)
+    arguments = ([tensor for tensor in training.everything() if tensor is not None] for training in (one, other))
+    assert same(*arguments)
 
 
 def test_hooks_in_the_place_of_earlier_ones_are_called():
@@ -367,7 +367,7 @@ def test_steps_without_gradients_are_refused_as_ever():
 
 @pytest.mark.parametrize("field", [None, "another"])
 def test_a_second_optimizer_learns(field):
-    """Its parameter, of the router or of a module around it, is named, and moves in each of its steps."""
+    """A parameter of another optimizer, in or around the router, is named, and moves in each of its steps."""
     moved = []
     for as_it_is in (False, True):
         training = Training(field=Scaled, fuse=True, way="fused") if field else Training()
@@ -378,7 +378,7 @@ def test_a_second_optimizer_learns(field):
         other, values = torch.optim.SGD([parameter], lr=1.0), []
         for step in range(6):
             training.train(1, as_it_is=as_it_is)
-            if step % 2:  # it accumulates in between
+            if step % 2:  # gradients accumulate in between
                 other.step()
                 other.zero_grad()
             values.append(parameter.detach().clone())
@@ -395,8 +395,8 @@ def test_a_second_optimizer_learns(field):
 
 @pytest.mark.parametrize("steps", [6, 7, 10, 32])
 def test_any_number_of_steps_of_a_call_keeps_averages_and_decay(steps):
-    """And the grid begins to learn where it does, not at the end of a call."""
-    found = []
+    """The grid also begins to learn at its own step, not at the end of a call."""
+    results = []
     for calls in (96 // steps * [steps] + [96 % steps], 96 * [1]):
         training, done = Training(cells=2), 0
         training.optimizer.average = 0.9
@@ -407,8 +407,8 @@ def test_any_number_of_steps_of_a_call_keeps_averages_and_decay(steps):
                 done += count
         with training.optimizer.averaged():
             shown = [p.detach().clone() for p in training.router.parameters()]
-        found.append([*shown, *training.everything()])
-    assert same(*found)
+        results.append([*shown, *training.everything()])
+    assert same(*results)
 
 
 def test_learning_rate_and_averages_follow_the_loop():
@@ -426,7 +426,7 @@ def test_learning_rate_and_averages_follow_the_loop():
 
 
 class Torch(torch.nn.Module):
-    """A field that is not fused, so its layers are torch's."""
+    """A field that is not fused, so that torch runs its layers."""
 
     def __init__(self):
         super().__init__()
@@ -445,21 +445,21 @@ def test_a_field_of_torch_runs_as_it_is():
 
 
 def test_a_fused_field_is_replayed():
-    """Also where its attributes change."""
-    found = []
+    """A change of the field's attributes is followed."""
+    results = []
     for as_it_is in (False, True):
         training = Training(cells=2, field=Scaled, fuse=True, way="fused")
         steps = training.train(6, as_it_is=as_it_is)
         replayed = "replayed" in training.step.explain()
         assert replayed != as_it_is, training.step.explain()
         training.router.module.scale = 3.0
-        found.append([*steps, *training.train(6, as_it_is=as_it_is)])
-    assert same(*found)
+        results.append([*steps, *training.train(6, as_it_is=as_it_is)])
+    assert same(*results)
 
 
 @replayed
 class Keeping(SplitStrategy):
-    """Says that its hook may be replayed, though torch sums in it."""
+    """A split rule marked as replayed, though torch sums in its hook."""
 
     line = 0
 
@@ -470,8 +470,8 @@ class Keeping(SplitStrategy):
 
 def test_torch_in_a_step_is_named_and_tried_no_longer():
     training = Training()
-    given = {"field": training.router}, [PlannedSplit(at=8, children=2)]
-    training.step.strategy = Keeping(*given, generator=torch.Generator().manual_seed(0))
+    arguments = {"field": training.router}, [PlannedSplit(at=8, children=2)]
+    training.step.strategy = Keeping(*arguments, generator=torch.Generator().manual_seed(0))
     training.train(8)
     explained = training.step.explain()
     assert explained == f"step: runs as it is, since torch computes sum, in {__file__.split('/')[-1]}:{Keeping.line}"
@@ -494,10 +494,10 @@ def test_a_profiler_sees_the_operations():
 def test_two_trainings_in_threads():
     alone = Training()
     expected = [*alone.train(30), *alone.everything()]
-    trainings, found = [Training(), Training()], [[], []]
+    trainings, actual = [Training(), Training()], [[], []]
 
     def run(number):
-        found[number] = trainings[number].train(30)
+        actual[number] = trainings[number].train(30)
 
     workers = [threading.Thread(target=run, args=(number,)) for number in range(2)]
     for worker in workers:
@@ -505,7 +505,7 @@ def test_two_trainings_in_threads():
     for worker in workers:
         worker.join(timeout=60)
     for number in range(2):
-        assert same([*found[number], *trainings[number].everything()], expected)
+        assert same([*actual[number], *trainings[number].everything()], expected)
 
 
 def test_a_step_that_is_not_finite_is_left_out():

@@ -1,4 +1,4 @@
-"""A training step computes in ops, or in torch entry by entry, which replays do again."""
+"""A training step computes in ops, and in pointwise operations of torch, which replays run again."""
 
 import pytest
 import torch
@@ -30,22 +30,22 @@ SEEDS_MEMORY_VIEWS = {
 
 
 class Calls(TorchDispatchMode):
-    """The names of torch's operations."""
+    """A mode that collects the names of torch's operations, except pointwise ones."""
 
     def __init__(self):
         super().__init__()
         self.names = set()
 
-    def __torch_dispatch__(self, function, types, given=(), named=None):
+    def __torch_dispatch__(self, function, types, arguments=(), named=None):
         if function.namespace != "voronerf" and torch.Tag.pointwise not in function.tags:
             self.names.add(function.name().partition("::")[2].partition(".")[0])
-        return function(*given, **(named or {}))
+        return function(*arguments, **(named or {}))
 
 
 @pytest.mark.native
 @pytest.mark.parametrize("contracted", [False, True])
 def test_a_step_computes_in_ops_alone(contracted):
-    """Of near cameras, sparse points, rays from elsewhere and voxels that stay empty, at a step that looks at these."""
+    """The step has near cameras, sparse points, unseen rays and empty voxels, and looks at these voxels."""
     cameras = orbit_cameras(4, radius=2.0, elevation=10.0, width=20, height=20, focal=22.0)
     images = torch.randint(255, (4, 20, 20, 3), dtype=torch.uint8)
     sparse = torch.randint(1600, (50,)), torch.rand(50) + 1
@@ -69,7 +69,7 @@ def test_a_step_computes_in_ops_alone(contracted):
         strategy.step_post_backward(output)
         return output
 
-    step(SETTLING_STEPS)  # in which what is computed becomes known
+    step(SETTLING_STEPS)  # a warm-up step
     with Calls() as calls:
         output = step(SETTLING_STEPS + GROUP)
     assert len(output.weights) and len(strategy.reservoir) and not bool(sampler.grid.occupied.flatten()[empty].any())

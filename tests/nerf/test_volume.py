@@ -1,4 +1,4 @@
-"""Volume rendering against slow loops and against integrals that are known."""
+"""Volume rendering against slow loops and known integrals."""
 
 import math
 
@@ -11,12 +11,12 @@ from voronerf.nerf.cameras import Rays, orbit_cameras
 
 BOX = torch.tensor([[-0.7, -0.7, -0.7], [0.7, 0.7, 0.7]])
 WHITE = torch.ones(3)
-#: Of eight samples from 1 to 3: those before the first that is near to 2.0 and 2.9, and how many are.
+#: For two points at 2.0 and 2.9: the samples before the first near one, and the number of near ones, of 8 from 1 to 3.
 ENDS = ((3, 2), (6, 2))
 
 
 def ball(positions, directions, ray_index):
-    """A dense ball of radius 0.6, coloured by position and by the ray's direction."""
+    """Returns colour and density of a dense ball of radius 0.6, coloured by position and by the ray's direction."""
     rgb = 0.5 + 0.4 * positions * directions[ray_index.long()]
     return rgb, torch.where(positions.norm(dim=-1) < 0.6, 30.0, 0.0)
 
@@ -111,23 +111,23 @@ def test_a_half_precision_field_is_summed_in_float32():
 
 @pytest.mark.parametrize("marched", [False, True])
 def test_what_is_near_the_camera_learns_less(marched):
-    """By the square of the distance, up to that from which gradients are whole."""
+    """Gradients grow with the square of the distance, up to the distance of full gradients."""
     ahead = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
     grid = OccupancyGrid(torch.tensor([[-9.0] * 3, [9.0] * 3]), 4, threshold=0.1) if marched else None
-    found = []
+    results = []
     for full in (None, 2.0):
         answers = torch.full((8, 4), 0.3, requires_grad=True)
         fog = lambda *_, answers=answers: (answers[:, :3], answers[:, 3])  # noqa: E731
         renderer = renderer_of({"field": fog}, samples=8, occupancy=grid, full_gradient=full)
         (rendered,) = renderer.render(ahead, 1.0, 3.0)
         rendered.colour.sum().backward()
-        found.append(answers.grad)
+        results.append(answers.grad)
     depths = 1.125 + 0.25 * torch.arange(8)
-    torch.testing.assert_close(found[1], found[0] * (depths / 2).square().clamp(max=1)[:, None])
+    torch.testing.assert_close(results[1], results[0] * (depths / 2).square().clamp(max=1)[:, None])
 
 
 def test_the_last_rays_end_at_points():
-    """The weights within 0.03 of the distance and a sample's length of 0.25 count, by minus their logarithm."""
+    """The loss is minus the logarithm of the weights within 0.03 of the distance and a sample's length of 0.25."""
     ahead = Rays(torch.zeros(3, 3), torch.tensor([[0.0, 0, 1]]).expand(3, 3))
     fog = lambda positions, *_: (torch.zeros_like(positions), torch.full_like(positions[:, 0], 0.5))  # noqa: E731
     renderer = renderer_of({"field": fog}, samples=8)

@@ -1,4 +1,4 @@
-"""Networks of cells as one plain layer after another, with torch's own gradients: the oracle of every backend."""
+"""Layers and networks as plain loops over cells, with torch's own gradients: the oracle of every backend."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of the operations share."""
+"""Helpers that the tests of the operations share."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ COUNTS = {
     "unequal": [1, 0, 9001, 2],
     "single cell": [33],
 }
-"""Samples of each cell: no samples, one, odd numbers with empty cells, more than two pieces, a plain network."""
+"""The numbers of samples in the cells: all 0, a single 1, odd with empty cells, more than two pieces, and one cell."""
 
 
 def need(op, backend, device, dtype):
-    """Skips, with the reason, where a backend does not take a device or dtype."""
+    """Skips the test, with the reason, if the backend does not support the device or dtype."""
     reason = backends.why_not(op, backend, device, dtype)
     if reason is not None:
         pytest.skip(reason)
 
 
 def offsets_of(counts, device="cpu"):
-    """Cell offsets from the number of samples of each cell."""
+    """Returns the cell offsets for the numbers of samples in the cells."""
     return torch.tensor([0, *counts]).cumsum(0).to(torch.int32).to(device)
 
 
 def strided(tensor):
-    """The same values with no two of them next to each other in memory."""
+    """Returns the same values, stored so that no two of them are adjacent in memory."""
     wide = tensor.new_full((*tensor.shape[:-1], 2 * tensor.shape[-1]), torch.nan if tensor.is_floating_point() else -7)
     wide[..., ::2] = tensor
     return wide[..., ::2]
@@ -43,19 +43,19 @@ def strided(tensor):
 
 @contextmanager
 def refused(kind, message):
-    """Passes if the block raises just this message; "..." stands for anything."""
+    """Passes if the block raises exactly this message; "..." stands for any text."""
     with pytest.raises(kind) as caught:
         yield
     begin, _, end = message.partition("...")
     assert type(caught.value) is kind
-    found = str(caught.value)
-    assert found == message or ("..." in message and found.startswith(begin) and found.endswith(end)), found
+    text = str(caught.value)
+    assert text == message or ("..." in message and text.startswith(begin) and text.endswith(end)), text
 
 
 def refusals(call, name=None, /, **good):
-    """Checks that an op takes the arguments ``good``, and what it says, after its name, where some of them are changed.
+    """Calls an op with the valid arguments ``good``; returns a function that checks the error for changed arguments.
 
-    The error is a TypeError where the message speaks of a type, and else a ValueError.
+    The expected message follows the op's name; the error is a TypeError if it mentions a type, else a ValueError.
     """
     call(**good)
 

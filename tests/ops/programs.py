@@ -1,4 +1,4 @@
-"""Programs in plain PyTorch whose gradients are those of their gradient programs, of every order."""
+"""Programs in plain PyTorch, differentiated to any order by their gradient programs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from voronerf.ops.grouped_program import reference
 
 
 class ByPrograms(torch.autograd.Function):
-    """``apply(text, offsets, order, ray_index, *inputs, *parameters)`` gives what the op gives."""
+    """The op as an autograd function: ``apply(text, offsets, order, ray_index, *inputs, *parameters)``."""
 
     @staticmethod
     def forward(ctx, text, offsets, order, ray_index, *tensors):
@@ -18,14 +18,14 @@ class ByPrograms(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(offsets, order, ray_index, *tensors)
         count = len(Program.parse(text).inputs)
-        given = [tensor.detach() for tensor in tensors]
+        arguments = [tensor.detach() for tensor in tensors]
         return tuple(
-            reference.evaluate(given[:count], given[count:], offsets, order, ray_index, text),
+            reference.evaluate(arguments[:count], arguments[count:], offsets, order, ray_index, text),
         )
 
     @staticmethod
     def backward(ctx, *arriving):
-        """Runs the gradient program, by this function too."""
+        """Runs the gradient program by this class, so that it is differentiable again."""
         offsets, order, ray_index, *tensors = ctx.saved_tensors
         program, k = Program.parse(ctx.text), len(offsets) - 1
         count, split, wanted = len(program.inputs), len(program.outputs), ctx.needs_input_grad[4:]
@@ -34,33 +34,33 @@ class ByPrograms(torch.autograd.Function):
             program, tuple(wanted[:count]), tuple(wanted[count:]), tuple(there[:split]), tuple(there[split:])
         )
         parts = (tensors[:count], arriving[:split], tensors[count:], arriving[split:])
-        given = [tensor for part in parts for tensor in part if tensor is not None]
-        results = iter(ByPrograms.apply(own.text, offsets, order, ray_index, *given))
-        found = [next(results) if want else None for want in wanted]
+        arguments = [tensor for part in parts for tensor in part if tensor is not None]
+        results = iter(ByPrograms.apply(own.text, offsets, order, ray_index, *arguments))
+        gradients = [next(results) if want else None for want in wanted]
         for i, tensor in enumerate(tensors[count:], start=count):
-            if found[i] is not None and len(tensor) == 1 < k:
-                found[i] = found[i].sum(0, keepdim=True)
-        return None, None, None, None, *found
+            if gradients[i] is not None and len(tensor) == 1 < k:
+                gradients[i] = gradients[i].sum(0, keepdim=True)
+        return None, None, None, None, *gradients
 
 
 def derivatives(run, tensors, orders=3):
-    """Results, the gradients of a weighted sum of them, and so on: of ``run(*leaves)``, a list of tensors.
+    """Returns the results of ``run(*leaves)`` and their derivatives, each of a weighted sum of the last.
 
     Args:
-        run: a function of tensors.
+        run: a function of tensors that returns a list of tensors.
         tensors: its arguments.
-        orders: how often it is differentiated.
+        orders: the number of derivatives.
 
     Returns:
-        The results, and for each order the gradients to all arguments.
+        The results, then for each order the gradients to all arguments.
     """
     generator = torch.Generator().manual_seed(5)
     leaves = [tensor.clone().requires_grad_() for tensor in tensors]
-    found = [list(run(*leaves))]
+    results = [list(run(*leaves))]
     for _ in range(orders):
         total = 0 * leaves[0].sum()
-        for tensor in found[-1]:
+        for tensor in results[-1]:
             total = total + (tensor * torch.randn(tensor.shape, generator=generator, dtype=tensor.dtype)).sum()
         options = {"create_graph": True, "allow_unused": True, "materialize_grads": True}
-        found.append(list(torch.autograd.grad(total, leaves, **options)))
-    return [tensor.detach() for part in found for tensor in part]
+        results.append(list(torch.autograd.grad(total, leaves, **options)))
+    return [tensor.detach() for part in results for tensor in part]

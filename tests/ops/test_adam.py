@@ -28,7 +28,7 @@ def test_leaves_out_a_step_that_is_not_finite(device, backend, spoilt):
 
 
 def test_leaves_out_a_step_wherever_a_gradient_is_not_finite(device, backend):
-    """On CUDA, 127 blocks look at 4,096 entries each, and then at others."""
+    """The entry lies at borders of the blocks: on CUDA, 127 blocks of 4,096 entries make one pass."""
     sizes, judged = [3, 90, 530_001, 0, 4097], [True, False, True, True, True]
     tensors = [[torch.ones(n, device=device) for n in sizes] for _ in range(4)]
     gradients, guard = tensors[1], Guard.on(device)
@@ -40,20 +40,20 @@ def test_leaves_out_a_step_wherever_a_gradient_is_not_finite(device, backend):
         assert bool(guard.found) and float(guard.in_a_row) == float(guard.skipped) == number + 1
         assert all(bool((parameter == 1).all()) for parameter in tensors[0]) and not any(rule.step for rule in rules)
         gradients[which][place] = 1
-    gradients[1][89] = torch.nan  # of a table
+    gradients[1][89] = torch.nan  # a gradient of a table
     adam(rules, *tensors, guard=guard, loss=guard.found + 1, backend=backend)
     assert not guard.found and not guard.in_a_row and float(guard.skipped) == len(places)
     assert all(bool((parameter != 1).all()) and rule.step for parameter, rule in zip(tensors[0], rules, strict=True))
 
 
 def test_a_table_may_have_any_gradient(device, backend):
-    """Its entries are not read to judge a step: they are products of gradients that are."""
+    """The gradient of a table is not checked: its entries are products of gradients that are checked."""
     table = [torch.ones(4, device=device) for _ in range(4)]
     table[1][2] = torch.nan
     guard, step = Guard.on(device), torch.zeros((), device=device)
     guard.begin(3)
-    given = [[tensor] for tensor in table]
-    adam([Rule(step, 0.1, every=False)], *given, guard=guard, loss=step + 1, backend=backend)
+    arguments = [[tensor] for tensor in table]
+    adam([Rule(step, 0.1, every=False)], *arguments, guard=guard, loss=step + 1, backend=backend)
     assert float(step) == 1 and float(guard.skipped) == 3 and float(guard.found) == 0
 
 
@@ -66,11 +66,11 @@ def test_what_was_found_before_leaves_out_a_step(device, backend):
 
 
 def test_refuses_what_would_be_read_out_of_bounds():
-    """Each on its own: a fast pass over all tensors decides whether they are looked at one by one."""
+    """Wrong arguments come one at a time: a fast pass over all tensors decides whether they are checked one by one."""
 
     def call(rules=None, **changed):
-        given = {name: [torch.ones(())] for name in ("parameters", "gradients", "means", "squares")}
-        adam(rules or [Rule(torch.zeros(()), 0.1)], **{**given, **changed})
+        arguments = {name: [torch.ones(())] for name in ("parameters", "gradients", "means", "squares")}
+        adam(rules or [Rule(torch.zeros(()), 0.1)], **{**arguments, **changed})
 
     call()
     rule = Rule(torch.zeros(()), 0.1)
@@ -126,7 +126,7 @@ def test_refuses_what_would_be_read_out_of_bounds():
 
 
 def table(shape, share, seed=0):
-    """A parameter, its gradient, of which a share is not zero, and both moments."""
+    """Returns a parameter, its gradient with a ``share`` of nonzero entries, and both moments."""
     generator = torch.Generator().manual_seed(seed)
     parameter, gradient, mean = (torch.randn(shape, generator=generator) for _ in range(3))
     gradient *= torch.rand(shape, generator=generator) < share
@@ -134,7 +134,7 @@ def table(shape, share, seed=0):
 
 
 def loop(parameter, gradient, mean, square, step, rate, betas, epsilon):
-    """Kingma and Ba 2015, algorithm 1, one entry at a time in float64."""
+    """Runs algorithm 1 of Kingma and Ba (2015), one entry at a time in float64."""
     p, g, m, v = (t.double().flatten().tolist() for t in (parameter, gradient, mean, square))
     for i in range(len(p)):
         if g[i] != 0:
@@ -148,26 +148,26 @@ def loop(parameter, gradient, mean, square, step, rate, betas, epsilon):
 @pytest.mark.parametrize("shape", [(0, 2), (1,), (15,), (17, 1), (331, 2), (4, 33, 8)])
 @pytest.mark.parametrize("share", [0.0, 0.05, 1.0])
 def test_a_table_equals_a_slow_loop(device, backend, shape, share):
-    given = table(shape, share)
-    found = [t.to(device).clone() for t in given]
+    arguments = table(shape, share)
+    actual = [t.to(device).clone() for t in arguments]
     rule = Rule(torch.tensor(2.0, device=device), 0.01, (0.9, 0.99), 1e-10, every=False)
-    adam([rule], *([tensor] for tensor in (found[0], strided(found[1]), *found[2:])), backend=backend)
-    expected = loop(*given, 3, 0.01, (0.9, 0.99), 1e-10)
-    untouched = given[1] == 0
-    for result, wanted, before in zip((found[0], *found[2:]), expected, (given[0], *given[2:]), strict=True):
+    adam([rule], *([tensor] for tensor in (actual[0], strided(actual[1]), *actual[2:])), backend=backend)
+    expected = loop(*arguments, 3, 0.01, (0.9, 0.99), 1e-10)
+    untouched = arguments[1] == 0
+    for result, wanted, before in zip((actual[0], *actual[2:]), expected, (arguments[0], *arguments[2:]), strict=True):
         torch.testing.assert_close(result.cpu().double(), wanted, rtol=1e-5, atol=1e-6)
         assert torch.equal(result.cpu()[untouched], before[untouched])
-    assert torch.equal(found[1].cpu(), given[1])
+    assert torch.equal(actual[1].cpu(), arguments[1])
 
 
 def test_gradients_of_minus_zero_are_none_and_nan_spreads(device, backend):
-    found = [t.to(device) for t in table((40,), 1.0)]
-    before = [t.clone() for t in found]
-    found[1].fill_(-0.0)
-    found[1][5] = torch.nan
+    tensors = [t.to(device) for t in table((40,), 1.0)]
+    before = [t.clone() for t in tensors]
+    tensors[1].fill_(-0.0)
+    tensors[1][5] = torch.nan
     rule = Rule(torch.zeros((), device=device), 0.1, every=False)
-    adam([rule], *([tensor] for tensor in found), backend=backend)
-    for now, then in zip((found[0], *found[2:]), (before[0], *before[2:]), strict=True):
+    adam([rule], *([tensor] for tensor in tensors), backend=backend)
+    for now, then in zip((tensors[0], *tensors[2:]), (before[0], *before[2:]), strict=True):
         assert bool(now[5].isnan())
         now[5] = then[5]
         assert torch.equal(now, then)
@@ -175,20 +175,20 @@ def test_gradients_of_minus_zero_are_none_and_nan_spreads(device, backend):
 
 @pytest.mark.native
 def test_native_bits_depend_neither_on_threads_nor_on_instructions():
-    given, results, threads = table((70_001,), 0.1), [], torch.get_num_threads()
+    arguments, results, threads = table((70_001,), 0.1), [], torch.get_num_threads()
     try:
         for isa in native.SUPPORTED_ISAS:
             for count in (1, 3):
                 torch.set_num_threads(count)
-                found = [t.clone() for t in given]
+                tensors = [t.clone() for t in arguments]
                 with native.using_isa(isa):
                     rule = Rule(torch.tensor(6.0), 0.01, every=False)
-                    adam([rule], *([tensor] for tensor in found), backend="native")
-                results.append(found)
+                    adam([rule], *([tensor] for tensor in tensors), backend="native")
+                results.append(tensors)
     finally:
         torch.set_num_threads(threads)
-    for found in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found, results[0], strict=True))
+    for tensors in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(tensors, results[0], strict=True))
 
 
 @pytest.mark.parametrize(
@@ -202,6 +202,6 @@ def test_native_bits_depend_neither_on_threads_nor_on_instructions():
     ],
 )
 def test_forged_rules_and_guards_are_refused(error, message, change, backend):
-    given = {"rules": [Rule(torch.ones(()), 0.1)], "guard": Guard.on("cpu"), "loss": torch.ones(()), **change}
+    arguments = {"rules": [Rule(torch.ones(()), 0.1)], "guard": Guard.on("cpu"), "loss": torch.ones(()), **change}
     with refused(error, f"adam: {message}"):
-        adam(given.pop("rules"), *([torch.ones(3)] for _ in range(4)), **given, backend=backend)
+        adam(arguments.pop("rules"), *([torch.ones(3)] for _ in range(4)), **arguments, backend=backend)

@@ -17,7 +17,7 @@ def samples(m):
 
 
 def slow(points, masses, centres, steps, alpha, nearby):
-    """Sample by sample and neighbour by neighbour; centres are float32 between the steps."""
+    """Balances sample by sample and neighbour by neighbour; centres are rounded to float32 between the steps."""
 
     def weigh():
         weights = [0.0] * len(places)
@@ -42,7 +42,7 @@ def slow(points, masses, centres, steps, alpha, nearby):
 @pytest.mark.parametrize(("k", "neighbours"), [(2, 8), (5, 2), (9, 8), (20, 8), (12, 1)])
 def test_equals_slow_loops(device, backend, k, neighbours):
     points, masses = samples(300)
-    found = balance_centres(
+    result = balance_centres(
         points.to(device),
         masses.to(device),
         points[:k].to(device),
@@ -52,18 +52,18 @@ def test_equals_slow_loops(device, backend, k, neighbours):
         backend=backend,
     )
     centres, weights = slow(points, masses, points[:k], 3, 0.3, neighbours)
-    torch.testing.assert_close(found[0].cpu(), centres, rtol=0, atol=2e-6)
-    torch.testing.assert_close(found[1].cpu(), weights, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(result[0].cpu(), centres, rtol=0, atol=2e-6)
+    torch.testing.assert_close(result[1].cpu(), weights, rtol=1e-12, atol=1e-12)
 
 
 def test_balances_and_repeats_itself(device, backend):
     points, masses = samples(2000)
-    given = points.to(device), masses.to(device), points[:16].to(device)
-    start, end = (balance_centres(*given, steps=steps, backend=backend) for steps in (0, 300))
-    assert torch.equal(start[0], given[2])
+    arguments = points.to(device), masses.to(device), points[:16].to(device)
+    start, end = (balance_centres(*arguments, steps=steps, backend=backend) for steps in (0, 300))
+    assert torch.equal(start[0], arguments[2])
     before, after = (float((part[1] / part[1].max()).std(correction=0)) for part in (start, end))
     assert before > 0.2 and after < before / 3
-    again = balance_centres(*(strided(tensor) for tensor in given), steps=300, backend=backend)
+    again = balance_centres(*(strided(tensor) for tensor in arguments), steps=300, backend=backend)
     assert torch.equal(again[0], end[0]) and torch.equal(again[1], end[1])
 
 

@@ -1,4 +1,4 @@
-"""Programs on Warp: layers by its kernel, whatever follows them and all other programs by PyTorch."""
+"""Programs on Warp: its kernel runs the layers, and PyTorch runs the following steps and all other programs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops._core.program import PARAMETER, Builder, Columns
 
 pytest.importorskip("warp")
-from voronerf.kernels.grouped_program import chain_of  # which imports Warp
+from voronerf.kernels.grouped_program import chain_of  # imports Warp
 
 GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
 KINDS = {
@@ -24,7 +24,7 @@ KINDS = {
 
 
 def with_activations(table, biased, ray):
-    """The program of a table, and of what a field does with its outputs: halves, one squared, side by side."""
+    """Returns the program of a table and its activations: all outputs halved, beside the tanh of one and its square."""
     inner = table.program(6 if table.integrated else 3, 3 if table.uses_directions else 0, None, biased, ray)
     b = Builder()
     inputs = {i: b.input(width, ray=i in inner.rays) for i, width in enumerate(inner.inputs)}
@@ -54,13 +54,13 @@ def test_chains_are_those_of_the_reference(name, shared, ray, ordered):
     assert chain_of(program.text) is not None
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1)).int() if ordered else None
     offsets = offsets_of([11, 0, 25]) + 2  # two rows before the cells and two behind them
-    found = []
+    outcomes = []
     for backend in ("warp", "reference"):
-        given = {"program": program, "order": order, "ray_index": index, "backend": backend}
-        results = grouped_program(tensors[:count], tensors[count:], offsets, **given)
+        arguments = {"program": program, "order": order, "ray_index": index, "backend": backend}
+        results = grouped_program(tensors[:count], tensors[count:], offsets, **arguments)
         total = sum(result.square().sum() for result in results)
-        found.append([*results, *torch.autograd.grad(total, tensors, materialize_grads=True, allow_unused=True)])
-    for a, b in zip(*found, strict=True):
+        outcomes.append([*results, *torch.autograd.grad(total, tensors, materialize_grads=True, allow_unused=True)])
+    for a, b in zip(*outcomes, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
@@ -97,13 +97,13 @@ def test_positions_of_rays_are_no_chain():
     b = Builder()
     program = b.program([b.linear(b.input(3, ray=True), b.parameter(2, 3), 2)])
     rays, weight, index = torch.rand(2, 3), torch.randn(1, 2, 3), torch.tensor([1, 0, 1, 1, 0]).int()
-    given = {"program": program, "ray_index": index, "backend": "warp"}
-    (out,) = grouped_program([rays], [weight], offsets_of([5]), **given)
+    arguments = {"program": program, "ray_index": index, "backend": "warp"}
+    (out,) = grouped_program([rays], [weight], offsets_of([5]), **arguments)
     torch.testing.assert_close(out, rays[index] @ weight[0].T)
 
 
 def test_an_activation_of_a_part_of_a_layer():
-    """It is a step behind the layers, of the part alone."""
+    """An activation of a part of a layer is a separate step behind the layers."""
     b = Builder()
     raw = b.linear(b.input(3), b.parameter(4, 3), 4)
     program = b.program([b.apply("sigmoid", raw.part(2, 2))])
@@ -114,7 +114,7 @@ def test_an_activation_of_a_part_of_a_layer():
 
 
 def test_an_output_that_a_layer_reads_is_kept_before_its_activation():
-    """The activation is a step behind the layers where something reads what is before it."""
+    """The activation is a separate step if another step reads the value before it."""
     b = Builder()
     raw = b.linear(b.input(3), b.parameter(4, 3), 4)
     program = b.program([b.apply("relu", raw), raw])

@@ -17,7 +17,7 @@ INF, NAN = math.inf, math.nan
 
 
 def slow(sigma, rgb, depths, deltas, background=None):
-    """One sample at a time, in float64."""
+    """Composites one sample at a time, in float64."""
     rays = []
     for ray in range(sigma.shape[0]):
         light, colour, opacity, depth, weights = 1.0, rgb.new_zeros(rgb.shape[2], dtype=torch.float64), 0.0, 0.0, []
@@ -61,14 +61,14 @@ def test_matches_a_slow_loop(device, backend, form, dtype, r, s, c):
     background = torch.rand(r, c).to(dtype)
     exact = slow(*inputs, background=background)
     ray_offsets = None if form == "dense" else offsets_of([s] * r, device)
-    given = inputs if form == "dense" else tuple(tensor.flatten(0, 1) for tensor in inputs)
-    found = composite(
-        *(tensor.to(device) for tensor in given),
+    arguments = inputs if form == "dense" else tuple(tensor.flatten(0, 1) for tensor in inputs)
+    actual = composite(
+        *(tensor.to(device) for tensor in arguments),
         ray_offsets=ray_offsets,
         background=background.to(device),
         backend=backend,
     )
-    for part, expected in zip(found, exact):
+    for part, expected in zip(actual, exact):
         assert_as_exact(part.reshape(expected.shape), expected.to(dtype), expected)
 
 
@@ -78,38 +78,38 @@ def test_packed_rays_of_any_length_equal_each_ray_alone(device, backend, counts,
     inputs = rays(len(counts), max(counts, default=0))
     background = torch.tensor([0.2, 0.5, 1.0]) if with_background else None
     packed = pack(inputs, counts) if counts else tuple(tensor.flatten(0, 1) for tensor in inputs)
-    found = composite(
+    actual = composite(
         *(strided(tensor.to(device)) for tensor in packed),
         ray_offsets=offsets_of(counts, device),
         background=None if background is None else background.to(device),
         backend=backend,
     )
-    assert found.colour.shape == (len(counts), 3)
-    assert found.opacity.shape == found.depth.shape == (len(counts),)
-    assert found.weights.shape == (sum(counts),)
+    assert actual.colour.shape == (len(counts), 3)
+    assert actual.opacity.shape == actual.depth.shape == (len(counts),)
+    assert actual.weights.shape == (sum(counts),)
     for ray, count in enumerate(counts):
         exact = slow(*(tensor[ray : ray + 1, :count] for tensor in inputs), background=background)
-        torch.testing.assert_close(found.colour[ray].double().cpu(), exact.colour[0], rtol=0, atol=1e-6)
-        torch.testing.assert_close(found.opacity[ray].double().cpu(), exact.opacity[0], rtol=0, atol=1e-6)
-        torch.testing.assert_close(found.depth[ray].double().cpu(), exact.depth[0], rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(actual.colour[ray].double().cpu(), exact.colour[0], rtol=0, atol=1e-6)
+        torch.testing.assert_close(actual.opacity[ray].double().cpu(), exact.opacity[0], rtol=0, atol=1e-6)
+        torch.testing.assert_close(actual.depth[ray].double().cpu(), exact.depth[0], rtol=1e-6, atol=1e-6)
 
 
 def test_rays_without_samples_show_the_background(device, backend):
     inputs = tuple(tensor.to(device) for tensor in rays(4, 0))
     background = torch.rand(4, 3, device=device)
-    found = composite(*inputs, background=background, backend=backend)
-    assert torch.equal(found.colour, background)
-    assert found.opacity.tolist() == found.depth.tolist() == [0, 0, 0, 0]
+    result = composite(*inputs, background=background, backend=backend)
+    assert torch.equal(result.colour, background)
+    assert result.opacity.tolist() == result.depth.tolist() == [0, 0, 0, 0]
     assert composite(*(tensor[:0] for tensor in inputs), backend=backend).colour.shape == (0, 3)
 
 
 def test_samples_outside_all_rays_count_for_nothing(device, backend):
     inputs = tuple(tensor.to(device) for tensor in pack(rays(1, 9), [9]))
     offsets = torch.tensor([2, 5, 7], dtype=torch.int32, device=device)
-    found = composite(*inputs, ray_offsets=offsets, backend=backend)
+    result = composite(*inputs, ray_offsets=offsets, backend=backend)
     alone = composite(*(tensor[2:7] for tensor in inputs), ray_offsets=offsets - 2, backend=backend)
-    torch.testing.assert_close(found.colour, alone.colour, rtol=0, atol=1e-6)
-    torch.testing.assert_close(found.opacity, alone.opacity, rtol=0, atol=1e-6)
+    torch.testing.assert_close(result.colour, alone.colour, rtol=0, atol=1e-6)
+    torch.testing.assert_close(result.opacity, alone.opacity, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
@@ -118,14 +118,14 @@ def test_infinite_density_is_opaque_and_hides_what_follows(device, backend, form
     deltas = torch.tensor([[0.5, 0.5, 0.5, 0.5], [0.0, 1e30, 1.0, 1.0]])
     rgb, depths = torch.rand(2, 4, 3), torch.arange(8.0).reshape(2, 4)
     inputs = [tensor.to(device).requires_grad_() for tensor in (sigma, rgb, depths, deltas)]
-    given = inputs if form == "dense" else [tensor.flatten(0, 1) for tensor in inputs]
+    arguments = inputs if form == "dense" else [tensor.flatten(0, 1) for tensor in inputs]
     ray_offsets = None if form == "dense" else offsets_of([4, 4], device)
-    found = composite(*given, ray_offsets=ray_offsets, backend=backend)
+    actual = composite(*arguments, ray_offsets=ray_offsets, backend=backend)
     first = 1 - math.exp(-0.5)
     expected = torch.tensor([[first, 1 - first, 0, 0], [0, 1, 0, 0]])
-    torch.testing.assert_close(found.weights.reshape(2, 4).cpu(), expected, rtol=0, atol=1e-6)
-    torch.testing.assert_close(found.opacity.cpu(), torch.ones(2), rtol=0, atol=1e-6)
-    sum(part.sum() for part in found).backward()
+    torch.testing.assert_close(actual.weights.reshape(2, 4).cpu(), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(actual.opacity.cpu(), torch.ones(2), rtol=0, atol=1e-6)
+    sum(part.sum() for part in actual).backward()
     assert all(tensor.grad.isfinite().all() for tensor in inputs)
 
 
@@ -134,10 +134,10 @@ def test_an_opaque_ray_costs_the_rays_behind_it_no_digits(device, backend, form)
     inputs = rays(40, 30)
     inputs[0][::2] = 1e30
     exact = slow(*inputs)
-    given = inputs if form == "dense" else tuple(tensor.flatten(0, 1) for tensor in inputs)
+    arguments = inputs if form == "dense" else tuple(tensor.flatten(0, 1) for tensor in inputs)
     ray_offsets = None if form == "dense" else offsets_of([30] * 40, device)
-    found = composite(*(tensor.to(device) for tensor in given), ray_offsets=ray_offsets, backend=backend)
-    torch.testing.assert_close(found.weights.reshape(40, 30).double().cpu(), exact.weights, rtol=0, atol=1e-6)
+    actual = composite(*(tensor.to(device) for tensor in arguments), ray_offsets=ray_offsets, backend=backend)
+    torch.testing.assert_close(actual.weights.reshape(40, 30).double().cpu(), exact.weights, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
@@ -147,18 +147,20 @@ def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend, form, wh
     spoiled = tuple(tensor.clone() for tensor in clean)
     spoiled[0][2, 3] = spoiled[3][2, 3] = 1
     spoiled[where][2, 3] = NAN
-    found = []
+    results = []
     for inputs in (clean, spoiled):
         leaves = [tensor.to(device).requires_grad_() for tensor in inputs]
-        given = leaves if form == "dense" else [tensor.flatten(0, 1) for tensor in leaves]
+        arguments = leaves if form == "dense" else [tensor.flatten(0, 1) for tensor in leaves]
         ray_offsets = None if form == "dense" else offsets_of([6] * 5, device)
-        result = composite(*given, ray_offsets=ray_offsets, background=torch.ones(3, device=device), backend=backend)
+        result = composite(
+            *arguments, ray_offsets=ray_offsets, background=torch.ones(3, device=device), backend=backend
+        )
         sum(part.sum() for part in result).backward()
         parts = [part.detach().reshape(5, -1) for part in result] + [leaf.grad.reshape(5, -1) for leaf in leaves]
-        found.append(torch.cat(parts, dim=1).cpu())
+        results.append(torch.cat(parts, dim=1).cpu())
     others = [0, 1, 3, 4]
-    torch.testing.assert_close(found[1][others], found[0][others], rtol=1e-5, atol=1e-6)
-    assert found[1][2].isnan().any()
+    torch.testing.assert_close(results[1][others], results[0][others], rtol=1e-5, atol=1e-6)
+    assert results[1][2].isnan().any()
 
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
@@ -173,15 +175,15 @@ def test_a_spoiled_density_spoils_the_weights_from_there_on(device, backend, for
 
 @pytest.mark.parametrize("background", ["ray", "all", ""])
 def test_gradients_in_front_of_any_background(backend, background):
-    for given in (dense(4, 33, 3, background), scene([3, 0, 130, 1], 2, background, outside=(2, 5))):
-        exact, plain = (evaluate(given, dtype, "reference") for dtype in (torch.float64, torch.float32))
-        for found, same, right in zip(evaluate(given, torch.float32, backend), plain, exact):
-            assert_as_exact(found, same, right)
+    for arguments in (dense(4, 33, 3, background), scene([3, 0, 130, 1], 2, background, outside=(2, 5))):
+        exact, plain = (evaluate(arguments, dtype, "reference") for dtype in (torch.float64, torch.float32))
+        for actual, same, right in zip(evaluate(arguments, torch.float32, backend), plain, exact):
+            assert_as_exact(actual, same, right)
 
 
 @pytest.mark.parametrize("parts", [("colour",), ("opacity",), ("depth",), ("weights",), ("depth", "weights")])
 def test_gradients_of_some_outputs(backend, parts):
-    for given in (dense(4, 21), dense(4, 21, 2, "all"), scene([4, 0, 9])):
-        exact = evaluate(given, torch.float64, "reference", parts)
-        for found, right in zip(evaluate(given, torch.float32, backend, parts), exact):
-            torch.testing.assert_close(found.double(), right, rtol=1e-5, atol=1e-5)
+    for arguments in (dense(4, 21), dense(4, 21, 2, "all"), scene([4, 0, 9])):
+        exact = evaluate(arguments, torch.float64, "reference", parts)
+        for actual, right in zip(evaluate(arguments, torch.float32, backend, parts), exact):
+            torch.testing.assert_close(actual.double(), right, rtol=1e-5, atol=1e-5)

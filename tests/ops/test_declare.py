@@ -1,4 +1,4 @@
-"""What follows from the signature of an op."""
+"""The parts of an op that follow from its signature: function, docstring, memory and checks."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from voronerf.ops._core.declare import Shaped, declared
 
 def test_the_public_function_has_the_signature_and_the_docstring():
     assert list(inspect.signature(cell_sort).parameters) == ["cells", "k", "backend"]
-    assert cell_sort.__module__ == "voronerf.ops.cell_sort" and cell_sort.__doc__.startswith("Stable order")
+    assert cell_sort.__module__ == "voronerf.ops.cell_sort" and cell_sort.__doc__.startswith("Returns the stable order")
     assert "    cells: int32 [n], values 0 to k - 1" in cell_sort.__doc__
     assert '\n        backend: "auto", "reference", "native" or "warp".\n\n    Returns:' in cell_sort.__doc__
-    assert "    background: same [c] or [r, c] or None, added with" in composite.__doc__
+    assert "    background: same [c] or [r, c] or None, a colour added with" in composite.__doc__
     with pytest.raises(TypeError, match=r"cell_sort\(\) missing 1 required positional argument: 'k'"):
         cell_sort(torch.zeros(1, dtype=torch.int32))
 
@@ -33,12 +33,12 @@ def test_memory_follows_letters_arguments_and_dtypes():
 def test_letters_of_either_form():
     op = declared("composite")
     dense, packed = torch.zeros(2, 7), torch.zeros(14)
-    given = op.Inputs(dense, torch.zeros(2, 7, 3), dense, dense, None, None)
-    assert (given.r, given.s, given.c) == (2, 7, 3)
+    arguments = op.Inputs(dense, torch.zeros(2, 7, 3), dense, dense, None, None)
+    assert (arguments.r, arguments.s, arguments.c) == (2, 7, 3)
     offsets = torch.tensor([0, 4, 9, 14], dtype=torch.int32)
-    given = op.Inputs(packed, torch.zeros(14, 3), packed, packed, offsets, torch.zeros(3))
-    assert (given.r, given.m, given.c, given.s) == (3, 14, 3, 0)
-    assert composite(*given[:4], ray_offsets=offsets, background=torch.zeros(3)).colour.shape == (3, 3)
+    arguments = op.Inputs(packed, torch.zeros(14, 3), packed, packed, offsets, torch.zeros(3))
+    assert (arguments.r, arguments.m, arguments.c, arguments.s) == (3, 14, 3, 0)
+    assert composite(*arguments[:4], ray_offsets=offsets, background=torch.zeros(3)).colour.shape == (3, 3)
 
 
 def test_a_struct_with_other_members_is_refused_at_once():
@@ -49,7 +49,7 @@ def test_a_struct_with_other_members_is_refused_at_once():
     ):
         op.inputs(kind)
     cells = torch.zeros(5, dtype=torch.int32)
-    assert op.inputs(kind, threads=lambda given: 2 * given.k)(op.Inputs(cells, 3)) == (cells, 5, 6)
+    assert op.inputs(kind, threads=lambda arguments: 2 * arguments.k)(op.Inputs(cells, 3)) == (cells, 5, 6)
 
 
 def test_what_is_no_shape_is_refused():

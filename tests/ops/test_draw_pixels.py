@@ -1,4 +1,4 @@
-"""Which pixels a batch is drawn from."""
+"""The pixels that a batch is drawn from."""
 
 import pytest
 import torch
@@ -43,9 +43,9 @@ def test_native_draws_are_those_of_the_reference(name, count):
         torch.set_num_threads(threads)
         for several in (None, 0, count // 3, count):
             known = None if several is None else Known(torch.arange(70, 80), torch.rand(10), several)
-            given = SEED, count, below, runs, known
-            for found, expected in zip(drawn(*given), draw_pixels(*given), strict=True):
-                assert torch.equal(found, expected)
+            arguments = SEED, count, below, runs, known
+            for actual, expected in zip(drawn(*arguments), draw_pixels(*arguments), strict=True):
+                assert torch.equal(actual, expected)
     torch.set_num_threads(before)
 
 

@@ -25,7 +25,7 @@ def test_points_are_everywhere_and_axes_independent(device, backend):
 
 def test_seeds_and_threads():
     need("draw_points", "native", torch.device("cpu"), torch.int32)
-    seeds = [torch.tensor([each], dtype=torch.int32) for each in (3, 4, 3)]
+    seeds = [torch.tensor([seed], dtype=torch.int32) for seed in (3, 4, 3)]
     one, two, three = (draw_points(seed, 5000, BOX, backend="native") for seed in seeds)
     assert torch.equal(one, three) and not torch.equal(one, two)
     on_any_number_of_threads(lambda: draw_points(seeds[0], 5000, BOX, backend="native"))

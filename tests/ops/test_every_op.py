@@ -1,8 +1,8 @@
-"""What holds for every op: it compiles whole for any size, takes any strides and sizes, refuses what it must, and its
-custom ops are registered well.
+"""Rules for every op: it compiles whole for any size, takes any strides and sizes, refuses wrong arguments, and its
+custom ops pass opcheck.
 
-A row is a kind of an op's case (``voronerf/ops/<op>/case.py``). What is particular to an op, such as its formula, is in
-its own file.
+Each kind of an op's case (``voronerf/ops/<op>/case.py``) is a test. Rules of a single op, such as its formula, are in
+the test file of that op.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ RUNS = [
 ]
 NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "routed_program", "adam", "average")
 NETWORKS += ("hash_encode",)
-"""Ops whose arguments tell how many tensors there are, and of which shapes."""
+"""The ops whose arguments determine the number of tensors and their shapes."""
 SINGLE = ("balance_centres", "cell_sort", "march_rays", "pixel_rays")
-"""Ops without floating-point numbers, or with those of one size alone."""
+"""The ops without floating-point tensors, or with a single floating-point dtype."""
 
 
 def rows(runs):
-    """A test of a name, a backend and a device."""
+    """Returns a parametrization by name, backend and device."""
     ids = ["-".join(getattr(run, "values", run)) for run in runs]
     return pytest.mark.parametrize(("name", "backend", "device"), runs, indirect=["device"], ids=ids)
 
 
 every_op = rows(RUNS)
-# Each op compiles in its first kind; opcheck traces the custom ops of the others.
+# Each op is compiled for its first kind only; opcheck traces the custom ops of the other kinds.
 first_kinds = rows(
     [
         run if run[1] == "native" else pytest.param(*run, marks=pytest.mark.slow)
@@ -69,7 +69,7 @@ native_op = pytest.mark.parametrize("name", list(natively))
 
 
 def prepare(name, backend, device, dtype=torch.float32):
-    """The op as a function of its tensors, and a maker of those by their number."""
+    """Returns the op as a function of its tensors, and a function that makes these tensors with n rows."""
     op, _, kind = name.partition(", ")
     case = CASES[op]
     need(op, backend, device, torch.int32 if op == "cell_sort" else torch.float32)
@@ -79,12 +79,12 @@ def prepare(name, backend, device, dtype=torch.float32):
         return tensor.to(device).detach().requires_grad_(tensor.is_floating_point())
 
     def make(n):
-        given = tree_map_only(Tensor, ready, case.make(Draw(n, dtype=dtype, **case.kinds[kind]), n))
-        rest.update({name: value for name, value in given.items() if not holds_tensors(value)})
-        return {name: value for name, value in given.items() if holds_tensors(value)}
+        arguments = tree_map_only(Tensor, ready, case.make(Draw(n, dtype=dtype, **case.kinds[kind]), n))
+        rest.update({name: value for name, value in arguments.items() if not holds_tensors(value)})
+        return {name: value for name, value in arguments.items() if holds_tensors(value)}
 
-    def run(given, backend=backend):
-        return getattr(ops, case.call or op)(**given, **rest, backend=backend)
+    def run(arguments, backend=backend):
+        return getattr(ops, case.call or op)(**arguments, **rest, backend=backend)
 
     return run, make
 
@@ -93,19 +93,19 @@ def holds_tensors(value):
     return any(isinstance(leaf, Tensor) for leaf in tree_leaves(value))
 
 
-def results(run, given):
-    """What an op gives, and the gradients of its outputs if it has any."""
-    found = [part for part in tree_leaves(run(given)) if isinstance(part, Tensor)]
-    leaves = [leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.requires_grad]
-    smooth = [part for part in found if part.requires_grad]
+def results(run, arguments):
+    """Returns the outputs of an op, and the gradients of their squares if some outputs are differentiable."""
+    tensors = [part for part in tree_leaves(run(arguments)) if isinstance(part, Tensor)]
+    leaves = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.requires_grad]
+    smooth = [part for part in tensors if part.requires_grad]
     if smooth:
         total = sum(part.square().sum() for part in smooth)
-        found += torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
-    return found
+        tensors += torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+    return tensors
 
 
-def assert_close(found, expected):
-    for part, other in zip(found, expected, strict=True):
+def assert_close(actual, expected):
+    for part, other in zip(actual, expected, strict=True):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5)
 
 
@@ -114,57 +114,57 @@ def assert_close(found, expected):
 def test_compiles_for_any_size(device, backend, name):
     torch.compiler.reset()
     run, tensors = prepare(name, backend, device)
-    # The reference consists of torch's own operations, whose gradients are torch's to trace.
+    # The reference consists of torch's own operations, whose gradients torch traces itself.
     backend = "eager" if backend == "reference" else "aot_eager"
     compiled = torch.compile(run, fullgraph=True, dynamic=True, backend=backend)  # one graph for any size
     for n in (9, 14):
-        given = tensors(n)
-        assert_close(results(compiled, given), results(run, given))
+        arguments = tensors(n)
+        assert_close(results(compiled, arguments), results(run, arguments))
 
 
 def columns(tensor):
-    """The same values, column by column in memory where there are any."""
+    """Returns the same values in column-major order, if the tensor has columns."""
     return tensor.mT.contiguous().mT if tensor.dim() > 1 else tensor
 
 
 def negated(tensor):
-    """The same values in a view with the negative bit, as ``.conj().imag`` gives; memory holds them negated."""
+    """Returns the same values as a view with the negative bit, like ``.conj().imag``; memory holds them negated."""
     return torch._neg_view(-tensor) if tensor.is_floating_point() else tensor
 
 
 @every_op
 def test_any_view(device, backend, name):
-    """Values count, and not how memory holds them."""
+    """Results depend on the values of the arguments, not on their memory layout."""
     run, tensors = prepare(name, backend, device)
-    given = tensors(33)
-    expected = results(run, given)
+    arguments = tensors(33)
+    expected = results(run, arguments)
     for form in (strided, columns, negated):
         spread = lambda tensor, form=form: form(tensor.detach()).requires_grad_(tensor.requires_grad)  # noqa: E731
-        assert_close(results(run, tree_map_only(Tensor, spread, given)), expected)
+        assert_close(results(run, tree_map_only(Tensor, spread, arguments)), expected)
 
 
 @every_op
 def test_any_size_gives_what_the_reference_gives(device, backend, name):
-    """Both kinds of rounding are allowed for: tests of each op compare with float64."""
+    """The tolerance allows for the rounding of both backends; the tests of each op compare with float64."""
     if backend == "reference":
         pytest.skip("is what the others are compared with")
     run, tensors = prepare(name, backend, device)
     for n in (0, 1, 2, 15, 16, 17, 33, 257):
-        given = tensors(n)
-        expected = results(functools.partial(run, backend="reference"), given)
-        assert_close(results(run, given), expected)
+        arguments = tensors(n)
+        expected = results(functools.partial(run, backend="reference"), arguments)
+        assert_close(results(run, arguments), expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64], ids=str)
 @rows([run for run in RUNS if run[1] != "reference" and run[0].partition(",")[0] not in SINGLE])
 def test_dtypes(device, backend, name, dtype):
-    """Values and gradients have the dtypes of the reference's, and are as close to those of float64."""
+    """Values and gradients have the dtypes of the reference, and are as close to the float64 results."""
     need(name.partition(", ")[0], backend, device, dtype)
     run, tensors = prepare(name, backend, device, dtype)
-    given = tensors(65)
-    wide = tree_map_only(Tensor, lambda tensor: tensor.double() if tensor.is_floating_point() else tensor, given)
-    plain, exact = (results(functools.partial(run, backend="reference"), inputs) for inputs in (given, wide))
-    for part, same, right in zip(results(run, given), plain, exact, strict=True):
+    arguments = tensors(65)
+    wide = tree_map_only(Tensor, lambda tensor: tensor.double() if tensor.is_floating_point() else tensor, arguments)
+    plain, exact = (results(functools.partial(run, backend="reference"), inputs) for inputs in (arguments, wide))
+    for part, same, right in zip(results(run, arguments), plain, exact, strict=True):
         assert_as_exact(part, same, right) if same.is_floating_point() else torch.testing.assert_close(part, right)
 
 
@@ -172,18 +172,18 @@ def test_dtypes(device, backend, name, dtype):
     "name", dict.fromkeys(run[0] for run in RUNS if CASES[run[0].partition(",")[0]].differentiable)
 )
 def test_gradcheck(name):
-    """Both derivatives of the reference in float64, along random directions."""
+    """Both derivatives of the reference pass gradcheck in float64, along random directions."""
     run, tensors = prepare(name, "reference", torch.device("cpu"), torch.float64)
     wide = lambda tensor: tensor.detach().double().requires_grad_() if tensor.is_floating_point() else tensor  # noqa: E731
-    given = tree_map_only(Tensor, wide, tensors(3))
-    leaves = [leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.requires_grad]
+    arguments = tree_map_only(Tensor, wide, tensors(3))
+    leaves = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.requires_grad]
     if name.partition(",")[0] == "render_loss":
-        leaves = [given["raw"]]
+        leaves = [arguments["raw"]]
 
     def call(*values):
         new = dict(zip(map(id, leaves), values))
-        found = run(tree_map_only(Tensor, lambda tensor: new.get(id(tensor), tensor), given))
-        return tuple(part for part in tree_leaves(found) if isinstance(part, Tensor) and part.requires_grad)
+        result = run(tree_map_only(Tensor, lambda tensor: new.get(id(tensor), tensor), arguments))
+        return tuple(part for part in tree_leaves(result) if isinstance(part, Tensor) and part.requires_grad)
 
     assert torch.autograd.gradcheck(call, leaves, fast_mode=True)
     assert torch.autograd.gradgradcheck(call, leaves, fast_mode=True)
@@ -191,29 +191,29 @@ def test_gradcheck(name):
 
 @rows([run for run in RUNS if run[0] in ("composite", "grouped_linear", "grouped_mlp", "routed_mlp")])
 def test_autocast(device, backend, name):
-    """Networks run in bfloat16, sums of rays in float32; gradients have the dtypes of what they are of."""
+    """Networks run in bfloat16, sums over rays in float32; each gradient has the dtype of its tensor."""
     run, tensors = prepare(name, backend, device)
-    given = tensors(33)
+    arguments = tensors(33)
     with torch.autocast(device.type, torch.bfloat16):
-        found = results(run, given)
-    expected = results(run, given)
-    assert found[0].dtype == (torch.float32 if name == "composite" else torch.bfloat16)
-    assert all(part.dtype == other.dtype for part, other in zip(found[-2:], expected[-2:]))
+        actual = results(run, arguments)
+    expected = results(run, arguments)
+    assert actual[0].dtype == (torch.float32 if name == "composite" else torch.bfloat16)
+    assert all(part.dtype == other.dtype for part, other in zip(actual[-2:], expected[-2:]))
     torch.testing.assert_close(
-        found[0].float(), expected[0], **({} if name == "composite" else {"rtol": 0.1, "atol": 0.1})
+        actual[0].float(), expected[0], **({} if name == "composite" else {"rtol": 0.1, "atol": 0.1})
     )
 
 
 @smooth_op
 def test_only_the_gradients_asked_for(device, backend, name):
-    """Each alone is what it is among all, also of a gradient that arrives expanded."""
+    """A gradient computed alone equals the same gradient among all, also for an expanded incoming gradient."""
     run, tensors = prepare(name, backend, device)
-    given = tensors(33)
-    leaves = [leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.requires_grad]
+    arguments = tensors(33)
+    leaves = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.requires_grad]
     options = {"allow_unused": True, "materialize_grads": True}
 
     def outputs():
-        return [part for part in tree_leaves(run(given)) if isinstance(part, Tensor) and part.requires_grad]
+        return [part for part in tree_leaves(run(arguments)) if isinstance(part, Tensor) and part.requires_grad]
 
     smooth = outputs()
     full = torch.autograd.grad(smooth, leaves, [torch.ones_like(part) for part in smooth], **options)
@@ -222,8 +222,8 @@ def test_only_the_gradients_asked_for(device, backend, name):
             leaf.requires_grad_(leaf is chosen)
         smooth = outputs()
         if smooth:
-            found = torch.autograd.grad([part.sum() for part in smooth], chosen, **options)
-            assert_close(found, [expected])
+            actual = torch.autograd.grad([part.sum() for part in smooth], chosen, **options)
+            assert_close(actual, [expected])
         else:
             assert not expected.any()
     for leaf in leaves:
@@ -236,44 +236,44 @@ def test_only_the_gradients_asked_for(device, backend, name):
 @native_op
 def test_same_bits_for_any_number_of_threads(isa, name):
     run, tensors = prepare(name, "native", torch.device("cpu"))
-    given = tensors(3000)
-    on_any_number_of_threads(lambda: [part.nan_to_num(7) for part in results(run, given)])
+    arguments = tensors(3000)
+    on_any_number_of_threads(lambda: [part.nan_to_num(7) for part in results(run, arguments)])
 
 
 @pytest.mark.native
 @native_op
 def test_every_output_is_written(request, name):
-    """Memory comes with what it held, which must not show, and between guards that must survive."""
+    """No output shows the old contents of its memory, and the guards around the memory survive."""
     run, tensors = prepare(name, "native", torch.device("cpu"))
     wanted = [results(run, tensors(n)) for n in (0, 1, 33, 70)]
     guards = request.getfixturevalue("poisoned")
     for n, expected in zip((0, 1, 33, 70), wanted):
-        for found, right in zip(results(run, tensors(n)), expected, strict=True):
-            torch.testing.assert_close(found, right, rtol=0, atol=0, equal_nan=True)
+        for actual, right in zip(results(run, tensors(n)), expected, strict=True):
+            torch.testing.assert_close(actual, right, rtol=0, atol=0, equal_nan=True)
     assert len(guards) >= 8
 
 
 OF_NETWORKS = ("adam", "average", "forward_with_tape", "render_opaque")
-"""Ops whose arguments no custom op could have, lists of rules and networks."""
+"""The ops that cannot be custom ops, since their arguments are lists of rules and networks."""
 
 
 @pytest.mark.parametrize(
     "name", [op for op, case in CASES.items() if (case.in_place or not case.traced) and op not in OF_NETWORKS]
 )
 def test_what_only_steps_call_compiles(name):
-    """As a custom op, which says what it writes into."""
+    """The op compiles as a custom op that declares its mutated arguments."""
     torch.compiler.reset()
     case = CASES[name]
 
-    def run(given):
-        found = getattr(ops, case.call or name)(**given, backend="native")
-        return found, {key: value for key, value in given.items() if isinstance(value, Tensor)}
+    def run(arguments):
+        actual = getattr(ops, case.call or name)(**arguments, backend="native")
+        return actual, {key: value for key, value in arguments.items() if isinstance(value, Tensor)}
 
     kind = [*case.kinds.values()][-1]
-    expected, found, again = (case.make(Draw(**kind), 6) for _ in range(3))
+    expected, actual, again = (case.make(Draw(**kind), 6) for _ in range(3))
     with torch._dynamo.config.patch(capture_dynamic_output_shape_ops=True):
-        found = torch.compile(run, fullgraph=True, backend="aot_eager")(found)
-    torch.testing.assert_close(found, run(expected), equal_nan=True)
+        actual = torch.compile(run, fullgraph=True, backend="aot_eager")(actual)
+    torch.testing.assert_close(actual, run(expected), equal_nan=True)
     with Calls() as calls:
         run(again)
     (called,) = calls.found.values()
@@ -281,7 +281,7 @@ def test_what_only_steps_call_compiles(name):
 
 
 class Calls(TorchFunctionMode):
-    """Notes the custom ops of the library that are called, and once for each kind of arguments what with."""
+    """A mode that collects the called custom ops of the library, with one call for each kind of arguments."""
 
     def __init__(self):
         super().__init__()
@@ -289,7 +289,7 @@ class Calls(TorchFunctionMode):
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         if isinstance(function, torch._ops.OpOverload) and function.namespace == "voronerf":
-            # An op that is called where nothing is recorded need not be differentiable.
+            # A custom op that is called without recorded gradients need not be differentiable.
             held = args if torch.is_grad_enabled() else tree_map_only(Tensor, Tensor.detach, args)
             kinds = [leaf.requires_grad if isinstance(leaf, Tensor) else leaf is None for leaf in tree_leaves(held)]
             self.found[function, str(kinds)] = (function, held)
@@ -298,22 +298,22 @@ class Calls(TorchFunctionMode):
 
 @every_op
 def test_custom_ops_pass_opcheck(device, backend, name):
-    """Those that its values call, its gradients, and its second derivatives."""
+    """The custom ops of the values, of the gradients and of the second derivatives pass opcheck."""
     if backend == "reference":
         pytest.skip("has none")
     run, tensors = prepare(name, backend, device)
-    given = tensors(6)
-    leaves = [leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.requires_grad]
+    arguments = tensors(6)
+    leaves = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.requires_grad]
     with Calls() as calls:
-        results(run, given)
-        for power in (1, 2):  # in a plain sum the gradients that arrive are constant
-            smooth = [part for part in tree_leaves(run(given)) if isinstance(part, Tensor) and part.requires_grad]
+        results(run, arguments)
+        for power in (1, 2):  # with power 1 the incoming gradients are constant
+            smooth = [part for part in tree_leaves(run(arguments)) if isinstance(part, Tensor) and part.requires_grad]
             if smooth:
                 total = sum(part.pow(power).sum() for part in smooth)
                 options = {"create_graph": True, "allow_unused": True, "materialize_grads": True}
                 bent = [first for first in torch.autograd.grad(total, leaves, **options) if first.requires_grad]
                 torch.autograd.backward([first.square().sum() for first in bent])
-    assert calls.found or (backend == "warp" and name.startswith("grouped_program"))  # which are no chains
+    assert calls.found or (backend == "warp" and name.startswith("grouped_program"))  # programs that are no chains
     for function, args in calls.found.values():
         torch.library.opcheck(function, args)
 
@@ -321,12 +321,12 @@ def test_custom_ops_pass_opcheck(device, backend, name):
 @pytest.mark.parametrize(("op", "message"), [(op, message) for op, case in CASES.items() for message in case.refused])
 def test_refuses(op, message):
     case = CASES[op]
-    name, given = case.call or op, case.make(Draw(), 6)
-    getattr(ops, name)(**given)
+    name, arguments = case.call or op, case.make(Draw(), 6)
+    getattr(ops, name)(**arguments)
     kinds = "an integer|an MLP|OwnSamples|True|a (number|tensor|list|function|HashGrid)"
     of_types = re.search(f"dtype|must be ({kinds})", message)
     with refused(TypeError if of_types else ValueError, f"{name}: {message}"):
-        getattr(ops, name)(**{**given, **case.refused[message]})
+        getattr(ops, name)(**{**arguments, **case.refused[message]})
 
 
 @pytest.mark.parametrize("backend", ["reference", "native"])
@@ -334,23 +334,23 @@ def test_refuses(op, message):
 def test_refuses_offsets_that_are_no_offsets(op, backend):
     case = CASES[op]
     for kind in case.kinds.values() if backend in backends.implemented(op) else ():
-        given = case.make(Draw(**kind), 6)
-        for name in given.keys() & {"offsets", "ray_offsets"}:
-            last = len(given[name]) - 1
-            for place, wrong in ((0, -1), (last // 2, int(given[name][-1]) + 1), (last, 1000)):
-                bad = given[name].clone()
+        arguments = case.make(Draw(**kind), 6)
+        for name in arguments.keys() & {"offsets", "ray_offsets"}:
+            last = len(arguments[name]) - 1
+            for place, wrong in ((0, -1), (last // 2, int(arguments[name][-1]) + 1), (last, 1000)):
+                bad = arguments[name].clone()
                 bad[place] = wrong
                 with pytest.raises(ValueError, match=rf"^\S+: {name} must rise[ ,].* number of .*, got "):
-                    getattr(ops, case.call or op)(**{**given, name: bad}, backend=backend)
+                    getattr(ops, case.call or op)(**{**arguments, name: bad}, backend=backend)
 
 
-def shapes_of(name, call, given):
-    """The shapes that a call checks, by the names of its tensors, and how often it speaks of each letter."""
+def shapes_of(name, call, arguments):
+    """Returns the shapes that a call checks, by tensor name, and how often the shapes mention each letter."""
     shapes, letters = {}, Counter()
 
     def tensor(self, key, value, dtypes, *shape):
         if self.op == name:
-            letters.update(self.sizes.keys() - known)  # a size that is no tensor's, such as a number of samples
+            letters.update(self.sizes.keys() - known)  # a size of no tensor, such as a number of samples
         whole(self, key, value, dtypes, *shape)
         if self.op == name:
             shapes[key] = [str(entry).removesuffix("+1") for entry in shape]
@@ -359,13 +359,13 @@ def shapes_of(name, call, given):
 
     known, whole = set(), checks.Checked.tensor
     with mock.patch.object(checks.Checked, "tensor", tensor), in_python(name):
-        call(**given)
+        call(**arguments)
     return shapes, letters
 
 
 @contextlib.contextmanager
 def in_python(name):
-    """The arguments of an op are checked in Python, not in the compiled module."""
+    """Makes the op check its arguments in Python, not in the compiled module."""
     if name in NETWORKS:
         yield
         return
@@ -376,7 +376,7 @@ def in_python(name):
 @pytest.mark.native
 @pytest.mark.parametrize("op", [op for op in CASES if op not in NETWORKS])
 def test_the_compiled_module_checks_what_python_checks(op):
-    """It takes all valid arguments; what it does not take Python refuses, in `test_refuses_tensors_that_do_not_fit`."""
+    """The compiled module accepts all valid arguments; `test_refuses_tensors_that_do_not_fit` covers the others."""
     case = CASES[op]
     call, name = getattr(ops, case.call or op), case.call or op
     for kind in case.kinds.values():
@@ -386,27 +386,27 @@ def test_the_compiled_module_checks_what_python_checks(op):
 
 @pytest.mark.parametrize("op", CASES)
 def test_refuses_tensors_that_do_not_fit(op):
-    """Anything but a tensor, other numbers of rows and columns, dtypes and devices, by the name of the argument."""
+    """An argument of another type, shape, dtype or device is refused by its name."""
     case = CASES[op]
     call, name = getattr(ops, case.call or op), case.call or op
     for kind in case.kinds.values():
-        given = case.make(Draw(**kind), 6)
-        tensors = {key: value for key, value in given.items() if isinstance(value, Tensor)}
-        shapes, letters = shapes_of(name, call, given)
+        arguments = case.make(Draw(**kind), 6)
+        tensors = {key: value for key, value in arguments.items() if isinstance(value, Tensor)}
+        shapes, letters = shapes_of(name, call, arguments)
         assert op in NETWORKS or tensors.keys() <= shapes.keys()
         for key, tensor in tensors.items():
             with pytest.raises(TypeError, match=rf"^{name}: {key} must be a tensor, got str$"):
-                call(**{**given, key: "x"})
+                call(**{**arguments, key: "x"})
             other = tensor.long() if tensor.dtype == torch.int32 else tensor.to(torch.int8)
             with pytest.raises(TypeError, match=rf"^{name}: \S+ must have (the )?dtype .*, got "):
-                call(**{**given, key: other})
+                call(**{**arguments, key: other})
             wrong = [tensor[None]]
             for place, entry in enumerate(shapes.get(key, [])):
                 if entry.isdigit() or letters[entry] > 1:
                     wrong.append(tensor.narrow(place, 0, tensor.shape[place] - 1))
             for part in wrong:
                 with pytest.raises(ValueError, match=rf"^{name}: \S+ must have shape \[.*, got "):
-                    call(**{**given, key: part})
+                    call(**{**arguments, key: part})
             if len(tensors) > 1:
                 with pytest.raises(ValueError, match=rf"^{name}: \S+ must (be on the device of|have values)"):
-                    call(**{**given, key: tensor.to("meta")})
+                    call(**{**arguments, key: tensor.to("meta")})

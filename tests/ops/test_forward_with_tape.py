@@ -24,7 +24,7 @@ TABLE = MLP(
 
 
 def network(device, n=40, k=3):
-    """Of k cells, with a table that they share and directions for each of seven rays."""
+    """Returns the arguments of a network of k cells that share a table, with directions for each of seven rays."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):
@@ -44,108 +44,108 @@ def network(device, n=40, k=3):
     }
 
 
-def as_program(given):
-    """The same network, in the form of a program."""
+def as_program(arguments):
+    """Returns the arguments of the same network as a program."""
     names = ("weights", "biases", "layers", "positions", "directions", "direction_index", "features")
-    places = {name: value for name, value in given.items() if name not in names}
+    places = {name: value for name, value in arguments.items() if name not in names}
     return {
         "program": TABLE.program(3, 2, None, (True, False), ray=True),
-        "inputs": [given["positions"], given["directions"]],
-        "parameters": parameters_of(given),
-        "ray_index": given["direction_index"],
+        "inputs": [arguments["positions"], arguments["directions"]],
+        "parameters": parameters_of(arguments),
+        "ray_index": arguments["direction_index"],
         **places,
     }
 
 
-def parameters_of(given):
-    return [*given["weights"], given["biases"][0], given["features"]]
+def parameters_of(arguments):
+    return [*arguments["weights"], arguments["biases"][0], arguments["features"]]
 
 
 def squares(out):
-    """With gradients that differ from row to row."""
+    """Returns a loss and its gradient, which differs from row to row."""
     factor = torch.linspace(0.5, 2, max(len(out), 1), device=out.device)[: len(out), None]
     return (factor * out.square()).sum(), 2 * factor * out
 
 
-def learn(given, *, backward=False, backend="auto"):
-    """The loss, with gradients."""
-    tape = forward_with_tape(as_program(given), backend=backend)
+def learn(arguments, *, backward=False, backend="auto"):
+    """Returns the loss; ``backward`` adds its gradients at once instead of deferring them."""
+    tape = forward_with_tape(as_program(arguments), backend=backend)
     assert not tape.raw.requires_grad
     return tape.backward(*squares(tape.raw), defer=not backward)
 
 
-def composed(given):
-    """The same loss, differentiated by torch."""
-    out, _ = routed_mlp(**given, backend="reference")
+def composed(arguments):
+    """Returns the same loss, differentiated by torch."""
+    out, _ = routed_mlp(**arguments, backend="reference")
     return squares(out)[0]
 
 
 @pytest.mark.parametrize(("n", "k"), [(0, 3), (1, 1), (40, 1), (40, 3)])
 @pytest.mark.parametrize("backward", [False, True])
 def test_equals_its_parts(device, backend, n, k, backward):
-    given, expected = network(device, n, k), network(device, n, k)
-    loss = learn(given, backward=backward, backend=backend)
+    arguments, expected = network(device, n, k), network(device, n, k)
+    loss = learn(arguments, backward=backward, backend=backend)
     wanted = composed(expected)
     assert loss.requires_grad != backward
     if not backward:
         (3 * loss).backward()
     wanted.backward()
     torch.testing.assert_close(loss.detach(), wanted.detach(), rtol=1e-4, atol=1e-5)
-    for found, other in zip(parameters_of(given), parameters_of(expected), strict=True):
+    for actual, other in zip(parameters_of(arguments), parameters_of(expected), strict=True):
         factor = 1 if backward else 3
-        torch.testing.assert_close(found.grad, factor * other.grad, rtol=1e-4, atol=1e-4)
-    assert given["positions"].grad is None and given["directions"].grad is None
+        torch.testing.assert_close(actual.grad, factor * other.grad, rtol=1e-4, atol=1e-4)
+    assert arguments["positions"].grad is None and arguments["directions"].grad is None
 
 
-def assert_same(found, expected):
-    """Bits, but for the table of a hash grid on a GPU: its sums have any order there."""
-    for place, (one, other) in enumerate(zip(found, expected, strict=True)):
-        if one.is_cuda and place == len(found) - 1:
+def assert_same(actual, expected):
+    """Compares bit for bit, except the table of a hash grid on a GPU, whose sums have any order."""
+    for place, (one, other) in enumerate(zip(actual, expected, strict=True)):
+        if one.is_cuda and place == len(actual) - 1:
             torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-4)
         else:
             assert torch.equal(one, other)
 
 
 def test_gradients_at_once_are_those_of_backward_bit_for_bit(device, backend):
-    """They are added to those that are there, as autograd does it."""
-    given, expected = network(device), network(device)
+    """The gradients are added to existing gradients, as in autograd."""
+    arguments, expected = network(device), network(device)
     for _ in range(2):
-        learn(given, backward=True, backend=backend)
+        learn(arguments, backward=True, backend=backend)
         learn(expected, backend=backend).backward()
-    assert_same(*([p.grad for p in parameters_of(each)] for each in (given, expected)))
+    assert_same(*([p.grad for p in parameters_of(call)] for call in (arguments, expected)))
 
 
 def test_only_what_needs_gradients_gets_them(device, backend):
     for frozen in ((0,), (0, 1, 2), (3,), (0, 1, 2, 3)):
-        given = network(device)
-        parameters = parameters_of(given)
+        arguments = network(device)
+        parameters = parameters_of(arguments)
         for number in frozen:
             parameters[number].requires_grad_(False)
         if len(frozen) < 4:
-            learn(given, backward=True, backend=backend)
+            learn(arguments, backward=True, backend=backend)
         assert [p.grad is None for p in parameters] == [number in frozen or len(frozen) == 4 for number in range(4)]
 
 
 def test_gradients_reach_what_parameters_are_made_of(device, backend):
-    """A shared layer is one parameter that all cells have, expanded: autograd adds up what the cells give it."""
+    """Autograd sums the cells' gradients of a shared layer, which is one parameter expanded to all cells."""
     results = []
     for backward in (True, False):
-        given = network(device)
-        shared = given["weights"][0].detach()[0].clone().requires_grad_()
-        given["weights"][0] = shared.expand(3, -1, -1)
-        loss = learn(given, backward=backward, backend=backend)
+        arguments = network(device)
+        shared = arguments["weights"][0].detach()[0].clone().requires_grad_()
+        arguments["weights"][0] = shared.expand(3, -1, -1)
+        loss = learn(arguments, backward=backward, backend=backend)
         if not backward:
             loss.backward()
-        results.append([shared.grad, *(p.grad for p in parameters_of(given)[1:])])
+        results.append([shared.grad, *(p.grad for p in parameters_of(arguments)[1:])])
     assert_same(*results)
 
 
 def test_hooks_of_parameters_are_called(device, backend):
-    given, called = network(device), []
-    first, second = given["weights"]
+    arguments, called = network(device), []
+    first, second = arguments["weights"]
     first.register_hook(lambda gradient: called.append(gradient.shape))
     second.register_post_accumulate_grad_hook(lambda parameter: called.append(parameter.shape))
-    learn(given, backward=True, backend=backend)
+    learn(arguments, backward=True, backend=backend)
     assert sorted(called) == sorted((first.shape, second.shape))
 
 
@@ -156,64 +156,64 @@ def test_a_loss_without_gradients_to_anything(device, backend):
 
 
 def test_under_autocast(device, backend):
-    given = network(device)
+    arguments = network(device)
     with torch.autocast(torch.device(device).type, torch.bfloat16):
-        loss = learn(given, backend=backend)
+        loss = learn(arguments, backend=backend)
     loss.backward()
     torch.testing.assert_close(loss.detach(), composed(network(device)).detach(), rtol=0.05, atol=0.0)
-    assert all(parameter.grad.dtype == torch.float32 for parameter in parameters_of(given))
+    assert all(parameter.grad.dtype == torch.float32 for parameter in parameters_of(arguments))
 
 
 @pytest.mark.parametrize("k", [1, 3])
 def test_frozen_cells_and_the_rows_that_count(k, backend):
-    """Others have no gradient, and the rows behind them no outputs either."""
+    """Frozen cells have no gradient; rows beyond the row count have neither gradient nor output."""
     more = {"frozen": torch.arange(k) == 1, "rows": torch.tensor([30], dtype=torch.int32)}
-    given, expected = {**network("cpu", k=k), **more}, {**network("cpu", k=k), **more}
-    loss = learn(given, backend=backend)
+    arguments, expected = {**network("cpu", k=k), **more}, {**network("cpu", k=k), **more}
+    loss = learn(arguments, backend=backend)
     loss.backward()
     wanted = composed(expected)
     wanted.backward()
     torch.testing.assert_close(loss.detach(), wanted.detach(), rtol=1e-4, atol=1e-5)
-    for found, other in zip(parameters_of(given), parameters_of(expected), strict=True):
-        torch.testing.assert_close(found.grad, other.grad, rtol=1e-4, atol=1e-4)
+    for actual, other in zip(parameters_of(arguments), parameters_of(expected), strict=True):
+        torch.testing.assert_close(actual.grad, other.grad, rtol=1e-4, atol=1e-4)
 
 
 def test_is_once_differentiable(device, backend):
-    given = network(device)
-    loss = learn(given, backend=backend)
+    arguments = network(device)
+    loss = learn(arguments, backend=backend)
     with pytest.raises(RuntimeError):
-        gradients = torch.autograd.grad(loss, parameters_of(given), create_graph=True)
-        torch.autograd.grad(sum(gradient.square().sum() for gradient in gradients), given["weights"][0])
+        gradients = torch.autograd.grad(loss, parameters_of(arguments), create_graph=True)
+        torch.autograd.grad(sum(gradient.square().sum() for gradient in gradients), arguments["weights"][0])
 
 
 def test_refuses_a_program_that_makes_no_sense(backend):
-    given = as_program(network("cpu"))
+    arguments = as_program(network("cpu"))
     wrong = {
         "network must hold program, inputs and parameters, got no inputs": {"inputs": ...},
         "program must be a Program, got str": {"program": "x"},
         "unknown arguments layers": {"layers": TABLE},
-        "parameters must be 4 tensors (inputs at least one), got 1": {"parameters": given["parameters"][:1]},
+        "parameters must be 4 tensors (inputs at least one), got 1": {"parameters": arguments["parameters"][:1]},
         "parameters[1] must have shape [k, 3, 10] with k = 3, got [2, 3, 10]": {
-            "parameters": [given["parameters"][0], torch.ones(2, 3, 10), *given["parameters"][2:]]
+            "parameters": [arguments["parameters"][0], torch.ones(2, 3, 10), *arguments["parameters"][2:]]
         },
         "ray_index must be given for a program with inputs of rays, got None": {"ray_index": None},
         "frozen must have shape [k] with k = 3, got [2]": {"frozen": torch.zeros(2, dtype=torch.bool)},
         "program must have one output [n, w] and inputs[0] [n, w], got others": {
-            "program": replace(given["program"], outputs=2 * given["program"].outputs)
+            "program": replace(arguments["program"], outputs=2 * arguments["program"].outputs)
         },
     }
     for message, change in wrong.items():
-        network_ = {name: value for name, value in {**given, **change}.items() if value is not ...}
+        network_ = {name: value for name, value in {**arguments, **change}.items() if value is not ...}
         error = TypeError if "must be a" in message or "unknown" in message else ValueError
         with refused(error, f"forward_with_tape: {message}"):
             forward_with_tape(network_, backend=backend)
 
 
 def test_refuses_what_makes_no_sense(device, backend):
-    given = network(device)
+    arguments = network(device)
     with refused(ValueError, "forward_with_tape: network must hold program, inputs and parameters, got no program"):
-        forward_with_tape({"inputs": [given["positions"]], "parameters": []})
-    tape = forward_with_tape(as_program(given), backend=backend)
+        forward_with_tape({"inputs": [arguments["positions"]], "parameters": []})
+    tape = forward_with_tape(as_program(arguments), backend=backend)
     loss, gradient = squares(tape.raw)
     with refused(ValueError, "forward_with_tape: loss must have shape [], got [40, 3]"):
         tape.backward(gradient, gradient)
@@ -223,7 +223,7 @@ def test_refuses_what_makes_no_sense(device, backend):
         tape.backward(0.0, gradient)
     with refused(TypeError, "forward_with_tape: defer must be True or False, got int"):
         tape.backward(loss, gradient, defer=1)
-    assert all(parameter.grad is None for parameter in parameters_of(given))
+    assert all(parameter.grad is None for parameter in parameters_of(arguments))
 
 
 @pytest.mark.parametrize(
@@ -237,17 +237,17 @@ def test_refuses_what_makes_no_sense(device, backend):
     ],
 )
 def test_a_network_of_other_entries_is_refused(error, message, change, backend):
-    given = {name: value for name, value in {**as_program(network("cpu")), **change}.items() if value is not ...}
+    arguments = {name: value for name, value in {**as_program(network("cpu")), **change}.items() if value is not ...}
     with refused(error, f"forward_with_tape: {message}"):
-        forward_with_tape(given, backend=backend)
+        forward_with_tape(arguments, backend=backend)
 
 
 @pytest.mark.native
 def test_the_dtype_of_the_parameters_decides_who_runs():
-    given = as_program(network("cpu"))
-    wide = {**given, "inputs": [x.double() for x in given["inputs"]]}
-    torch.testing.assert_close(forward_with_tape(wide, backend="native").raw, forward_with_tape(given).raw)
-    exact = {**given, "parameters": [p.detach().double() for p in given["parameters"]]}
+    arguments = as_program(network("cpu"))
+    wide = {**arguments, "inputs": [x.double() for x in arguments["inputs"]]}
+    torch.testing.assert_close(forward_with_tape(wide, backend="native").raw, forward_with_tape(arguments).raw)
+    exact = {**arguments, "parameters": [p.detach().double() for p in arguments["parameters"]]}
     assert torch.equal(forward_with_tape(exact).raw, forward_with_tape(exact, backend="reference").raw)
     with pytest.raises(BackendUnavailable, match=r"forward_with_tape takes .* not float64"):
         forward_with_tape(exact, backend="native")

@@ -87,7 +87,7 @@ CASES: dict[str, tuple[Call, list[Tensor]]] = {
 
 
 def gradients(call, backend, values, device, dtype):
-    """Of a loss on values, slopes and curvatures, the latter beside a slope in which they are not linear."""
+    """Returns the gradients of a loss on values, slopes and curvatures (of a nonlinear function of the slopes)."""
     leaves = [value.to(device, dtype).requires_grad_() for value in values]
     y = call(backend, *leaves)
     weights = draw(*y.shape, seed=9).to(y)
@@ -103,14 +103,14 @@ def test_a_loss_on_second_derivatives(name, device, backend):
     need("grouped_mlp" if name == "directions" else name, backend, device, torch.float32)
     call, values = CASES[name]
     expected = gradients(call, "reference", values, torch.device("cpu"), torch.float64)
-    found = gradients(call, backend, values, device, torch.float32)
-    for a, b in zip(found, expected, strict=True):
+    actual = gradients(call, backend, values, device, torch.float32)
+    for a, b in zip(actual, expected, strict=True):
         torch.testing.assert_close(a.double().cpu(), b, rtol=2e-3, atol=2e-4 * float(b.abs().max()))
 
 
 @pytest.mark.op("grouped_mlp")
 def test_slopes_of_no_samples_by_frozen_networks(device, backend):
-    """As where a march through empty space has found nothing, and normals are trained on."""
+    """Slopes without samples occur if a march finds only empty space while normals are trained."""
     need("grouped_mlp", backend, device, torch.float32)
     x = torch.zeros(0, 3, device=device, requires_grad=True)
     weights = [draw(K, 6, 15, seed=2).to(device), draw(K, 2, 6, seed=3).to(device)]

@@ -17,14 +17,14 @@ WIDTHS = [(1, 1), (63, 64), (90, 3), (3, 90)]
 
 
 def layer(counts, i, o, dtype=torch.float32):
-    """Samples, weight and bias of one layer."""
+    """Returns the samples, the weight and the bias of one layer."""
     k = len(counts)
     tensors = torch.randn(sum(counts), i), torch.randn(k, o, i) / i**0.5, torch.randn(k, o)
     return [tensor.to(dtype) for tensor in tensors]
 
 
 def results(linear, inputs, offsets, dtype, device, g, **options):
-    """Output and gradients in a dtype, on a device."""
+    """Returns the output and its gradients in a dtype, on a device."""
     leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
     x, weight, bias = leaves
     y = linear(x, offsets.to(device), weight, bias, **options)
@@ -43,8 +43,8 @@ def test_output_and_gradients_match_a_plain_loop(device, backend, counts, activa
     cpu = torch.device("cpu")
     exact = results(loops.grouped_linear, inputs, offsets, torch.float64, cpu, g, activation=activation)
     plain = results(loops.grouped_linear, inputs, offsets, torch.float32, cpu, g, activation=activation)
-    found = results(grouped_linear, inputs, offsets, torch.float32, device, g, activation=activation, backend=backend)
-    for part, same, right in zip(found, plain, exact):
+    actual = results(grouped_linear, inputs, offsets, torch.float32, device, g, activation=activation, backend=backend)
+    for part, same, right in zip(actual, plain, exact):
         assert_as_exact(part, same, right)
 
 
@@ -57,8 +57,8 @@ def test_dtypes_and_widths(device, backend, i, o, dtype):
     cpu = torch.device("cpu")
     exact = results(loops.grouped_linear, inputs, offsets, torch.float64, cpu, g)
     plain = results(loops.grouped_linear, inputs, offsets, dtype, cpu, g)
-    found = results(grouped_linear, inputs, offsets, dtype, device, g, backend=backend)
-    for part, same, right in zip(found, plain, exact):
+    actual = results(grouped_linear, inputs, offsets, dtype, device, g, backend=backend)
+    for part, same, right in zip(actual, plain, exact):
         assert_as_exact(part, same, right)
 
 
@@ -71,7 +71,7 @@ def test_sums_over_many_samples_are_wide(device, backend, dtype):
     x = torch.ones(n, 1, dtype=dtype, device=device)
     y = grouped_linear(x, offsets_of([n], device), weight, bias, backend=backend)
     y.backward(torch.ones_like(y))
-    # A sum held in a half type would stop at 256 or 2,048.
+    # A sum in a half type would stop at 256 or 2,048.
     assert weight.grad.item() == bias.grad.item() == torch.tensor(float(n), dtype=dtype).item()
 
 
@@ -79,9 +79,9 @@ def test_without_bias(device, backend):
     counts = COUNTS["odd"]
     x, weight, _ = (tensor.to(device) for tensor in layer(counts, 5, 4))
     offsets = offsets_of(counts, device)
-    found = grouped_linear(x, offsets, weight, backend=backend)
+    actual = grouped_linear(x, offsets, weight, backend=backend)
     expected = grouped_linear(x, offsets, weight, torch.zeros(len(counts), 4, device=device), backend=backend)
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(actual, expected)
 
 
 def test_rows_of_no_cell_are_zero(device, backend):

@@ -18,7 +18,7 @@ CPU = torch.device("cpu")
 TABLES = {
     "one layer": MLP((Layer((POSITIONS,), 1),), (0,)),
     "plain": MLP((Layer((POSITIONS,), 9, "softplus"), Layer((0,), 4)), (1,), position_octaves=4),
-    # Skip connection, density head, branch that sees the direction: the original architecture in small.
+    # A small version of the original architecture: a skip connection, a density head and a view branch.
     "nerf": MLP(
         (
             Layer((POSITIONS,), 16, "sine"),
@@ -33,7 +33,7 @@ TABLES = {
         position_octaves=3,
         direction_octaves=2,
     ),
-    # Harmonics of the direction, beside a skip connection and by themselves.
+    # Harmonics of the direction, beside a skip connection and alone.
     "spherical": MLP(
         (
             Layer((POSITIONS,), 16, "softplus"),
@@ -46,14 +46,14 @@ TABLES = {
         direction_encoding="spherical",
         direction_degree=4,
     ),
-    # Gaussians, mip-NeRF's positions.
+    # The positions of mip-NeRF, which are Gaussians.
     "integrated": MLP(
         (Layer((POSITIONS,), 9, "softplus"), Layer((0, POSITIONS), 6, "sine"), Layer((DIRECTIONS, 1), 4)),
         outputs=(2, 0),
         position_octaves=5,
         position_encoding="integrated",
     ),
-    # A layer read three times, one that is an output and an input, one that nothing reads, one output twice.
+    # One layer read three times, one as output and input, one that nothing reads, and one output listed twice.
     "tangled": MLP(
         (
             Layer((DIRECTIONS, POSITIONS, DIRECTIONS), 5, "sigmoid"),
@@ -69,7 +69,7 @@ TABLES = {
 
 @dataclass
 class Case:
-    """A network, its samples, and what is asked of it."""
+    """A network, its samples and its options."""
 
     table: MLP
     offsets: Tensor
@@ -123,8 +123,8 @@ def test_output_and_gradients_match_the_specification(device, backend, name, cou
     case = Case.make(name, counts)
     exact = case.results(loops.grouped_mlp, torch.float64)
     plain = case.results(loops.grouped_mlp, torch.float32)
-    found = case.results(grouped_mlp, torch.float32, device, backend=backend)
-    for part, same, right in zip(found, plain, exact):
+    actual = case.results(grouped_mlp, torch.float32, device, backend=backend)
+    for part, same, right in zip(actual, plain, exact):
         assert_as_exact(part, same, right)
 
 
@@ -135,8 +135,8 @@ def test_dtypes(device, backend, name, dtype):
     case = Case.make(name, COUNTS["odd"], dtype)
     exact = case.results(loops.grouped_mlp, torch.float64)
     plain = case.results(loops.grouped_mlp, dtype)
-    found = case.results(grouped_mlp, dtype, device, backend=backend)
-    for part, same, right in zip(found, plain, exact):
+    actual = case.results(grouped_mlp, dtype, device, backend=backend)
+    for part, same, right in zip(actual, plain, exact):
         assert_as_exact(part, same, right)
 
 
@@ -149,8 +149,8 @@ def test_directions_of_each_sample_and_of_each_ray_agree(device, backend):
     case.direction_index = None
     by_sample = case.run(grouped_mlp, [leaves[0], leaves[1][index.to(device)], *leaves[2:]], backend=backend)
     torch.testing.assert_close(by_ray, by_sample, rtol=1e-5, atol=1e-6)
-    found, expected = (torch.autograd.grad(y.sum(), leaves[1])[0] for y in (by_ray, by_sample))
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    actual, expected = (torch.autograd.grad(y.sum(), leaves[1])[0] for y in (by_ray, by_sample))
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
@@ -172,7 +172,7 @@ def test_harmonics_inside_and_before(device, backend, degree):
 def test_integrated_inside_and_before(device, backend, scale):
     case = Case.make("integrated", COUNTS["odd"])
     leaves = [tensor.to(device) for tensor in case.inputs]
-    leaves[0] *= scale  # beyond the angles of the vector sine
+    leaves[0] *= scale  # beyond the range of the vector sine
     leaves[0][:3, 3:] = torch.tensor([[0.0], [1e5], [torch.inf]], device=device)
     inside = case.run(grouped_mlp, leaves, backend=backend)
     encoded = integrated_encode(*leaves[0].chunk(2, dim=1), 5, backend=backend)
@@ -183,7 +183,7 @@ def test_integrated_inside_and_before(device, backend, scale):
 
 @pytest.mark.parametrize("width", [15, 30, 31, 32, 63])
 def test_infinity_in_bfloat16_stays_what_it_is(device, backend, width, request):
-    """Rows of pairs end in padding, whose product with infinity is NaN. CUDA and Warp leave that to the row."""
+    """The padding of a pair of columns times infinity is NaN; on CUDA and Warp this NaN stays in its row."""
     cuda = device.type == "cuda" or request.config.getoption("--emulate-cuda") is not None
     padded = backend == "warp" or (backend == "native" and cuda)
     weights = [torch.ones(1, width, 2, device=device), torch.ones(1, 5, width, device=device)]
@@ -193,9 +193,9 @@ def test_infinity_in_bfloat16_stays_what_it_is(device, backend, width, request):
     offsets = torch.tensor([0, 2], dtype=torch.int32, device=device)
     half = [weight.bfloat16() for weight in weights]
     need("grouped_mlp", backend, device, torch.bfloat16)
-    found = grouped_mlp(x.bfloat16(), offsets, half, [None, None], layers=table, backend=backend)
-    assert found[1].tolist() == [2.0 * width] * 5
-    assert found[0].nan_to_num(0.0).tolist() == [0.0] * 5 and (padded or not bool(found.isnan().any()))
+    result = grouped_mlp(x.bfloat16(), offsets, half, [None, None], layers=table, backend=backend)
+    assert result[1].tolist() == [2.0 * width] * 5
+    assert result[0].nan_to_num(0.0).tolist() == [0.0] * 5 and (padded or not bool(result.isnan().any()))
 
 
 def test_wide_positions_with_half_weights_keep_their_octaves(device, backend):
@@ -205,10 +205,10 @@ def test_wide_positions_with_half_weights_keep_their_octaves(device, backend):
     case.inputs[2] = torch.randn(len(COUNTS["odd"]), 9, 63) / 8
     halves = [case.inputs[0], case.inputs[1], *(tensor.bfloat16() for tensor in case.inputs[2:])]
     exact = case.run(loops.grouped_mlp, [tensor.double() for tensor in halves])
-    found = case.run(grouped_mlp, [tensor.to(device) for tensor in halves], backend=backend)
-    assert found.dtype == torch.bfloat16
-    # Rounded to bfloat16 before they are encoded, positions would be wrong by 512 / 256 radians.
-    assert error(found, exact) < 0.02
+    actual = case.run(grouped_mlp, [tensor.to(device) for tensor in halves], backend=backend)
+    assert actual.dtype == torch.bfloat16
+    # Positions rounded to bfloat16 before the encoding would be wrong by 512 / 256 radians.
+    assert error(actual, exact) < 0.02
 
 
 def test_rows_of_no_cell_are_zero(device, backend):
@@ -279,7 +279,7 @@ def test_inputs_without_features_are_refused(device, backend):
             call(layers, 3, 0, directions=positions[:, :0])
         with refused(ValueError, message.replace("...", "directions")):
             call(layers, 3, 0, directions=positions[:4, :0], direction_index=index.to(device))
-    # What no layer reads may be empty.
+    # An input that no layer reads may be empty.
     unread = MLP((Layer((DIRECTIONS,), 4, "relu"),), (0,))
     assert call(unread, 0, 3, directions=positions).shape == (5, 4)
 

@@ -35,7 +35,7 @@ def offsets_of(sizes: list[int]) -> Tensor:
 
 
 def random_program(seed: int) -> Program:
-    """Steps drawn at random, each of values drawn at random."""
+    """Returns a program of random steps on random operands."""
     draw, b = random.Random(seed), Builder()
     values = [b.input(draw.choice([1, 3, 16, 33])) for _ in range(draw.randint(1, 3))]
     smooth = ["softplus", "sigmoid", "tanh", "silu", "gelu", "sine", "elu", "copy"]
@@ -78,10 +78,10 @@ def arguments(
 
 
 def derivatives(program: Program, rows: list, parameters: list, offsets: Tensor, backend: str, order=None) -> list:
-    """Results, their gradients, and the gradients of a function of those."""
+    """Returns the results, their gradients, and the gradients of a weighted sum of these gradients."""
     leaves = [t.clone().requires_grad_() for t in (*rows, *parameters)]
-    given = leaves[: len(rows)], leaves[len(rows) :]
-    results = grouped_program(*given, offsets, program=program, order=order, backend=backend)
+    arguments = leaves[: len(rows)], leaves[len(rows) :]
+    results = grouped_program(*arguments, offsets, program=program, order=order, backend=backend)
     generator = torch.Generator().manual_seed(5)
 
     def weighted(tensors: list) -> Tensor:
@@ -100,7 +100,7 @@ def derivatives(program: Program, rows: list, parameters: list, offsets: Tensor,
 
 
 def check(program: Program, sizes: list[int], shared: bool = False, order: Tensor | None = None) -> None:
-    """Native against the reference in float64, relative to what the reference in float32 reaches."""
+    """Compares native with the float64 reference; allows twice the error of the float32 reference."""
     wide = derivatives(program, *arguments(program, sizes, torch.float64, shared), "reference", order)
     narrow = derivatives(program, *arguments(program, sizes, torch.float32, shared), "reference", order)
     native = derivatives(program, *arguments(program, sizes, torch.float32, shared), "native", order)
@@ -117,12 +117,12 @@ def check(program: Program, sizes: list[int], shared: bool = False, order: Tenso
     [(name, i) for name, f in FUNCTIONS.items() if name != "stop" for i in range(min(f.orders, 3) + 1)],
 )
 def test_derivative_of_every_function(name: str, order: int) -> None:
-    """Each line of functions_tile.h against autograd of the formula."""
+    """Each line of functions_tile.h equals autograd of the formula."""
     b = Builder()
     x = b.input(19)
-    found = b.function(name, x, *NUMBERS.get(name, (0.7, 0.0)), order=order)
-    assert found is not None
-    program = b.program([found])
+    columns = b.function(name, x, *NUMBERS.get(name, (0.7, 0.0)), order=order)
+    assert columns is not None
+    program = b.program([columns])
     generator = torch.Generator().manual_seed(1)
     rows = 3 * torch.randn(101, 19, generator=generator, dtype=torch.float64)
     rows = rows.abs() + 0.1 if name in ("log", "power") else rows
@@ -140,39 +140,39 @@ FAR = [*(sign * 10.0**size for size in (-30, -3, 0, 1, 1.5, 2, 3, 10, 19, 30, 38
     "name", ["exp", "sigmoid", "tanh", "silu", "gelu", "softplus", "elu", "clamp", "relu", "abs", "erf", "atan"]
 )
 def test_derivatives_far_away_and_at_borders(name: str, order: int) -> None:
-    """Of arguments as large as they come, at 0, and where a function has its kinks."""
+    """Derivatives are right for very large arguments, at 0, and at the kinks of a function."""
     b = Builder()
-    found = b.function(name, b.input(1), *{"clamp": (-1.0, 10.0)}.get(name, (1.0, 20.0)), order=order)
-    if found is None:
+    columns = b.function(name, b.input(1), *{"clamp": (-1.0, 10.0)}.get(name, (1.0, 20.0)), order=order)
+    if columns is None:
         return
     rows = torch.tensor([*FAR, float("nan")] if name == "clamp" else FAR)[:, None]
-    given = [], offsets_of([len(rows)])
-    (exact,) = grouped_program([rows.double()], *given, program=b.program([found]), backend="reference")
+    arguments = [], offsets_of([len(rows)])
+    (exact,) = grouped_program([rows.double()], *arguments, program=b.program([columns]), backend="reference")
     for isa in native.SUPPORTED_ISAS:
         with native.using_isa(isa):
-            (ours,) = grouped_program([rows], *given, program=b.program([found]), backend="native")
+            (ours,) = grouped_program([rows], *arguments, program=b.program([columns]), backend="native")
         torch.testing.assert_close(ours, exact.float(), rtol=2e-5, atol=3e-7, equal_nan=True)
 
 
 @pytest.mark.parametrize("isa", native.SUPPORTED_ISAS)
 @pytest.mark.parametrize("name", list(FUNCTIONS))
 def test_columns_do_not_touch_each_other(name: str, isa: str) -> None:
-    """A column's bits are the same whatever stands beside it, as old floats stand behind the last one."""
+    """The bits of a column do not depend on the columns beside it, such as stale floats behind the last one."""
     b = Builder()
     program = b.program([b.apply(name, b.input(5), *NUMBERS.get(name, (0.7, 0.0)))])
     rows = 3 * torch.randn(64, 5, generator=torch.Generator().manual_seed(0))
-    found = []
+    results = []
     for odd in (1.0, 1e5, 1e30, torch.nan):
         rows[:, 4] = odd
         with native.using_isa(isa):
             (result,) = grouped_program([rows], [], offsets_of([64]), program=program, backend="native")
-        found.append(result[:, :4].clone())
-    for others in found[1:]:
-        torch.testing.assert_close(others, found[0], rtol=0, atol=0, equal_nan=True)
+        results.append(result[:, :4].clone())
+    for others in results[1:]:
+        torch.testing.assert_close(others, results[0], rtol=0, atol=0, equal_nan=True)
 
 
 def test_sums_spread_over_a_layer_and_products_with_relu() -> None:
-    """Operands that a layer and a merged ReLU once left out."""
+    """A layer adds a spread sum, and a ReLU behind a layer is multiplied by an input."""
     b = Builder()
     x, y = b.input(5), b.input(7)
     one = b.total(x, 5)._replace(width=7, spread=True)
@@ -185,36 +185,36 @@ def test_sums_spread_over_a_layer_and_products_with_relu() -> None:
 @pytest.mark.parametrize("order", range(4))
 @pytest.mark.parametrize("power", [0.3, -1.25, 2.4, 1 / 3, 5.0, -3.5, 70.0])
 def test_powers(power: float, order: int) -> None:
-    """Whole, half and any other ones, of positive numbers, 0 and negative ones."""
+    """Integer, half-integer and other powers are right for positive numbers, 0 and negative numbers."""
     b = Builder()
-    found = b.function("power", b.input(1), power, order=order)
-    assert found is not None
+    columns = b.function("power", b.input(1), power, order=order)
+    assert columns is not None
     rows = torch.tensor([0.001, 0.3, 1.0, 1.5, 2.7, 0.0, -1.5])[:, None]
-    given = [], offsets_of([len(rows)])
-    (exact,) = grouped_program([rows.double()], *given, program=b.program([found]), backend="reference")
+    arguments = [], offsets_of([len(rows)])
+    (exact,) = grouped_program([rows.double()], *arguments, program=b.program([columns]), backend="reference")
     for isa in native.SUPPORTED_ISAS:
         with native.using_isa(isa):
-            (ours,) = grouped_program([rows], *given, program=b.program([found]), backend="native")
+            (ours,) = grouped_program([rows], *arguments, program=b.program([columns]), backend="native")
         torch.testing.assert_close(ours, exact.float(), rtol=2e-5, atol=3e-7, equal_nan=True)
 
 
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("shared", [False, True])
 def test_every_step(sizes: list[int], shared: bool) -> None:
-    """Values, gradients and their gradients, for cells of all sizes."""
+    """Values, gradients and second derivatives are right for cells of all sizes."""
     check(every_step(), sizes, shared)
 
 
 @pytest.mark.parametrize("seed", range(40))
 def test_random_programs(seed: int) -> None:
-    """Values, gradients and their gradients of programs that nobody has thought of."""
+    """Values, gradients and second derivatives of random programs are right."""
     check(random_program(seed), [97, 0, 30])
 
 
 @pytest.mark.parametrize("order_of", [1, 2])
 @pytest.mark.parametrize("seed", range(12))
 def test_gradient_program_against_autograd(seed: int, order_of: int) -> None:
-    """The program of a gradient, run in PyTorch, against autograd of the program; twice, too."""
+    """The gradient program equals autograd of the program; so does the gradient program of a gradient."""
     program = every_step() if seed == 0 else random_program(100 + seed)
     rows, parameters, offsets = arguments(program, [9, 0, 6], torch.float64)
     for _ in range(order_of):
@@ -230,13 +230,13 @@ def test_gradient_program_against_autograd(seed: int, order_of: int) -> None:
         split = len(program.outputs)
         program = gradient(program, *asked, *arriving)
         rows, parameters = [*rows, *gradients[:split]], [*parameters, *gradients[split:]]
-        found = grouped_program(rows, parameters, offsets, program=program, backend="reference")
-        for ours, exact in zip(found, expected, strict=True):
+        actual = grouped_program(rows, parameters, offsets, program=program, backend="reference")
+        for ours, exact in zip(actual, expected, strict=True):
             torch.testing.assert_close(ours, exact, rtol=1e-9, atol=1e-9)
 
 
 def test_order_strays_and_layouts() -> None:
-    """Rows anywhere, rows of no cell, and inputs that are not contiguous."""
+    """Results are right for rows in any order, rows of no cell, and inputs that are not contiguous."""
     program = every_step()
     sizes = [30, 0, 71]
     check(program, sizes, order=torch.randperm(101, generator=torch.Generator().manual_seed(0)).int())
@@ -248,14 +248,14 @@ def test_order_strays_and_layouts() -> None:
         assert not ours[:2].any() and not ours[90:].any()
     turned = [x.t().contiguous().t() for x in rows]
     for order in (None, torch.randperm(101, generator=torch.Generator().manual_seed(0)).int()):
-        given = {"program": program, "order": order, "backend": "native"}
-        for ours, theirs in zip(*(grouped_program(r, parameters, offsets, **given) for r in (turned, rows))):
+        options = {"program": program, "order": order, "backend": "native"}
+        for ours, theirs in zip(*(grouped_program(r, parameters, offsets, **options) for r in (turned, rows))):
             assert torch.equal(ours, theirs)
 
 
 @pytest.mark.parametrize("isa", native.SUPPORTED_ISAS)
 def test_instruction_sets(isa: str) -> None:
-    """Every instruction set of this machine."""
+    """Results are right with every instruction set of this machine."""
     program = every_step()
     with native.using_isa(isa):
         check(program, [97, 0, 30])
@@ -264,7 +264,7 @@ def test_instruction_sets(isa: str) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_types(dtype: torch.dtype) -> None:
-    """The results are those of float32 for the rounded arguments, but for the rounding of products."""
+    """Half-type results equal the float32 results of the rounded arguments, up to the rounding of products."""
     program = random_program(3)
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
     wide = [[t.float() for t in part] for part in (rows, parameters)]
@@ -278,7 +278,7 @@ def test_half_types(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("width", [1, 2, 33])
 def test_one_column_in_the_place_of_all_is_put_out(width: int, dtype: torch.dtype, backend: str) -> None:
-    """One column stands for all, in an output and in the gradient of a sum over columns."""
+    """A spread column fills all columns, in an output and in the gradient of a sum over columns."""
     b = Builder()
     x = b.input(width)
     program = b.program([x.part(width - 1, 1)._replace(width=width, spread=True), b.total(x, width)])
@@ -292,15 +292,15 @@ def test_one_column_in_the_place_of_all_is_put_out(width: int, dtype: torch.dtyp
 
 
 def test_refuses_what_is_no_program() -> None:
-    """The other rules are in the op's case."""
+    """A string as program and wrong offsets are refused; the other rules are in the op's case."""
     with pytest.raises(TypeError, match="grouped_program: program must be a Program, got str"):
         grouped_program([torch.ones(2, 2)], [], offsets_of([2]), program="x")  # type: ignore[arg-type]
     rows, parameters, _ = arguments(every_step(), [6], torch.float32)
     for offsets in ([0, 7], [0, 3, 2], [-1, 6]):
         for backend in ("native", "reference"):
             with pytest.raises(ValueError, match="grouped_program: offsets must rise from 0 or more to at most"):
-                given = torch.tensor(offsets, dtype=torch.int32)
-                grouped_program(rows, [p[:1] for p in parameters], given, program=every_step(), backend=backend)
+                wrong = torch.tensor(offsets, dtype=torch.int32)
+                grouped_program(rows, [p[:1] for p in parameters], wrong, program=every_step(), backend=backend)
 
 
 @pytest.mark.parametrize("backend", ["reference", "native"])
@@ -309,27 +309,27 @@ def test_an_order_that_leaves_the_rows_is_refused(backend, wrong):
     b = Builder()
     program = b.program([b.apply("exp", b.input(2))])
     order = torch.tensor([3, 1, wrong, 0], dtype=torch.int32)
-    given = [torch.rand(4, 2)], [], torch.tensor([0, 1, 3], dtype=torch.int32)
+    arguments = [torch.rand(4, 2)], [], torch.tensor([0, 1, 3], dtype=torch.int32)
     message = f"grouped_program: order must lie in 0 to 3, got values from {min(0, wrong)} to {max(3, wrong)}"
-    refuses(message, grouped_program, *given, program=program, order=order, backend=backend)
+    refuses(message, grouped_program, *arguments, program=program, order=order, backend=backend)
 
 
 def test_a_spread_parameter_in_what_a_linear_step_adds_is_refused():
-    """It was read as columns that follow each other."""
+    """The compiled module would read the spread parameter as consecutive columns."""
     b = Builder()
     x, matrix, bias = b.input(3), b.parameter(4, 3), b.parameter(4)
     added = Columns(PARAMETER, bias, 0, 4, spread=True)
-    made = b.linear(x, matrix, 4, add=added)
-    program = b.program([made])
-    (step,) = (step for step in program.steps if step.op == "linear")
-    assert not step.operands[1].spread  # the builder makes columns of it
-    steps = tuple(each._replace(operands=(x, added)) if each is step else each for each in program.steps)
+    result = b.linear(x, matrix, 4, add=added)
+    program = b.program([result])
+    (linear,) = (step for step in program.steps if step.op == "linear")
+    assert not linear.operands[1].spread  # the builder expands it to columns
+    steps = tuple(step._replace(operands=(x, added)) if step is linear else step for step in program.steps)
     rule = "Program: steps must be without spread columns in what a linear one adds, got Step(op='linear'"
     refuses(rule, replace, program, steps=steps)
 
 
 def test_a_program_of_what_is_not_there_is_refused():
-    """The compiled module trusts a program: each number of one, larger than it is, is refused where it is made."""
+    """The compiled module trusts a program, so the constructor refuses every number that is out of range."""
     program = every_step()
 
     def larger(value):
@@ -349,7 +349,7 @@ def test_a_program_of_what_is_not_there_is_refused():
                 taken += 1
             except ValueError as error:
                 assert str(error).startswith("Program: ") and "\n" not in str(error)
-    assert taken == 4  # parameters with more entries than are read, and two steps with more columns, which are 0
+    assert taken == 4  # allowed: parameters with unread entries, and two steps with more columns, which are 0
     program = gradient(gradient(encoded(), *ALL), (True,) * 5, (True,) * 3, (True,) * 3, (True,) * 3)
     assert {"encode", "scatter"} <= {step.op for step in program.steps}
     kept = []
@@ -365,7 +365,7 @@ def test_a_program_of_what_is_not_there_is_refused():
 
 
 ALL = (True,) * 3, (True,) * 3, (True,) * 2, ()
-"""What is asked for of :func:`encoded`, and given."""
+"""The arguments of ``gradient`` for :func:`encoded`: all gradients are wanted, and all outputs have one."""
 ENCODED = {
     **{
         name: (name, *next((d, size) for d in (3, 6) for size in (4, 2) if encoding.fits(d, size)))
@@ -380,7 +380,7 @@ ENCODED = {
 
 
 def of_encoding(kind: str, ray: bool = False) -> tuple[Program, HashGrid]:
-    """sin(W e(x)) of each row, and e(x) times another input, by ray."""
+    """Returns a program with sin(W e(x)) for each row, and e(x) times another input, summed by ray; and its grid."""
     name, raw, size = ENCODED[kind]
     grid = replace(GRID, interpolation="linear") if kind == "linear hash" else GRID
     b = Builder()
@@ -393,7 +393,7 @@ def of_encoding(kind: str, ray: bool = False) -> tuple[Program, HashGrid]:
 
 
 def formula(kind: str, grid: HashGrid, x: Tensor, table: Tensor | None, cells: Tensor) -> Tensor:
-    """The encoding in PyTorch."""
+    """Returns the encoding, computed in PyTorch."""
     name, _, size = ENCODED[kind]
     if name in ENCODINGS:
         return ENCODINGS[name].formula(x, size)
@@ -403,7 +403,7 @@ def formula(kind: str, grid: HashGrid, x: Tensor, table: Tensor | None, cells: T
 
 
 def encoding_arguments(program: Program, kind: str, sizes: list[int], rays: int) -> list[Tensor]:
-    """Inputs, then parameters, in float64; a table for each cell where the kind says so."""
+    """Returns inputs, then parameters, in float64; each cell has its own table if the kind says so."""
     generator, n, k = torch.Generator().manual_seed(3), sum(sizes) + 5, len(sizes)
     tensors = [
         torch.rand(rays if i in program.rays else n, w, generator=generator, dtype=torch.float64)
@@ -419,7 +419,7 @@ def encoding_arguments(program: Program, kind: str, sizes: list[int], rays: int)
 @pytest.mark.parametrize("ray", [False, True], ids=["of samples", "of rays"])
 @pytest.mark.parametrize("kind", ENCODED)
 def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None:
-    """Values and three orders of gradients: of the reference, and of gradient programs. Some rows are in no cell."""
+    """Values and three orders of gradients are right, for the reference and for gradient programs."""
     if ray and kind.endswith(("hash", "cell")):
         pytest.skip("the positions of a grid are samples")
     program, grid = of_encoding(kind, ray)
@@ -452,13 +452,13 @@ def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None
 
     expected = of_every_order(by_hand, tensors)
     for run in (by_reference, by_programs):
-        for found, exact in zip(of_every_order(run, tensors), expected, strict=True):
-            torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-9)
+        for actual, exact in zip(of_every_order(run, tensors), expected, strict=True):
+            torch.testing.assert_close(actual, exact, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", [*ENCODINGS, "hash", "hash of each cell"])
 def test_gradient_programs_of_encodings_by_differences(kind: str) -> None:
-    """gradcheck and gradgradcheck, whose oracle is no derivative."""
+    """Gradient programs pass gradcheck and gradgradcheck, which use finite differences."""
     program, _ = of_encoding(kind)
     tensors = [tensor.requires_grad_() for tensor in encoding_arguments(program, kind, [2, 1], 3)]
     ray_index = torch.arange(8).int() % 3
@@ -474,7 +474,7 @@ def test_gradient_programs_of_encodings_by_differences(kind: str) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="pages are protected otherwise")
 @pytest.mark.parametrize("name", ENCODINGS)
 def test_nothing_is_read_behind_a_gradient(name: str) -> None:
-    """An encoding's gradient of few rows reads its inputs where they are, in front of a page that is not there."""
+    """The gradient of an encoding reads few rows in place; a protected page follows them."""
     _, raw, size = ENCODED[name]
     b = Builder()
     program = b.program([b.encode(name, b.input(raw), size)])
@@ -491,48 +491,48 @@ def test_nothing_is_read_behind_a_gradient(name: str) -> None:
     x, _ = torch.rand(n, raw, generator=generator), g.uniform_(generator=generator)
     arguments = [x, g], [], offsets_of([n])
     options = {"program": gradient(program, (True,), (), (True,), ())}
-    found, exact = (grouped_program(*arguments, **options, backend=backend) for backend in ("native", "reference"))
-    torch.testing.assert_close(found, exact)
+    actual, exact = (grouped_program(*arguments, **options, backend=backend) for backend in ("native", "reference"))
+    torch.testing.assert_close(actual, exact)
 
 
 def test_which_derivatives_the_compiled_module_has() -> None:
-    """F_0, G_1 and T_0; any other counts as one of a high order."""
+    """The compiled module has F_0, G_1 and T_0; any other derivative counts as one of a high order."""
     program = encoded()
     first = gradient(program, *ALL)
     assert program.orders == 0 and first.orders == 1
     numbers = {step.numbers[2:] for step in first.steps if step.op == "encode"}
     assert numbers == {(0, 0), (1, 1)} and [s.numbers for s in first.steps if s.op == "scatter"] == [(0, 0, 0)]
     assert gradient(first, (True,) * 5, (False,) * 3, (True,) * 3, (False,) * 3).orders > 3
-    # The second derivative to the table alone looks the new table up.
+    # The second derivative with respect to the table alone looks up the new table.
     last = [i == 0 for i in range(len(first.sums))]
     only = gradient(first, (False,) * 3 + (True,) * 2, (False,) * 3, (False,) * 3, tuple(last))
     assert only.orders <= 3 and 3 in only.tables
 
 
 def test_tables_have_dtypes_of_their_own() -> None:
-    """They are read as they are beside inputs of any dtype, and their gradients have their dtype."""
+    """Tables keep their dtype beside inputs of any dtype, and their gradients have the dtype of the table."""
     program = encoded()
     generator = torch.Generator().manual_seed(0)
     inputs = [torch.rand(4 if i in program.rays else 7, w, generator=generator) for i, w in enumerate(program.inputs)]
     parameters = [torch.randn(1, *shape, generator=generator) for shape in program.parameters]
-    given = {"program": program, "ray_index": torch.arange(7).int() % 4}
+    arguments = {"program": program, "ray_index": torch.arange(7).int() % 4}
     for dtype in (torch.float16, torch.bfloat16, torch.float32):
         table = parameters[0].to(dtype).requires_grad_()
         for of, backend in ((torch.float32, "native"), (torch.float64, "reference"), (torch.bfloat16, "native")):
             rows, (_, *others) = [x.to(of) for x in inputs], [p.to(of) for p in parameters]
             wide = torch.promote_types(of, torch.float32)
-            found = grouped_program(rows, [table, *others], offsets_of([3, 4]), **given, backend=backend)
+            actual = grouped_program(rows, [table, *others], offsets_of([3, 4]), **arguments, backend=backend)
             exact = grouped_program(
                 [x.to(wide) for x in rows],
                 [table.to(wide), *(p.to(wide) for p in others)],
                 offsets_of([3, 4]),
-                **given,
+                **arguments,
                 backend="reference",
             )
-            for ours, theirs in zip(found, exact, strict=True):
+            for ours, theirs in zip(actual, exact, strict=True):
                 assert ours.dtype == of
                 assert agree(ours, theirs.to(of))
-            (slope,) = torch.autograd.grad(found[0].sum(), table)
+            (slope,) = torch.autograd.grad(actual[0].sum(), table)
             (right,) = torch.autograd.grad(exact[0].sum(), table)
             assert slope.dtype == dtype
             torch.testing.assert_close(slope, right, rtol=2e-2, atol=2e-2)
@@ -540,13 +540,13 @@ def test_tables_have_dtypes_of_their_own() -> None:
 
 @pytest.mark.parametrize("backend", ["reference", "native"])
 def test_the_sum_of_a_shared_table_is_one(backend: str) -> None:
-    """Sums of other parameters and of tables of cells have one entry for each cell."""
+    """A shared table has one sum; other parameters and tables of cells have one sum for each cell."""
     program = gradient(encoded(), *ALL)
     rays, n = 4, 7
     inputs = [torch.rand(rays if i in program.rays else n, w) for i, w in enumerate(program.inputs)]
     for few in (1, 3):
         parameters = [torch.randn(few, *shape) for shape in program.parameters]
-        found = grouped_program(
+        result = grouped_program(
             inputs,
             parameters,
             offsets_of([3, 0, 4]),
@@ -554,24 +554,24 @@ def test_the_sum_of_a_shared_table_is_one(backend: str) -> None:
             ray_index=torch.arange(n).int() % rays,
             backend=backend,
         )
-        assert [len(tensor) for tensor in found] == [n, n, rays, few, 3, 3]
+        assert [len(tensor) for tensor in result] == [n, n, rays, few, 3, 3]
 
 
 @pytest.mark.parametrize("what", ["rows", "rays", "nothing"])
 def test_programs_of_rays_of_no_size(what: str) -> None:
-    """No samples, and no rays."""
+    """Programs of rays run without samples, and without rays."""
     program = encoded()
     n, rays = {"rows": (0, 3), "rays": (0, 0), "nothing": (0, 0)}[what]
     inputs = [torch.rand(rays if i in program.rays else n, w) for i, w in enumerate(program.inputs)]
     parameters = [torch.randn(2, *shape) for shape in program.parameters]
-    given = {"program": program, "ray_index": torch.zeros(n).int()}
+    arguments = {"program": program, "ray_index": torch.zeros(n).int()}
     for backend in ("reference", "native"):
-        found = grouped_program(inputs, parameters, offsets_of([0, 0]), **given, backend=backend)
-        assert [tensor.shape for tensor in found] == [(n, 3), (rays, 3)] and not any(t.any() for t in found)
+        result = grouped_program(inputs, parameters, offsets_of([0, 0]), **arguments, backend=backend)
+        assert [tensor.shape for tensor in result] == [(n, 3), (rays, 3)] and not any(t.any() for t in result)
 
 
 def test_high_derivatives_within_a_custom_op() -> None:
-    """PyTorch calls it where autograd does not see, as torch.compile does: derivatives were 0 there."""
+    """Derivatives are right inside a custom op, where autograd records nothing, as under torch.compile."""
     b = Builder()
     x, along = b.input(3), b.input(3)
     sine = b.function("sine", x, 1.0, order=4)
@@ -579,15 +579,15 @@ def test_high_derivatives_within_a_custom_op() -> None:
     program = b.program([sine, b.encode("frequency", x, 1, along=[along, along])])
     rows = [torch.rand(5, 3), torch.rand(5, 3)]
     how = (program.text, "grouped_program", "float32", False, -1)
-    found = torch.ops.voronerf.grouped_program_native(rows, [], offsets_of([5]), None, None, [], *how)
-    torch.testing.assert_close(found[0], rows[0].sin())
+    result = torch.ops.voronerf.grouped_program_native(rows, [], offsets_of([5]), None, None, [], *how)
+    torch.testing.assert_close(result[0], rows[0].sin())
     second = -rows[1].square() * torch.stack([rows[0].sin(), rows[0].cos()])
-    torch.testing.assert_close(found[1], torch.cat([torch.zeros(5, 3), *second], dim=1))
+    torch.testing.assert_close(result[1], torch.cat([torch.zeros(5, 3), *second], dim=1))
 
 
 @pytest.mark.parametrize("dynamic", [None, True])
 def test_programs_of_rays_compile(dynamic: bool | None) -> None:
-    """One graph, also where integers of the program are taken for sizes."""
+    """The program compiles to one graph, also where its integers are taken for sizes."""
     torch.compiler.reset()
     program = encoded()
     parameters = [torch.rand(1, *shape).requires_grad_() for shape in program.parameters]
@@ -599,23 +599,23 @@ def test_programs_of_rays_compile(dynamic: bool | None) -> None:
     for rays in (4, 5):
         inputs = [torch.rand(rays if i in program.rays else 9, w) for i, w in enumerate(program.inputs)]
         ray_index = torch.arange(9).int() % rays
-        found, expected = compiled(inputs, ray_index), run(inputs, ray_index)
-        slopes = [torch.autograd.grad(sum(t.sum() for t in part), parameters) for part in (found, expected)]
-        for ours, theirs in zip((*found, *slopes[0]), (*expected, *slopes[1]), strict=True):
+        actual, expected = compiled(inputs, ray_index), run(inputs, ray_index)
+        slopes = [torch.autograd.grad(sum(t.sum() for t in part), parameters) for part in (actual, expected)]
+        for ours, theirs in zip((*actual, *slopes[0]), (*expected, *slopes[1]), strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
 def test_refuses_rays_that_do_not_fit() -> None:
-    """Each message on rays and tables; the others are in the op's case."""
+    """Every rule about rays and tables has its message; the other rules are in the op's case."""
     program = encoded()
     inputs = [torch.rand(4 if i in program.rays else 6, w) for i, w in enumerate(program.inputs)]
     parameters = [torch.rand(1, *shape) for shape in program.parameters]
     index = torch.tensor([0, 1, 2, 3, 0, 1], dtype=torch.int32)
 
     def refused(message: str, error: type = ValueError, **changed: object) -> None:
-        given = {"inputs": inputs, "parameters": parameters, "offsets": offsets_of([6]), "program": program}
-        given = {**given, "ray_index": index, **changed}
-        refuses(f"grouped_program: {message}", grouped_program, error=error, **given)
+        arguments = {"inputs": inputs, "parameters": parameters, "offsets": offsets_of([6]), "program": program}
+        arguments = {**arguments, "ray_index": index, **changed}
+        refuses(f"grouped_program: {message}", grouped_program, error=error, **arguments)
 
     refused("ray_index must be given for a program with inputs of rays, got None", ray_index=None)
     refused("ray_index must have shape [n] with n = 6, got [5]", ray_index=index[1:])
@@ -628,13 +628,13 @@ def test_refuses_rays_that_do_not_fit() -> None:
     refused("inputs[2] must have shape [r, 3], got [4, 2]", inputs=[*inputs[:2], inputs[2][:, 1:]])
     message = "parameters[0] must have dtype float16, bfloat16, float32 or float64, got int32"
     refused(message, TypeError, parameters=[parameters[0].int(), *parameters[1:]])
-    # An order is no index of rays, also after a call with one has passed.
+    # An order is not taken for a ray index, even after a successful call with a ray index.
     grouped_program(inputs, parameters, offsets_of([6]), program=program, ray_index=index)
     refused("ray_index must be given for a program with inputs of rays, got None", ray_index=None, order=index)
 
 
 def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
-    """Each rule of encodings by its message."""
+    """Every rule about encodings has its message."""
     program = encoded()
     refuses("Program: rays must be numbers of inputs, each once, got (3,)", replace, program, rays=(3,))
     refuses("Program: rays must be numbers of inputs, each once, got (2, 2)", replace, program, rays=(2, 2))
@@ -666,7 +666,7 @@ def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
         {"name": "frequency", "numbers": (1, 1, 0, 0)},
     ):
         refuses("Program: steps must be of values", replace, program, steps=changed(**fields))
-    # A table is read as one alone, and a sum has one layout.
+    # A step reads a table only as a table, and a sum has one layout.
     b = Builder(program)
     refuses("Program: steps must be of values", b.program, [b.binary("mul", of_a_ray, Columns(PARAMETER, 0, 0, 3))])
     refuses("Program: outputs must be of values", replace, program, outputs=(Columns(PARAMETER, 0, 0, 3),))
@@ -675,7 +675,7 @@ def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
     column = Step("columns", scatter.out, 3, (of_a_ray,), (0,))
     for steps in ((*first.steps, column), (first.steps[0], column._replace(out=scatter.out), *first.steps[1:])):
         refuses("Program: steps must be of values", replace, first, steps=steps)
-    # G_1 has the encoding of its own x.
+    # G_1 must read the encoding of its own x.
     back = next(step for step in first.steps if step.op == "encode" and step.numbers[3] and step.name == "hash")
     wrong = back._replace(operands=(*back.operands[:2], back.operands[1]))
     steps = tuple(wrong if step == back else step for step in first.steps)
@@ -683,7 +683,7 @@ def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
 
 
 def test_texts_of_programs() -> None:
-    """All that a program has comes back from its text."""
+    """A program comes back from its text unchanged."""
     for program in (every_step(), encoded(), gradient(encoded(), *ALL)):
         assert Program.parse(program.text) == program
         assert Program.parse(program.text).text == program.text
@@ -691,7 +691,7 @@ def test_texts_of_programs() -> None:
 
 
 def test_rows_without_a_gradient_where_tensors_lie_turned() -> None:
-    """They are left out by what they are, with columns of inputs and gradients [w, n] in memory."""
+    """Rows with a zero gradient are left out, also where inputs and gradients are stored as [w, n]."""
     b, n = Builder(), 200
     x = b.input(5)
     program = b.program([b.linear(x, b.parameter(4, 5), 4)])
@@ -710,40 +710,41 @@ def test_rows_without_a_gradient_where_tensors_lie_turned() -> None:
 
 
 def test_rows_of_rays_that_lie_turned() -> None:
-    """As many rays as samples."""
+    """Column-major rays are right, also where there are as many rays as samples."""
     b, n = Builder(), 6
     program = b.program([b.binary("add", b.input(4), b.input(4, ray=True))])
     x, rays = torch.rand(n, 4), torch.rand(4, n).t()
     index = torch.arange(n).flip(0).int()
-    found = grouped_program([x, rays], [], offsets_of([2, 4]), program=program, ray_index=index, backend="native")
-    torch.testing.assert_close(found[0], x + rays.flip(0))
+    result = grouped_program([x, rays], [], offsets_of([2, 4]), program=program, ray_index=index, backend="native")
+    torch.testing.assert_close(result[0], x + rays.flip(0))
 
 
 def test_second_derivatives_where_rows_have_no_gradient() -> None:
-    """What is kept of a hash grid is of all rows, also those that add nothing to the first one."""
+    """A hash grid keeps values of all rows, also of rows that add nothing to the first derivative."""
     b, n = Builder(), 40
     table = b.parameter(*GRID.table_shape)
     e = b.encode("hash", b.input(3), b.grid(GRID.text), table)
     program = b.program([b.apply("sigmoid", b.linear(e, b.parameter(2, e.width), 2))])
     x, light = torch.rand(n, 3), torch.rand(n, 2)
     light[5:] = 0
-    given, found = [torch.randn(1, *shape) for shape in program.parameters], []
+    arguments, results = [torch.randn(1, *shape) for shape in program.parameters], []
     for backend in ("reference", "native"):
-        leaves = [parameter.clone().requires_grad_() for parameter in given]
+        leaves = [parameter.clone().requires_grad_() for parameter in arguments]
         (out,) = grouped_program([x], leaves, offsets_of([10, 30]), program=program, backend=backend)
         first = torch.autograd.grad((out * light).sum(), leaves, create_graph=True)
-        found.append(torch.autograd.grad(sum((slope**2).sum() for slope in first), leaves))
-    for ours, exact in zip(*found, strict=True):
+        results.append(torch.autograd.grad(sum((slope**2).sum() for slope in first), leaves))
+    for ours, exact in zip(*results, strict=True):
         torch.testing.assert_close(ours, exact, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("products", ["float32", "bfloat16"])
 def test_shapes_of_a_gpu_that_is_not_there(products):
-    """Tensors without memory have shapes and a device, of which nothing is asked."""
+    """Fake tensors have shapes and a device, and nothing asks a GPU."""
     b = Builder()
     program = b.program([b.linear(b.input(5), b.parameter(7, 5), 7)])
     with FakeTensorMode():
         x, weight = torch.empty(9, 5, device="cuda"), torch.empty(2, 7, 5, device="cuda")
         offsets = torch.zeros(3, dtype=torch.int32, device="cuda")
-        found = plans.run(plans.Rows([x], [weight], offsets, None, None), plans.How(program.text, products=products))
-        assert [tuple(t.shape) for t in found] == [(9, 7)]
+        options = plans.RunOptions(program.text, products=products)
+        result = plans.run(plans.Rows([x], [weight], offsets, None, None), options)
+        assert [tuple(t.shape) for t in result] == [(9, 7)]

@@ -32,7 +32,7 @@ grids = pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
 
 
 def points(n, grid, dtype=torch.float32):
-    """Points in the box, a tenth of which lie outside."""
+    """Returns points of which a tenth lie outside of the box."""
     low, high = torch.tensor(grid.box, dtype=torch.float64)
     return (low + (high - low) * (1.1 * torch.rand(n, 3, dtype=torch.float64) - 0.05)).to(dtype)
 
@@ -42,7 +42,7 @@ def features(grid, dtype=torch.float32):
 
 
 def peer(place, table, *, convention, levels, features, log2_entries, base, finest):
-    """One point in 0..1 as the libraries encode it, written from their sources with their names, a number at a time.
+    """Encodes one point in 0..1, a number at a time, by the sources of other libraries and with their names.
 
     tiny-cuda-nn: grid.h, grid_scale, grid_resolution, grid_index. torch-ngp: gridencoder.cu, get_grid_index, and
     grid.py. nerfstudio: field_components/encodings.py, HashEncoding.pytorch_fwd.
@@ -99,9 +99,9 @@ def test_reads_the_tables_of_other_libraries(convention, sizes):
     grid = HashGrid(**sizes, convention=convention)
     table, places = features(grid, torch.float64), torch.rand(60, 3, dtype=torch.float64)
     expected = [peer(place, table, convention=convention, **sizes) for place in places.tolist()]
-    found = hash_encode(places, table, grid)
-    # The scales of tiny-cuda-nn and torch-ngp are float32's.
-    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-3)
+    actual = hash_encode(places, table, grid)
+    # tiny-cuda-nn and torch-ngp compute their scales in float32.
+    torch.testing.assert_close(actual, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize(*all_pairs({"name": GRIDS, "n": [0, 1, 17, 300], "dtype": FLOATS}))
@@ -110,9 +110,9 @@ def test_matches_the_reference(device, backend, name, n, dtype):
     grid = GRIDS[name]
     x, table = points(n, grid), features(grid, dtype)
     exact = reference(x.double(), table.double(), grid)
-    found = hash_encode(x.to(device), table.to(device), grid, backend=backend)
-    assert found.dtype == torch.promote_types(dtype, torch.float32)
-    assert_as_exact(found, reference(x, table, grid), exact)
+    actual = hash_encode(x.to(device), table.to(device), grid, backend=backend)
+    assert actual.dtype == torch.promote_types(dtype, torch.float32)
+    assert_as_exact(actual, reference(x, table, grid), exact)
 
 
 @grids
@@ -129,8 +129,8 @@ def test_gradients_of_two_orders(device, backend, grid):
         return [*first, *second]
 
     exact, plain = derivatives(reference, torch.float64), derivatives(reference, torch.float32)
-    found = derivatives(lambda x, t, grid: hash_encode(x, t, grid, backend=backend), torch.float32)
-    for a, b, c in zip(found, plain, exact, strict=True):
+    actual = derivatives(lambda x, t, grid: hash_encode(x, t, grid, backend=backend), torch.float32)
+    for a, b, c in zip(actual, plain, exact, strict=True):
         a, b, c = a.cpu().double(), b.double(), c
         # A point within rounding of a corner may be interpolated on the other side of it.
         assert (a - c).norm() <= 2 * (b - c).norm() + 1e-5 * c.norm() + 1e-30
@@ -140,10 +140,10 @@ def test_a_table_for_each_cell(device, backend):
     grid = GRIDS["both"]
     tables = torch.randn(3, *grid.table_shape, device=device)
     x, cells = points(50, grid).to(device), torch.randint(3, (50,), dtype=torch.int32, device=device)
-    found = hash_encode(x, tables, grid, cells=cells, backend=backend)
+    result = hash_encode(x, tables, grid, cells=cells, backend=backend)
     for cell, table in enumerate(tables):
         rows = cells == cell
-        torch.testing.assert_close(found[rows], hash_encode(x[rows], table, grid, backend=backend), rtol=0, atol=1e-6)
+        torch.testing.assert_close(result[rows], hash_encode(x[rows], table, grid, backend=backend), rtol=0, atol=1e-6)
 
 
 def test_gradients_of_a_half_table_are_summed_in_float32(device, backend):
@@ -152,8 +152,8 @@ def test_gradients_of_a_half_table_are_summed_in_float32(device, backend):
     need("hash_encode", backend, device, torch.bfloat16)
     places = torch.zeros(1000, 3, device=device)
     out = hash_encode(places, table, grid, backend=backend)
-    (found,) = torch.autograd.grad(out.sum(), table)
-    assert float(found.float().sum()) == pytest.approx(1000, rel=0.01), "bfloat16 counts to 256"
+    (result,) = torch.autograd.grad(out.sum(), table)
+    assert float(result.float().sum()) == pytest.approx(1000, rel=0.01), "bfloat16 counts to 256"
 
 
 def test_outside_of_the_box_and_nan(device, backend):
@@ -206,7 +206,7 @@ def test_a_grid_is_text():
 
 
 def derivatives(encode, grid, x, table, cells, dtype):
-    """Features, their gradients, and the gradients of those along a direction and of the table's."""
+    """Returns features, their gradients, and the derivatives of these gradients along random directions."""
     generator = torch.Generator().manual_seed(1)
     leaves = [x.to(torch.promote_types(dtype, torch.float32)).requires_grad_(), table.to(dtype).requires_grad_()]
     out = encode(*leaves, grid, cells=cells)
@@ -228,10 +228,10 @@ def test_every_instruction_set(isa, poisoned, name, dtype, several):
     grid, n = GRIDS[name], 131
     x, cells = points(n, grid), torch.randint(3, (n,), dtype=torch.int32) if several else None
     table = torch.randn((3, *grid.table_shape) if several else grid.table_shape).to(dtype)
-    found = derivatives(lambda *a, **o: hash_encode(*a, **o, backend="native"), grid, x, table, cells, dtype)
+    actual = derivatives(lambda *a, **o: hash_encode(*a, **o, backend="native"), grid, x, table, cells, dtype)
     exact = derivatives(reference, grid, x.double(), table.double(), cells, torch.float64)
     plain = derivatives(reference, grid, x, table, cells, torch.float32)
-    for a, b, c in zip(found, plain, exact, strict=True):
+    for a, b, c in zip(actual, plain, exact, strict=True):
         rounding = torch.finfo(a.dtype).eps
         assert (a.double() - c).norm() <= 2 * (b.double() - c).norm() + (2 * rounding + 1e-6) * c.norm()
 
@@ -249,6 +249,6 @@ def test_third_derivatives(backend):
             slopes = (slopes * v.to(dtype)).sum()
         return torch.autograd.grad(slopes, leaves)
 
-    found = third(lambda *arguments: hash_encode(*arguments, backend=backend), torch.float32)
-    for a, b, c in zip(found, third(reference, torch.float32), third(reference, torch.float64), strict=True):
+    result = third(lambda *arguments: hash_encode(*arguments, backend=backend), torch.float32)
+    for a, b, c in zip(result, third(reference, torch.float32), third(reference, torch.float64), strict=True):
         assert (a - c).norm() <= 2 * (b - c).norm() + 1e-5 * c.norm()

@@ -22,7 +22,7 @@ COUNTS = [5, 0, 130, 1]
 
 
 def table_of(grid, **options):
-    """A layer that reads positions, a skip that reads them again, a head that sees directions."""
+    """Returns a layer table with a layer on positions, a skip that reads them again, and a head with directions."""
     layers = (
         Layer(("positions",), 17, "relu"),
         Layer((0, "positions"), 16, "softplus"),
@@ -59,13 +59,13 @@ def test_grouped_equals_encoding_and_network(device, backend, grid, own):
     weights, biases, features = network(grid, own, device)
     x, rays, index = inputs(n, device)
     leaves = [t.requires_grad_() for t in (x, rays, features, *weights, *biases)]
-    given = {"directions": rays, "direction_index": index, "backend": backend}
-    found = grouped_mlp(x, offsets, weights, biases, layers=table_of(grid), features=features, **given)
+    arguments = {"directions": rays, "direction_index": index, "backend": backend}
+    actual = grouped_mlp(x, offsets, weights, biases, layers=table_of(grid), features=features, **arguments)
     encoded = hash_encode(x, features, grid, cells=cells_of(offsets, x) if own else None, backend="reference")
-    expected = grouped_mlp(encoded, offsets, weights, biases, layers=table_of(None), **given)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-    g = torch.randn_like(found)
-    for a, b in zip(torch.autograd.grad(found, leaves, g), torch.autograd.grad(expected, leaves, g), strict=True):
+    expected = grouped_mlp(encoded, offsets, weights, biases, layers=table_of(None), **arguments)
+    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
+    g = torch.randn_like(actual)
+    for a, b in zip(torch.autograd.grad(actual, leaves, g), torch.autograd.grad(expected, leaves, g), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
@@ -80,14 +80,14 @@ def test_routed_equals_grouped(device, backend, grid, own, where):
     centres = torch.rand(k, 3, device=device)
     cells = nearest_centre(x, centres)
     leaves = [t.requires_grad_() for t in (x, rays, features, *weights, *biases)]
-    given = {"directions": rays, "direction_index": index, "backend": backend}
+    arguments = {"directions": rays, "direction_index": index, "backend": backend}
     place = {"centres": {"centres": centres}, "cells": {"cells": cells}, "one cell": {}}[where]
-    found, _ = routed_mlp(x, weights, biases, layers=table_of(grid), features=features, **place, **given)
+    actual, _ = routed_mlp(x, weights, biases, layers=table_of(grid), features=features, **place, **arguments)
     encoded = hash_encode(x, features, grid, cells=cells if own else None, backend="reference")
-    expected, _ = routed_mlp(encoded, weights, biases, layers=table_of(None), cells=cells, **given)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-    g = torch.randn_like(found)
-    for a, b in zip(torch.autograd.grad(found, leaves, g), torch.autograd.grad(expected, leaves, g), strict=True):
+    expected, _ = routed_mlp(encoded, weights, biases, layers=table_of(None), cells=cells, **arguments)
+    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
+    g = torch.randn_like(actual)
+    for a, b in zip(torch.autograd.grad(actual, leaves, g), torch.autograd.grad(expected, leaves, g), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
@@ -105,9 +105,9 @@ def test_rows_without_a_gradient_teach_nothing(device, backend, own, kept, where
     g = torch.zeros(90, 4, device=device).index_fill_(0, rows, 1.0)
 
     def gradients(x, index, cells, g):
-        given = {"layers": table_of(grid), "features": features, "directions": rays, "direction_index": index}
-        found, _ = routed_mlp(x, weights, biases, cells=cells, backend=backend, **given)
-        return torch.autograd.grad(found, leaves, g)
+        arguments = {"layers": table_of(grid), "features": features, "directions": rays, "direction_index": index}
+        result, _ = routed_mlp(x, weights, biases, cells=cells, backend=backend, **arguments)
+        return torch.autograd.grad(result, leaves, g)
 
     alone = gradients(x[rows], index[rows], None if cells is None else cells[rows], g[rows])
     counts = (1, 2, 3) if backend == "native" and device.type == "cpu" else (1,)
@@ -125,8 +125,8 @@ def test_second_derivatives(device, backend, own):
         weights, biases, features = network(grid, own, device, dtype)
         leaves = [t.to(dtype).detach().requires_grad_() for t in (x, features, weights[0], biases[1])]
         at, features, weights[0], biases[1] = leaves
-        given = {"directions": rays.to(dtype), "direction_index": index, "backend": backend}
-        out = grouped_mlp(at, offsets, weights, biases, layers=table_of(grid), features=features, **given)
+        arguments = {"directions": rays.to(dtype), "direction_index": index, "backend": backend}
+        out = grouped_mlp(at, offsets, weights, biases, layers=table_of(grid), features=features, **arguments)
         (slope,) = torch.autograd.grad(out[:, 0].sum(), at, create_graph=True)
         return torch.autograd.grad(((slope.norm(dim=1) - 1) ** 2).sum(), leaves)
 
@@ -140,10 +140,10 @@ def test_is_part_of_a_graph(device, backend, own):
     torch.compiler.reset()
     offsets, (weights, biases, features) = offsets_of(COUNTS, device), network(GRIDS["plain"], own, device)
     x, rays, index = inputs(sum(COUNTS), device)
-    given = {"directions": rays, "direction_index": index, "layers": table_of(GRIDS["plain"]), "backend": backend}
+    arguments = {"directions": rays, "direction_index": index, "layers": table_of(GRIDS["plain"]), "backend": backend}
 
     def run(x, features):
-        return grouped_mlp(x, offsets, weights, biases, features=features, **given)
+        return grouped_mlp(x, offsets, weights, biases, features=features, **arguments)
 
     compiled = torch.compile(run, fullgraph=True, backend="eager")
     torch.testing.assert_close(compiled(x, features), run(x, features))
@@ -156,26 +156,26 @@ def test_rows_of_no_cell_teach_nothing_whatever_they_hold(device, backend, own):
     x, rays, index = inputs(9, device)
     x[0], x[8] = torch.nan, torch.inf
     leaves = [leaf.requires_grad_() for leaf in (x, features, *weights)]
-    given = {"directions": rays, "direction_index": index, "layers": table_of(GRIDS["plain"]), "backend": backend}
-    out = grouped_mlp(x, offsets_of([3, 0, 2, 2], device) + 1, weights, biases, features=features, **given)
-    found = torch.autograd.grad(out.square().sum(), leaves)
-    assert out.isfinite().all() and all(slope.isfinite().all() for slope in found)
+    arguments = {"directions": rays, "direction_index": index, "layers": table_of(GRIDS["plain"]), "backend": backend}
+    out = grouped_mlp(x, offsets_of([3, 0, 2, 2], device) + 1, weights, biases, features=features, **arguments)
+    result = torch.autograd.grad(out.square().sum(), leaves)
+    assert out.isfinite().all() and all(slope.isfinite().all() for slope in result)
 
 
 def test_errors():
     grid, offsets = GRIDS["plain"], offsets_of(COUNTS)
     weights, biases, features = network(grid, False)
     x, rays, index = inputs(sum(COUNTS))
-    given = {"directions": rays, "direction_index": index, "layers": table_of(grid)}
+    arguments = {"directions": rays, "direction_index": index, "layers": table_of(grid)}
     with refused(ValueError, "grouped_mlp: features must be given for layers with a hash grid, got None"):
-        grouped_mlp(x, offsets, weights, biases, **given)
+        grouped_mlp(x, offsets, weights, biases, **arguments)
     e = len(features)
     with refused(ValueError, f"grouped_mlp: features must have shape [{e}, 2], got [{e - 1}, 2]"):
-        grouped_mlp(x, offsets, weights, biases, features=features[1:], **given)
+        grouped_mlp(x, offsets, weights, biases, features=features[1:], **arguments)
     with refused(ValueError, "grouped_mlp: positions must have 3 features where they are hashed, got 2"):
-        grouped_mlp(x[:, :2], offsets, weights, biases, features=features, **given)
+        grouped_mlp(x[:, :2], offsets, weights, biases, features=features, **arguments)
     with refused(ValueError, f"routed_mlp: features must be None for layers without a hash grid, got [{e}, 2]"):
-        routed_mlp(x.repeat(1, 3), weights, biases, **{**given, "layers": table_of(None)}, features=features)
+        routed_mlp(x.repeat(1, 3), weights, biases, **{**arguments, "layers": table_of(None)}, features=features)
     with refused(ValueError, "MLP: grid must come with the hash encoding, and without position_octaves, got hash ..."):
         MLP((Layer(("positions",), 4),), (0,), position_encoding="hash")
 

@@ -14,20 +14,20 @@ def test_is_the_mean_of_the_encoding_over_the_gaussian(device, backend):
     normal = torch.randn(200_000, 3, dtype=torch.float64)
     drawn = frequency_encode(mean + deviation * torch.cat([normal, -normal]), 3, include_input=False).mean(dim=0)
     encoded = integrated_encode(mean.to(device), deviation.square().to(device), 3, backend=backend)
-    # The standard error of 400,000 samples of something between -1 and 1.
+    # The standard error of 400,000 samples of a value between -1 and 1.
     torch.testing.assert_close(encoded[0].double().cpu(), drawn, rtol=0, atol=5 / 400_000**0.5)
 
 
 def test_without_variance_is_the_frequency_encoding(device, backend):
     means = torch.rand(33, 3, device=device)
-    found = integrated_encode(means, torch.zeros_like(means), 5, backend=backend)
-    torch.testing.assert_close(found, frequency_encode(means, 5, include_input=False), rtol=0, atol=1e-6)
+    result = integrated_encode(means, torch.zeros_like(means), 5, backend=backend)
+    torch.testing.assert_close(result, frequency_encode(means, 5, include_input=False), rtol=0, atol=1e-6)
 
 
 def test_large_variances_fade_to_zero(device, backend):
     means = torch.ones(1, 3, device=device)
-    found = integrated_encode(means, torch.tensor([[1e30, float("inf"), 3e38]], device=device), 16, backend=backend)
-    assert (found == 0).all()
+    result = integrated_encode(means, torch.tensor([[1e30, float("inf"), 3e38]], device=device), 16, backend=backend)
+    assert (result == 0).all()
 
 
 def test_errors():

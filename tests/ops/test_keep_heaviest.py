@@ -1,4 +1,4 @@
-"""The heaviest samples of a batch, against sorting them in Python."""
+"""The heaviest samples of a batch, against a sort in Python."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ pytestmark = pytest.mark.op("keep_heaviest")
 
 
 def slow(points, importance, q):
-    """What becomes of a batch."""
-    found = [(-value, i) for i, value in enumerate(importance.tolist()) if 0 < value < math.inf]
+    """Returns the importance and the points that are kept of a batch."""
+    ranked = [(-value, i) for i, value in enumerate(importance.tolist()) if 0 < value < math.inf]
     kept, places = torch.zeros(q), torch.zeros(q, points.shape[1])
-    for place, (_, i) in enumerate(sorted(found)[:q]):
+    for place, (_, i) in enumerate(sorted(ranked)[:q]):
         if bool(points[i].isfinite().all()):
             kept[place], places[place] = importance[i], points[i]
     return kept, places
@@ -44,8 +44,8 @@ def test_equals_sorting(device, backend, m, q, d, order):
     expected[1][2], expected[0][2] = slow(points, importance, q)
     memory = [tensor.to(device, copy=True) for tensor in (kept, slots, added)]
     samples = (strided(tensor.to(device)) for tensor in (points, weights))
-    keep_heaviest(*memory, *samples, **{n: strided(each.to(device)) for n, each in rays.items()}, backend=backend)
-    assert same([each.cpu() for each in memory], (*expected, torch.tensor([6])))
+    keep_heaviest(*memory, *samples, **{n: strided(tensor.to(device)) for n, tensor in rays.items()}, backend=backend)
+    assert same([tensor.cpu() for tensor in memory], (*expected, torch.tensor([6])))
 
 
 def test_threads_make_no_difference():
@@ -72,7 +72,7 @@ def test_refuses_what_makes_no_sense(backend):
     refuses("error and ray_index must be given together, got no ray_index", ray_index=None)
     refuses("kept_points must be contiguous, got strides (3, 6, 1)", kept_points=torch.zeros(3, 2, 3).transpose(0, 1))
     refuses("added must have shape [1], got [2]", added=torch.zeros(2, dtype=torch.int64))
-    assert int(kept["added"]) == 1 and not kept["kept_importance"][1].any()  # the good call, and no other
+    assert int(kept["added"]) == 1 and not kept["kept_importance"][1].any()  # only the valid call has added a batch
 
 
 def test_a_count_may_be_anything(backend):
@@ -80,4 +80,4 @@ def test_a_count_may_be_anything(backend):
     for count, slot in ((-1, 2), (-(2**62), -(2**62) % 3), (2**62, 2**62 % 3)):
         kept, slots, added = torch.zeros(3, 1, 1), torch.zeros(3, 1), torch.tensor([count])
         keep_heaviest(kept, slots, added, torch.ones(1, 1), torch.ones(1), backend=backend)
-        assert slots[:, 0].tolist() == [float(each == slot) for each in range(3)] and int(added) == count + 1
+        assert slots[:, 0].tolist() == [float(place == slot) for place in range(3)] and int(added) == count + 1

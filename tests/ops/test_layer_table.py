@@ -52,7 +52,7 @@ def test_text_of_integrated_positions():
     assert MLP.parse(gaussians.text) == gaussians
     points = MLP(layers, (1,), 16)
     assert points != gaussians and points.text != gaussians.text
-    # As it was written before there was a choice.
+    # The text does not name the default encoding.
     assert points.text == '[[[["positions"], 4, "relu"], [[0, "positions"], 2, "none"]], [1], 16, null]'
     for octaves in (None, 0):
         with pytest.raises(ValueError, match=r"^MLP: position_octaves must be at least 1 with the integrated encoding"):
@@ -138,7 +138,7 @@ PROGRAMS = {
 @pytest.mark.parametrize("ray", [False, True], ids=["of samples", "of rays"])
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_program_is_the_network(name, ray):
-    """Values and two orders of gradients against the reference of grouped_mlp; by the program, and its gradients."""
+    """The program and its gradient programs equal grouped_mlp, in values and two orders of gradients."""
     table, generator = PROGRAMS[name], torch.Generator().manual_seed(0)
     counts, rays, p, q = [4, 0, 6], 5, 6 if PROGRAMS[name].integrated else 3, 3
     n, k, offsets = sum(counts) + 3, len(counts), offsets_of(counts) + 1
@@ -182,20 +182,20 @@ def test_program_is_the_network(name, ray):
 
     def by_the_op(*leaves):
         count = len(inputs)
-        given = leaves[:count], leaves[count:], offsets
-        return grouped_program(*given, program=program, ray_index=index, backend="reference")
+        arguments = leaves[:count], leaves[count:], offsets
+        return grouped_program(*arguments, program=program, ray_index=index, backend="reference")
 
     def by_programs(*leaves):
         return ByPrograms.apply(program.text, offsets, None, index, *leaves)
 
     expected = derivatives(by_layers, tensors, 2)
     for run in (by_the_op, by_programs):
-        for found, exact in zip(derivatives(run, tensors, 2), expected, strict=True):
-            torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-9)
+        for actual, exact in zip(derivatives(run, tensors, 2), expected, strict=True):
+            torch.testing.assert_close(actual, exact, rtol=1e-9, atol=1e-9)
 
 
 def test_program_of_other_widths_and_without_what_is_not_read():
-    """Weights may be wider than the table says; inputs and parameters keep their numbers."""
+    """Weights may be wider than the table says; inputs and parameters keep their indices."""
     table = MLP((Layer((POSITIONS,), 8, "relu"), Layer((0, DIRECTIONS), 4), Layer((0,), 2)), (2,), 2)
     program = table.program(3, 3, (5, 6, 7), (True, True, False), True)
     assert program.inputs == (3, 3) and program.rays == (1,)

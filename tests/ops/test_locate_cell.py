@@ -19,7 +19,7 @@ DEPTH = 3
 
 
 def slow(points, centres):
-    """Down the tree, one point at a time."""
+    """Descends the tree, one point at a time."""
     leaves = []
     for point in points:
         diagram = 0

@@ -1,4 +1,4 @@
-"""Marching through a grid: against stratified depths and a slow loop, and every backend bit for bit the reference."""
+"""Marching through a grid: against stratified depths and a slow loop; all backends equal the reference bit for bit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.op("march_rays")
 
 
 def case(r, shape=(5, 4, 7), share=0.4):
-    """Rays from outside through a box, some of which begin in it, end in it, or miss it."""
+    """Returns rays from outside through a box; some of them begin in it, end in it, or miss it."""
     directions = torch.nn.functional.normalize(0.4 * torch.randn(r, 3) + torch.tensor([0.0, 0.0, 1.0]), dim=-1)
     near = 0.2 + torch.rand(r)
     return {
@@ -33,63 +33,66 @@ def case(r, shape=(5, 4, 7), share=0.4):
     }
 
 
-def march(given, samples, device, backend, **options):
+def march(arguments, samples, device, backend, **options):
     moved = {name: value.to(device) if isinstance(value, Tensor) else value for name, value in options.items()}
-    result = march_rays(*(tensor.to(device) for tensor in given.values()), samples, **moved, backend=backend)
+    result = march_rays(*(tensor.to(device) for tensor in arguments.values()), samples, **moved, backend=backend)
     assert all(part.device.type == device.type for part in result)
     return type(result)(*(part.cpu() for part in result))
 
 
-def same(found, expected):
-    for name, a, b in zip(found._fields, found, expected):
+def same(actual, expected):
+    for name, a, b in zip(actual._fields, actual, expected):
         assert a.dtype == b.dtype and torch.equal(a, b), name
 
 
 def test_a_full_grid_gives_stratified_samples(device, backend):
-    given = case(9) | {"occupied": torch.ones(3, 2, 4, dtype=torch.bool), "box": torch.tensor([[-9.0] * 3, [9.0] * 3])}
+    arguments = case(9) | {
+        "occupied": torch.ones(3, 2, 4, dtype=torch.bool),
+        "box": torch.tensor([[-9.0] * 3, [9.0] * 3]),
+    }
     for spacing in SPACINGS:
-        found = march(given, 33, device, backend, spacing=spacing)
-        depths, deltas, _ = stratified_depths(given["near"], given["far"], 33, jitter=False, spacing=spacing)
-        torch.testing.assert_close(found.depths.reshape(9, 33), depths)
-        torch.testing.assert_close(found.deltas.reshape(9, 33), deltas)
-        assert found.ray_offsets.tolist() == [33 * i for i in range(10)]
-        assert found.ray_index.tolist() == [i // 33 for i in range(9 * 33)]
-        assert found.stop.tolist() == [33] * 9
-        ray = found.ray_index.long()
-        places = given["origins"][ray] + found.depths[:, None] * given["directions"][ray]
-        torch.testing.assert_close(found.positions, places)
+        result = march(arguments, 33, device, backend, spacing=spacing)
+        depths, deltas, _ = stratified_depths(arguments["near"], arguments["far"], 33, jitter=False, spacing=spacing)
+        torch.testing.assert_close(result.depths.reshape(9, 33), depths)
+        torch.testing.assert_close(result.deltas.reshape(9, 33), deltas)
+        assert result.ray_offsets.tolist() == [33 * i for i in range(10)]
+        assert result.ray_index.tolist() == [i // 33 for i in range(9 * 33)]
+        assert result.stop.tolist() == [33] * 9
+        ray = result.ray_index.long()
+        places = arguments["origins"][ray] + result.depths[:, None] * arguments["directions"][ray]
+        torch.testing.assert_close(result.positions, places)
 
 
 @pytest.mark.parametrize("space", [SPHERE, AHEAD])
 def test_samples_of_a_contracted_grid_are_those_in_its_occupied_cells(device, backend, space):
-    given = case(40) | {"box": space.cube, "far": torch.full((40,), 6.0)}
+    arguments = case(40) | {"box": space.cube, "far": torch.full((40,), 6.0)}
     options = {"spacing": "disparity", "contraction": space.numbers}
-    found = march(given, 50, device, backend, **options)
-    depths, deltas, _ = stratified_depths(given["near"], given["far"], 50, jitter=False, spacing="disparity")
-    world = given["origins"][:, None] + depths[..., None] * given["directions"][:, None]
+    result = march(arguments, 50, device, backend, **options)
+    depths, deltas, _ = stratified_depths(arguments["near"], arguments["far"], 50, jitter=False, spacing="disparity")
+    world = arguments["origins"][:, None] + depths[..., None] * arguments["directions"][:, None]
     place = (space.points(world) - space.cube[0]) / (space.cube[1] - space.cube[0])
-    sizes = torch.tensor(given["occupied"].shape)
+    sizes = torch.tensor(arguments["occupied"].shape)
     cell = (place * sizes).long().clamp(min=0).minimum(sizes - 1).unbind(-1)
-    kept = given["occupied"][cell] & ((place >= 0) & (place <= 1)).all(-1)
-    assert 0 < len(found.depths) == int(kept.sum()) < 40 * 50
-    torch.testing.assert_close(found.depths, depths[kept])
-    torch.testing.assert_close(found.deltas, deltas[kept])
-    torch.testing.assert_close(found.positions, space.points(world[kept]))
+    kept = arguments["occupied"][cell] & ((place >= 0) & (place <= 1)).all(-1)
+    assert 0 < len(result.depths) == int(kept.sum()) < 40 * 50
+    torch.testing.assert_close(result.depths, depths[kept])
+    torch.testing.assert_close(result.deltas, deltas[kept])
+    torch.testing.assert_close(result.positions, space.points(world[kept]))
 
 
 def test_samples_are_those_in_occupied_cells(device, backend):
-    given = case(40)
-    found = march(given, 50, device, backend)
-    everywhere = march(given | {"occupied": torch.ones(1, 1, 1, dtype=torch.bool)}, 50, device, backend)
-    assert 0 < len(found.depths) < len(everywhere.depths) < 40 * 50
-    low, high = given["box"].double()
+    arguments = case(40)
+    actual = march(arguments, 50, device, backend)
+    everywhere = march(arguments | {"occupied": torch.ones(1, 1, 1, dtype=torch.bool)}, 50, device, backend)
+    assert 0 < len(actual.depths) < len(everywhere.depths) < 40 * 50
+    low, high = arguments["box"].double()
     expected = []
     for ray, depth in zip(everywhere.ray_index.tolist(), everywhere.depths):
-        place = given["origins"][ray].double() + depth.double() * given["directions"][ray].double()
+        place = arguments["origins"][ray].double() + depth.double() * arguments["directions"][ray].double()
         cell = ((place - low) / (high - low) * torch.tensor([5, 4, 7])).long()
-        if given["occupied"][tuple(cell)]:
+        if arguments["occupied"][tuple(cell)]:
             expected.append((ray, float(depth)))
-    assert list(zip(found.ray_index.tolist(), found.depths.tolist())) == expected
+    assert list(zip(actual.ray_index.tolist(), actual.depths.tolist())) == expected
 
 
 @pytest.mark.parametrize(("r", "samples"), [(0, 4), (1, 1), (65, 31), (130, 32), (63, 65)])
@@ -99,7 +102,7 @@ def test_samples_are_those_in_occupied_cells(device, backend):
 def test_equals_the_reference_to_the_last_bit(device, backend, rest, r, samples):
     need("march_rays", backend, device, torch.float32)
     for shape in ((1, 1, 1), (16, 3, 33)):
-        given = case(r, shape)
+        arguments = case(r, shape)
         for more in (
             {},
             {"uniforms": torch.rand(r, samples)},
@@ -109,8 +112,8 @@ def test_equals_the_reference_to_the_last_bit(device, backend, rest, r, samples)
             {"capacity": 41},
             {"capacity": 5000, "most": 2, "start": torch.randint(0, samples, (r,), dtype=torch.int32)},
         ):
-            expected = march(given, samples, torch.device("cpu"), "reference", **rest, **more)
-            same(march(given, samples, device, backend, **rest, **more), expected)
+            expected = march(arguments, samples, torch.device("cpu"), "reference", **rest, **more)
+            same(march(arguments, samples, device, backend, **rest, **more), expected)
 
 
 @pytest.mark.parametrize("rest", [{}, {"contraction": SPHERE.numbers}, {"contraction": AHEAD.numbers}])
@@ -119,22 +122,25 @@ def test_many_rays_of_a_picture_equal_the_reference(device, backend, rest, spaci
     need("march_rays", backend, device, torch.float32)
     rest = rest | {"spacing": spacing}
     for shape, share in (((24, 20, 28), 0.0), ((24, 20, 28), 0.002), ((24, 20, 28), 0.05), ((8, 33, 5), 0.5)):
-        given = case(900, shape, share)
-        given["far"][:40], given["far"][40:80] = given["near"][:40] * (1 + 1e-5), 100.0  # short strata, and long ones
+        arguments = case(900, shape, share)
+        arguments["far"][:40], arguments["far"][40:80] = (
+            arguments["near"][:40] * (1 + 1e-5),
+            100.0,
+        )  # short strata, and long ones
         for more in ({}, {"most": 3}, {"start": torch.randint(0, 70, (900,), dtype=torch.int32), "most": 5}):
-            expected = march(given, 64, torch.device("cpu"), "reference", **rest, **more)
-            same(march(given, 64, device, backend, **rest, **more), expected)
+            expected = march(arguments, 64, torch.device("cpu"), "reference", **rest, **more)
+            same(march(arguments, 64, device, backend, **rest, **more), expected)
 
 
 def test_a_seed_stands_for_uniforms_of_its_own(device, backend):
     r, samples = 200, 40
     box = torch.tensor([[-99.0] * 3, [99.0] * 3])
-    given = case(r) | {"occupied": torch.ones(1, 1, 1, dtype=torch.bool), "box": box}
-    given["near"], given["far"] = torch.zeros(r), torch.full((r,), float(samples))  # strata of length 1
+    arguments = case(r) | {"occupied": torch.ones(1, 1, 1, dtype=torch.bool), "box": box}
+    arguments["near"], arguments["far"] = torch.zeros(r), torch.full((r,), float(samples))  # strata of length 1
     drawn = []
     for seed in (7, 8, -(2**31)):
-        found = march(given, samples, device, backend, seed=torch.tensor([seed], dtype=torch.int32))
-        drawn.append(found.depths.reshape(r, samples) - torch.arange(samples))
+        result = march(arguments, samples, device, backend, seed=torch.tensor([seed], dtype=torch.int32))
+        drawn.append(result.depths.reshape(r, samples) - torch.arange(samples))
     assert all(bool((part >= 0).all() and (part <= 1).all()) for part in drawn)
     near, other = drawn[0].flatten(), drawn[1].flatten()
     shares = torch.histc(near, 20, 0, 1) / len(near)
@@ -144,34 +150,34 @@ def test_a_seed_stands_for_uniforms_of_its_own(device, backend):
 
 
 def test_waves_give_together_what_one_call_gives(device, backend):
-    given, uniforms = case(30), torch.rand(30, 40)
-    whole = march(given, 40, device, backend, uniforms=uniforms)
+    arguments, uniforms = case(30), torch.rand(30, 40)
+    whole = march(arguments, 40, device, backend, uniforms=uniforms)
     for options in ({"most": 1}, {"most": 7}, {"capacity": 100}, {"capacity": 60, "most": 4}):
-        found = [[] for _ in range(30)]
+        depths = [[] for _ in range(30)]
         start = torch.zeros(30, dtype=torch.int32)
         for _ in range(41):
-            wave = march(given, 40, device, backend, uniforms=uniforms, start=start, **options)
+            wave = march(arguments, 40, device, backend, uniforms=uniforms, start=start, **options)
             count = int(wave.ray_offsets[-1])
             assert not wave.depths[count:].any() and not wave.deltas[count:].any() and not wave.ray_index[count:].any()
             for ray, depth in zip(wave.ray_index[:count].tolist(), wave.depths[:count].tolist()):
-                found[ray].append(depth)
+                depths[ray].append(depth)
             start = wave.stop
         assert start.tolist() == [40] * 30
-        assert [depth for own in found for depth in own] == whole.depths.tolist()
+        assert [depth for own in depths for depth in own] == whole.depths.tolist()
 
 
 def test_rays_of_no_length_and_of_no_numbers_have_no_samples(device, backend):
-    given = case(6) | {"occupied": torch.ones(2, 2, 2, dtype=torch.bool)}
-    given["origins"][:] = 0
-    given["near"][:], given["far"][:] = 0.1, 0.5
-    given["far"][0] = given["near"][0]
-    given["far"][1] = -1
-    given["origins"][2, 1] = torch.nan
-    given["directions"][3, 0] = torch.inf
-    given["near"][4] = torch.nan
-    found = march(given, 8, device, backend)
-    assert found.ray_offsets[:6].tolist() == [0] * 6 and found.ray_offsets[6] > 0
-    assert found.stop.tolist() == [8] * 6
+    arguments = case(6) | {"occupied": torch.ones(2, 2, 2, dtype=torch.bool)}
+    arguments["origins"][:] = 0
+    arguments["near"][:], arguments["far"][:] = 0.1, 0.5
+    arguments["far"][0] = arguments["near"][0]
+    arguments["far"][1] = -1
+    arguments["origins"][2, 1] = torch.nan
+    arguments["directions"][3, 0] = torch.inf
+    arguments["near"][4] = torch.nan
+    result = march(arguments, 8, device, backend)
+    assert result.ray_offsets[:6].tolist() == [0] * 6 and result.ray_offsets[6] > 0
+    assert result.stop.tolist() == [8] * 6
 
 
 def test_refuses_what_makes_no_sense():

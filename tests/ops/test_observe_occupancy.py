@@ -21,10 +21,10 @@ SPACES = {
 
 
 def slow(density, positions, sigma, deltas, weights, decay, hidden, stretch):
-    """One sample at a time, in a dictionary of the cells that have some."""
-    found = {}
+    """Observes one sample at a time, in a dictionary of the cells with samples."""
+    results = {}
     for place, *sample in zip(*(part.tolist() for part in (positions, sigma, deltas, weights, stretch))):
-        if sample[1] == 0:  # stands for no part of a ray
+        if sample[1] == 0:  # a length of 0 is no part of a ray
             continue
         cell = []
         for axis, size in enumerate(density.shape):
@@ -33,9 +33,9 @@ def slow(density, positions, sigma, deltas, weights, decay, hidden, stretch):
             cell.append(0 if math.isnan(share) else int(min(max(share * size, 0), size - 1)))
         value = math.inf if math.isnan(sample[0]) else sample[0]
         seen = sample[2] > hidden * -math.expm1(-value * sample[1])
-        found.setdefault(tuple(cell), []).append(value * sample[3] if seen else 0.0)
+        results.setdefault(tuple(cell), []).append(value * sample[3] if seen else 0.0)
     result = density.clone()
-    for cell, values in found.items():
+    for cell, values in results.items():
         result[cell] = max(float(density[cell] * decay), *values)
     return result
 
@@ -51,20 +51,20 @@ def test_equals_a_slow_loop(device, backend, shape, m, decay, space):
     deltas[2::7] = 0.0
     sigma[::50], positions[3::50, 1] = torch.nan, torch.nan
     contraction = SPACES[space]
-    # What lies nowhere lies infinitely far away.
+    # A position that is NaN counts as infinitely far away.
     far = positions.nan_to_num(1e9)
     stretch = torch.ones(m) if contraction is None else contraction.stretch(far.double())
     expected = slow(density, positions, sigma, deltas, weights, decay, 0.01, stretch)
-    found, occupied = density.to(device, copy=True), (density >= 0.9).to(device)
+    actual, occupied = density.to(device, copy=True), (density >= 0.9).to(device)
     samples = [strided(tensor.to(device)) for tensor in (positions, sigma, deltas, weights)]
-    given = [tensor.clone() for tensor in samples]
+    arguments = [tensor.clone() for tensor in samples]
     numbers = None if contraction is None else contraction.numbers.to(device)
     rule = {"decay": decay, "threshold": 0.9, "hidden": 0.01, "contraction": numbers, "backend": backend}
-    observe_occupancy(found, occupied, BOX.to(device), *samples, **rule)
+    observe_occupancy(actual, occupied, BOX.to(device), *samples, **rule)
     rounding = {"rtol": 0 if contraction is None else 1e-3, "atol": 0}
-    torch.testing.assert_close(found.cpu(), expected, **rounding)
-    assert torch.equal(occupied, found >= 0.9)
-    for before, after in zip(given, samples):
+    torch.testing.assert_close(actual.cpu(), expected, **rounding)
+    assert torch.equal(occupied, actual >= 0.9)
+    for before, after in zip(arguments, samples):
         torch.testing.assert_close(after, before, rtol=0, atol=0, equal_nan=True)
 
 
@@ -73,16 +73,16 @@ def test_samples_without_rays_are_seen_and_fixed_cells_stay(device, backend):
     positions, sigma = BOX[0] + (BOX[1] - BOX[0]) * torch.rand(500, 3), 3 * torch.rand(500)
     sigma[::50] = torch.nan
     fixed = torch.rand(5, 6, 7) < 0.3
-    given = positions, sigma, torch.ones(500), torch.ones(500), torch.ones(500)
+    arguments = positions, sigma, torch.ones(500), torch.ones(500), torch.ones(500)
     for kept in (fixed, None):
-        expected = slow(density, *given[:4], 0.5, 0.0, given[4])
+        expected = slow(density, *arguments[:4], 0.5, 0.0, arguments[4])
         expected = expected if kept is None else torch.where(kept, density, expected)
-        found, occupied = density.to(device, copy=True), (density >= 0.9).to(device)
+        actual, occupied = density.to(device, copy=True), (density >= 0.9).to(device)
         rule = {"decay": 0.5, "threshold": 0.9, "hidden": 0.0, "backend": backend}
-        samples = (strided(tensor.to(device)) for tensor in given[:2])
+        samples = (strided(tensor.to(device)) for tensor in arguments[:2])
         there = None if kept is None else strided(kept.to(device))
-        observe_occupancy(found, occupied, BOX.to(device), *samples, **rule, fixed=there)
-        assert torch.equal(found.cpu(), expected)
+        observe_occupancy(actual, occupied, BOX.to(device), *samples, **rule, fixed=there)
+        assert torch.equal(actual.cpu(), expected)
         assert torch.equal(occupied.cpu(), expected >= 0.9)
 
 

@@ -57,8 +57,8 @@ def test_compiles_as_one_graph(device, compiler):
         pytest.skip("torch.compile finds no C++ compiler")
     leaves = inputs(device)
     expected = render(*leaves)
-    with inductor.patch({"cpp.vec_isa_ok": False}):  # to ask for vectors takes two compilations
-        found = torch.compile(render, fullgraph=True, backend=compiler)(*leaves)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-    for gradient, other in zip(*(torch.autograd.grad(y.square().sum(), leaves[3:]) for y in (found, expected))):
+    with inductor.patch({"cpp.vec_isa_ok": False}):  # the check of vector instructions takes two compilations
+        actual = torch.compile(render, fullgraph=True, backend=compiler)(*leaves)
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+    for gradient, other in zip(*(torch.autograd.grad(y.square().sum(), leaves[3:]) for y in (actual, expected))):
         torch.testing.assert_close(gradient, other, rtol=1e-3, atol=1e-5)

@@ -22,8 +22,8 @@ def scene(channels, lens):
     models = None
     if lens == "mixed":
         models = torch.arange(4, dtype=torch.int32) % 3
-        bent[2, 0] = 0.9  # of FOV
-        bent[3] = 0  # no lens
+        bent[2, 0] = 0.9  # an FOV lens
+        bent[3] = 0  # no distortion
     images = torch.randint(0, 256, (4, HEIGHT, WIDTH, channels), dtype=torch.uint8)
     return Cameras(poses, intrinsics, WIDTH, HEIGHT, bent, models), images
 
@@ -40,7 +40,7 @@ def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, chan
     box = BOX if boxed else None
     on = lambda tensor: None if tensor is None else tensor.to(device)  # noqa: E731
     options = {"near": 2.5, "far": 4.0, "box": on(box), "background": on(behind), "backend": backend}
-    found = cameras.to(device).pixel_rays(on(images), on(index), **options)
+    actual = cameras.to(device).pixel_rays(on(images), on(index), **options)
     pixel = index % (HEIGHT * WIDTH)
     rays = cameras.rays(index // (HEIGHT * WIDTH), pixel % WIDTH, pixel // WIDTH)
     near, far, hit = intersect_box(rays.origins, rays.directions, box, 2.5, 4.0)
@@ -48,20 +48,20 @@ def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, chan
     if channels == 4 and behind is not None:
         colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
     assert b < 300 or not boxed or 0 < int(hit.sum()) < b
-    for part, expected in zip(found, (rays.origins, rays.directions, near, far, colour[:, :3]), strict=True):
+    for part, expected in zip(actual, (rays.origins, rays.directions, near, far, colour[:, :3]), strict=True):
         torch.testing.assert_close(part.cpu(), expected, atol=2e-6, rtol=2e-6)
 
 
 def test_rays_along_an_axis_are_in_a_slab_or_not(device, backend):
-    """Where a component of the direction is zero."""
+    """A direction with a component of zero is inside or outside of a slab along its whole ray."""
     poses = torch.eye(4).repeat(3, 1, 1)
     poses[:, :3, 3] = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [-1.0, 1.0, 9.0]])
     lens, images = torch.tensor([[1.0, 1.0, 0.5, 0.5]]).repeat(3, 1), torch.zeros(3, 1, 1, 3, dtype=torch.uint8)
     box = torch.tensor([[-1.0, -1.0, -3.0], [1.0, 1.0, -2.0]])
     tensors = (tensor.to(device) for tensor in (poses, lens, images, torch.arange(3)))
-    found = pixel_rays(*tensors, near=1.0, far=20.0, box=box.to(device), backend=backend)
-    assert found.near.tolist()[::2] == [2.0, 11.0] and found.far.tolist()[::2] == [3.0, 12.0]
-    assert found.near[1] == found.far[1]
+    result = pixel_rays(*tensors, near=1.0, far=20.0, box=box.to(device), backend=backend)
+    assert result.near.tolist()[::2] == [2.0, 11.0] and result.far.tolist()[::2] == [3.0, 12.0]
+    assert result.near[1] == result.far[1]
 
 
 def test_refuses_what_makes_no_sense():

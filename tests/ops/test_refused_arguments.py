@@ -1,4 +1,4 @@
-"""Tensors of kinds that no operation takes; what each op refuses is in its case."""
+"""Tensors of kinds that no operation takes; the case of each op lists the op's own refusals."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from voronerf.ops._core.cases import Draw, cases
 POINTS = torch.rand(4, 3)
 
 
-def composite(**given):
-    return ops.composite(torch.rand(2, 3), torch.rand(2, 3, 3), torch.rand(2, 3), torch.rand(2, 3), **given)
+def composite(**arguments):
+    return ops.composite(torch.rand(2, 3), torch.rand(2, 3, 3), torch.rand(2, 3), torch.rand(2, 3), **arguments)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_tensors_that_are_not_dense(kind, make):
 
 @pytest.mark.op("grouped_linear")
 def test_inference_tensors(backend):
-    """They are taken unless autograd would have to keep them."""
+    """Ops take inference tensors unless autograd would have to keep them."""
     with torch.inference_mode():
         weight, background = torch.rand(1, 2, 3), torch.ones(3)
         offsets = torch.tensor([0, 4], dtype=torch.int32)
@@ -55,8 +55,8 @@ def test_ops_that_differentiate_inside_take_inference_tensors(op, inside):
         call = cases()[op].make(Draw(3), 7)
         call = tree_map(lambda value: value.clone() if isinstance(value, torch.Tensor) else value, call)
     with torch.inference_mode(inside):
-        found = [tree_leaves(getattr(ops, op)(**call, backend=backend)) for backend in ("reference", "native")]
-    for part, other in zip(*found, strict=True):
+        results = [tree_leaves(getattr(ops, op)(**call, backend=backend)) for backend in ("reference", "native")]
+    for part, other in zip(*results, strict=True):
         assert torch.allclose(part, other, atol=1e-5)
 
 
@@ -71,7 +71,7 @@ def test_cells_without_a_table_are_refused_by_every_backend(backend):
 @pytest.mark.parametrize("op", ["run_sums", "run_gradients"])
 @pytest.mark.parametrize("backend", ["reference", "native"])
 def test_runs_that_are_not_of_the_samples_are_refused(op, backend):
-    """A run without a sample at the end would have the ray of a sample that is not there."""
+    """A run without samples at the end would read the ray of a sample that does not exist."""
     call = cases()[op].make(Draw(3), 9)
     offsets = call["samples"].run_offsets
     for change in (
@@ -81,7 +81,7 @@ def test_runs_that_are_not_of_the_samples_are_refused(op, backend):
         offsets + 1,
         offsets - 1,
     ):
-        given = {**call, "samples": call["samples"]._replace(run_offsets=change.int())}
+        arguments = {**call, "samples": call["samples"]._replace(run_offsets=change.int())}
         if op == "run_gradients":
-            given["answers"] = torch.zeros(len(change) - 1, 6)
-        refuses(f"{op}: run_offsets must rise from 0 to the", getattr(ops, op), **given, backend=backend)
+            arguments["answers"] = torch.zeros(len(change) - 1, 6)
+        refuses(f"{op}: run_offsets must rise from 0 to the", getattr(ops, op), **arguments, backend=backend)

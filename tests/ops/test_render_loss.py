@@ -13,7 +13,7 @@ SCALE = 10.0
 
 
 def rays(counts, dtype=torch.float64, outside=(0, 0)):
-    """Raw outputs, lengths and offsets of packed samples, targets and backgrounds of their rays."""
+    """Returns raw outputs, lengths and offsets of packed samples, and targets and backgrounds of their rays."""
     m, r = sum(counts) + sum(outside), len(counts)
     raw, deltas = 3 * torch.randn(m, 4, dtype=dtype), torch.rand(m, dtype=dtype) / 10
     offsets = offsets_of(counts) + outside[0]
@@ -21,7 +21,7 @@ def rays(counts, dtype=torch.float64, outside=(0, 0)):
 
 
 def step_by_step(raw, deltas, offsets, target, background, activated=False):
-    """Activations, if any, composite and loss as three steps."""
+    """Computes activations (unless ``activated``), composite and loss as three steps."""
     colour, density = raw[:, :3], raw[:, 3]
     if not activated:
         colour, density = torch.sigmoid(colour), SCALE * torch.nn.functional.softplus(density)
@@ -34,20 +34,20 @@ def rule(activated):
     return {"activated": True} if activated else {"density_scale": SCALE}
 
 
-def evaluate(device, given, dtype, backend, hidden=0.0, activated=False):
-    """All results, and the gradient of three times the loss."""
-    raw, deltas, offsets, target, background = (t.to(device) for t in given)
+def evaluate(device, arguments, dtype, backend, hidden=0.0, activated=False):
+    """Returns all results, and the gradient of three times the loss."""
+    raw, deltas, offsets, target, background = (t.to(device) for t in arguments)
     wide = torch.promote_types(dtype, torch.float32)
     leaf = raw.to(dtype).requires_grad_()
     rest = deltas.to(wide), offsets, target.to(wide)
     background = background.to(wide)
     if backend is None:
-        found = step_by_step(leaf, *rest, background, activated)
+        result = step_by_step(leaf, *rest, background, activated)
     else:
         options = {**rule(activated), "hidden": hidden, "backend": backend}
-        found = render_loss(leaf, *rest, background=background, **options)
-    (gradient,) = torch.autograd.grad(3 * found.loss, leaf)
-    return [*(part.detach() for part in found), gradient]
+        result = render_loss(leaf, *rest, background=background, **options)
+    (gradient,) = torch.autograd.grad(3 * result.loss, leaf)
+    return [*(part.detach() for part in result), gradient]
 
 
 @pytest.mark.parametrize(
@@ -56,19 +56,19 @@ def evaluate(device, given, dtype, backend, hidden=0.0, activated=False):
 @pytest.mark.parametrize("outside", [(0, 0), (3, 2)])
 @pytest.mark.parametrize("activated", [False, True])
 def test_is_activations_composite_and_squared_error(device, backend, counts, outside, activated):
-    given = rays(counts, outside=outside)
+    arguments = rays(counts, outside=outside)
     if activated:
-        given[0][:, 3].mul_(SCALE).clamp_(min=-0.5)  # a little of it negative, as no activation is
+        arguments[0][:, 3].mul_(SCALE).clamp_(min=-0.5)  # a little of it negative, as no activation is
     of = {"activated": activated}
-    exact = evaluate(device, given, torch.float64, None, **of)
-    plain = evaluate(device, given, torch.float32, "reference", **of)
-    for found, same, right in zip(evaluate(device, given, torch.float32, backend, **of), plain, exact):
-        assert_as_exact(found, same, right)
+    exact = evaluate(device, arguments, torch.float64, None, **of)
+    plain = evaluate(device, arguments, torch.float32, "reference", **of)
+    for actual, same, right in zip(evaluate(device, arguments, torch.float32, backend, **of), plain, exact):
+        assert_as_exact(actual, same, right)
 
 
 @pytest.mark.parametrize("hidden", [0.0, 0.3])
 def test_gradients_to_activated_values(device, backend, hidden):
-    """Weight times the gradient to the colour of the ray; to raw numbers it has the slopes of the activations, too."""
+    """A colour's gradient is weight times the ray's gradient; raw outputs also have the slopes of the activations."""
     raw, *rest = rays([40, 0, 3, 90])
     values = torch.cat([torch.sigmoid(raw[:, :3]), SCALE * torch.nn.functional.softplus(raw[:, 3:])], 1)
     slopes = torch.cat([values[:, :3] * (1 - values[:, :3]), SCALE * torch.sigmoid(raw[:, 3:])], 1)
@@ -84,20 +84,20 @@ def test_gradients_to_activated_values(device, backend, hidden):
 
 @pytest.mark.parametrize("hidden", [0.0, 0.3])
 def test_no_density_has_a_gradient_where_light_arrives(device, backend, hidden):
-    """Density 0, as of a relu, weighs nothing, but more of it would."""
+    """A density of 0, as from a relu, has no weight, but more density would have."""
     raw = torch.tensor([[0.9, 0.5, 0.1, 0.0], [0.2, 0.2, 0.2, 20.0], [0.9, 0.5, 0.1, 0.0]], device=device)
     rest = torch.full((3,), 0.5, device=device), offsets_of([3]).to(device), torch.zeros(1, 3, device=device)
     leaf = raw.requires_grad_()
-    found = render_loss(leaf, *rest, activated=True, hidden=hidden, backend=backend)
-    found.loss.backward()
-    assert found.weights[[0, 2]].tolist() == [0, 0] and torch.equal(found.density, raw.detach()[:, 3])
+    result = render_loss(leaf, *rest, activated=True, hidden=hidden, backend=backend)
+    result.loss.backward()
+    assert result.weights[[0, 2]].tolist() == [0, 0] and torch.equal(result.density, raw.detach()[:, 3])
     assert float(leaf.grad[0, 3]) == pytest.approx(0.5 * 2 * 0.2 * (0.7 + 0.3 - 0.1) / 3, rel=1e-3)
     assert abs(float(leaf.grad[2, 3])) < 1e-4 and (hidden == 0 or not leaf.grad[2].any())
 
 
 @pytest.mark.parametrize("scale", [0.02, 0.5])
 def test_robust_loss_is_squared_for_small_errors_and_grows_linearly(device, backend, scale):
-    """Against the formula of Charbonnier, step by step in float64; rays on target, near it and far from it."""
+    """The loss equals Charbonnier's formula in float64, for rays on, near and far from the target."""
     raw, deltas, offsets, target, background = rays([40, 0, 3, 90])
     seen = step_by_step(raw, deltas, offsets, target, background).colour
     target = seen + torch.tensor([0.0, 1e-4, 0.1, 0.4], dtype=seen.dtype)[:, None]
@@ -105,15 +105,17 @@ def test_robust_loss_is_squared_for_small_errors_and_grows_linearly(device, back
     error = step_by_step(leaf, deltas, offsets, target, background).colour.sub(target).square().sum(-1)
     exact = (2 * scale * ((error + scale**2).sqrt() - scale)).mean() / 3
     (expected,) = torch.autograd.grad(exact, leaf)
-    given = [t.to(device, t.dtype if t.dtype == torch.int32 else torch.float32) for t in (raw, deltas, offsets, target)]
-    values = given[0].requires_grad_()
+    arguments = [
+        t.to(device, t.dtype if t.dtype == torch.int32 else torch.float32) for t in (raw, deltas, offsets, target)
+    ]
+    values = arguments[0].requires_grad_()
     rule = {"background": background.float().to(device), "density_scale": SCALE, "robust": scale, "backend": backend}
-    found = render_loss(values, *given[1:], **rule)
-    found.loss.backward()
-    torch.testing.assert_close(found.loss.double().cpu(), exact.detach(), rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(found.error.double().cpu(), error.detach(), rtol=1e-4, atol=1e-7)
+    actual = render_loss(values, *arguments[1:], **rule)
+    actual.loss.backward()
+    torch.testing.assert_close(actual.loss.double().cpu(), exact.detach(), rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(actual.error.double().cpu(), error.detach(), rtol=1e-4, atol=1e-7)
     torch.testing.assert_close(values.grad.double().cpu(), expected, rtol=1e-3, atol=1e-7)
-    assert float(found.loss) < float(error.mean()) / 3
+    assert float(actual.loss) < float(error.mean()) / 3
 
 
 def test_backgrounds(device, backend):
@@ -121,8 +123,8 @@ def test_backgrounds(device, backend):
     rest = {"density_scale": SCALE, "backend": backend}
     one = torch.rand(3, device=device)
     shared = render_loss(raw, deltas, offsets, target, background=one, **rest)
-    each = render_loss(raw, deltas, offsets, target, background=one.expand(3, 3), **rest)
-    assert all(torch.equal(a, b) for a, b in zip(shared, each))
+    separate = render_loss(raw, deltas, offsets, target, background=one.expand(3, 3), **rest)
+    assert all(torch.equal(a, b) for a, b in zip(shared, separate))
     assert torch.equal(shared.colour[1], one)
     black = render_loss(raw, deltas, offsets, target, **rest)
     assert torch.equal(black.colour[1], torch.zeros(3, device=device))
@@ -131,16 +133,16 @@ def test_backgrounds(device, backend):
 @pytest.mark.parametrize("counts", [[40, 0, 3, 90], [300]])
 @pytest.mark.parametrize("activated", [False, True])
 def test_what_little_light_reaches_has_no_gradient(device, backend, counts, activated):
-    given = rays(counts, outside=(1, 2))
+    arguments = rays(counts, outside=(1, 2))
     if activated:
-        given[0][:, 3] = SCALE * given[0][:, 3].abs()
-    *plain, whole = evaluate(device, given, torch.float32, backend, activated=activated)
-    *others, found = evaluate(device, given, torch.float32, backend, hidden=0.3, activated=activated)
+        arguments[0][:, 3] = SCALE * arguments[0][:, 3].abs()
+    *plain, whole = evaluate(device, arguments, torch.float32, backend, activated=activated)
+    *others, result = evaluate(device, arguments, torch.float32, backend, hidden=0.3, activated=activated)
     assert all(torch.equal(a, b) for a, b in zip(plain, others))
-    light = plain[2] / -torch.expm1(-plain[3] * given[1].to(plain[3]))
+    light = plain[2] / -torch.expm1(-plain[3] * arguments[1].to(plain[3]))
     seen = (light > 0.3) & (torch.arange(len(light), device=light.device) > 0)
     assert 0 < int(seen.sum()) < len(light) - 3
-    assert torch.equal(found, whole * seen[:, None])
+    assert torch.equal(result, whole * seen[:, None])
 
 
 def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend):
@@ -149,20 +151,20 @@ def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend):
     spoiled[6, 3] = torch.nan
     rest = {"background": background, "density_scale": SCALE, "backend": backend}
     clean = render_loss(raw, deltas, offsets, target, **rest)
-    found = render_loss(spoiled, deltas, offsets, target, **rest)
-    assert found.colour[1].isnan().all() and found.loss.isnan()
+    result = render_loss(spoiled, deltas, offsets, target, **rest)
+    assert result.colour[1].isnan().all() and result.loss.isnan()
     for ray in (0, 2):
-        assert torch.equal(found.colour[ray], clean.colour[ray])
+        assert torch.equal(result.colour[ray], clean.colour[ray])
     leaf = spoiled.requires_grad_()
     render_loss(leaf, deltas, offsets, target, **rest).loss.backward()
-    assert leaf.grad[7:9].isnan().all()  # behind it: no light that is known
+    assert leaf.grad[7:9].isnan().all()  # unknown light reaches the samples behind it
     assert leaf.grad[:4].isfinite().all() and leaf.grad[9:].isfinite().all()
 
 
 @pytest.mark.parametrize("counts", [[3, 0, 17, 1, 0, 40, 2], [300, 5, 200, 0, 1000], [0, 9, 0], [4] * 150])
 @pytest.mark.parametrize("robust", [0.0, 0.05])
 def test_unseen_rays_have_no_colour_to_learn(device, backend, counts, robust):
-    """Their loss, error and gradient are 0, even of targets and colours that are no numbers."""
+    """Unseen rays have loss, error and gradient 0, even if targets and colours are NaN."""
     raw, deltas, offsets, target, background = rays(counts, torch.float32, outside=(2, 3))
     r, triples = len(counts), (len(counts) + 1) // 4
     first, leaf = r - 3 * triples, raw.double().requires_grad_()
@@ -171,23 +173,23 @@ def test_unseen_rays_have_no_colour_to_learn(device, backend, counts, robust):
     exact = (2 * robust * ((error + robust**2).sqrt() - robust) if robust else error).sum() / (3 * r)
     exact.backward()
     rest = {"density_scale": SCALE, "robust": robust, "backend": backend}
-    given = [tensor.to(device) for tensor in (deltas, offsets, target)]
-    expected = render_loss(raw.to(device), *given, background=background.to(device), **rest)
-    given[2][first:] = torch.nan
+    arguments = [tensor.to(device) for tensor in (deltas, offsets, target)]
+    expected = render_loss(raw.to(device), *arguments, background=background.to(device), **rest)
+    arguments[2][first:] = torch.nan
     values = raw.to(device).requires_grad_()
-    found = render_loss(values, *given, background=background.to(device), triples=triples, **rest)
-    found.loss.backward()
-    torch.testing.assert_close(found.loss.double().cpu(), exact.detach(), rtol=1e-5, atol=1e-7)
+    actual = render_loss(values, *arguments, background=background.to(device), triples=triples, **rest)
+    actual.loss.backward()
+    torch.testing.assert_close(actual.loss.double().cpu(), exact.detach(), rtol=1e-5, atol=1e-7)
     torch.testing.assert_close(values.grad.double().cpu(), leaf.grad, rtol=1e-3, atol=1e-6)
     begins = int(offsets[first])
-    assert not values.grad[begins:].any() and not found.error[first:].any()
-    assert torch.equal(found.error[:first], expected.error[:first])
-    assert all(torch.equal(part, other) for part, other in zip(found[1:4], expected[1:4]))
+    assert not values.grad[begins:].any() and not actual.error[first:].any()
+    assert torch.equal(actual.error[:first], expected.error[:first])
+    assert all(torch.equal(part, other) for part, other in zip(actual[1:4], expected[1:4]))
     spoiled = values.detach().clone()
     spoiled[begins:] = torch.nan
-    other = render_loss(spoiled.requires_grad_(), *given, background=background.to(device), triples=triples, **rest)
+    other = render_loss(spoiled.requires_grad_(), *arguments, background=background.to(device), triples=triples, **rest)
     other.loss.backward()
-    assert torch.equal(other.loss, found.loss) and torch.equal(spoiled.grad, values.grad)
+    assert torch.equal(other.loss, actual.loss) and torch.equal(spoiled.grad, values.grad)
 
 
 @pytest.mark.parametrize("activated", [False, True])
@@ -195,30 +197,30 @@ def test_infinite_density_is_opaque_and_has_no_gradient(device, backend, activat
     raw, deltas, offsets, target, background = (t.to(device) for t in rays([4], torch.float32))
     raw[1, 3] = torch.inf
     leaf = raw.requires_grad_()
-    found = render_loss(leaf, deltas, offsets, target, background=background, **rule(activated), backend=backend)
-    found.loss.backward()
-    assert found.weights[2:].tolist() == [0, 0]
+    result = render_loss(leaf, deltas, offsets, target, background=background, **rule(activated), backend=backend)
+    result.loss.backward()
+    assert result.weights[2:].tolist() == [0, 0]
     assert leaf.grad.isfinite().all() and leaf.grad[1:, 3].tolist() == [0, 0, 0]
 
 
 def test_only_the_loss_has_gradients(device, backend):
     raw, deltas, offsets, target, _ = (t.to(device).requires_grad_(t.is_floating_point()) for t in rays([4]))
-    found = render_loss(raw.float(), deltas.float(), offsets, target.float(), density_scale=SCALE, backend=backend)
-    assert found.loss.requires_grad and not any(part.requires_grad for part in found[1:])
-    found.loss.backward()
+    result = render_loss(raw.float(), deltas.float(), offsets, target.float(), density_scale=SCALE, backend=backend)
+    assert result.loss.requires_grad and not any(part.requires_grad for part in result[1:])
+    result.loss.backward()
     assert raw.grad is not None and deltas.grad is None and target.grad is None
 
 
 @pytest.mark.parametrize("activated", [False, True])
 def test_the_gradient_has_a_gradient(device, backend, activated):
-    given = rays([4, 0, 9])
+    arguments = rays([4, 0, 9])
     exact = None
     for dtype, chosen in ((torch.float64, "reference"), (torch.float32, "reference"), (torch.float32, backend)):
-        raw, deltas, target, background = (given[i].to(device, dtype) for i in (0, 1, 3, 4))
+        raw, deltas, target, background = (arguments[i].to(device, dtype) for i in (0, 1, 3, 4))
         raw.requires_grad_()
         rest = {"background": background, **rule(activated), "hidden": 0.2, "backend": chosen}
-        found = render_loss(raw, deltas, given[2].to(device), target, **rest)
-        (gradient,) = torch.autograd.grad(found.loss, raw, create_graph=True)
+        actual = render_loss(raw, deltas, arguments[2].to(device), target, **rest)
+        (gradient,) = torch.autograd.grad(actual.loss, raw, create_graph=True)
         (second,) = torch.autograd.grad(gradient.square().sum(), raw)
         if dtype == torch.float64:
             exact = second

@@ -1,4 +1,4 @@
-"""What rays of a picture see: one operation against the waves of others."""
+"""The rays of a picture: one operation against the waves of separate operations."""
 
 import itertools
 
@@ -23,16 +23,16 @@ CHOICES = [
 @pytest.mark.parametrize(("n", "positions", "cells", "spacing", "activated"), CHOICES)
 def test_native_sees_what_the_reference_sees(n, positions, cells, spacing, activated):
     pins = {"positions": positions, "cells": cells, "spacing": spacing, "activated": activated}
-    given = CASE.make(Draw(n, **pins), n)
-    found, expected = (render_opaque(**given, backend=backend) for backend in ("native", "reference"))
-    for name, part, other in zip(found._fields, found, expected, strict=True):
+    arguments = CASE.make(Draw(n, **pins), n)
+    actual, expected = (render_opaque(**arguments, backend=backend) for backend in ("native", "reference"))
+    for name, part, other in zip(actual._fields, actual, expected, strict=True):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5, msg=name)
-    assert n < 33 or 0.1 < float(found.opacity.mean()) < 1.1
+    assert n < 33 or 0.1 < float(actual.opacity.mean()) < 1.1
 
 
 @pytest.mark.parametrize("backend", ["reference", pytest.param("native", marks=pytest.mark.native)])
 def test_activated_values_are_seen_as_they_are(backend):
-    """Activated by the networks or by the operation; and what an activation would not give."""
+    """Activated values are rendered unchanged, also values that no activation gives."""
     layers = {last: MLP((Layer(("positions",), 4, last),), outputs=(0,)) for last in ("none", "softplus")}
     origins, directions = torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]])
     ray = origins, directions, torch.zeros(1), torch.full((1,), 4.0)
@@ -40,14 +40,14 @@ def test_activated_values_are_seen_as_they_are(backend):
     parameters = [torch.zeros(1, 4, 3), torch.tensor([[3.0, -2, 0.5, -0.25]])]
 
     def see(last, **rule):
-        given = {"program": layers[last].program(3, 0, None, (True,)), "parameters": parameters}
-        return render_opaque(*ray, occupied, box, 64, given, opaque=0.0, backend=backend, **rule)
+        arguments = {"program": layers[last].program(3, 0, None, (True,)), "parameters": parameters}
+        return render_opaque(*ray, occupied, box, 64, arguments, opaque=0.0, backend=backend, **rule)
 
     raw, soft = see("none", density_scale=1.0), see("softplus", activated=True)
     for name in ("opacity", "depth", "light", "heaviest"):
         torch.testing.assert_close(getattr(soft, name), getattr(raw, name), msg=name)
     seen = see("none", activated=True)
-    opacity = -torch.tensor([0.5]).expm1()  # of density -0.25 over 2
+    opacity = -torch.tensor([0.5]).expm1()  # the density is -0.25 over a length of 2
     torch.testing.assert_close(seen.opacity, opacity)
     torch.testing.assert_close(seen.colour, opacity * torch.tensor([[3.0, -2, 0.5]]))
     torch.testing.assert_close(seen.light, 1 - opacity)
@@ -56,15 +56,15 @@ def test_activated_values_are_seen_as_they_are(backend):
 @pytest.mark.native
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, "autocast"], ids=str)
 def test_networks_of_other_dtypes_are_seen(dtype):
-    """Tables of another dtype than the rays, and autocast: not by the one operation, but as well."""
-    given = CASE.make(Draw(1), 300)
-    network = dict(given["network"])
+    """Tables of other dtypes and autocast do not use the one operation, but give the same results."""
+    arguments = CASE.make(Draw(1), 300)
+    network = dict(arguments["network"])
     if isinstance(dtype, torch.dtype):
         *others, table = network["parameters"]
         network["parameters"] = [*others, table.to(dtype)]
     with torch.autocast("cpu", torch.bfloat16, enabled=dtype == "autocast"):
-        found = render_opaque(**{**given, "network": network}, backend="native")
-    for part, other in zip(found[:4], render_opaque(**given, backend="reference")[:4], strict=True):
+        result = render_opaque(**{**arguments, "network": network}, backend="native")
+    for part, other in zip(result[:4], render_opaque(**arguments, backend="reference")[:4], strict=True):
         assert part.dtype == torch.float32
         torch.testing.assert_close(part, other, rtol=0.03, atol=0.03)
 
@@ -72,28 +72,30 @@ def test_networks_of_other_dtypes_are_seen(dtype):
 @pytest.mark.native
 @pytest.mark.parametrize("kind", [{}, {"cells": 9, "wave": 1}, {"contraction": torch.tensor([0.1, 0, 0, 0.4])}])
 def test_a_ray_sees_the_same_bits_beside_any_others(kind):
-    """On any number of threads, and in any order: which rays share a wave depends on both."""
-    given = CASE.make(Draw(7, **kind), 5000)
-    found = on_any_number_of_threads(lambda: render_opaque(**given, backend="native"))
+    """The bits of a ray do not depend on the threads or the order of rays, which decide the rays of a wave."""
+    arguments = CASE.make(Draw(7, **kind), 5000)
+    result = on_any_number_of_threads(lambda: render_opaque(**arguments, backend="native"))
     order = torch.randperm(5000, generator=torch.Generator().manual_seed(0))
-    moved = {name: given[name][order] for name in MOVED}
-    for part, other in zip(found, render_opaque(**{**given, **moved}, backend="native"), strict=True):
+    moved = {name: arguments[name][order] for name in MOVED}
+    for part, other in zip(result, render_opaque(**{**arguments, **moved}, backend="native"), strict=True):
         assert torch.equal(part[order], other)
 
 
 def test_leaps_over_empty_cells_find_the_same():
-    """Strata are many more than the cells of the grid, so that the native rays leap."""
-    given = CASE.make(Draw(3, samples=130, side=4), 40)
-    given["occupied"] = torch.zeros(12, 12, 12, dtype=torch.bool)
-    given["occupied"][5:7, 4:8, 3:9] = True
-    few, many = ({**given, **{name: given[name].repeat_interleave(copies, 0) for name in MOVED}} for copies in (1, 8))
+    """The larger batch has so many more strata than grid cells that its native rays leap."""
+    arguments = CASE.make(Draw(3, samples=130, side=4), 40)
+    arguments["occupied"] = torch.zeros(12, 12, 12, dtype=torch.bool)
+    arguments["occupied"][5:7, 4:8, 3:9] = True
+    few, many = (
+        {**arguments, **{name: arguments[name].repeat_interleave(copies, 0) for name in MOVED}} for copies in (1, 8)
+    )
     assert len(few["near"]) * 130 < 4 * 12**3 <= len(many["near"]) * 130
     for part, other in zip(render_opaque(**few), render_opaque(**many), strict=True):
         assert torch.equal(part, other[::8])
 
 
 def test_a_tree_of_diagrams_tells_the_cells():
-    """Two halves, of which one is halved again: three networks of one colour each."""
+    """One half of space is halved again: three networks of one colour each."""
     program = MLP((Layer(("positions",), 4),), outputs=(0,)).program(3, 0, None, (True,))
     colours = torch.tensor([[9.0, -9, -9, 9], [-9, 9, -9, 9], [-9, -9, 9, 9]])
     network = {"program": program, "parameters": [torch.zeros(3, 4, 3), colours], "depth": 2}
@@ -111,17 +113,17 @@ def test_a_tree_of_diagrams_tells_the_cells():
 
 
 def test_what_is_of_the_samples_is_refused():
-    given = CASE.make(Draw(0), 3)
+    arguments = CASE.make(Draw(0), 3)
     with refused(TypeError, "render_opaque: network must hold ... alone, got cells"):
-        render_opaque(**{**given, "network": {**given["network"], "cells": torch.zeros(3, dtype=torch.int32)}})
+        render_opaque(**{**arguments, "network": {**arguments["network"], "cells": torch.zeros(3, dtype=torch.int32)}})
     with refused(TypeError, "render_opaque: network must hold program, parameters, ... alone, got layers"):
-        render_opaque(**{**given, "network": {"program": 3, "parameters": [], "layers": None}})
+        render_opaque(**{**arguments, "network": {"program": 3, "parameters": [], "layers": None}})
     with refused(TypeError, "render_opaque: program must be a Program, got int"):
-        render_opaque(**{**given, "network": {"program": 3, "parameters": []}})
+        render_opaque(**{**arguments, "network": {"program": 3, "parameters": []}})
     layers = MLP((Layer(("positions",), 3),), outputs=(0,))
     program = {"program": layers.program(3, 0, None, (False,)), "parameters": [torch.zeros(1, 3, 3)]}
     with refused(ValueError, "render_opaque: program must put out 4 numbers, colour and density, got 3"):
-        render_opaque(**{**given, "network": program})
-    wide = {**given["network"], "parameters": [p.double() for p in given["network"]["parameters"]]}
+        render_opaque(**{**arguments, "network": program})
+    wide = {**arguments["network"], "parameters": [p.double() for p in arguments["network"]["parameters"]]}
     with refused(TypeError, "render_opaque: parameters must have dtype float32 or one of 16 bits, got float64"):
-        render_opaque(**{**given, "network": wide})
+        render_opaque(**{**arguments, "network": wide})

@@ -43,7 +43,7 @@ def test_matches_a_slow_walk(device, backend, r, s, count, given):
     for ray in range(r):
         targets = uniforms[ray].tolist() if given else midpoints
         expected = slow(weights[ray].tolist(), edges[ray].tolist(), targets)
-        # Rounding of the running mass moves a depth by its share of a bin, and a light bin is long for its mass.
+        # Rounding the running mass moves a depth by a share of its bin, and a light bin is long for its mass.
         share = weights[ray].sum() / weights[ray][weights[ray] > 0].min() if weights[ray].sum() > 0 else 1
         tolerance = float(1e-6 * s * max(1, share) * edges[ray].max())
         torch.testing.assert_close(depths[ray], torch.tensor(expected), rtol=0, atol=tolerance)
@@ -113,5 +113,5 @@ def test_errors():
 def test_weights_at_the_ends_of_float32(backend, device, scale):
     weights = torch.tensor([[scale, scale, 0.0, 0.0]], device=device)
     edges = torch.arange(5.0, device=device)[None]
-    found = resample(weights, edges, 4, backend=backend).cpu()
-    torch.testing.assert_close(found, torch.tensor([[0.25, 0.75, 1.25, 1.75]]))
+    result = resample(weights, edges, 4, backend=backend).cpu()
+    torch.testing.assert_close(result, torch.tensor([[0.25, 0.75, 1.25, 1.75]]))

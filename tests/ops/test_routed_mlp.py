@@ -19,7 +19,7 @@ pytestmark = pytest.mark.op("routed_mlp")
 
 CPU = torch.device("cpu")
 PLAIN = MLP((Layer((POSITIONS,), 9, "softplus"), Layer((0,), 4)), (1,), position_octaves=4)
-# Skip connection, density head, branch that sees the direction.
+# A skip connection, a density head and a view branch.
 NERF = MLP(
     (
         Layer((POSITIONS,), 16, "sine"),
@@ -48,7 +48,7 @@ TREE = {
 
 @dataclass
 class Case:
-    """A network, its samples, where the cells come from."""
+    """A network, its samples and the source of its cells."""
 
     table: MLP
     leaves: list[Tensor]
@@ -101,11 +101,11 @@ class Case:
         }
         return routed_mlp(**arguments)
 
-    def given(self, dtype=torch.float32, device=CPU):
+    def leaf_tensors(self, dtype=torch.float32, device=CPU):
         return [tensor.detach().to(device, dtype).requires_grad_() for tensor in self.leaves]
 
     def specified(self, leaves):
-        """One cell after another, by its definition."""
+        """Evaluates one cell after another, by definition."""
         positions, directions, *parameters = leaves
         index = self.options.get("direction_index")
         seen = directions if index is None else directions[index]
@@ -123,7 +123,7 @@ class Case:
         return out[order.argsort()]
 
     def results(self, run, dtype, device=CPU):
-        leaves = self.given(dtype, device)
+        leaves = self.leaf_tensors(dtype, device)
         y = run(leaves)
         g = torch.randn(y.shape, generator=torch.Generator().manual_seed(1)).to(device, dtype)
         return [y, *torch.autograd.grad(y, leaves, g, allow_unused=True, materialize_grads=True)]
@@ -131,8 +131,8 @@ class Case:
     def check(self, device, backend, dtype=torch.float32):
         exact = self.results(self.specified, torch.float64)
         plain = self.results(self.specified, dtype)
-        found = self.results(lambda leaves: self.run(leaves, backend=backend)[0], dtype, device)
-        for part, usual, right in zip(found, plain, exact):
+        actual = self.results(lambda leaves: self.run(leaves, backend=backend)[0], dtype, device)
+        for part, usual, right in zip(actual, plain, exact):
             assert_as_exact(part, usual, right)
 
 
@@ -167,8 +167,8 @@ def test_float64_positions_and_half_coordinates(device, backend):
     case = Case.make()
     leaves = [tensor.to(device) for tensor in case.leaves]
     expected, _ = case.run(leaves, backend=backend)
-    found, cells = case.run([leaves[0].double(), *leaves[1:]], backend=backend)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    actual, cells = case.run([leaves[0].double(), *leaves[1:]], backend=backend)
+    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
     assert torch.equal(cells.cpu(), case.expected_cells)
     halves = leaves[0].half()
     _, cells = case.run(leaves, coords=halves, backend=backend)
@@ -181,9 +181,9 @@ def test_coordinates_beside_encoded_positions(device, backend):
     raw, _ = case.run(leaves, backend=backend)
     encoded = frequency_encode(leaves[0], 4)
     case.table = replace(case.table, position_octaves=None)
-    for given in ({}, {"coords": leaves[0]}):
-        found, cells = case.run([encoded, *leaves[1:]], **given, backend=backend)
-        torch.testing.assert_close(found, raw, rtol=1e-5, atol=1e-5)
+    for arguments in ({}, {"coords": leaves[0]}):
+        result, cells = case.run([encoded, *leaves[1:]], **arguments, backend=backend)
+        torch.testing.assert_close(result, raw, rtol=1e-5, atol=1e-5)
         assert torch.equal(cells.cpu(), case.expected_cells)
     _, elsewhere = case.run([encoded, *leaves[1:]], coords=leaves[0] + 9, backend=backend)
     assert not torch.equal(elsewhere.cpu(), case.expected_cells)
@@ -196,10 +196,10 @@ def test_samples_nowhere_go_to_the_first_cell(device, backend):
         rows = [3, 17, 40]
         for row, value in zip(rows, (torch.nan, torch.inf, -torch.inf)):
             case.leaves[0][row] = value
-        leaves = case.given(torch.float32, device)
-        out, found = case.run(leaves, backend=backend)
+        leaves = case.leaf_tensors(torch.float32, device)
+        out, result = case.run(leaves, backend=backend)
         others = [row for row in range(61) if row not in rows]
-        assert (found[rows] == 0).all() and torch.equal(found[others], cells[others])
+        assert (result[rows] == 0).all() and torch.equal(result[others], cells[others])
         torch.testing.assert_close(out[others], plain[others], rtol=1e-5, atol=1e-6)
         out[others].sum().backward()
         assert leaves[0].grad[others].isfinite().all() and leaves[2].grad[1:].isfinite().all()
@@ -210,14 +210,14 @@ def test_second_derivatives(device, backend, rays):
     case = Case.make("integrated", "flat", n=9, rays=rays)
 
     def penalty(run, dtype, device):
-        leaves = case.given(dtype, device)
+        leaves = case.leaf_tensors(dtype, device)
         (slope,) = torch.autograd.grad(run(leaves).square().sum(), leaves[0], create_graph=True)
         return list(torch.autograd.grad(slope.square().sum(), leaves, allow_unused=True, materialize_grads=True))
 
     exact = penalty(case.specified, torch.float64, CPU)
     plain = penalty(case.specified, torch.float32, CPU)
-    found = penalty(lambda leaves: case.run(leaves, backend=backend)[0], torch.float32, device)
-    for part, usual, right in zip(found, plain, exact):
+    actual = penalty(lambda leaves: case.run(leaves, backend=backend)[0], torch.float32, device)
+    for part, usual, right in zip(actual, plain, exact):
         assert_as_exact(part, usual, right)
 
 
@@ -286,7 +286,7 @@ def test_errors_of_the_kernel():
     refuses = refusals(functools.partial(tree.run, tree.leaves, backend="native"), "routed_mlp")
     refuses("child must name a diagram (below the number of diagrams) or a leaf (negative)", child=TREE["child"] + 9)
     refuses("depth must be the number of levels of the tree, got 1, which is too few", depth=1)
-    # A leaf that no network has.
+    # A leaf without a network.
     refuses("cells must lie in 0 to 5, got values from ...", child=torch.where(TREE["child"] == -6, -7, TREE["child"]))
     refuses(
         "direction_index must be 0 to 4, got 5",
@@ -338,14 +338,14 @@ def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name, dty
         g = torch.linspace(-1, 2, y.numel()).view_as(y).to(y.dtype)
         return [y, *torch.autograd.grad(y, leaves, g, allow_unused=True, materialize_grads=True)]
 
-    found = on_any_number_of_threads(lambda: results(lambda leaves: case.run(leaves, backend="native")[0]))
-    assert same(found, results(separate))
+    actual = on_any_number_of_threads(lambda: results(lambda leaves: case.run(leaves, backend="native")[0]))
+    assert same(actual, results(separate))
 
 
 @pytest.mark.parametrize("rows", [0, 1, 23, 40])
 @pytest.mark.parametrize("k", [1, 3])
 def test_rows_beyond_those_that_count_are_in_no_cell(device, backend, rows, k):
-    """Whatever they hold: such a tail is what a march with a capacity leaves."""
+    """Rows beyond the row count may hold anything, like the tail of a march with a capacity."""
     table = MLP((Layer(("positions",), 8, "relu"), Layer((0,), 2)), outputs=(1,))
     torch.manual_seed(0)
     results = []
@@ -356,10 +356,13 @@ def test_rows_beyond_those_that_count_are_in_no_cell(device, backend, rows, k):
         ]
         weights = [weight.requires_grad_() for weight in weights]
         positions = torch.linspace(0, 1, 120, device=device).view(40, 3)[:count]
-        given = {"layers": table, "centres": positions.new_tensor([[0.1] * 3, [0.5] * 3, [0.9] * 3]) if k > 1 else None}
+        arguments = {
+            "layers": table,
+            "centres": positions.new_tensor([[0.1] * 3, [0.5] * 3, [0.9] * 3]) if k > 1 else None,
+        }
         if count == 40:
-            given["rows"] = torch.tensor([rows], dtype=torch.int32, device=device)
-        out, cells = routed_mlp(positions, weights, [None, None], **given, backend=backend)
+            arguments["rows"] = torch.tensor([rows], dtype=torch.int32, device=device)
+        out, cells = routed_mlp(positions, weights, [None, None], **arguments, backend=backend)
         out.square().sum().backward()
         results.append((out, cells, [weight.grad for weight in weights]))
     (out, cells, gradients), (all_out, all_cells, all_gradients) = results

@@ -1,4 +1,4 @@
-"""Smooth depths of rays that no picture shows: against autograd through a slow loop."""
+"""The smoothness loss on depths of unseen rays: against autograd through a slow loop."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.op("smooth_depth_gradient")
 
 
 def case(counts, skipped=0):
-    """Samples of rays that have so many each, after some that belong to none."""
+    """Returns samples of rays with ``counts`` samples each, after ``skipped`` samples of no ray."""
     m = sum(counts) + skipped
     offsets = (torch.tensor([0, *counts]).cumsum(0) + skipped).to(torch.int32)
     deltas, density = 0.02 + 0.1 * torch.rand(m), 8 * torch.rand(m)
@@ -22,16 +22,16 @@ def case(counts, skipped=0):
     return density, depths, deltas, weights, offsets, 4 + torch.rand(len(counts))
 
 
-def learnt(given, device="cpu", **rule):
+def learnt(arguments, device="cpu", **rule):
     """Returns a loss of 2 and a gradient of ones after the op has added to them."""
-    given = [tensor.to(device) for tensor in given]
-    loss, gradient = torch.full_like(given[-1].sum(), 2), given[0].new_ones(len(given[0]), 4)
-    smooth_depth_gradient(loss, gradient, *given, **rule)
+    arguments = [tensor.to(device) for tensor in arguments]
+    loss, gradient = torch.full_like(arguments[-1].sum(), 2), arguments[0].new_ones(len(arguments[0]), 4)
+    smooth_depth_gradient(loss, gradient, *arguments, **rule)
     return loss.cpu(), gradient.cpu()
 
 
 def slow(density, depths, deltas, offsets, far, triples, hidden):
-    """The loss in float64, one ray after the other, differentiable in the densities."""
+    """Computes the loss in float64, one ray after the other, differentiable with respect to the densities."""
     seen = []
     for ray in range(len(far) - 3 * triples, len(far)):
         light, disparity = density.new_ones(()), density.new_zeros(())
@@ -41,21 +41,21 @@ def slow(density, depths, deltas, offsets, far, triples, hidden):
             light = light * through
         seen.append(disparity + light / far[ray])
     sides = zip(seen[:triples], seen[triples : 2 * triples], seen[2 * triples :])
-    bent = [torch.log((one + other) / (2 * middle)) for middle, one, other in sides]
-    return sum(2 * 0.05 * ((each**2 + 0.05**2) ** 0.5 - 0.05) for each in bent) / triples
+    curvatures = [torch.log((one + other) / (2 * middle)) for middle, one, other in sides]
+    return sum(2 * 0.05 * ((curvature**2 + 0.05**2) ** 0.5 - 0.05) for curvature in curvatures) / triples
 
 
 @pytest.mark.parametrize(("scale", "hidden"), [(None, 0.0), (2.5, 0.3)])
 @pytest.mark.parametrize(("counts", "skipped", "triples"), [((5, 0, 1, 12, 33, 2, 7), 0, 2), ((4, 9, 30, 3), 5, 1)])
 def test_equals_autograd_through_a_slow_loop(device, backend, counts, skipped, triples, scale, hidden):
     need("smooth_depth_gradient", backend, device, torch.float32)
-    given = case(counts, skipped)
+    arguments = case(counts, skipped)
     rule = {"activated": True} if scale is None else {"density_scale": scale}
     rule |= {"triples": triples, "factor": 0.25, "hidden": hidden, "backend": backend}
-    loss, gradient = learnt(given, device, **rule)
-    density, depths, deltas, _, offsets, far = given
+    loss, gradient = learnt(arguments, device, **rule)
+    density, depths, deltas, _, offsets, far = arguments
     exact = density.double().requires_grad_()
-    if scale is not None:  # before the softplus
+    if scale is not None:  # raw values before the softplus
         exact = (scale * torch.expm1(exact.detach() / scale).log() / scale).requires_grad_()
     of_density = exact if scale is None else scale * torch.nn.functional.softplus(exact)
     expected = 0.25 * slow(of_density, depths.double(), deltas.double(), offsets, far.double(), triples, hidden)
@@ -75,5 +75,5 @@ def test_no_triples_change_nothing(backend):
 
 def test_does_not_depend_on_the_number_of_threads():
     need("smooth_depth_gradient", "native", torch.device("cpu"), torch.float32)
-    given = case((9,) * 700)
-    on_any_number_of_threads(lambda: learnt(given, triples=200, factor=1.0, density_scale=2.0, backend="native"))
+    arguments = case((9,) * 700)
+    on_any_number_of_threads(lambda: learnt(arguments, triples=200, factor=1.0, density_scale=2.0, backend="native"))

@@ -14,9 +14,9 @@ pytestmark = pytest.mark.op("sparse_depth_gradient")
 
 
 def case(counts, dtype=torch.float32, others=(), skipped=0):
-    """Rays with so many samples, whose densities make some of them opaque; points are among the samples.
+    """Returns rays with ``counts`` samples each, some of them opaque; the end points lie among the samples.
 
-    Others follow, without points; some samples before belong to no ray.
+    Rays of ``others`` samples follow, without end points; the first ``skipped`` samples belong to no ray.
     """
     counts = [*counts, *others]
     m = sum(counts)
@@ -26,8 +26,8 @@ def case(counts, dtype=torch.float32, others=(), skipped=0):
     density = 20 * torch.rand(m, dtype=dtype)
     distances = 2 + torch.rand(len(counts) - len(others), dtype=dtype)
     if m:
-        given = density, torch.zeros(m, 3, dtype=dtype), depths, deltas
-        weights = composite(*given, ray_offsets=offsets, backend="reference").weights
+        arguments = density, torch.zeros(m, 3, dtype=dtype), depths, deltas
+        weights = composite(*arguments, ray_offsets=offsets, backend="reference").weights
     else:
         weights = density
     loose = torch.rand(4, skipped, dtype=dtype)
@@ -35,17 +35,17 @@ def case(counts, dtype=torch.float32, others=(), skipped=0):
     return *samples, offsets + skipped, distances
 
 
-def learnt(given, device="cpu", **rule):
-    """The loss and the gradient that are added to 2 and to a table of ones."""
-    given = [tensor.to(device) for tensor in given]
-    loss, gradient = torch.full_like(given[-1].sum(), 2), given[0].new_ones(len(given[0]), 4)
-    sparse_depth_gradient(loss, gradient, *given, **rule)
+def learnt(arguments, device="cpu", **rule):
+    """Returns the loss and the density gradient that the op adds to existing values."""
+    arguments = [tensor.to(device) for tensor in arguments]
+    loss, gradient = torch.full_like(arguments[-1].sum(), 2), arguments[0].new_ones(len(arguments[0]), 4)
+    sparse_depth_gradient(loss, gradient, *arguments, **rule)
     assert bool((gradient[:, :3] == 1).all())
     return loss.cpu() - 2, gradient[:, 3].cpu() - 1
 
 
 def slow(density, depths, deltas, offsets, distances):
-    """The loss in float64, one ray after the other, differentiable in the densities."""
+    """Computes the loss in float64, one ray after the other, differentiable with respect to the densities."""
     total = density.new_zeros(())
     for ray, distance in enumerate(distances):
         light, there = density.new_ones(()), density.new_zeros(())
@@ -62,12 +62,12 @@ def slow(density, depths, deltas, offsets, distances):
 @pytest.mark.parametrize(("others", "skipped"), [((), 0), ((7, 0, 40), 0), ((3,), 5)])
 def test_equals_autograd_through_a_slow_loop(device, backend, others, skipped, scale):
     need("sparse_depth_gradient", backend, device, torch.float32)
-    given = case((5, 0, 1, 12, 33, 2), others=others, skipped=skipped)
+    arguments = case((5, 0, 1, 12, 33, 2), others=others, skipped=skipped)
     rule = {"activated": True} if scale is None else {"density_scale": scale}
-    loss, gradient = learnt(given, device, factor=0.25, backend=backend, **rule)
-    density, depths, deltas, _, offsets, distances = given
+    loss, gradient = learnt(arguments, device, factor=0.25, backend=backend, **rule)
+    density, depths, deltas, _, offsets, distances = arguments
     exact = density.double().requires_grad_()
-    if scale is not None:  # before the softplus
+    if scale is not None:  # raw values before the softplus
         exact = (scale * torch.expm1(exact.detach() / scale).log() / scale).requires_grad_()
     of_density = exact if scale is None else scale * torch.nn.functional.softplus(exact)
     expected = 0.25 * slow(of_density, depths.double(), deltas.double(), offsets, distances.double())
@@ -78,22 +78,22 @@ def test_equals_autograd_through_a_slow_loop(device, backend, others, skipped, s
 
 
 def test_what_is_not_finite_stays_in_its_ray(device, backend):
-    """A weight that is NaN takes its ray's gradient where it counts; an infinite density lets nothing through."""
+    """A NaN weight near the point leaves its ray without gradient; an infinite density lets no light through."""
     need("sparse_depth_gradient", backend, device, torch.float32)
     counts = (12, 12, 12, 12)
-    given = [tensor.clone() for tensor in case(counts)]
-    density, depths, deltas, weights, _, distances = given
+    arguments = [tensor.clone() for tensor in case(counts)]
+    density, depths, deltas, weights, _, distances = arguments
     near = (depths - distances.repeat_interleave(12)).abs() <= NEARBY * distances.repeat_interleave(12) + deltas
     weights[near] += 0.1
-    fine, rule = learnt(given, device, factor=0.25, activated=True, backend=backend), {"factor": 0.25}
-    weights[:12][~near[:12]] = torch.nan  # of the first ray, where they do not count
+    fine, rule = learnt(arguments, device, factor=0.25, activated=True, backend=backend), {"factor": 0.25}
+    weights[:12][~near[:12]] = torch.nan  # in the first ray, away from its point
     density[12:24] = torch.inf
-    _, gradient = learnt(given, device, **rule, activated=True, backend=backend)
+    _, gradient = learnt(arguments, device, **rule, activated=True, backend=backend)
     torch.testing.assert_close(gradient[:12], fine[1][:12])
     assert bool(gradient[12:24].isfinite().all())
     torch.testing.assert_close(gradient[24:], fine[1][24:])
     weights[24:36][near[24:36]] = torch.nan
-    loss, gradient = learnt(given, device, **rule, activated=True, backend=backend)
+    loss, gradient = learnt(arguments, device, **rule, activated=True, backend=backend)
     assert bool(loss.isnan()) and not bool(gradient[24:36].any())
     torch.testing.assert_close(gradient[:12], fine[1][:12])
 
@@ -103,8 +103,8 @@ def test_a_ray_whose_point_gets_no_light_has_no_gradient(device, backend):
     density, depths, deltas, weights, offsets, distances = case((6, 6, 6))
     weights[6:12] = 0
     distances[2] = torch.nan
-    given = density, depths, deltas, weights, offsets, distances
-    loss, gradient = learnt(given, device, factor=1.0, activated=True, backend=backend)
+    arguments = density, depths, deltas, weights, offsets, distances
+    loss, gradient = learnt(arguments, device, factor=1.0, activated=True, backend=backend)
     assert bool(loss.isfinite()) and bool(gradient[:6].any()) and not bool(gradient[6:].any())
 
 
@@ -117,5 +117,5 @@ def test_no_points(device, backend, others):
 
 def test_does_not_depend_on_the_number_of_threads():
     need("sparse_depth_gradient", "native", torch.device("cpu"), torch.float32)
-    given = case((9,) * 700)
-    on_any_number_of_threads(lambda: learnt(given, factor=1.0, density_scale=2.0, backend="native"))
+    arguments = case((9,) * 700)
+    on_any_number_of_threads(lambda: learnt(arguments, factor=1.0, density_scale=2.0, backend="native"))

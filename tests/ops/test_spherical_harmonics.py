@@ -16,7 +16,7 @@ def directions_of(n):
 
 
 def legendre(band, order, z):
-    """The associated Legendre function of cos(theta) = z, with the phase of Condon and Shortley, by its recurrence."""
+    """Returns the associated Legendre function of cos(theta) = z, with Condon-Shortley phase, by its recurrence."""
     before, value = 0.0, (-1) ** order * math.prod(range(1, 2 * order, 2)) * math.sqrt(1 - z * z) ** order
     for l in range(order + 1, band + 1):
         before, value = value, ((2 * l - 1) * z * value - (l + order - 1) * before) / (l - order)
@@ -24,7 +24,7 @@ def legendre(band, order, z):
 
 
 def slow(directions, degree):
-    """One harmonic of one unit vector at a time, by its definition in spherical coordinates."""
+    """Computes one harmonic of one unit vector at a time, by its definition in spherical coordinates."""
     rows = []
     for x, y, z in directions.double().tolist():
         row, angle = [], math.atan2(y, x)
@@ -42,19 +42,19 @@ def slow(directions, degree):
 @pytest.mark.parametrize("n", [1, 3, 17, 64, 65, 200])
 def test_matches_the_definition(device, backend, n, degree):
     directions = directions_of(n)
-    found = spherical_harmonics(directions.float().to(device), degree, backend=backend)
-    assert found.shape == (n, degree**2)
-    torch.testing.assert_close(found.double().cpu(), slow(directions, degree), rtol=0, atol=2e-6)
+    result = spherical_harmonics(directions.float().to(device), degree, backend=backend)
+    assert result.shape == (n, degree**2)
+    torch.testing.assert_close(result.double().cpu(), slow(directions, degree), rtol=0, atol=2e-6)
 
 
 def test_poles_and_axes(device, backend):
     axes = torch.cat([torch.eye(3), -torch.eye(3)])
-    found = spherical_harmonics(axes.to(device), 4, backend=backend)
-    torch.testing.assert_close(found.double().cpu(), slow(axes, 4), rtol=0, atol=1e-6)
+    result = spherical_harmonics(axes.to(device), 4, backend=backend)
+    torch.testing.assert_close(result.double().cpu(), slow(axes, 4), rtol=0, atol=1e-6)
 
 
 def tiny_cuda_nn(x, y, z):
-    """The polynomials of its kernel_sh (sphericalharmonics.h, degree 4), as they are written there."""
+    """Returns the polynomials of tiny-cuda-nn's kernel_sh (sphericalharmonics.h, degree 4), as in its source."""
     xy, xz, yz, x2, y2, z2 = x * y, x * z, y * z, x * x, y * y, z * z
     return [
         0.28209479177387814,
@@ -79,15 +79,15 @@ def tiny_cuda_nn(x, y, z):
 def test_of_any_length_as_in_tiny_cuda_nn(device, backend):
     x = 4 * torch.rand(40, 3, dtype=torch.float64) - 2
     expected = torch.tensor([tiny_cuda_nn(*row) for row in x.tolist()], dtype=torch.float64)
-    found = spherical_harmonics(x.float().to(device), 4, backend=backend)
-    torch.testing.assert_close(found.double().cpu(), expected, rtol=1e-5, atol=1e-5)
+    actual = spherical_harmonics(x.float().to(device), 4, backend=backend)
+    torch.testing.assert_close(actual.double().cpu(), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_not_a_number_stays_in_its_row(device, backend):
     directions = directions_of(20).float().to(device)
     directions[7, 1] = torch.nan
-    found = spherical_harmonics(directions, 4, backend=backend)
-    assert found[7, 1].isnan() and found[:7].isfinite().all() and found[8:].isfinite().all()
+    result = spherical_harmonics(directions, 4, backend=backend)
+    assert result[7, 1].isnan() and result[:7].isfinite().all() and result[8:].isfinite().all()
 
 
 def test_errors():

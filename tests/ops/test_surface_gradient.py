@@ -1,4 +1,4 @@
-"""Rays whose light does not come from one surface: against autograd through a slow loop over pairs."""
+"""The loss of rays whose light comes from several surfaces: against autograd through a slow loop over pairs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.op("surface_gradient")
 
 
 def case(counts, skipped=0):
-    """Samples of rays that have so many each, after some that belong to none."""
+    """Returns samples of rays with ``counts`` samples each, after ``skipped`` samples of no ray."""
     m = sum(counts) + skipped
     offsets = (torch.tensor([0, *counts]).cumsum(0) + skipped).to(torch.int32)
     deltas, density = 0.02 + 0.1 * torch.rand(m), 8 * torch.rand(m)
@@ -26,16 +26,16 @@ def case(counts, skipped=0):
     return density, depths, deltas, weights, offsets, near, 4 + near
 
 
-def learnt(given, device="cpu", **rule):
+def learnt(arguments, device="cpu", **rule):
     """Returns a loss of 2 and a gradient of ones after the op has added to them."""
-    given = [tensor.to(device) for tensor in given]
-    loss, gradient = torch.full_like(given[-1].sum(), 2), given[0].new_ones(len(given[0]), 4)
-    surface_gradient(loss, gradient, *given, **rule)
+    arguments = [tensor.to(device) for tensor in arguments]
+    loss, gradient = torch.full_like(arguments[-1].sum(), 2), arguments[0].new_ones(len(arguments[0]), 4)
+    surface_gradient(loss, gradient, *arguments, **rule)
     return loss.cpu(), gradient.cpu()
 
 
 def slow(density, depths, deltas, offsets, near, far, hidden, distortion, orientation):
-    """The loss in float64, one ray after the other, differentiable in the densities."""
+    """Computes the loss in float64, one ray after the other, differentiable with respect to the densities."""
     total = density.new_zeros(())
     for ray in range(len(far)):
         light, lit, scale = density.new_ones(()), [], 1 / (1 / near[ray] - 1 / far[ray])
@@ -61,12 +61,14 @@ def slow(density, depths, deltas, offsets, near, far, hidden, distortion, orient
 @pytest.mark.parametrize("factors", [{"distortion": 0.25, "orientation": 0.5}, {"distortion": 0.0, "orientation": 1.0}])
 def test_equals_autograd_through_a_slow_loop(device, backend, counts, skipped, scale, hidden, factors):
     need("surface_gradient", backend, device, torch.float32)
-    given = case(counts, skipped)
+    arguments = case(counts, skipped)
     rule = {"activated": True} if scale is None else {"density_scale": scale}
-    loss, gradient = learnt(given, device, **factors, **rule, hidden=hidden, backend=backend)
-    density, depths, deltas, _, *rest = (tensor.double() if tensor.is_floating_point() else tensor for tensor in given)
+    loss, gradient = learnt(arguments, device, **factors, **rule, hidden=hidden, backend=backend)
+    density, depths, deltas, _, *rest = (
+        tensor.double() if tensor.is_floating_point() else tensor for tensor in arguments
+    )
     exact = density.requires_grad_()
-    if scale is not None:  # before the softplus
+    if scale is not None:  # raw values before the softplus
         exact = (scale * torch.expm1(exact.detach() / scale).log() / scale).requires_grad_()
     of_density = exact if scale is None else scale * torch.nn.functional.softplus(exact)
     expected = slow(of_density, depths, deltas, *rest, hidden, **factors)
@@ -79,7 +81,7 @@ def test_equals_autograd_through_a_slow_loop(device, backend, counts, skipped, s
 
 @pytest.mark.parametrize("anything", [0.0, float("nan")])
 def test_samples_of_no_ray_hold_anything(device, backend, anything):
-    """Steps on a GPU have room for more samples than there are."""
+    """Samples of no ray may hold anything, since steps on a GPU allocate more rows than samples."""
     need("surface_gradient", backend, device, torch.float32)
     *samples, offsets, near, far = case((4, 9, 30, 3), skipped=5)
     offsets, near, far = offsets[:-1], near[:-1], far[:-1]
@@ -100,7 +102,7 @@ def test_without_samples_nothing_changes(backend, counts):
 
 def test_does_not_depend_on_the_number_of_threads():
     need("surface_gradient", "native", torch.device("cpu"), torch.float32)
-    given = case((9,) * 700)
+    arguments = case((9,) * 700)
     on_any_number_of_threads(
-        lambda: learnt(given, distortion=1.0, orientation=1.0, density_scale=2.0, backend="native")
+        lambda: learnt(arguments, distortion=1.0, orientation=1.0, density_scale=2.0, backend="native")
     )

@@ -1,4 +1,4 @@
-"""Ways are not measured in these tests: the most promising one runs, on a loaded machine too."""
+"""Routers do not measure in these tests: they take the most promising way, on a loaded machine too."""
 
 from __future__ import annotations
 
@@ -10,4 +10,4 @@ from voronerf.router import dispatch
 @pytest.fixture(autouse=True)
 def unmeasured(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "measures" not in request.keywords:
-        monkeypatch.setattr(dispatch, "measure", lambda found, call, grouping: [0.0] * len(found))
+        monkeypatch.setattr(dispatch, "measure", lambda ways, call, grouping: [0.0] * len(ways))

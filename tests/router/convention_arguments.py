@@ -1,4 +1,4 @@
-"""Arguments that belong to samples, rays or nothing, in containers and objects."""
+"""Fields whose arguments belong to samples, to rays or to neither, in containers and objects."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Samples:
 
 
 class TakesSamples(nn.Module):
-    """Takes samples as an object; returns one, with a result that depends on a code for each camera."""
+    """A field that takes samples as an object; its result depends on a code for each camera."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Fields that nobody listed, by how they are called and by what they do with samples."""
+"""Fields beyond the listed codebases, by how they are called and by their operations on samples."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Heads(nn.Module):
 
     def forward(self, x: Tensor) -> dict[str, Any]:
         h = F.elu(self.trunk(x))
-        found: dict[str, Any] = {name: head(h) for name, head in self.heads.items()}
-        found["semantics"] = {"logits": found["semantics"], "label": found["semantics"].argmax(-1)}
-        return {**found, "normals": None, "kind": "heads"}
+        result: dict[str, Any] = {name: head(h) for name, head in self.heads.items()}
+        result["semantics"] = {"logits": result["semantics"], "label": result["semantics"].argmax(-1)}
+        return {**result, "normals": None, "kind": "heads"}
 
 
 class ControlFlow(nn.Module):
@@ -69,7 +69,7 @@ class Branches(nn.Module):
 
 
 class Normals(nn.Module):
-    """A gradient taken inside forward, and state kept on the module, as nerfstudio's fields do."""
+    """A field with a gradient inside forward, and with state on the module, as in nerfstudio."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ class Checkpointed(nn.Module):
 
 
 class RowOrder(nn.Module):
-    """Samples taken apart and put together again inside forward."""
+    """A field that splits or sorts its samples inside forward, and restores their order."""
 
     def __init__(self, way: str) -> None:
         super().__init__()
@@ -116,13 +116,13 @@ def squareplus(x: Tensor, b: float) -> Tensor:
     return 0.5 * (x + torch.sqrt(x * x + b))
 
 
-with warnings.catch_warnings():  # it is deprecated, and old code uses it
+with warnings.catch_warnings():  # TorchScript is deprecated, but old code uses it
     warnings.simplefilter("ignore", DeprecationWarning)
     scripted = torch.jit.script(squareplus)
 
 
 class Scripted(nn.Module):
-    """A function compiled by TorchScript, which no PyTorch function mode sees into."""
+    """A field with a TorchScript function, which no PyTorch function mode sees into."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -133,7 +133,7 @@ class Scripted(nn.Module):
 
 
 class TruncExp(torch.autograd.Function):
-    """As torch-ngp's: the exponential of small numbers only in the backward pass, under automatic mixed precision."""
+    """The trunc_exp of torch-ngp: the backward pass clamps the exponent, under automatic mixed precision."""
 
     @staticmethod
     @torch.amp.custom_fwd(device_type="cpu", cast_inputs=torch.float32)

@@ -1,7 +1,7 @@
-"""What a routed field must equal: a loop over the cells, with a mask and a module of its own for each.
+"""The reference of a routed field: a loop over the cells, with a mask and a separate module for each cell.
 
-A `Case` is a field, arguments as its codebase passes them, and what the router has to be told. Modules of distinct
-cells come from the case itself, so the loop shares no code with the router. Letters: n samples, k cells.
+A `Case` is a field, its arguments as its codebase passes them, and the router's options. The case itself makes the
+modules of distinct cells, so the loop shares no code with the router. Letters: n samples, k cells.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ K = 5
 
 
 def example(name: str) -> ModuleType:
-    """The script of that name in `examples/`, imported."""
+    """Imports the script of that name in `examples/`."""
     full = f"examples_{name}"
     if full not in sys.modules:
         spec = importlib.util.spec_from_file_location(full, EXAMPLES / f"{name}.py")
@@ -38,7 +38,7 @@ def example(name: str) -> ModuleType:
 
 
 Arguments = tuple[tuple[Any, ...], dict[str, Any]]
-RAYS = (9, 7)  # unlike any number of features
+RAYS = (9, 7)  # differ from all numbers of features
 
 
 def uniform(lead: tuple[int, ...], features: int = 3) -> Tensor:
@@ -50,7 +50,7 @@ def first(x: Tensor, *_: Any, **__: Any) -> Tensor:
 
 
 def one(features: int = 7) -> Callable[[tuple[int, ...]], Arguments]:
-    """One tensor, whose first three features are the position."""
+    """Returns a maker of one tensor argument, whose first three features are the position."""
     return lambda lead: ((uniform(lead, features),), {})
 
 
@@ -59,23 +59,23 @@ of_seven = one()
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A field and how it is called.
+    """A field, its arguments, and how a router runs it.
 
     Attributes:
-        name: of the test.
-        make: a fresh field with random parameters, float32.
+        name: the name of the test.
+        make: returns a fresh field with random float32 parameters.
         arguments: leading shape -> (args, kwargs), float32.
         positions: the arguments -> positions [..., 3].
         lead: leading shape of the samples: (n,), or (rays, samples).
-        options: of the router.
-        given: whether positions are passed at the call.
-        method: what is called.
-        way: how the router runs it: "fused" or "grouped", where the module and each of its functions run once for all
+        options: the options of the router.
+        passes_coords: whether to pass the positions as ``coords`` at the call.
+        method: the name of the called method.
+        way: the expected way: "fused" or "grouped", where the module and each of its functions run once for all
             cells, or "cell by cell".
-        fuses: whether it is a case with ``fuse=True`` too.
-        rank: dimensions of a sample's tensors as the loop passes them; 3 is [m, 1, d].
-        by_parameters: whether gradients of the parameters' gradients are compared; those of ``torch._weight_norm`` are
-            wrong in PyTorch itself.
+        fuses: whether to test the case with ``fuse=True`` too.
+        rank: the number of dimensions of a sample's tensors in the loop; 3 means [m, 1, d].
+        by_parameters: whether to compare second derivatives by parameters; PyTorch's own are wrong for
+            ``torch._weight_norm``.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Case:
     positions: Callable[..., Tensor] = first
     lead: tuple[int, ...] = (61,)
     options: dict[str, Any] = dataclasses.field(default_factory=lambda: {"coords": "first3"})
-    given: bool = False
+    passes_coords: bool = False
     method: str = "forward"
     way: str = "grouped"
     fuses: bool = False
@@ -99,7 +99,7 @@ class Case:
         return dataclasses.replace(self, name=f"{self.name}, fused", options=options, way="fused")
 
     def modules(self, dtype: torch.dtype = torch.float32, k: int = K) -> list[nn.Module]:
-        """A module of its own for each of k cells, every parameter random, biases too; what they share is one."""
+        """Returns a separate module for each of k cells, with random parameters; shared parameters are one object."""
         modules = [randomised(self.make()).to(dtype) for _ in range(k)]
         for name, parameter in modules[0].named_parameters():
             if any(fnmatch.fnmatch(name, pattern) for pattern in self.options.get("share", ())):
@@ -109,9 +109,9 @@ class Case:
         return modules
 
     def call(self, module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """The field's method on a module or a router."""
+        """Calls the field's method on a module or a router."""
         function = module if self.method == "forward" else getattr(module, self.method)
-        if self.given and isinstance(module, VoronoiRouter):
+        if self.passes_coords and isinstance(module, VoronoiRouter):
             kwargs = {**kwargs, "coords": self.positions(*args, **kwargs)}
         return function(*args, **kwargs)
 
@@ -126,7 +126,7 @@ def randomised(module: nn.Module) -> nn.Module:
 
 
 def mapped(tree: Any, function: Callable[[Tensor], Any]) -> Any:
-    """Arguments with every tensor replaced, in tuples, lists, dicts and dataclasses."""
+    """Returns the arguments with every tensor replaced, in tuples, lists, dicts and dataclasses."""
     if isinstance(tree, Tensor):
         return function(tree)
     if isinstance(tree, dict):
@@ -142,7 +142,7 @@ def mapped(tree: Any, function: Callable[[Tensor], Any]) -> Any:
 
 
 def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """(path, value) of everything in an output that is no container; the path names the containers' types."""
+    """Yields (path, value) of each leaf of an output; the path names the types of the containers."""
     kind = type(tree).__name__
     if isinstance(tree, dict):
         for key, value in tree.items():
@@ -158,12 +158,12 @@ def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def tensors(tree: Any) -> dict[str, Tensor]:
-    """The tensors of an output by path; everything else by its path and text, so that structures compare."""
+    """Returns tensors of an output by path; other leaves have path and text as a key, so that structures compare."""
     return {path if isinstance(v, Tensor) else f"{path}={v!r}": v for path, v in leaves(tree)}
 
 
 def prepared(case: Case, dtype: torch.dtype, lead: tuple[int, ...] | None = None) -> tuple[Any, Any, list[Tensor]]:
-    """Arguments of a dtype, and the floating tensors among them as leaves that take a gradient."""
+    """Returns arguments of a dtype, and their floating-point tensors as leaf tensors with gradients."""
     inputs: list[Tensor] = []
 
     def take(tensor: Tensor) -> Tensor:
@@ -177,13 +177,13 @@ def prepared(case: Case, dtype: torch.dtype, lead: tuple[int, ...] | None = None
 
 
 def nearest(case: Case, centres: Tensor, args: Any, kwargs: Any) -> Tensor:
-    """Cell of each sample, int64 [n]."""
+    """Returns the cell of each sample, int64 [n]."""
     positions = case.positions(*args, **kwargs).detach().reshape(-1, 3).double()
     return (positions[:, None] - centres.double()).square().sum(-1).argmin(1)
 
 
 def loop(case: Case, modules: list[nn.Module], cells: Tensor, args: Any, kwargs: Any) -> dict[str, Tensor]:
-    """Outputs by path, each sample evaluated by the module of its cell, int64 [n], one cell after the other."""
+    """Returns the outputs by path; one cell after the other, its module evaluates its samples. ``cells``: int64 [n]."""
     n, lead = cells.shape[0], case.lead
 
     def rows(index: Tensor) -> Callable[[Tensor], Tensor]:
@@ -216,22 +216,22 @@ def loop(case: Case, modules: list[nn.Module], cells: Tensor, args: Any, kwargs:
 
 
 def routed(case: Case, modules: list[nn.Module], centres: Tensor | VoronoiDiagram, **options: Any) -> VoronoiRouter:
-    """A router whose cells are the given modules."""
+    """Returns a router with these modules as cells."""
     return VoronoiRouter.from_modules(modules, centres, **{**case.options, **options})
 
 
 def close(
-    found: dict[str, Any], expected: dict[str, Any], *, rtol: float | None = None, atol: float | None = None
+    actual: dict[str, Any], expected: dict[str, Any], *, rtol: float | None = None, atol: float | None = None
 ) -> None:
-    """Same structure, same shapes and dtypes, same numbers."""
-    assert list(found) == list(expected)
+    """Checks that structure, shapes, dtypes and numbers are the same."""
+    assert list(actual) == list(expected)
     for key, value in expected.items():
         if isinstance(value, Tensor):
-            torch.testing.assert_close(found[key], value, rtol=rtol, atol=atol, msg=lambda m, key=key: f"{key}: {m}")
+            torch.testing.assert_close(actual[key], value, rtol=rtol, atol=atol, msg=lambda m, key=key: f"{key}: {m}")
 
 
 def scalar(outputs: dict[str, Any]) -> Tensor:
-    """A loss that weighs every number of the outputs differently, the same each time it is called."""
+    """Returns a loss with another weight for every number of the outputs, the same weights in each call."""
     generator = torch.Generator().manual_seed(7)
     parts = []
     for value in outputs.values():
@@ -244,22 +244,22 @@ def scalar(outputs: dict[str, Any]) -> Tensor:
 def gradients(
     of: list[nn.Module] | VoronoiRouter, loss: Tensor, inputs: list[Tensor], **options: Any
 ) -> dict[str, Tensor]:
-    """Gradients by name: of a router's parameters, or of those of a loop's modules, stacked [k, ...]; of the inputs."""
+    """Returns gradients by name: of parameters of a router, or of a loop's modules [k, ...], and of inputs."""
     modules = [of.module] if isinstance(of, VoronoiRouter) else of
     names = [name for name, p in modules[0].named_parameters() if p.requires_grad]
-    own = [list(dict.fromkeys(m.get_parameter(name) for m in modules)) for name in names]  # one, where cells share it
+    own = [list(dict.fromkeys(m.get_parameter(name) for m in modules)) for name in names]  # one if cells share it
     wanted = [*itertools.chain(*own), *inputs]
     options = {"allow_unused": True, "materialize_grads": True, "retain_graph": True, **options}
-    found = iter(torch.autograd.grad(loss, wanted, **options))
+    following = iter(torch.autograd.grad(loss, wanted, **options))
     result = {}
     for name, parameters in zip(names, own):
-        parts = [next(found) for _ in parameters]
+        parts = [next(following) for _ in parameters]
         result[name] = parts[0] if len(parts) == 1 else torch.stack(parts)
-    return {**result, **{f"input {i}": gradient for i, gradient in enumerate(found)}}
+    return {**result, **{f"input {i}": gradient for i, gradient in enumerate(following)}}
 
 
 class Counter:
-    """Counts a module class's calls of a method, and the rows of each; the first argument holds the samples."""
+    """A counter of a method's calls and of the rows in each call; the first argument holds the samples."""
 
     def __init__(self, monkeypatch: Any, cls: type[nn.Module], method: str) -> None:
         self.rows: list[int] = []
@@ -268,8 +268,8 @@ class Counter:
 
         @functools.wraps(original)
         def counted(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
-            found = [v for _, v in leaves((args, kwargs)) if isinstance(v, Tensor)]
-            self.rows.append(found[0].shape[0])
+            inputs = [v for _, v in leaves((args, kwargs)) if isinstance(v, Tensor)]
+            self.rows.append(inputs[0].shape[0])
             return original(module, *args, **kwargs)
 
         monkeypatch.setattr(owner, method, counted)

@@ -1,4 +1,4 @@
-"""Fields that nobody listed, by what they do with their parameters: layers, norms, weights made by hand, tables."""
+"""Fields beyond the listed codebases, by how they use parameters: layers, norms, handmade weights, tables."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LearnedScale(nn.Module):
 
 
 class OldWeightNorm(nn.Module):
-    """NeuS's SDF network: weight_norm by hooks, softplus of beta 100, a skip divided by the root of two."""
+    """NeuS's SDF network: weight_norm by hooks, softplus of beta 100, a skip divided by the square root of two."""
 
     def __init__(self, norm: Callable[[nn.Module], nn.Module]) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class Residual(nn.Module):
 
 
 class RawWeights(nn.Module):
-    """No nn.Linear at all: every way to write a product with a weight."""
+    """A field without nn.Linear, with a product of weight and samples in one of many spellings."""
 
     def __init__(self, way: str) -> None:
         super().__init__()
@@ -118,7 +118,7 @@ class Tied(nn.Module):
 
 
 class LatentCode(nn.Module):
-    """A vector of the module's own, repeated for every sample."""
+    """A latent vector parameter, repeated for every sample."""
 
     def __init__(self, way: str) -> None:
         super().__init__()
@@ -139,7 +139,7 @@ class LatentCode(nn.Module):
 
 
 class Lookup(nn.Module):
-    """Appearance by image: an Embedding, its average, and F.embedding."""
+    """An appearance code by image, from an Embedding, its average, and F.embedding."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -154,7 +154,7 @@ class Lookup(nn.Module):
 
 
 class Convolution(nn.Module):
-    """A convolution over features: no sample sees another, and no grouped version."""
+    """A convolution over the features of each sample, which has no grouped version."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The eight conventions of examples/, in every form in which their codebases call them."""
+"""The eight conventions of examples/, in every form that their codebases use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Lead = tuple[int, ...]
 
 
 def encoded(octaves: int, direction_octaves: int | None) -> Any:
-    """Arguments of a field that is encoded outside: one tensor."""
+    """Returns a maker of one tensor argument, encoded outside of the field."""
 
     def arguments(lead: Lead) -> Arguments:
         x = nerf_pytorch.encode(uniform(lead), octaves)
@@ -31,12 +31,12 @@ def pair(lead: Lead) -> Arguments:
 
 
 def with_rays(lead: Lead) -> Arguments:
-    """Positions, and one direction for each ray."""
+    """Returns positions, and one direction for each ray."""
     return (uniform(lead), uniform(lead[:1])), {}
 
 
 def mip_arguments(view: bool) -> Any:
-    # The means are three of the features here, so that the loop finds them; the router is told at the call.
+    # Three features are the means here, so that the loop finds them; the router gets them at the call.
     def arguments(lead: Lead) -> Arguments:
         x = uniform(lead, 12)
         return ((x, uniform(lead[:1], 9)) if view else (x,)), {}
@@ -109,7 +109,7 @@ def studio_case(method: str, arguments: Any) -> Case:
 
 
 def other(method: str, options: Any, make: Any, arguments: Any, fuses: bool = True, **more: Any) -> Case:
-    """A method beside forward."""
+    """Returns the case of a method other than forward."""
     return Case(f"{make.__name__} {method}", make, arguments, options=options, method=method, fuses=fuses, **more)
 
 
@@ -121,7 +121,7 @@ PART = Case(
     lambda lead: ((*pair(lead)[0], torch.rand(lead) < 0.5), {"geo_feat": uniform(lead, 4)}),
     options=NGP,
     method="color",
-    way="cell by cell",  # the module takes some of its rows, so that cells end elsewhere
+    way="cell by cell",  # the module selects rows, so that cells end elsewhere
 )
 LISTED = [
     Case("nerf-pytorch", skips, encoded(2, 1), fuses=True),
@@ -129,8 +129,18 @@ LISTED = [
     Case("FlexibleNeRF", flexible_field, encoded(2, 1), lead=RAYS, fuses=True),
     Case("nerf_pl", pl_field, encoded(2, 1), fuses=True),
     Case("nerf_pl sigma_only", pl_field, lambda lead: (encoded(2, None)(lead)[0], {"sigma_only": True}), fuses=True),
-    Case("mipnerf_pl", mip_field, mip_arguments(True), first, RAYS, WITH_VIEW, given=True, fuses=True, rank=3),
-    Case("mipnerf_pl without views", mip_field, mip_arguments(False), first, RAYS, {}, given=True, fuses=True, rank=3),
+    Case("mipnerf_pl", mip_field, mip_arguments(True), first, RAYS, WITH_VIEW, passes_coords=True, fuses=True, rank=3),
+    Case(
+        "mipnerf_pl without views",
+        mip_field,
+        mip_arguments(False),
+        first,
+        RAYS,
+        {},
+        passes_coords=True,
+        fuses=True,
+        rank=3,
+    ),
     Case("nerfacc packed", nerfacc_field, pair, options=NERFACC, fuses=True),
     Case("nerfacc with a condition per ray", nerfacc_field, with_rays, first, RAYS, WITH_CONDITION, fuses=True),
     other("query_density", NERFACC, nerfacc_field, one(3)),

@@ -1,4 +1,4 @@
-"""Small fields in which parameters meet samples in one way each, with a rule for all cells at once or without one."""
+"""Small fields in which parameters meet samples in one way each, with or without a grouped rule."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from voronerf.router import register
 
 
 class Odd(nn.Module):
-    """Parameters of many shapes, and a step with some of them."""
+    """A field with parameters of many shapes, and a step that uses some of them."""
 
     def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ class Corners(nn.Module):
 
 
 class Planes(nn.Module):
-    """A plane read with the samples in the second dimension, and a volume with them in the last but one."""
+    """A plane with the samples in its second dimension, and a volume with the samples in the last but one."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ class Planes(nn.Module):
 
 
 class Encoded(nn.Module):
-    """An encoder that all cells may share, and a network of each."""
+    """An encoder that all cells may share, and a table and a head."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -113,7 +113,7 @@ def two_layers() -> nn.Module:
 
 
 class Scales(nn.Module):
-    """A function of the caller's own."""
+    """A field that applies a function of the caller."""
 
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor]) -> None:
         super().__init__()
@@ -124,7 +124,7 @@ class Scales(nn.Module):
 
 
 def seen(name: str) -> Callable[[Tensor, Tensor], Tensor]:
-    """A function of that name that PyTorch's function modes see, as those of other libraries are."""
+    """Returns a function with that name that PyTorch's function modes see, like functions of other libraries."""
 
     def function(rows: Tensor, factor: Tensor) -> Tensor:
         if torch.overrides.has_torch_function((rows, factor)):

@@ -16,7 +16,7 @@ from ops import foreign_fields as fields
 
 
 class Lookup(torch.autograd.Function):
-    """A compiled look-up, as PyTorch sees it."""
+    """A table look-up as a custom autograd function, like compiled look-ups."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, index: Tensor) -> Tensor:
@@ -51,7 +51,7 @@ class Encoder(nn.Module):
 
 
 class Field(nn.Module):
-    """An encoder, a network, and a scale of its results that cells share."""
+    """An encoder, a network, and a scale of its results, which cells may share."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class Field(nn.Module):
 
 
 def inside(lead: tuple[int, ...]) -> Any:
-    """Positions within what the tables cover, and directions."""
+    """Returns positions inside the range of the tables, and directions."""
     return (uniform(lead) * 0.95, F.normalize(uniform(lead), dim=-1)), {}
 
 

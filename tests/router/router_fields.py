@@ -1,4 +1,4 @@
-"""Small modules of many makes, and the plain loop over masks that a router of any of them has to equal."""
+"""Small modules of many kinds, and the plain loop over masks that a router of any of them has to equal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from voronerf.router import VoronoiRouter
 
 
 class SkipNet(nn.Module):
-    """The classic shape: a list of layers with a skip, split inputs, two heads."""
+    """A network of the classic shape: a list of layers with a skip, split inputs, two heads."""
 
     def __init__(self, depth: int = 4, width: int = 12, skip: int = 2, points: int = 9, views: int = 6) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class Sine(nn.Module):
 
 
 class Heads(nn.Module):
-    """Several results in a dict, 1-D ones among them; flags and an optional argument."""
+    """A field with several results in a dict, some of them 1-D; flags and an optional argument."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -68,14 +68,14 @@ class Heads(nn.Module):
         return {"sigma": torch.exp(h[..., 0].clamp(max=4)), "features": h[..., 1:]}
 
     def forward(self, x: Tensor, d: Tensor | None = None, density_only: bool = False) -> Any:
-        found = self.density(x)
+        result = self.density(x)
         if density_only or d is None:
-            return found["sigma"]
-        return torch.sigmoid(self.colour(torch.cat([d, found["features"]], -1))), found["sigma"]
+            return result["sigma"]
+        return torch.sigmoid(self.colour(torch.cat([d, result["features"]], -1))), result["sigma"]
 
 
 def perturb(router: VoronoiRouter, generator: torch.Generator, size: float = 0.2) -> VoronoiRouter:
-    """Makes the cells differ."""
+    """Adds random numbers to the parameters, so that the cells differ."""
     with torch.no_grad():
         for parameter in router.parameters():
             parameter += size * torch.randn(parameter.shape, generator=generator).to(parameter)
@@ -83,7 +83,7 @@ def perturb(router: VoronoiRouter, generator: torch.Generator, size: float = 0.2
 
 
 def tensors(value: Any) -> list[Tensor]:
-    """The tensors of a result, in order."""
+    """Returns the tensors of a result, in order."""
     if isinstance(value, Tensor):
         return [value]
     items = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else []
@@ -93,7 +93,7 @@ def tensors(value: Any) -> list[Tensor]:
 def masked_loop(
     router: VoronoiRouter, cells: Tensor, args: Sequence[Any], method: str = "forward"
 ) -> tuple[list[Tensor], list[nn.Module]]:
-    """What a router stands for: a mask and a module for each cell; flat arguments [n, ...]."""
+    """Returns the results of a loop over masks, and the cells' modules; arguments are flat, [n, ...]."""
     modules = [router.cell(i) for i in range(router.num_cells)]
     results: list[Tensor] = []
     for i, module in enumerate(modules):
@@ -101,9 +101,9 @@ def masked_loop(
         if not mask.any():
             continue
         part = [value[mask] if isinstance(value, Tensor) and value.dim() else value for value in args]
-        found = tensors(getattr(module, method)(*part))
+        outputs = tensors(getattr(module, method)(*part))
         if not results:
-            results = [part.new_zeros(len(cells), *part.shape[1:]) for part in found]
+            results = [part.new_zeros(len(cells), *part.shape[1:]) for part in outputs]
         index = mask.nonzero()[:, 0]
-        results = [whole.index_copy(0, index, part) for whole, part in zip(results, found, strict=True)]
+        results = [whole.index_copy(0, index, part) for whole, part in zip(results, outputs, strict=True)]
     return results, modules

@@ -1,4 +1,4 @@
-"""What VoronoiRouter refuses: modules that mix samples, and calls that leave open where samples are."""
+"""Modules that VoronoiRouter refuses since they mix samples, and calls that do not tell where samples are."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def centres() -> Tensor:
 
 
 class Mixes(nn.Module):
-    """A linear layer, a step that brings samples together, and another layer."""
+    """A linear layer, a step that mixes samples, and another layer."""
 
     def __init__(self, step: Callable[[Any, Tensor], Any], **parts: nn.Module) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ ALONG_RAYS: list[tuple[Callable[..., Any], dict[str, Callable[[], nn.Module]]]] 
 @pytest.mark.filterwarnings("ignore:.*cell by cell")
 @pytest.mark.parametrize("number", range(len(MIXING) + len(ALONG_RAYS)))
 def test_modules_that_mix_samples_are_refused(number: int, centres: Tensor) -> None:
-    """Each sample sees others of the batch; or those of its ray."""
+    """Each sample depends on other samples of the batch or of its ray."""
     step, parts = [*MIXING, *ALONG_RAYS][number]
     module = Mixes(step, **{name: make() for name, make in parts.items()})
     with pytest.raises((ValueError, TypeError), match=r"(?s)VoronoiRouter.*sample"):
@@ -83,7 +83,7 @@ def test_modules_that_mix_samples_are_refused(number: int, centres: Tensor) -> N
 
 
 class Field(nn.Module):
-    """Takes features, and others of a sample or a ray."""
+    """A field of features, and of optional features of a sample or a ray."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -120,7 +120,7 @@ def holding(value: Any) -> nn.Module:
 
 @dataclasses.dataclass
 class Compared(nn.Module):
-    """Has no hash, since instances are equal by their fields."""
+    """A module without a hash, since instances are equal by their fields."""
 
     width: int = 2
 

@@ -1,4 +1,4 @@
-"""The choice between the ways of a call: measured, said, and without a trace."""
+"""The choice between the ways of a call: it is measured, reported, and leaves no trace."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def test_the_fastest_is_taken_and_said(monkeypatch: pytest.MonkeyPatch, fastest:
     calls = []
     monkeypatch.setattr(dispatch, "_LOOKS", 1)
 
-    def measured(found: Any, call: Any, grouping: Any) -> list[float]:
-        calls.append([way.name for way in found])
-        return [0.001 if way.name == fastest else 0.004 for way in found]
+    def measured(ways: Any, call: Any, grouping: Any) -> list[float]:
+        calls.append([way.name for way in ways])
+        return [0.001 if way.name == fastest else 0.004 for way in ways]
 
     monkeypatch.setattr(dispatch, "measure", measured)
     router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=True), uniform((200,))
@@ -60,7 +60,7 @@ def test_a_fused_way_is_left_if_it_is_clearly_slower_again_and_again(
 ) -> None:
     now, looks = [0.0], list[float]()
 
-    def measured(found: Any, call: Any, grouping: Any) -> list[float]:
+    def measured(ways: Any, call: Any, grouping: Any) -> list[float]:
         looks.append(now[0])
         return [fused[len(looks) - 1], 2.4, 9.0]
 
@@ -79,7 +79,7 @@ def test_a_fused_way_is_left_if_it_is_clearly_slower_again_and_again(
 
 
 def test_what_is_about_as_fast_and_more_promising_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatch, "measure", lambda found, call, grouping: [1.01, 1.0])
+    monkeypatch.setattr(dispatch, "measure", lambda ways, call, grouping: [1.01, 1.0])
     router = VoronoiRouter(network(), CENTRES, coords="first3")
     router(uniform((200,)))
     assert router.explain().startswith("forward: grouped: ")
@@ -107,7 +107,7 @@ def test_a_way_that_is_none() -> None:
 
 
 class Counts(nn.Module):
-    """Draws numbers, and writes into a buffer."""
+    """A module that draws random numbers and writes into a buffer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -126,19 +126,19 @@ def test_measuring_leaves_no_trace(requires_grad: bool) -> None:
     fixed = copy.deepcopy(router)
     fixed.way = "grouped"
     torch.manual_seed(3)
-    found = router(x)
+    result = router(x)
     after = torch.get_rng_state()
     text = router.explain()
     assert " ms for 200 samples, " in text and "grouped" in text and "cell by cell" in text
     torch.manual_seed(3)
-    torch.testing.assert_close(found, fixed(x))
+    torch.testing.assert_close(result, fixed(x))
     if text.startswith("forward: grouped"):
         assert torch.equal(after, torch.get_rng_state()) and router.module.seen == fixed.module.seen == 1
     assert all(parameter.grad is None for parameter in router.parameters()) and x.grad is None
 
 
 class Half(nn.Module):
-    """Runs grouped unless a sample lies outside."""
+    """A module that runs grouped unless a sample lies outside."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -160,7 +160,7 @@ def test_batches_that_cannot_be_grouped_are_tried_by_doubling() -> None:
     tries[0] = 0
     for _ in range(64):
         torch.testing.assert_close(router(far), masked_loop(router, router.diagram.locate(far), [far])[0][0])
-    assert 64 * cells < tries[0] <= 64 * 2 * cells + 10  # the loop's calls, those of the expected values, few others
+    assert 64 * cells < tries[0] <= 64 * 2 * cells + 10  # calls of the loop, of the expected values, few others
     for _ in range(80):
         router(near)
     tries[0] = 0

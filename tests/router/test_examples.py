@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from convention_harness import EXAMPLES
 
-ELSEWHERE = ("nerf_pytorch_style", "poisson", "train")  # which have tests of their own
+ELSEWHERE = ("nerf_pytorch_style", "poisson", "train")  # these scripts have tests of their own
 SCRIPTS = sorted(path for path in EXAMPLES.glob("*.py") if path.stem not in ELSEWHERE)
 
 
@@ -27,7 +27,7 @@ def test_there_is_a_script_for_each_codebase() -> None:
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_script(path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each compares its field before and after by itself."""
+    """Each script itself compares its field before and after routing."""
     run(path, monkeypatch)
     assert re.search(r"\d+ (cells|modules in one router)", capsys.readouterr().out)
 
@@ -38,14 +38,14 @@ SMALL = {"downscale": 5, "seconds": 1.5, "width": 16, "depth": 3, "rays": 256, "
 @pytest.mark.parametrize("voronoi", [False, True], ids=["one network", "cells"])
 def test_training_loop(voronoi: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     ticks = itertools.count()
-    monkeypatch.setattr("time.perf_counter", lambda: 0.03 * next(ticks))  # of a step, however busy the machine is
+    monkeypatch.setattr("time.perf_counter", lambda: 0.03 * next(ticks))  # 0.03 seconds a step on any machine
     options = [f"--{name}={value}" for name, value in SMALL.items()]
     run(EXAMPLES / "nerf_pytorch_style.py", monkeypatch, "builtin", *options, *["--voronoi"] * voronoi)
     last = capsys.readouterr().out.splitlines()[-1]
-    found = re.fullmatch(r"(16 cells|one network) of width 16: (\d+) steps in (\d+) s, test PSNR ([\d.]+) dB", last)
-    assert found is not None, last
-    assert found[1] == ("16 cells" if voronoi else "one network")
-    assert float(found[4]) > 8
+    result = re.fullmatch(r"(16 cells|one network) of width 16: (\d+) steps in (\d+) s, test PSNR ([\d.]+) dB", last)
+    assert result is not None, last
+    assert result[1] == ("16 cells" if voronoi else "one network")
+    assert float(result[4]) > 8
 
 
 def test_three_lines_are_changed() -> None:

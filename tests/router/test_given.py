@@ -1,4 +1,4 @@
-"""Fields that say their program: what changes is followed, and what is no program still gives what a loop gives."""
+"""Fields that declare their program: changes are followed, and a field without a program still equals a loop."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TABLE = MLP((Layer(("positions",), 6, "relu"), Layer((0,), 4)), outputs=(1,))
 
 
 class Said(nn.Module):
-    """Two layers, and any activation."""
+    """Two layers and an activation."""
 
     def __init__(self, act: Any = torch.sigmoid) -> None:
         super().__init__()
@@ -41,22 +41,22 @@ def make(field: nn.Module | None = None, **options: Any) -> VoronoiRouter:
 
 
 def loop(router: VoronoiRouter, *args: Tensor) -> tuple[Tensor, ...]:
-    """The cells' modules, each on its samples."""
+    """Returns the results of the cells' modules, each on its own samples."""
     cells = router.assign(args[0])
     parts = [router.cell(cell)(*(x[cells == cell] for x in args)) for cell in range(K)]
     parts = [part if isinstance(part, tuple) else (part,) for part in parts]
-    found = [torch.zeros(N, *each.shape[1:], dtype=each.dtype) for each in parts[0]]
+    outputs = [torch.zeros(N, *result.shape[1:], dtype=result.dtype) for result in parts[0]]
     for cell, part in enumerate(parts):
-        for out, own in zip(found, part, strict=True):
+        for out, own in zip(outputs, part, strict=True):
             out[cells == cell] = own
-    return tuple(found)
+    return tuple(outputs)
 
 
 def agree(router: VoronoiRouter, *args: Tensor, **allowed: float) -> None:
     assert router.explain() == "forward: fused"
-    found = router(*args)
-    found = found if isinstance(found, tuple) else (found,)
-    for a, b in zip(found, loop(router, *args), strict=True):
+    result = router(*args)
+    result = result if isinstance(result, tuple) else (result,)
+    for a, b in zip(result, loop(router, *args), strict=True):
         assert a.dtype == b.dtype
         torch.testing.assert_close(a, b, **{"rtol": 1e-4, "atol": 1e-5, **allowed})
 
@@ -77,7 +77,7 @@ def other_activation(router: VoronoiRouter) -> None:
     router.module.act = router.module.activate = torch.tanh
 
 
-CHANGES = {each.__name__: each for each in (other_weight, other_layer, other_module, other_activation)}
+CHANGES = {change.__name__: change for change in (other_weight, other_layer, other_module, other_activation)}
 
 
 @pytest.mark.parametrize("name", CHANGES)
@@ -125,8 +125,8 @@ def test_any_activation_stays_behind_the_fused_layers(act: Any) -> None:
 
 def test_results_keep_their_structure() -> None:
     router = make(Said(lambda raw: {"colour": raw[:, :3], "density": [raw[:, 3]]}))
-    found = router(torch.rand(N, 3))
-    assert found.keys() == {"colour", "density"} and isinstance(found["density"], list)
+    result = router(torch.rand(N, 3))
+    assert result.keys() == {"colour", "density"} and isinstance(result["density"], list)
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
@@ -151,9 +151,9 @@ class Scaled(Said):
 
 def test_each_cell_may_have_its_parameter_of_the_activation() -> None:
     router, x = make(Scaled()), torch.rand(N, 3)
-    found = router(x)
+    result = router(x)
     assert router.explain().startswith("forward: grouped") and len(router.module.scale.unique()) == K
-    torch.testing.assert_close(found, *loop(router, x))
+    torch.testing.assert_close(result, *loop(router, x))
 
 
 def test_wide_positions_are_encoded_as_they_are() -> None:

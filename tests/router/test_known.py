@@ -1,4 +1,4 @@
-"""Calls whose program is known: later calls of a kind run in two operations, with the same bits."""
+"""Calls with a known program: later calls of the same kind run in two operations, with the same bits."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Call = Callable[[VoronoiRouter], Any]
 
 
 class Named(nn.Module):
-    """Results in a dict and a list, of positions and a direction."""
+    """A field with results in a dict and a list, from positions and a direction."""
 
     def __init__(self, columns: int = 6) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ def rows(n: int, columns: int = 3, seed: int = 0) -> Tensor:
 
 
 def outcome(router: VoronoiRouter, call: Call, *leaves: Tensor) -> list[Tensor]:
-    """Results and gradients of a call."""
+    """Returns the results and gradients of a call."""
     torch.manual_seed(4)
     results = tensors(call(router))
     wanted = [p for p in (*router.parameters(), *leaves) if p.requires_grad]
@@ -59,7 +59,7 @@ def outcome(router: VoronoiRouter, call: Call, *leaves: Tensor) -> list[Tensor]:
 
 @pytest.fixture
 def ordinary(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Tensor]]:
-    """The same where nothing is known."""
+    """Returns a function that calls a router without any known program."""
 
     def run(router: VoronoiRouter, call: Call, *leaves: Tensor) -> list[Tensor]:
         with monkeypatch.context() as patch:
@@ -71,17 +71,17 @@ def ordinary(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Tensor]]:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Of methods, that were not known."""
-    found: list[str] = []
+    """Collects the methods of calls without a known program."""
+    results: list[str] = []
     route = VoronoiRouter._route_as_it_is
 
     def noted(self: VoronoiRouter, method: str, /, *args: Any, **kwargs: Any) -> Any:
-        found.append(method)
+        results.append(method)
         return route(self, method, *args, **kwargs)
 
-    for name in ("_route_as_it_is", "_route_uncompiled"):  # the latter once torch's compiler is imported
+    for name in ("_route_as_it_is", "_route_uncompiled"):  # the second one once torch's compiler is imported
         monkeypatch.setattr(VoronoiRouter, name, noted)
-    return found
+    return results
 
 
 def net(columns: int = 3) -> nn.Module:
@@ -126,8 +126,8 @@ def test_a_second_call_is_known_and_gives_the_same_bits(
         assert calls == ["forward"] and router.explain() == "forward: fused"
         second, expected = outcome(router, call), ordinary(router, call)
     assert calls == ["forward", "forward"], "the first, and the last"
-    for found in (first, second):
-        assert all(a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+    for actual in (first, second):
+        assert all(a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(actual, expected, strict=True))
     assert all(tensor.is_contiguous() for tensor in second)
 
 
@@ -135,10 +135,10 @@ def test_autocast_rounds_alike(ordinary: Callable[..., list[Tensor]], calls: lis
     router = routed(net())
     with torch.autocast("cpu", torch.bfloat16):
         for _ in range(2):
-            found = outcome(router, lambda r: r(rows(64)))
-        assert calls == ["forward"] and found[0].dtype is torch.bfloat16
+            actual = outcome(router, lambda r: r(rows(64)))
+        assert calls == ["forward"] and actual[0].dtype is torch.bfloat16
         expected = ordinary(router, lambda r: r(rows(64)))
-    assert all(map(torch.equal, found, expected))
+    assert all(map(torch.equal, actual, expected))
     assert outcome(router, lambda r: r(rows(64)))[0].dtype is torch.float32
 
 
@@ -146,9 +146,9 @@ def test_autocast_rounds_alike(ordinary: Callable[..., list[Tensor]], calls: lis
 def test_of_any_number_of_samples(n: int, ordinary: Callable[..., list[Tensor]], calls: list[str]) -> None:
     router = routed(net())
     router(rows(64))
-    found = outcome(router, lambda r: r(rows(n)))
+    result = outcome(router, lambda r: r(rows(n)))
     assert calls == ["forward"]
-    assert all(map(torch.equal, found, ordinary(router, lambda r: r(rows(n)))))
+    assert all(map(torch.equal, result, ordinary(router, lambda r: r(rows(n)))))
     assert router(rows(0)).shape == (0, 4)
 
 
@@ -167,8 +167,8 @@ def test_few_samples_are_as_well_known_as_many(
         for lead in leads:
             x, d = rows(math.prod(lead)), rows(math.prod(lead), seed=1)
             expected = masked_loop(router, router.assign(x), [x, d])[0]
-            for found, flat in zip(tensors(router(x.reshape(*lead, 3), d.reshape(*lead, 3))), expected, strict=True):
-                torch.testing.assert_close(found.flatten(0, len(lead) - 1), flat)
+            for actual, flat in zip(tensors(router(x.reshape(*lead, 3), d.reshape(*lead, 3))), expected, strict=True):
+                torch.testing.assert_close(actual.flatten(0, len(lead) - 1), flat)
         assert len(probes) == 0 if turn else len(probes) <= 6, "one a kind, and again for the first large batch"
     assert calls == [] or not fuse
 
@@ -182,7 +182,7 @@ def test_what_few_samples_have_shown_is_looked_at_again_with_more(monkeypatch: p
 
 
 class Given(nn.Module):
-    """Takes a vector that all samples share, or the rays do."""
+    """A field of a vector that all samples share, or of one vector per ray."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -205,23 +205,23 @@ def test_a_row_beside_one_sample_may_be_what_all_share(fuse: bool, method: str, 
         warnings.simplefilter("error")
         for n in sizes:
             x = rows(n)
-            found = getattr(router, method)(x, t) if method != "forward" else router(x, t)
+            actual = getattr(router, method)(x, t) if method != "forward" else router(x, t)
             expected = masked_loop(router, router.assign(x), [x, t.expand(n, 3)])[0]
-            torch.testing.assert_close([found], expected)
+            torch.testing.assert_close([actual], expected)
 
 
 def test_a_row_beside_one_ray_is_of_that_ray_or_of_all_samples() -> None:
     router = routed(Given(), way="fastest")
     for r, s, rays in [(1, 6, 1), (1, 1, 1), (5, 9, 5), (1, 9, 1), (5, 9, 1), (5, 1, 5), (5, 1, 1), (1, 9, 1)]:
         x, t = rows(r * s), rows(rays, seed=1)
-        each = t.expand(r, 3).repeat_interleave(s, 0)
-        for given in (t, t[:, None])[rays < r :]:  # [1, f] beside several rays is refused
-            expected = masked_loop(router, router.assign(x), [x, each])[0][0].reshape(r, s, 4)
-            torch.testing.assert_close(router(x.reshape(r, s, 3), given), expected)
+        codes = t.expand(r, 3).repeat_interleave(s, 0)
+        for arguments in (t, t[:, None])[rays < r :]:  # [1, f] beside several rays is refused
+            expected = masked_loop(router, router.assign(x), [x, codes])[0][0].reshape(r, s, 4)
+            torch.testing.assert_close(router(x.reshape(r, s, 3), arguments), expected)
 
 
 class Mean(nn.Linear):
-    """Mixes the samples of a call."""
+    """A layer that mixes the samples of a call."""
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x - x.mean(0))
@@ -246,24 +246,24 @@ def test_gradients_to_arguments_and_second_derivatives(ordinary: Callable[..., l
         return [y, *torch.autograd.grad(y.sum(), x, create_graph=True)]
 
     outcome(router, eikonal, x)
-    found = outcome(router, eikonal, x)
+    result = outcome(router, eikonal, x)
     assert calls == ["forward"]
-    assert all(map(torch.equal, found, ordinary(router, eikonal, x)))
+    assert all(map(torch.equal, result, ordinary(router, eikonal, x)))
 
 
 def test_frozen_cells(ordinary: Callable[..., list[Tensor]], calls: list[str]) -> None:
     router = routed(net())
     router(rows(64))
     router.freeze([0, 2])
-    found, expected = outcome(router, lambda r: r(rows(64))), ordinary(router, lambda r: r(rows(64)))
+    actual, expected = outcome(router, lambda r: r(rows(64))), ordinary(router, lambda r: r(rows(64)))
     assert calls == ["forward", "forward"]
-    assert torch.equal(found[0], expected[0])
-    for own, other in zip(found[1:], expected[1:], strict=True):
+    assert torch.equal(actual[0], expected[0])
+    for own, other in zip(actual[1:], expected[1:], strict=True):
         assert torch.equal(own, other) and not own[[0, 2]].any() and own[[1, 3]].any()
-    x = rows(64).requires_grad_()  # what has gradients leaves frozen cells out of the backward pass
+    x = rows(64).requires_grad_()  # with gradients to x, the backward pass leaves frozen cells out
     for _ in range(2):
-        found = outcome(router, lambda r: r(x), x)
-    assert not found[-1][torch.isin(router.assign(x), torch.tensor([0, 2]))].any()
+        actual = outcome(router, lambda r: r(x), x)
+    assert not actual[-1][torch.isin(router.assign(x), torch.tensor([0, 2]))].any()
 
 
 def test_methods_share_the_cells_that_were_drawn(calls: list[str]) -> None:
@@ -271,15 +271,15 @@ def test_methods_share_the_cells_that_were_drawn(calls: list[str]) -> None:
     x = rows(200)
     for _ in range(3):
         calls.clear()
-        density, found = router.density(x), router(x, x)
-        assert torch.equal(found["more"][0], density), "of the same cells"
+        density, result = router.density(x), router(x, x)
+        assert torch.equal(result["more"][0], density), "of the same cells"
     assert calls == []
     with torch.no_grad():
         assert not torch.equal(router.density(x), router.density(x)), "drawn anew for the same method"
 
 
 def doubled(module: nn.Module) -> nn.Module:
-    """A copy with other parameters."""
+    """Returns a copy with other parameters."""
     copied = copy.deepcopy(module)
     with torch.no_grad():
         for parameter in copied.parameters():
@@ -324,9 +324,9 @@ def test_arguments_unlike_those_of_before(calls: list[str]) -> None:
     with pytest.raises(TypeError, match="must be floating-point"):
         router(x.int(), x)
     with torch.inference_mode():
-        made = rows(64)
+        inside = rows(64)
     del calls[:]
-    assert torch.equal(router(made, made)["colour"], router(made.clone(), made.clone())["colour"])
+    assert torch.equal(router(inside, inside)["colour"], router(inside.clone(), inside.clone())["colour"])
     assert calls == ["forward"], "tensors of inference mode are copied where gradients are kept"
 
 
@@ -340,19 +340,19 @@ def test_what_samples_share_may_be_of_inference_mode(fuse: bool) -> None:
     x = rows(40).requires_grad_()
     for argument in (t, rows(40)):
         for _ in range(3):
-            found = outcome(router, lambda r: r(x, argument), x)  # noqa: B023
+            actual = outcome(router, lambda r: r(x, argument), x)  # noqa: B023
         (expected,), _ = masked_loop(router, router.assign(x), [x, argument.clone().expand(40, 3)])
-        torch.testing.assert_close(found[0], expected)
-        torch.testing.assert_close(found[-1], torch.autograd.grad(expected.square().sum(), x)[0])
+        torch.testing.assert_close(actual[0], expected)
+        torch.testing.assert_close(actual[-1], torch.autograd.grad(expected.square().sum(), x)[0])
 
 
 def test_a_field_with_a_layer_table_explains_itself_as_any_other() -> None:
-    given, traced = VoronoiRouter(NeRF(width=16, depth=2), rows(6)), routed(net())
-    assert given.explain() == "forward: fused", "which is known beforehand"
+    arguments, traced = VoronoiRouter(NeRF(width=16, depth=2), rows(6)), routed(net())
+    assert arguments.explain() == "forward: fused", "which is known beforehand"
     assert traced.explain() == "forward: not called yet"
-    given(rows(40), nn.functional.normalize(rows(40, seed=1), dim=-1))
+    arguments(rows(40), nn.functional.normalize(rows(40, seed=1), dim=-1))
     traced(rows(40))
-    assert given.explain() == traced.explain() == "forward: fused"
+    assert arguments.explain() == traced.explain() == "forward: fused"
 
 
 @pytest.mark.parametrize("make", [lambda: (routed(net()), (rows(64),)), lambda: (routed(Named()), (rows(64),) * 2)])

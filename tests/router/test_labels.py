@@ -1,4 +1,4 @@
-"""Labels in the place of positions: one network for each speaker, station, object or image."""
+"""Labels in place of positions: one network for each speaker, station, object or image."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def routed(module: nn.Module, way: str = "fused", cells: Any = K, **options: Any
 
 
 def drawn(generator: torch.Generator, *shape: int, dtype: torch.dtype = torch.int64) -> Tensor:
-    """Labels; the last network gets no sample."""
+    """Draws labels; the last network gets no sample."""
     return torch.randint(K - 1, shape, generator=generator, dtype=dtype)
 
 
@@ -48,16 +48,16 @@ def gradients(results: list[Tensor], wanted: list[Tensor]) -> list[Tensor]:
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
 def test_every_way_equals_the_loop_with_gradients(way: str, dtype: torch.dtype, generator: torch.Generator) -> None:
     router = routed(Sine(), way)
-    for n in (40, 23, 1):  # the first call of a kind, a known one, few samples
+    for n in (40, 23, 1):  # the first call of a kind, a known call, few samples
         x, cells = torch.rand(n, 3, generator=generator, requires_grad=True), drawn(generator, n, dtype=dtype)
         expected, modules = masked_loop(router, cells, [x])
-        found = tensors(router(x, cells=cells))
-        torch.testing.assert_close(found, expected)
+        actual = tensors(router(x, cells=cells))
+        torch.testing.assert_close(actual, expected)
         singles = [p for module in modules for p in module.parameters()]
         *of_cells, of_x = gradients(expected, [*singles, x])
         count = len(list(router.parameters()))
         stacked = [torch.stack(of_cells[i::count]) for i in range(count)]
-        torch.testing.assert_close(gradients(found, [*router.parameters(), x]), [*stacked, of_x])
+        torch.testing.assert_close(gradients(actual, [*router.parameters(), x]), [*stacked, of_x])
     assert router.explain() == f"forward: {'cell by cell' if way == 'loop' else way}"
     assert router(torch.rand(0, 3), cells=torch.zeros(0, dtype=dtype)).shape == (0, 2)
 
@@ -67,14 +67,14 @@ def test_labels_have_the_leading_shape_of_samples(way: str, generator: torch.Gen
     router, x, cells = routed(Sine(), way), torch.rand(8, 6, 3, generator=generator), drawn(generator, 8, 6)
     flat = router(x.flatten(0, 1), cells=cells.flatten())
     torch.testing.assert_close(router(x, cells=cells), flat.reshape(8, 6, 2))
-    members = torch.arange(K).expand(8, K)  # an ensemble: each row for every network
+    members = torch.arange(K).expand(8, K)  # an ensemble: every network gets each row
     expected = torch.stack([router.cell(i)(x[:, 0]) for i in range(K)], 1)
     torch.testing.assert_close(router(x[:, :1], cells=members), expected)
 
 
 @pytest.mark.parametrize("way", ["grouped", "loop"])
 def test_what_lies_behind_the_shape_of_labels_is_one_sample(way: str, generator: torch.Generator) -> None:
-    class Softmax(nn.Module):  # of all rows of an image
+    class Softmax(nn.Module):  # over all rows of an image
         def __init__(self) -> None:
             super().__init__()
             self.layer = nn.Linear(3, 2)
@@ -114,7 +114,7 @@ def test_a_diagram_gives_way_to_labels(generator: torch.Generator) -> None:
         torch.testing.assert_close(router(x, cells=cells), masked_loop(router, cells, [x])[0][0])
         torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
     drawing = routed(Heads(), "grouped", router.diagram, coords="first3", assignment="stochastic", methods=["density"])
-    torch.testing.assert_close(drawing(x, cells=cells), masked_loop(drawing, cells, [x])[0][0])  # none is drawn
+    torch.testing.assert_close(drawing(x, cells=cells), masked_loop(drawing, cells, [x])[0][0])  # no cells are drawn
 
 
 def test_a_module_with_an_argument_of_this_name_gets_it(generator: torch.Generator) -> None:
@@ -145,8 +145,8 @@ def test_one_row_for_all_members_of_an_ensemble(way: str, generator: torch.Gener
     router = routed(nn.Linear(3, 2), way)
     for n in (5, 1):
         x = torch.rand(n, 3, generator=generator)
-        found = router(x[:, None], cells=torch.arange(K).expand(n, K))
-        torch.testing.assert_close(found, torch.stack([router.cell(i)(x) for i in range(K)], 1))
+        result = router(x[:, None], cells=torch.arange(K).expand(n, K))
+        torch.testing.assert_close(result, torch.stack([router.cell(i)(x) for i in range(K)], 1))
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -237,7 +237,7 @@ def test_states_parts_copies_and_new_labels(tmp_path: Path, generator: torch.Gen
 def test_graphs_of_the_compiler(whole: bool, generator: torch.Generator) -> None:
     router, x, cells = routed(Sine(), "fused" if whole else "grouped"), torch.rand(40, 3), drawn(generator, 40)
     expected = router(x, cells=cells)
-    torch._dynamo.reset()  # what it knows of the other case
+    torch._dynamo.reset()  # forget the graphs of the other case
 
     def twice(x: Tensor, cells: Tensor) -> Tensor:
         return 2 * router(x, cells=cells)
@@ -257,6 +257,6 @@ def test_gradients_by_torch_func(generator: torch.Generator) -> None:
     def loss(parameters: dict[str, Tensor], cells: Tensor) -> Tensor:
         return torch.func.functional_call(router, parameters, (x,), {"cells": cells}).square().sum()
 
-    found = torch.func.grad(loss)(parameters, cells)
+    actual = torch.func.grad(loss)(parameters, cells)
     expected = gradients([router(x, cells=cells)], list(parameters.values()))
-    torch.testing.assert_close(list(found.values()), expected)
+    torch.testing.assert_close(list(actual.values()), expected)

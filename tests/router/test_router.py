@@ -32,7 +32,7 @@ def samples(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def trained(field: NeRF, generator: torch.Generator) -> tuple[VoronoiRouter, torch.optim.Optimizer]:
-    """A router of three cells after a few steps of Adam in two parameter groups."""
+    """Returns a router of three cells after a few steps of Adam in two parameter groups."""
     router = VoronoiRouter(field, torch.randn(3, 3, generator=generator))
     heads = [p for name, p in router.named_parameters() if "colour" in name]
     rest = [p for name, p in router.named_parameters() if "colour" not in name]
@@ -48,7 +48,7 @@ def trained(field: NeRF, generator: torch.Generator) -> tuple[VoronoiRouter, tor
 def test_results_from_before_a_split_that_are_still_held_do_not_disturb(
     field: NeRF, generator: torch.Generator
 ) -> None:
-    """Parameters stay the same objects, of another shape; a graph that was built before remembers the old one."""
+    """Parameters stay the same objects, with another shape; an earlier graph remembers the old shape."""
     router, _ = trained(field, generator)
     positions, directions = samples(200, generator)
     held = router(positions, directions)
@@ -91,7 +91,7 @@ def test_copies_and_the_wrapped_field_are_independent(field: NeRF, generator: to
 
 @pytest.mark.parametrize("kind", ["one", "flat", "nested", "many"])
 def test_every_kind_of_diagram_equals_the_loop(kind: str, field: NeRF, generator: torch.Generator) -> None:
-    cells = {"one": 1, "many": 300}.get(kind, 4)  # a diagram of many centres looks cells up by itself
+    cells = {"one": 1, "many": 300}.get(kind, 4)  # with many centres, a diagram looks cells up by itself
     diagram = VoronoiDiagram(torch.randn(cells, 3, generator=generator))
     if kind == "nested":
         diagram, _ = diagram.refine({1: torch.randn(3, 3, generator=generator)})
@@ -99,10 +99,10 @@ def test_every_kind_of_diagram_equals_the_loop(kind: str, field: NeRF, generator
     positions, directions = samples(50, generator)
     positions.requires_grad_()
     (rgb, sigma), _ = masked_loop(router, router.diagram.locate(positions), [positions, directions])
-    found, density = router(positions, directions)
-    torch.testing.assert_close(found, rgb)
+    result, density = router(positions, directions)
+    torch.testing.assert_close(result, rgb)
     torch.testing.assert_close(density, sigma)
-    ours, theirs = (torch.autograd.grad(c.sum() + d.sum(), positions) for c, d in ((found, density), (rgb, sigma)))
+    ours, theirs = (torch.autograd.grad(c.sum() + d.sum(), positions) for c, d in ((result, density), (rgb, sigma)))
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
     shifted, _ = router(positions, directions, coords=positions + 1)
     assert torch.allclose(shifted, rgb) == (kind == "one")

@@ -1,4 +1,4 @@
-"""Around a routed module: its own hooks, fields that say more than their table, odd arguments, threads, failures."""
+"""Edge cases of routing: module hooks, fields that do more than their table, odd arguments, threads, failures."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def centres(k: int = 4) -> Tensor:
     return torch.rand(k, 3, generator=torch.Generator().manual_seed(k)) * 2 - 1
 
 
-def close(found: Tensor, expected: Tensor) -> None:
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+def close(actual: Tensor, expected: Tensor) -> None:
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
 
 
 # Hooks ----------------------------------------------------------------------------------------------------------------
@@ -42,11 +42,11 @@ def test_hooks_of_the_module_itself_run() -> None:
     router, x = VoronoiRouter(module, centres(), coords="first3"), samples()
     for _ in range(3):
         close(router(x), module(x))
-    handle = router.module.register_forward_hook(lambda m, given, out: 2 * out)
+    handle = router.module.register_forward_hook(lambda m, arguments, out: 2 * out)
     for _ in range(3):
         close(router(x), 2 * module(x))
     handle.remove()
-    router.module.register_forward_pre_hook(lambda m, given: (given[0] + 1,))
+    router.module.register_forward_pre_hook(lambda m, arguments: (arguments[0] + 1,))
     close(router(x), module(x + 1))
 
 
@@ -54,7 +54,7 @@ def test_hooks_of_the_module_itself_run() -> None:
 
 
 class Moved(NeRF):
-    """Its forward does more than the table says."""
+    """A field whose forward does more than its table says."""
 
     def forward(self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> Any:
         return super().forward(positions * 2 + 0.1, directions, ray_index)
@@ -71,14 +71,14 @@ def test_such_fields_as_the_renderer_calls_them() -> None:
     router = VoronoiRouter(field, centres())
     expected = field(x, rays, index)
     by_rule = VoronoiRouter(field, centres(), coords=lambda p, d, i: p.flip(-1))
-    given = {"directions": rays, "ray_index": index}
-    for found in (
+    arguments = {"directions": rays, "ray_index": index}
+    for actual in (
         router(x, rays, index),
-        router(x, **given),
+        router(x, **arguments),
         router(x, rays, ray_index=index),
         by_rule(x, rays, index),
     ):
-        for part, whole in zip(found, expected, strict=True):
+        for part, whole in zip(actual, expected, strict=True):
             close(part, whole)
     compiled = torch.compile(router, backend="eager")
     for part, whole in zip(compiled(x, rays, index), expected, strict=True):
@@ -91,7 +91,7 @@ def test_hooks_and_weight_norm_of_a_field_with_a_table() -> None:
     router = VoronoiRouter(field, centres())
     close(router(x, directions(40))[0], field(x, directions(40))[0])
     for module in (router.module, field):
-        module.register_forward_hook(lambda m, given, out: (out[0] * 0.5, out[1]))
+        module.register_forward_hook(lambda m, arguments, out: (out[0] * 0.5, out[1]))
     close(router(x, directions(40))[0], field(x, directions(40))[0])
     field = NeRF(width=16, depth=2)
     torch.nn.utils.parametrizations.weight_norm(field.trunk[1])
@@ -100,7 +100,7 @@ def test_hooks_and_weight_norm_of_a_field_with_a_table() -> None:
 
 @pytest.mark.parametrize("rule", ["function", "slice", "at the call"])
 def test_coords_of_a_field_with_a_table(rule: str) -> None:
-    """The cell is that of the position with its axes reversed."""
+    """The coords of the rule decide the cell, not the position itself."""
     module = NeRF(width=16, depth=2, position_encoding="integrated") if rule == "slice" else NeRF(width=16, depth=2)
     x = samples()[:, :3]
     if rule == "slice":
@@ -111,12 +111,12 @@ def test_coords_of_a_field_with_a_table(rule: str) -> None:
         for parameter in router.module.parameters():
             parameter += 0.2 * torch.randn_like(parameter)
     at = x[:, 3:] if rule == "slice" else x.flip(-1)
-    found = router(x, directions(40), coords=at) if rule == "at the call" else router(x, directions(40))
+    actual = router(x, directions(40), coords=at) if rule == "at the call" else router(x, directions(40))
     cells = router.diagram.locate(at)
     assert cells.unique().numel() > 1 or rule == "slice"
     for cell in cells.unique().tolist():
         rows = cells == cell
-        for part, expected in zip(found, router.cell(cell)(x[rows], directions(40)[rows]), strict=True):
+        for part, expected in zip(actual, router.cell(cell)(x[rows], directions(40)[rows]), strict=True):
             close(part[rows], expected)
 
 
@@ -180,7 +180,7 @@ def test_state_that_is_loaded_in_inference_mode() -> None:
         router.load_state_dict(other.state_dict())
         for _ in range(3):
             close(router(x), expected)
-    with torch.no_grad():  # torch lets no gradient pass through what was made in inference mode
+    with torch.no_grad():  # torch lets no gradient pass through inference tensors
         for _ in range(3):
             close(router(x), expected)
     with torch.inference_mode():
@@ -190,25 +190,25 @@ def test_state_that_is_loaded_in_inference_mode() -> None:
 def test_networks_traced_in_two_threads_leave_custom_functions_as_they_were() -> None:
     before, routers = torch.autograd.Function.apply, [VoronoiRouter(Truncated(), centres(), coords="first3", fuse=True)]
     routers.append(copy.deepcopy(routers[0]))
-    x, found = torch.rand(60, 7), {}
+    x, results = torch.rand(60, 7), {}
     start = threading.Barrier(2)
 
     def call(i: int) -> None:
         start.wait(20)
-        found[i] = routers[i](x)["sigma"]
+        results[i] = routers[i](x)["sigma"]
 
     threads = [threading.Thread(target=call, args=(i,)) for i in range(2)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(60)
-    close(found[0], found[1])
-    close(found[0], routers[0].cell(0)(x)["sigma"])
+    close(results[0], results[1])
+    close(results[0], routers[0].cell(0)(x)["sigma"])
     assert torch.autograd.Function.apply == before
 
 
 def test_centres_go_where_the_module_is(device: torch.device) -> None:
-    """They are given on the CPU, as is the first centre of a coarse stage, which needs no look-up."""
+    """Centres come from the CPU, also the first centre of a coarse stage, which needs no look-up."""
     router, x = VoronoiRouter(network().to(device), torch.zeros(1, 3), coords="first3"), samples().to(device)
     router.generator = torch.Generator(device).manual_seed(3)
     coarse = router(x)

@@ -1,4 +1,4 @@
-"""Frozen cells: no gradient, no step of any optimiser, no backward time; the same bits."""
+"""Frozen cells have no gradient, no optimiser step and no backward time; the other cells keep the same bits."""
 
 import copy
 import pickle
@@ -52,8 +52,8 @@ def test_frozen_cells_have_no_gradient_and_others_the_same(kind, backend):
     values = loss_of(router, points)
     router.freeze(FROZEN)
     torch.testing.assert_close(loss_of(router, points), values)
-    found = gradients(router, points)
-    for own, full in zip(found, expected, strict=True):
+    actual = gradients(router, points)
+    for own, full in zip(actual, expected, strict=True):
         assert not own[FROZEN].any() and own[LEARNING].any()
         torch.testing.assert_close(own[LEARNING], full[LEARNING])
 
@@ -107,7 +107,7 @@ def test_an_optimiser_that_was_not_given_is_found_out(kind):
     for _ in range(3):
         gradients(own, points)
         optimizer.step()
-    own.load_cell(1, other.cell(0))  # by the router itself
+    own.load_cell(1, other.cell(0))  # the router itself may change frozen cells
     gradients(own, points)
 
 
@@ -164,9 +164,9 @@ def test_tables_learn_from_other_cells_alone(own):
     near = router.assign(points) == 0
     (expected,) = (g.clone() for g in gradients_of_table(router, points[near], len(points)))
     router.freeze([1])
-    (found,) = gradients_of_table(router, points, len(points))
-    torch.testing.assert_close(found, expected)
-    assert found.any() and (not own or not found[1].any())
+    (actual,) = gradients_of_table(router, points, len(points))
+    torch.testing.assert_close(actual, expected)
+    assert actual.any() and (not own or not actual[1].any())
 
 
 def gradients_of_table(router, points, count):

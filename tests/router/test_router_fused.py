@@ -1,4 +1,4 @@
-"""What becomes a step of a fused network, and what runs between its parts."""
+"""Functions that become steps of a fused network, and functions that run between its parts."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ K = 4
 
 
 def written(make: Callable[[Any], Tensor]) -> Callable[[Any, Tensor], Tensor]:
-    """A step that writes into a tensor that it makes."""
+    """Returns a step that makes a tensor and writes into it."""
 
     def step(net: Any, h: Tensor) -> Tensor:
-        made = make(h)
-        made[..., 0] = 1.5 * h[..., 1]
-        made[..., 2:5] = h[..., 3:6]
-        made[:, 5:].copy_(h[:, :3])
-        made[:, 6] *= 2
-        return made
+        result = make(h)
+        result[..., 0] = 1.5 * h[..., 1]
+        result[..., 2:5] = h[..., 3:6]
+        result[:, 5:].copy_(h[:, :3])
+        result[:, 6] *= 2
+        return result
 
     return step
 
@@ -83,7 +83,7 @@ class Around(nn.Module):
 
 
 def both(make: Callable[[], nn.Module], x: Tensor, *args: Any, **options: Any) -> tuple[Any, Any, VoronoiRouter]:
-    """(result, that of a loop over masks with the router's parameters, router) for a module of its own in each cell."""
+    """Returns (result, result of a loop over masks, router), with a separate module in each cell."""
     modules = [randomised(make()) for _ in range(K)]
     centres = torch.rand(K, 3, generator=torch.Generator().manual_seed(3)) * 2 - 1
     options = {"coords": "first3", "fuse": True, "way": "fused", **options}
@@ -98,11 +98,11 @@ def both(make: Callable[[], nn.Module], x: Tensor, *args: Any, **options: Any) -
     return router(x, *args), expected, router
 
 
-ONCE = ("a norm of zeros",)  # PyTorch has NaN in its second derivative
+ONCE = ("a norm of zeros",)  # its second derivative is NaN in PyTorch
 
 
 def derivatives(y: Tensor, x: Tensor, router: VoronoiRouter, twice: bool = True) -> list[Tensor]:
-    """The first derivatives by x and by parameters, and those of a penalty of the first ones."""
+    """Returns the first derivatives by x and parameters, and the derivatives of a penalty on the gradient."""
     weights = torch.linspace(0.5, 1.5, y.numel()).view_as(y)
     wanted = [x, *router.parameters()]
     first = torch.autograd.grad((y * weights).sum(), wanted, create_graph=twice, retain_graph=True, allow_unused=True)
@@ -113,19 +113,19 @@ def derivatives(y: Tensor, x: Tensor, router: VoronoiRouter, twice: bool = True)
 
 @pytest.mark.parametrize("name", STEPS)
 def test_a_step_of_the_program(name: str) -> None:
-    """Values, first and second derivatives are those of the loop, and nothing runs between."""
+    """Values, first and second derivatives equal the loop, and nothing runs between the fused steps."""
     torch.manual_seed(0)
     x = uniform((90,)).requires_grad_()
-    found, expected, router = both(lambda: Around(STEPS[name]), x)
+    actual, expected, router = both(lambda: Around(STEPS[name]), x)
     assert router.explain() == "forward: fused"
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-    ours, theirs = (derivatives(y, x, router, name not in ONCE) for y in (found, expected))
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+    ours, theirs = (derivatives(y, x, router, name not in ONCE) for y in (actual, expected))
     for a, b in zip(ours, theirs, strict=True):
         torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
 
 
 class Parts(nn.Module):
-    """Layers, and a ``forward`` that returns parts of what they give."""
+    """Layers, and a ``forward`` that returns parts of their output."""
 
     def __init__(self, forward: Callable[[Any, Tensor], Any]) -> None:
         super().__init__()
@@ -190,7 +190,7 @@ PARTS_BETWEEN: dict[str, Callable[[Any, Tensor], Any]] = {
     ],
 )
 def test_parts_of_what_is_split(forward: Callable[[Any, Tensor], Any], between: bool) -> None:
-    """Values, their structure and gradients are those of the loop, whatever is split and where its parts go."""
+    """Values, their structure and gradients equal the loop, whatever is split and wherever its parts go."""
     torch.manual_seed(0)
     centres = torch.rand(K, 3) * 2 - 1
     router = VoronoiRouter(Parts(forward), centres, coords="first3", fuse=True, way="fused")
@@ -231,7 +231,7 @@ class FourierKAN(nn.Module):
 
 
 class Convolved(nn.Module):
-    """Convolutions of one place, over samples or behind each, and one that covers all places of a sample."""
+    """Convolutions of one place, along samples or features, and a convolution that covers all places of a sample."""
 
     def __init__(self, form: str) -> None:
         super().__init__()
@@ -251,7 +251,7 @@ class Convolved(nn.Module):
 
 
 class Recurrent(nn.Module):
-    """A GRU's cell from its first state, zeros, and from another."""
+    """A GRU cell, from its first state, zeros, and from a later state."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -262,7 +262,7 @@ class Recurrent(nn.Module):
 
 
 class Masked(nn.Module):
-    """A number in the place of what a mask of entries, or one of samples, chooses."""
+    """A network that writes numbers where a mask of entries, or a mask of samples, is true."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -276,7 +276,7 @@ class Masked(nn.Module):
 
 
 class Shaped(Masked):
-    """Shapes that are computed in tensors, as a size and as a number."""
+    """A network with shapes from tensors: a size as a tensor, and a size as a number."""
 
     def forward(self, x: Tensor) -> Tensor:
         y = self.a(x.reshape(torch.prod(torch.tensor(x.shape[:-1])), -1))
@@ -299,10 +299,10 @@ MODULES: dict[str, Callable[[], nn.Module]] = {
 def test_a_module_that_is_one_program(name: str) -> None:
     torch.manual_seed(0)
     x = uniform((90,)).requires_grad_()
-    found, expected, router = both(MODULES[name], x)
+    actual, expected, router = both(MODULES[name], x)
     assert router.explain() == "forward: fused"
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-    for a, b in zip(derivatives(found, x, router), derivatives(expected, x, router), strict=True):
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+    for a, b in zip(derivatives(actual, x, router), derivatives(expected, x, router), strict=True):
         torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
 
 
@@ -319,7 +319,7 @@ class Exponential(torch.autograd.Function):
         return g * torch.exp(ctx.saved_tensors[0].clamp(-0.2, 0.2))
 
 
-bound_early = Exponential.apply  # as modules do when they are imported
+bound_early = Exponential.apply  # bound at import, as in some modules
 
 
 def by_sum(net: Any, h: Tensor) -> Tensor:
@@ -340,7 +340,7 @@ class Slope(Around):
 
 
 class Field(Slope):
-    """nerfstudio's SDFField: the gradient by positions that ``forward`` computes, which it makes require one."""
+    """nerfstudio's SDFField: the gradient by positions that ``forward`` computes and makes require a gradient."""
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x * 0.5 + 0.1)
@@ -357,14 +357,14 @@ BETWEEN: dict[str, tuple[Callable[[], nn.Module], str]] = {
 
 @pytest.mark.parametrize("name", BETWEEN)
 def test_what_runs_between_the_runs(name: str) -> None:
-    """Values and derivatives are those of the loop, where PyTorch computes a part; also where none are asked for."""
+    """Values and derivatives equal the loop where PyTorch computes a part, also under no_grad."""
     torch.manual_seed(0)
     make, says = BETWEEN[name]
     x = uniform((90,)).requires_grad_()
-    found, expected, router = both(make, x)
+    actual, expected, router = both(make, x)
     assert router.explain().startswith("forward: fused in runs") and says in router.explain()
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-    for a, b in zip(derivatives(found, x, router), derivatives(expected, x, router), strict=True):
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+    for a, b in zip(derivatives(actual, x, router), derivatives(expected, x, router), strict=True):
         torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
     if "by what was computed" not in name:
         with torch.no_grad():
@@ -373,7 +373,7 @@ def test_what_runs_between_the_runs(name: str) -> None:
 
 
 class Timed(nn.Module):
-    """torch-ngp's D-NeRF: a time that all samples share goes through a layer of its own."""
+    """torch-ngp's D-NeRF: a time that all samples share goes through its own layer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -387,8 +387,8 @@ class Timed(nn.Module):
 
 def test_arguments_that_all_samples_share_are_those_of_each_call() -> None:
     x, t = uniform((90,)), torch.tensor([[0.2]], requires_grad=True)
-    found, expected, router = both(Timed, x, t)
-    torch.testing.assert_close(found, expected)
+    actual, expected, router = both(Timed, x, t)
+    torch.testing.assert_close(actual, expected)
     modules = [router.cell(cell) for cell in range(K)]
     for value in (0.7, -2.0):
         t = torch.tensor([[value]], requires_grad=True)
@@ -410,7 +410,7 @@ def test_a_path_that_an_argument_chooses_is_refused() -> None:
 
 
 class Product(torch.autograd.Function):
-    """faster-KAN: a function of samples and parameters with a backward of its own."""
+    """faster-KAN: a custom function of samples and parameters, with its own backward."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, grid: Tensor) -> Tensor:

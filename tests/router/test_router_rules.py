@@ -1,4 +1,4 @@
-"""Steps of real fields that meet parameters in one run for all cells, against a loop over masks."""
+"""Steps of real fields in which all cells run at once, against a loop over masks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from voronerf import VoronoiRouter
 
 
 class FiLM(nn.Module):
-    """pi-GAN: frequencies and shifts of a layer that a network makes of a code, here a parameter."""
+    """pi-GAN: a network maps a code, here a parameter, to frequencies and shifts of a layer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class TensorVM(nn.Module):
 
 
 class BARF(nn.Module):
-    """Coarse to fine: a weight of each frequency, from a parameter that is read through ``.data``."""
+    """Coarse to fine: a weight for each frequency, from a parameter that is read through ``.data``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class BARF(nn.Module):
 
 
 class Gabor(nn.Module):
-    """WIRE: complex layers behind a real one."""
+    """WIRE: complex layers behind a real layer."""
 
     def __init__(self, bias: bool = True) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class Gabor(nn.Module):
 
 
 class Spectrum(Gabor):
-    """The same with complex results."""
+    """The same layers with complex results."""
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.exp(1j * self.layers[0](self.first(x).cfloat())) @ self.out.weight.T
@@ -126,7 +126,7 @@ def real(tensor: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("fuse", [True, False])
 def test_complex_layers_stay_complex_under_autocast(fuse: bool) -> None:
-    """Torch's autocast leaves them as they are; real layers before them are rounded, fused ones at their ends."""
+    """Autocast leaves complex layers alone; it rounds real layers before them, and fused layers at their ends."""
     generator = torch.Generator().manual_seed(3)
     centres = torch.rand(5, 3, generator=generator) * 2 - 1
     torch.manual_seed(0)
@@ -136,13 +136,13 @@ def test_complex_layers_stay_complex_under_autocast(fuse: bool) -> None:
     expected = router(x)
     (slope,) = torch.autograd.grad(expected.sum(), x)
     with torch.autocast("cpu", torch.bfloat16):
-        found = router(x)
-    assert found.dtype == torch.float32 and ("fused in runs" if fuse else "grouped") in router.explain()
-    torch.testing.assert_close(found, expected, rtol=0.1, atol=0.1)
-    torch.testing.assert_close(torch.autograd.grad(found.sum(), x)[0].norm(), slope.norm(), rtol=0.1, atol=0.1)
+        actual = router(x)
+    assert actual.dtype == torch.float32 and ("fused in runs" if fuse else "grouped") in router.explain()
+    torch.testing.assert_close(actual, expected, rtol=0.1, atol=0.1)
+    torch.testing.assert_close(torch.autograd.grad(actual.sum(), x)[0].norm(), slope.norm(), rtol=0.1, atol=0.1)
 
 
-@pytest.mark.parametrize("n", [60, 6000])  # look-ups of few samples have a way of their own
+@pytest.mark.parametrize("n", [60, 6000])  # look-ups of few samples take another path
 @pytest.mark.parametrize("name", MODULES)
 def test_results_and_gradients_are_those_of_the_loop(name: str, n: int) -> None:
     generator = torch.Generator().manual_seed(3)
@@ -151,16 +151,16 @@ def test_results_and_gradients_are_those_of_the_loop(name: str, n: int) -> None:
     router = perturb(VoronoiRouter(MODULES[name](), centres, coords="first3", way="grouped"), generator)
     x = (uniform((n,)) * 1.1).requires_grad_()
     (expected,), modules = masked_loop(router, router.diagram.locate(x), [x])
-    found = router(x)
+    actual = router(x)
     assert router.explain() == "forward: grouped"
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
 
-    weights = torch.randn(real(found).shape, generator=generator)
-    ours = torch.autograd.grad((real(found) * weights).sum(), x, create_graph=True)[0]
+    weights = torch.randn(real(actual).shape, generator=generator)
+    ours = torch.autograd.grad((real(actual) * weights).sum(), x, create_graph=True)[0]
     theirs = torch.autograd.grad((real(expected) * weights).sum(), x, create_graph=True)[0]
     torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-4)
 
-    (ours.square().sum() + (real(found) * weights).sum()).backward()
+    (ours.square().sum() + (real(actual) * weights).sum()).backward()
     (theirs.square().sum() + (real(expected) * weights).sum()).backward()
     for path, parameter in router.module.named_parameters():
         own = [module.get_parameter(path) for module in modules]
@@ -198,7 +198,7 @@ def test_third_derivatives_of_layer_norms_are_right_in_every_way(way: Any, k: in
     centres = torch.rand(k, 3, generator=generator)
     router = perturb(VoronoiRouter(Normed().double(), centres, coords="first3", fuse=True, way=way), generator)
     x = torch.rand(n, 3, dtype=torch.float64, generator=generator).requires_grad_()
-    router(x)  # of a call without norms nothing is concluded
+    router(x)  # a call without norms decides nothing for later calls
     router.module.on = True
     leaves = [x, *router.parameters()]
     along = [torch.randn(leaf.shape, generator=generator).double() * 1e-6 for leaf in leaves]
@@ -219,5 +219,5 @@ def test_third_derivatives_of_layer_norms_are_right_in_every_way(way: Any, k: in
         return value
 
     gradients = torch.autograd.grad(laplacian(), leaves, allow_unused=True, materialize_grads=True)
-    found = sum((g * step).sum() for g, step in zip(gradients, along, strict=True))
-    torch.testing.assert_close(found, (moved(1) - moved(-1)) / 2, rtol=1e-5, atol=0)
+    result = sum((g * step).sum() for g, step in zip(gradients, along, strict=True))
+    torch.testing.assert_close(result, (moved(1) - moved(-1)) / 2, rtol=1e-5, atol=0)

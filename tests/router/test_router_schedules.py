@@ -24,9 +24,9 @@ X = uniform((90,))
 
 
 class Scheduled(nn.Module):
-    """Reads numbers of many kinds beside its arguments; ``use`` says which."""
+    """A module that reads numbers of many kinds besides its arguments; ``use`` says which."""
 
-    progress = 0.25  # of the class, until it is set
+    progress = 0.25  # an attribute of the class, until it is set
 
     def __init__(self, use: Callable[..., Tensor]) -> None:
         super().__init__()
@@ -50,11 +50,11 @@ def routed(use: Callable[..., Tensor], **options: Any) -> VoronoiRouter:
 
 
 def check(router: VoronoiRouter, *args: Any) -> None:
-    """Values and gradients of parameters are those of the loop over cells, as the module is now."""
-    found = router(X, *args)
+    """Checks that values and parameter gradients equal the loop over cells, in the current state of the module."""
+    actual = router(X, *args)
     (expected,), modules = masked_loop(router, router.assign(X), [X, *args])
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-    found.square().sum().backward()
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+    actual.square().sum().backward()
     expected.square().sum().backward()
     for name, p in router.module.named_parameters():
         own = [m.get_parameter(name).grad for m in modules]
@@ -66,16 +66,16 @@ def check(router: VoronoiRouter, *args: Any) -> None:
 
 @pytest.fixture
 def traces(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """What each trace so far has taken as inputs."""
-    found: list[Any] = []
+    """Collects the inputs of each trace."""
+    results: list[Any] = []
 
     class Counted(Fused):
-        def __init__(self, call: Any, given: Any, inputs: Any) -> None:
-            found.append(inputs.sources)
-            super().__init__(call, given, inputs)
+        def __init__(self, call: Any, arguments: Any, inputs: Any) -> None:
+            results.append(inputs.sources)
+            super().__init__(call, arguments, inputs)
 
     monkeypatch.setattr(probe, "Fused", Counted)
-    return found
+    return results
 
 
 NUMBERS: dict[str, tuple[Callable[..., Tensor], list[Any]]] = {
@@ -92,18 +92,18 @@ NUMBERS: dict[str, tuple[Callable[..., Tensor], list[Any]]] = {
 @pytest.mark.filterwarnings("ignore:VoronoiRouter.*not fused any more")
 @pytest.mark.parametrize("name", NUMBERS)
 def test_a_number_that_changes_becomes_an_input(name: str, traces: list[Any]) -> None:
-    """Two traces at most serve all values, or a few, and then the module runs grouped; each value is followed."""
+    """A few traces serve all values, or the module runs grouped in the end; each value is followed."""
     use, values = NUMBERS[name]
     router = routed(use)
     for value in values:
         check(router, value)
     assert "fused" in router.explain()
-    if name not in ("a slope", "a limit"):  # Python numbers of functions, which are no tensors
+    if name not in ("a slope", "a limit"):  # arguments that have to be Python numbers
         assert len(traces) <= 4 and traces[-1]
     count = len(traces)
     for value in values:
         check(router, value)
-    assert len(traces) == count  # what was traced once is not traced again
+    assert len(traces) == count  # the second pass makes no new trace
 
 
 def test_a_number_that_chooses_a_path_ends_grouped(traces: list[Any]) -> None:

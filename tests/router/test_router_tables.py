@@ -1,4 +1,4 @@
-"""Tables and planes of the cells: looked up for all cells at once, with the gradients of one module for each cell."""
+"""Tables and planes of the cells: one look-up for all cells, with the gradients of a separate module for each cell."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ def _router(module: nn.Module, k: int) -> VoronoiRouter:
 
 
 def _loop(router: VoronoiRouter, x: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Results, and the parameters of each cell's module, one after the other for each name."""
-    (found,), modules = masked_loop(router, router.assign(x), [x])
-    return found, [p for name, _ in router.module.named_parameters() for p in (m.get_parameter(name) for m in modules)]
+    """Returns the results, and the parameters of the cells' modules, one after the other for each name."""
+    (result,), modules = masked_loop(router, router.assign(x), [x])
+    return result, [p for name, _ in router.module.named_parameters() for p in (m.get_parameter(name) for m in modules)]
 
 
 def _gradients(out: Tensor, parameters: list[Tensor], k: int, weights: Tensor) -> list[Tensor]:
-    """Of a router, [k, ...], or of the modules of a loop."""
-    found = torch.autograd.grad(out, parameters, weights, retain_graph=True, materialize_grads=True, allow_unused=True)
-    return list(found) if k == 0 else [torch.stack(found[i : i + k]) for i in range(0, len(found), k)]
+    """Returns gradients [k, ...], stacked over the modules of a loop; k is 0 for a router."""
+    result = torch.autograd.grad(out, parameters, weights, retain_graph=True, materialize_grads=True, allow_unused=True)
+    return list(result) if k == 0 else [torch.stack(result[i : i + k]) for i in range(0, len(result), k)]
 
 
 def test_indices_outside_of_a_table_are_refused() -> None:
@@ -39,15 +39,15 @@ def test_indices_outside_of_a_table_are_refused() -> None:
 
 
 def test_pieces_cut_large_cells_and_join_small_ones() -> None:
-    """A wide network runs in pieces of 1,024 rows: of one cell that has most of the samples, of several small ones."""
+    """A wide network runs in pieces of 1,024 rows: several for a large cell, and one for several small cells."""
     torch.manual_seed(3)
     router = _router(nn.Sequential(nn.Linear(3, 1100), nn.ReLU(), nn.Linear(1100, 2)), 40)
     x = torch.cat([torch.rand(2500, 3) * 0.1, torch.rand(1500, 3) * 2 - 1])[torch.randperm(4000)]
     cells = router.assign(x)
     assert cells.bincount(minlength=40).max() > 2048, "one cell of three pieces"
-    found, (expected, leaves) = router(x), _loop(router, x)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * float(expected.detach().abs().max()))
+    actual, (expected, leaves) = router(x), _loop(router, x)
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4 * float(expected.detach().abs().max()))
     weights = torch.randn(4000, 2)
     theirs = _gradients(expected, leaves, 40, weights)
-    for a, b in zip(_gradients(found, list(router.parameters()), 0, weights), theirs, strict=True):
+    for a, b in zip(_gradients(actual, list(router.parameters()), 0, weights), theirs, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))

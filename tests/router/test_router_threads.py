@@ -23,14 +23,14 @@ CENTRES = torch.rand(5, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
 
 
 class Field(nn.Module):
-    """Slow enough that another thread comes in between; ``Bilinear`` has no rule, so that it runs cell by cell."""
+    """A field slow enough for another thread to intervene; ``Bilinear`` has no rule, so it runs cell by cell."""
 
     def __init__(self, last: nn.Module) -> None:
         super().__init__()
         self.net, self.last = nn.Sequential(nn.Linear(3, 16), nn.ReLU(), nn.Linear(16, 3)), last
 
     def forward(self, x: Tensor) -> Tensor:
-        time.sleep(0)  # lets go of the interpreter
+        time.sleep(0)  # releases the interpreter lock
         h = self.net(x)
         time.sleep(0)
         return self.last(h, h) if isinstance(self.last, nn.Bilinear) else self.last(h)
@@ -94,11 +94,11 @@ def test_reading_beside_calls(last: nn.Module, way: str) -> None:
     assert min(calls) > 0
 
 
-# What a module does to itself -----------------------------------------------------------------------------------------
+# Modules that change themselves ---------------------------------------------------------------------------------------
 
 
 class Itself(nn.Linear):
-    """A layer that does something to itself in ``forward``."""
+    """A layer that acts on itself in ``forward``."""
 
     def __init__(self, act: Callable[[Any], Any]) -> None:
         super().__init__(3, 2)
@@ -145,8 +145,8 @@ def test_what_forward_does_to_its_parameters_is_refused_and_changes_nothing(act:
     for _ in range(2):
         with pytest.raises(TypeError, match=f"VoronoiRouter: Itself.forward {says}"):
             router(uniform((n,)))
-        found = router.state_dict()
-        assert found.keys() == before.keys() and all(torch.equal(found[name], before[name]) for name in before)
+        result = router.state_dict()
+        assert result.keys() == before.keys() and all(torch.equal(result[name], before[name]) for name in before)
 
 
 def keeps(net: Any) -> None:
@@ -155,13 +155,13 @@ def keeps(net: Any) -> None:
 
 def test_attributes_are_of_one_run() -> None:
     router, x = VoronoiRouter(Itself(keeps), CENTRES, coords="first3"), uniform((60,))
-    found = router(x)
-    torch.testing.assert_close(found, masked_loop(router, router.diagram.locate(x), [x])[0][0])
+    result = router(x)
+    torch.testing.assert_close(result, masked_loop(router, router.diagram.locate(x), [x])[0][0])
     assert router.module.calls == 0 and not hasattr(router.module, "kept")
 
 
 class Caches(nn.Linear):
-    """Keeps what it makes of its weight, as if this were always the same."""
+    """A layer that caches a function of its weight, as if the weight never changed."""
 
     made: Any = None
 
@@ -183,7 +183,7 @@ def test_what_is_made_of_one_cells_parameters_is_not_for_another(k: int) -> None
 
 
 class Helper:
-    """No module, but holds one."""
+    """An object that is no module, but holds one."""
 
     def __init__(self, layer: nn.Module) -> None:
         self.layer = layer
@@ -193,7 +193,7 @@ class Helper:
 
 
 class Indirect(nn.Module):
-    """Comes to its layers by lists, dicts, objects, bound methods, partials and a child that knows its parent."""
+    """A module with layers behind lists, dicts, objects, methods, partials and a child that knows its parent."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""VoronoiRouter within checkpoints, transforms of functions, tracers and compilers."""
+"""VoronoiRouter within checkpoints, function transforms, tracers and compilers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def generator() -> torch.Generator:
 
 
 class Looked(nn.Module):
-    """A table of each cell, looked up twice, and layers."""
+    """A table for each cell, looked up twice, and layers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -71,12 +71,12 @@ def test_a_checkpoint_around_first_calls_and_new_sizes(
     router = router_of(make(), generator, **WAYS[way])
     for n in (500, 5000, 40, 3):
         x = torch.rand(n, 3, generator=generator)
-        found = gradients(lambda x: checkpoint(router, x, use_reentrant=False), router, x)
-        torch.testing.assert_close(found, gradients(router, router, x), rtol=1e-4, atol=1e-5)
+        result = gradients(lambda x: checkpoint(router, x, use_reentrant=False), router, x)
+        torch.testing.assert_close(result, gradients(router, router, x), rtol=1e-4, atol=1e-5)
 
 
 class Picky(nn.Module):
-    """Batches with negative positions cannot be grouped."""
+    """A module that cannot run grouped on batches with negative positions."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -94,8 +94,8 @@ def test_a_checkpoint_around_batches_of_which_some_cannot_be_grouped(generator: 
     for sign in (1, -1, -1, 1, -1, 1, 1, -1):
         x = torch.rand(200, 3, generator=generator)
         x[::7, 0] *= sign
-        found = gradients(lambda x: checkpoint(router, x, use_reentrant=False), router, x)
-        torch.testing.assert_close(found, gradients(router, router, x), rtol=1e-4, atol=1e-5)
+        result = gradients(lambda x: checkpoint(router, x, use_reentrant=False), router, x)
+        torch.testing.assert_close(result, gradients(router, router, x), rtol=1e-4, atol=1e-5)
 
 
 # torch.func -----------------------------------------------------------------------------------------------------------
@@ -159,23 +159,23 @@ def test_first_calls_of_frozen_cells(way: str, context: str, n: int, generator: 
     router.freeze([0, 1, 5])
     plain = copy.deepcopy(router)
     plain.way, plain.fuse = "loop", False
-    found = CONTEXTS[context](router, x)
+    actual = CONTEXTS[context](router, x)
     if context == "func twice":
         (first,) = torch.autograd.grad(plain(x).square().sum(), x, create_graph=True)
         expected = torch.autograd.grad(first.sum(), x)[0]
     else:
         expected = plain(x) if context == "inference" else by_autograd(plain(x), x)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_func_grad_of_several_methods(generator: torch.Generator) -> None:
     router = router_of(Heads(), generator, methods=["density"], way="grouped")
     x = torch.rand(100, 3, generator=generator)
-    found = grad(lambda x: router.density(x)["sigma"].sum() + router(x).sum())(x)
+    result = grad(lambda x: router.density(x)["sigma"].sum() + router(x).sum())(x)
     own = x.clone().requires_grad_()
     (router.density(own)["sigma"].sum() + router(own).sum()).backward()
-    torch.testing.assert_close(found, own.grad)
-    assert router.density(x)["sigma"].shape == (100,)  # nothing of the transform is kept
+    torch.testing.assert_close(result, own.grad)
+    assert router.density(x)["sigma"].shape == (100,)  # the router keeps nothing of the transform
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -224,8 +224,8 @@ def test_a_table_of_layers_and_an_op_refuse_tangents(generator: torch.Generator)
             jvp(run, (x,), (x,))
         own = x.clone().requires_grad_()
         run(own).square().sum().backward()
-        found = grad(lambda x, run=run: run(x).square().sum())(x)
-        torch.testing.assert_close(found, own.grad)
+        result = grad(lambda x, run=run: run(x).square().sum())(x)
+        torch.testing.assert_close(result, own.grad)
 
 
 # Compilers ------------------------------------------------------------------------------------------------------------

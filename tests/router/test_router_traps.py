@@ -1,4 +1,4 @@
-"""What is easily done wrong around a VoronoiRouter, and what it then says."""
+"""Common mistakes around a VoronoiRouter, and its messages about them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_apply_initialises_cell_by_cell(generator: torch.Generator) -> None:
             nn.init.constant_(module.bias, 0.25)
 
     parameters = list(router.parameters())
-    whole = nn.ModuleDict({"field": router})  # as a model that holds the router does it
+    whole = nn.ModuleDict({"field": router})  # like a model that holds the router
     assert whole.apply(init) is whole
     assert all(a is b for a, b in zip(parameters, router.parameters(), strict=True))
     weight = router.module[2].weight
@@ -108,7 +108,7 @@ def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Gen
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for _ in range(64):  # as where gradients are accumulated; the first call finds none
+        for _ in range(64):  # gradients may be accumulated; the first call finds none
             step()
     with pytest.warns(
         UserWarning, match=r"no optimizer has changed the parameters.*make it of router.parameters\(\)"
@@ -117,12 +117,12 @@ def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Gen
     assert told[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for _ in range(65):  # once
+        for _ in range(65):  # the warning comes once
             step()
 
 
 def test_a_fused_optimiser_with_the_state_of_other_cells_is_stopped(generator: torch.Generator) -> None:
-    """It would write past the end of that state."""
+    """A step would write past the end of the old state."""
     router, x = router_of(net(), generator, k=1), torch.rand(20, 3, generator=generator)
     old, other = torch.optim.Adam(router.parameters(), fused=True), torch.optim.Adam(net().parameters(), fused=True)
     router(x).sum().backward()
@@ -150,7 +150,7 @@ def test_optimisers_that_train_something_are_not_told(generator: torch.Generator
         both = torch.optim.Adam([*fields[1].parameters(), *routers[1].parameters()])
         routers[1](x).sum().backward()
         both.step()
-        fields[2](x).sum().backward()  # the plain module is trained beside
+        fields[2](x).sum().backward()  # the plain module is trained as well
         torch.optim.SGD(fields[2].parameters(), 0.1).step()
 
 
@@ -207,7 +207,7 @@ def test_attributes_and_methods_of_the_module_are_pointed_to(generator: torch.Ge
 
 
 class MadeInside(nn.Module):
-    """Makes a layer in every call, as one of its own or for once."""
+    """A module that makes a layer in every call, and keeps it as a child or uses it once."""
 
     def __init__(self, kept: bool) -> None:
         super().__init__()
@@ -232,7 +232,7 @@ def test_layers_that_are_made_inside_of_forward(kept: bool, fuse: bool, generato
 
 
 class Scaled(nn.Module):
-    """A layer and a parameter, beside what a test adds."""
+    """A layer and a parameter, besides the attribute that a test adds."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -308,9 +308,9 @@ def test_an_encoding_without_position_is_told_once(k: int, together: bool, gener
 def test_directions_are_told(generator: torch.Generator) -> None:
     x = torch.rand(600, 3, generator=generator)
     d = F.normalize(x - 0.5, dim=1)
-    for given in (d, torch.cat([d, x], 1)):
+    for arguments in (d, torch.cat([d, x], 1)):
         with pytest.warns(UserWarning, match="'first3' takes unit vectors, such as directions"):
-            router_of(net(given.shape[1]), generator)(given)
+            router_of(net(arguments.shape[1]), generator)(arguments)
 
 
 def test_centres_in_other_units_are_told_once(generator: torch.Generator) -> None:
@@ -319,7 +319,7 @@ def test_centres_in_other_units_are_told_once(generator: torch.Generator) -> Non
         router = VoronoiRouter(net(), 100 * torch.rand(8, 3, generator=generator), coords="first3", **options)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            router(x[:100])  # too few to tell
+            router(x[:100])  # too few samples to tell
         with pytest.warns(UserWarning, match=r"2,000 of 2,000 samples are in one of 8.*from_points\(positions, 8\)"):
             router(x)
         with warnings.catch_warnings():
@@ -346,4 +346,4 @@ def test_centres_that_fit_are_not_told(generator: torch.Generator) -> None:
         router_of(net(), generator, k=1)(x)
         spread = router_of(net(), generator)
         spread(x)
-        spread(x * 0 + 0.5)  # the first large batch has shown that they fit
+        spread(x * 0 + 0.5)  # the first large batch has shown that the centres fit

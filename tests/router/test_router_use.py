@@ -75,7 +75,7 @@ def test_methods_share_an_assignment(generator: torch.Generator, monkeypatch: py
     torch.testing.assert_close(router.density(x)["sigma"], sigma)
     assert len(drawn) == 1
     torch.testing.assert_close(sigma, masked_loop(router, drawn[0], [x, d])[0][1])
-    router.density(x)  # a second step with the same batch draws anew
+    router.density(x)  # a second step with the same batch draws new cells
     x.add_(1)
     router(x, d)
     assert len(drawn) == 3
@@ -94,7 +94,7 @@ OPTIMIZERS: dict[str, Callable[[Any], torch.optim.Optimizer]] = {
 
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_children_step_as_their_parent_would(generator: torch.Generator, name: str) -> None:
-    """A split that changes no assignment: both routers go on alike, at rates that the schedule sets."""
+    """After a split that changes no assignment, both routers step alike, at the rates of the schedule."""
     x = uniform(generator, 200, 3)
     router = router_of(Sine(), generator, k=2)
     router.module.b.requires_grad_(False)
@@ -160,7 +160,7 @@ def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
     with pytest.raises(ValueError, match="a number of children needs points, and no parents"):
         router.subdivide(4)
     other = router_of(Sine(), generator, k=1)
-    other.subdivide(4, points=x)  # all weigh the same
+    other.subdivide(4, points=x)  # all points weigh the same
     assert other.num_cells == 4
     with pytest.raises(TypeError, match="must be a VoronoiDiagram or a number of children, got float"):
         router.subdivide(2.0)  # type: ignore[arg-type]
@@ -183,9 +183,9 @@ def test_half_precision(generator: torch.Generator, dtype: torch.dtype, make: ty
     router = router.to(dtype)
     assert router.diagram.centres.dtype == torch.float32
     for _ in range(3):
-        found = router(x)
-        assert found.dtype == dtype
-        torch.testing.assert_close(found.float(), exact, rtol=0.1, atol=0.05)
+        actual = router(x)
+        assert actual.dtype == dtype
+        torch.testing.assert_close(actual.float(), exact, rtol=0.1, atol=0.05)
 
 
 @pytest.mark.parametrize("make", [SkipNet, Sine])
@@ -195,9 +195,9 @@ def test_autocast(generator: torch.Generator, make: type[nn.Module]) -> None:
     exact = router(x)
     for _ in range(3):
         with torch.autocast("cpu", torch.bfloat16):
-            found = router(x)
-            assert found.dtype == router.cell(0)(x).dtype
-        torch.testing.assert_close(found.float(), exact, rtol=0.1, atol=0.05)
+            actual = router(x)
+            assert actual.dtype == router.cell(0)(x).dtype
+        torch.testing.assert_close(actual.float(), exact, rtol=0.1, atol=0.05)
         assert router(x).dtype == torch.float32
 
 
@@ -224,19 +224,19 @@ def test_fused_under_autocast_is_as_near_to_float64_as_the_loop(make: type[nn.Mo
     router = VoronoiRouter(make(), uniform(generator, 5, 3), coords="first3", fuse=True, way="fused")
     perturb(router, generator, 0.01 if make is Fast else 0.2)
     x = uniform(generator, 120, 15 if make is SkipNet else 3)
-    router(x)  # and autocast comes later
+    router(x)  # the first call runs without autocast
     cells = router.diagram.locate(x[:, :3])
     exact_router = copy.deepcopy(router).double()
     (exact, *_), exact_modules = masked_loop(exact_router, cells, [x.double()])
     with torch.autocast("cpu", dtype):
-        found = router(x)
-        found = found[0] if isinstance(found, tuple) else found
+        actual = router(x)
+        actual = actual[0] if isinstance(actual, tuple) else actual
         (loop, *_), modules = masked_loop(router, cells, [x])
-    assert router.explain() == "forward: fused" and found.dtype == loop.dtype
+    assert router.explain() == "forward: fused" and actual.dtype == loop.dtype
     weights = torch.randn(exact.shape, generator=generator)
-    for y in (found, loop, exact):
+    for y in (actual, loop, exact):
         (y * weights.to(y)).sum().backward()
-    pairs = [(found, loop, exact)]
+    pairs = [(actual, loop, exact)]
     for name, p in router.module.named_parameters():
         if p.grad is not None:
             own = [torch.stack([m.get_parameter(name).grad for m in cells]) for cells in (modules, exact_modules)]
@@ -247,19 +247,19 @@ def test_fused_under_autocast_is_as_near_to_float64_as_the_loop(make: type[nn.Mo
 
 
 def test_inference_mode(generator: torch.Generator) -> None:
-    """Made, called and fed in inference mode, a router trains after it."""
+    """A router that is made, called and fed in inference mode trains after it."""
     for options in ({"fuse": True, "way": "fused"}, {"way": "grouped"}, {"way": "loop"}):
         with torch.inference_mode():
             router, x = router_of(Heads(), generator, **options), uniform(generator, 50, 3)
             before = router(x)
-        found = router(x)
-        torch.testing.assert_close(found, before.clone())
-        found.sum().backward()
+        result = router(x)
+        torch.testing.assert_close(result, before.clone())
+        result.sum().backward()
         assert all(p.grad is not None for name, p in router.named_parameters() if ".net." in name)
 
 
 class Labelled(Tensor):
-    """Names of columns beside a tensor, as in PINA: results of functions are of this class, but have no names."""
+    """A tensor with column names, as in PINA; results of functions have this class, but no names."""
 
     @staticmethod
     def of(x: Tensor, labels: list[str]) -> Labelled:
@@ -281,7 +281,7 @@ class Labelled(Tensor):
 
 
 class Named(nn.Module):
-    """Uses names of columns, in one of several ways."""
+    """A module that uses column names in one of several ways."""
 
     def __init__(self, use: str) -> None:
         super().__init__()
@@ -306,10 +306,10 @@ def test_tensors_of_subclasses_are_taken_as_plain(generator: torch.Generator, op
     (slope,) = torch.autograd.grad(expected.sum(), leaf)
     labelled = Labelled.of(x.clone(), list("xyzabcdefghijkl")).requires_grad_()
     for _ in range(2):
-        found = router(labelled)
-        assert type(found) is Tensor
-        torch.testing.assert_close(found, expected)
-        torch.testing.assert_close(torch.autograd.grad(found.sum(), labelled)[0].as_subclass(Tensor), slope)
+        actual = router(labelled)
+        assert type(actual) is Tensor
+        torch.testing.assert_close(actual, expected)
+        torch.testing.assert_close(torch.autograd.grad(actual.sum(), labelled)[0].as_subclass(Tensor), slope)
     torch.testing.assert_close(router(x, coords=Labelled.of(x[:, :3], list("xyz"))), expected)
     torch.testing.assert_close(router(labelled.reshape(6, 10, 15)), expected.reshape(6, 10, 4))
     assert router.explain().split(":")[1].split()[0] == options["way"].replace("loop", "cell")
@@ -346,7 +346,7 @@ def test_modules_that_need_a_subclass_of_tensors_are_told(generator: torch.Gener
 
 
 class Unsliced(Tensor):
-    """A subclass whose pieces lack what it needs."""
+    """A subclass of tensors whose slices lack the column names."""
 
     def column(self, name: str) -> Tensor:
         return self.as_subclass(Tensor)[..., self._labels.index(name)]
@@ -392,9 +392,9 @@ def test_compile_checkpoint_and_functional_call(generator: torch.Generator) -> N
         lambda: torch.func.functional_call(router, dict(router.named_parameters()), (x,)),
     ]
     for call in calls:
-        found = call()
-        torch.testing.assert_close(found, expected)
-        for a, b in zip(torch.autograd.grad(found.square().sum(), parameters), wanted, strict=True):
+        actual = call()
+        torch.testing.assert_close(actual, expected)
+        for a, b in zip(torch.autograd.grad(actual.square().sum(), parameters), wanted, strict=True):
             torch.testing.assert_close(a, b)
     assert not torch.allclose(torch.func.functional_call(router, halves, (x,)), expected)
     torch._dynamo.reset()
@@ -446,7 +446,7 @@ def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
 
 
 def test_an_average_of_weights_is_split_with_its_router(generator: torch.Generator) -> None:
-    """As the page of recipes says: ``AveragedModel`` holds a copy of the router, with a diagram of its own."""
+    """``AveragedModel`` holds a copy of the router, with its own diagram, as in the page of recipes."""
     router, x = router_of(SkipNet(), generator), uniform(generator, 40, 15)
     router(x)
     average = torch.optim.swa_utils.AveragedModel(router, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.5))
@@ -461,17 +461,17 @@ def test_an_average_of_weights_is_split_with_its_router(generator: torch.Generat
 
 
 class Decides(nn.Module):
-    """Decides by what is true of any sample, directly or inverted."""
+    """A module that decides by a condition on any sample, directly or inverted."""
 
     def __init__(self, inverted: bool) -> None:
         super().__init__()
         self.lin, self.inverted = nn.Linear(3, 2), inverted
 
     def forward(self, x: Tensor) -> Tensor:
-        found = (x[:, 0] > 0.2).any()
+        condition = (x[:, 0] > 0.2).any()
         if self.inverted:
-            return self.lin(x) if torch.logical_not(found) else -self.lin(x)
-        return -self.lin(x) if found else self.lin(x)
+            return self.lin(x) if torch.logical_not(condition) else -self.lin(x)
+        return -self.lin(x) if condition else self.lin(x)
 
 
 @pytest.mark.filterwarnings("ignore:.*cell by cell")
@@ -483,8 +483,8 @@ def test_decisions_are_those_of_each_cell_or_refused(generator: torch.Generator,
     torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
     x[7, 0] = 0.5
     try:
-        found = router(x)
+        result = router(x)
     except TypeError as error:
         assert "mixes samples" in str(error)
     else:
-        torch.testing.assert_close(found, masked_loop(router, router.diagram.locate(x), [x])[0][0])
+        torch.testing.assert_close(result, masked_loop(router, router.diagram.locate(x), [x])[0][0])

@@ -1,4 +1,4 @@
-"""Sines and cosines of octaves, in the ways that codebases write them, are found and give the same numbers."""
+"""Sines and cosines of octaves, as codebases write them, become an encoding and give the same numbers."""
 
 import math
 
@@ -73,12 +73,12 @@ def test_gives_the_same(name, backend):
     parameters = [
         p[:1] if p.dim() > len(own) else p[None] for p, own in zip(known.parameters, known.program.parameters)
     ]
-    (found,) = grouped_program([points], parameters, offsets, program=known.program, backend=backend)
+    (actual,) = grouped_program([points], parameters, offsets, program=known.program, backend=backend)
     module = router.cell(0)
     same = x.clone().requires_grad_()
     expected = module(same)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-    found.square().sum().backward()
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+    actual.square().sum().backward()
     expected.square().sum().backward()
     torch.testing.assert_close(points.grad, same.grad, rtol=1e-3, atol=1e-4)
     for name, p in router.module.named_parameters():
@@ -96,6 +96,10 @@ def test_numbers_that_are_learnt_are_left():
     x, scale = b.input(3), b.parameter(3)
     angles = b.binary("mul", x, Columns(PARAMETER, scale, 0, 3))
     program = b.program([b.apply("sine", angles, 1.0), b.apply("sine", angles, 1.0, math.pi / 2)])
-    found = [with_encodings(program, constants) for constants in ({}, {scale: [3.0, 3.0, 3.0]})]
-    assert [step.numbers for step in found[0].steps if step.op == "encode"] == [(1, 0, 0, 0)]  # of the product
-    assert found[0].steps[1].name == "mul" and [step.name for step in found[1].steps] == ["", "affine", "frequency"]
+    programs = [with_encodings(program, constants) for constants in ({}, {scale: [3.0, 3.0, 3.0]})]
+    assert [step.numbers for step in programs[0].steps if step.op == "encode"] == [(1, 0, 0, 0)]  # of the product
+    assert programs[0].steps[1].name == "mul" and [step.name for step in programs[1].steps] == [
+        "",
+        "affine",
+        "frequency",
+    ]

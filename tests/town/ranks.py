@@ -1,4 +1,4 @@
-"""Ranks in processes of this machine, with one thread each; torch is imported once for all of them."""
+"""Runs ranks as processes of one thread each, forked from a server that has imported torch once."""
 
 import contextlib
 import io
@@ -13,7 +13,7 @@ from torch.distributed import TCPStore
 
 from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
 
-#: Seconds until ranks that hang are ended.
+#: The seconds after which hanging ranks are killed.
 LIMIT = 300
 
 
@@ -38,58 +38,58 @@ def new_store():
     return TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
 
 
-def start_ranks(function, each, folder, restarts=0, store=None):
-    """The processes of ranks that call a function, each with arguments of its own; what they print comes into a folder.
+def start_ranks(function, arguments, folder, restarts=0, store=None):
+    """Starts a process for each rank, which calls a function with the rank's arguments in ``arguments``.
 
-    The store is that of earlier starts, as torchrun keeps it.
+    The ranks print to files in ``folder``. ``store`` is the store of earlier starts, which torchrun keeps.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["voronerf.app.cli", "voronerf.app.train.loop"])
-    store, size = store or new_store(), len(each)
+    store, size = store or new_store(), len(arguments)
     ranks = [
-        context.Process(target=_rank, args=(rank, size, store.port, folder, restarts, function, given))
-        for rank, given in enumerate(each)
+        context.Process(target=_rank, args=(rank, size, store.port, folder, restarts, function, args))
+        for rank, args in enumerate(arguments)
     ]
     for rank in ranks:
         rank.start()
-    ranks[0].store = store  # which lives as long
+    ranks[0].store = store  # keeps the store alive
     return ranks
 
 
 def said_by(ranks, folder):
-    """What each rank has printed, once it has ended by itself."""
+    """Returns each rank's printed text, empty for a rank that was killed."""
     said = [Path(folder) / f"rank-{rank}.txt" for rank in range(len(ranks))]
     return [path.read_text() if path.is_file() else "" for path in said]
 
 
 def complaints(texts):
-    """The lines that tell of an error."""
+    """Returns the error lines of the ranks' texts."""
     return [line for text in texts for line in text.splitlines() if line.startswith("voronerf: error:")]
 
 
-def on_ranks(function, *args, folder, size=2, each=None, restarts=0, store=None):
-    """Calls a function on every rank, with arguments of its own where ``each`` has them.
+def on_ranks(function, *args, folder, size=2, arguments=None, restarts=0, store=None):
+    """Calls a function on every rank, with the same arguments or with the rank's arguments in ``arguments``.
 
-    Returns the exit status of each rank, and what it printed.
+    Returns (exit status of each rank, printed text of each rank).
     """
-    ranks = start_ranks(function, each or [args] * size, Path(folder), restarts, store)
+    ranks = start_ranks(function, arguments or [args] * size, Path(folder), restarts, store)
     for rank in ranks:
         rank.join(LIMIT)
         if rank.is_alive():
             rank.kill()
             rank.join()
     texts = said_by(ranks, folder)
-    print(*texts, sep="\n", file=sys.stderr)  # where a test fails
+    print(*texts, sep="\n", file=sys.stderr)  # pytest shows it if a test fails
     return [rank.exitcode for rank in ranks], texts
 
 
 def network_files(run):
-    """The files of the territories of the last checkpoint of a run."""
+    """Returns the territories' network files of a run's last checkpoint."""
     path = checkpoint_path(run)
     return [path.with_name(name) for name in load_checkpoint(path).values["parts"][0]["networks"]]
 
 
 def town_tensors(run):
-    """The tensors of the last checkpoint of a run, and of the files of all territories."""
-    found = [load_checkpoint(path).tensors for path in (checkpoint_path(run), *network_files(run))]
-    return {f"{number}.{name}": tensor for number, part in enumerate(found) for name, tensor in part.items()}
+    """Returns the tensors of a run's last checkpoint and of all its territories' files, by name."""
+    parts = [load_checkpoint(path).tensors for path in (checkpoint_path(run), *network_files(run))]
+    return {f"{number}.{name}": tensor for number, part in enumerate(parts) for name, tensor in part.items()}

@@ -1,4 +1,4 @@
-"""Runs that are joined, cut and placed: as files and as pictures."""
+"""Tests of joined, cut and placed runs, as files and as pictures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SMALL = ("log2_entries=10", "levels=4")
 
 @pytest.fixture(autouse=True, scope="module")
 def coarse_grids():
-    """Grids of runs that have none take less time."""
+    """Makes the grids coarse that are built for runs without a grid, which saves time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(importlib.import_module("voronerf.app.train.build"), "PICTURE_RESOLUTION", 24)
         patch.setattr(editing, "PICTURE_RESOLUTION", 24)
@@ -43,7 +43,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory, scene):
-    """Two runs: a hash grid with an occupancy grid, and another field, width and no grid."""
+    """The folders of two runs: a hash grid with an occupancy grid, and a wider NeRF without a grid."""
     folder = tmp_path_factory.mktemp("runs")
     shared = {"steps": 60, "rays": 128, "samples": (16,), "evaluations": 1}
     first = TrainConfig(out=folder / "first", cells=(4,), width=8, field_options=SMALL, **shared)
@@ -74,10 +74,10 @@ def placed_run(run, thing, at, out, scale=1.0):
 
 
 def in_region(part, points):
-    """Which points of the scene lie in all solids of a part."""
-    own = part.frame.inverse.points(points)
+    """Returns which points of the scene lie in all solids of a part, bool [n]."""
+    local = part.frame.inverse.points(points)
     return (
-        torch.stack([solid.holds(own) for solid in part.region]).all(0) if part.region else torch.ones(len(own)).bool()
+        torch.stack([solid.holds(local) for solid in part.region]).all(0) if part.region else torch.ones(len(local)).bool()
     )
 
 
@@ -96,10 +96,10 @@ def test_runs_of_different_fields_are_joined(opened, runs, tmp_path) -> None:
     who = joined.router.assign(points)[inside]
     k = opened[0].router.num_cells
     assert torch.equal(who < k, nearest < k)
-    asked = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(400, dtype=torch.int32)
-    density = joined.router(*asked)[1][inside]
-    for own, run in ((who < k, opened[0]), (who >= k, opened[1])):
-        assert torch.allclose(density[own], run.router(*asked)[1][inside][own], rtol=1e-4, atol=1e-5)
+    inputs = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(400, dtype=torch.int32)
+    density = joined.router(*inputs)[1][inside]
+    for mask, run in ((who < k, opened[0]), (who >= k, opened[1])):
+        assert torch.allclose(density[mask], run.router(*inputs)[1][inside][mask], rtol=1e-4, atol=1e-5)
     assert joined.evaluate(lpips="off")["psnr"] > 8
     assert [contents(run) for run in runs] == before
 
@@ -121,7 +121,7 @@ def test_a_joined_run_is_joined_and_cut_again(opened, tmp_path) -> None:
     four = joined_run([pair, pair], tmp_path / "four", frames=[Similarity(), Similarity.of((0, 3, 0), (0, 0, 90))])
     assert len([*four.router]) == 4 and four.router.num_cells == 2 * pair.router.num_cells
     files = list((tmp_path / "four" / "checkpoints").glob("networks-*"))
-    assert len(files) == 2  # what stands in two places is stored once
+    assert len(files) == 2  # networks in two places are stored once
     assert four.router[0].networks[0] is four.router[2].networks[0]
     low, high = pair.router[1].frame.points(opened[1].scene.box)
     back = cut_run(four, Solid.box(low.tolist(), high.tolist()), tmp_path / "back")
@@ -129,8 +129,8 @@ def test_a_joined_run_is_joined_and_cut_again(opened, tmp_path) -> None:
         torch.equal(p.diagram.centres, pair.router[1].diagram.centres) for p in back.router
     )
     x = torch.rand(300, 3) * (high - low) + low
-    asked = x, torch.tensor([[0.0, 0, 1]]), torch.zeros(300, dtype=torch.int32)
-    assert torch.allclose(back.router(*asked)[1], pair.router(*asked)[1], rtol=1e-4, atol=1e-5)
+    inputs = x, torch.tensor([[0.0, 0, 1]]), torch.zeros(300, dtype=torch.int32)
+    assert torch.allclose(back.router(*inputs)[1], pair.router(*inputs)[1], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -139,9 +139,9 @@ def test_the_grid_has_all_that_the_grids_of_the_runs_have(opened, tmp_path) -> N
     joined = joined_run(opened, tmp_path / "joined", frames=frames)
     grid = joined.renderer.occupancy
     for run, frame in zip(opened, frames, strict=True):
-        own = editing.Source.of(run.path).grid
-        full = own.occupied.view(-1).nonzero()[:, 0]
-        points = own.points(full, torch.rand(len(full), 3))
+        run_grid = editing.Source.of(run.path).grid
+        full = run_grid.occupied.view(-1).nonzero()[:, 0]
+        points = run_grid.points(full, torch.rand(len(full), 3))
         assert grid.occupied.view(-1)[grid.voxels(frame.points(points)).long()].all()
     assert grid.share < 1
 
@@ -149,14 +149,14 @@ def test_the_grid_has_all_that_the_grids_of_the_runs_have(opened, tmp_path) -> N
 def test_a_region_is_cut_exactly(opened, tmp_path) -> None:
     run, ball = opened[0], Solid(ball=(0.2, 0.1, 0.0, 0.4))
     points = torch.rand(500, 3) * 2 - 1
-    asked = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(500, dtype=torch.int32)
+    inputs = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(500, dtype=torch.int32)
     inside = ball.holds(points)
     kept, rest = cut_run(run, ball, tmp_path / "kept"), cut_run(run, ball, tmp_path / "rest", outside=True)
-    for found, where in ((kept, inside), (rest, ~inside)):
-        density, occupied = found.router(*asked)[1], found.router.assign(points) >= 0
+    for cut, where in ((kept, inside), (rest, ~inside)):
+        density, occupied = cut.router(*inputs)[1], cut.router.assign(points) >= 0
         assert not density[~where].any()
-        # The same rows alone: networks round otherwise where more rows are evaluated at once.
-        wanted = run.router(points[occupied], asked[1], asked[2][occupied])[1]
+        # Evaluates the same rows only: rounding depends on the number of rows.
+        wanted = run.router(points[occupied], inputs[1], inputs[2][occupied])[1]
         assert occupied.any() and torch.equal(density[occupied], wanted)
     assert (kept.scene.box[1] - kept.scene.box[0]).max() <= 0.8 + 2 * 2.36 / 16
     size = {path: sum(map(len, contents(tmp_path / path).values())) for path in ("kept", "rest")}
@@ -191,9 +191,9 @@ def test_an_object_is_placed_on_top(opened, tmp_path) -> None:
     foot = both.router[1].frame.points(torch.cat((thing.scene.box.mean(0)[:2], thing.scene.box[0, 2:]))[None])
     assert torch.allclose(foot, torch.tensor([[0.1, 0.2, 0.5]]), atol=1e-5)
     points = torch.rand(500, 3) * 2 - 1
-    asked = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(500, dtype=torch.int32)
-    assert (both.router(*asked)[1] >= opened[1].router(*asked)[1] * in_region(both.router[0], points) - 1e-5).all()
-    again = cut_run(both, [both.router.num_cells - 1], tmp_path / "again")  # the object alone
+    inputs = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(500, dtype=torch.int32)
+    assert (both.router(*inputs)[1] >= opened[1].router(*inputs)[1] * in_region(both.router[0], points) - 1e-5).all()
+    again = cut_run(both, [both.router.num_cells - 1], tmp_path / "again")  # only the object
     assert [part.layer for part in again.router] == [0]
 
 
@@ -257,14 +257,14 @@ def test_out_is_a_new_folder(opened, tmp_path) -> None:
 
 
 def altered(run, out, *, config=None, bias=0.0, **scene):
-    """A copy of a run with other settings, more density, or another scene in its files."""
+    """Copies a run with changed settings, density bias or scene in its files; returns the copy's folder."""
     shutil.copytree(run, out)
     write_scene(out / "scene.json", replace(read_scene(run / "scene.json"), **scene))
-    found = load_checkpoint(checkpoint_path(out))
-    tensors = {name: tensor.clone() for name, tensor in found.tensors.items() if not name.startswith("optimizer.")}
+    checkpoint = load_checkpoint(checkpoint_path(out))
+    tensors = {name: tensor.clone() for name, tensor in checkpoint.tensors.items() if not name.startswith("optimizer.")}
     if bias:
         tensors["router.module.density.bias"] += bias
-    values = {**found.values, "config": {**found.values["config"], **(config or {})}}
+    values = {**checkpoint.values, "config": {**checkpoint.values["config"], **(config or {})}}
     save_checkpoint(checkpoint_path(out), Checkpoint(tensors, values))
     return out
 
@@ -273,13 +273,13 @@ def test_what_cannot_be_joined(runs, tmp_path) -> None:
     one, two = runs
     cones = altered(two, tmp_path / "cones", config={"field": "mipnerf", "field_options": []})
     endless, black = altered(two, tmp_path / "endless", box=None), altered(two, tmp_path / "black", background=None)
-    for given, said in (
+    for settings, said in (
         ([one], "two runs or more"),
         ([cones, two], "cannot be joined or cut: its cones"),
         ([one, endless], "must have bounds to be joined"),
         ([one, black], "must have the background of first, white, got none"),
     ):
-        refuses(said, town.join, given, tmp_path / "no", error=ConfigError)
+        refuses(said, town.join, settings, tmp_path / "no", error=ConfigError)
     refuses("there is no checkpoint in it", town.join, [one, tmp_path], tmp_path / "no", error=CheckpointError)
     refuses("an object must have bounds", town.place, one, endless, (0, 0, 0), tmp_path / "no", error=ConfigError)
     assert not (tmp_path / "no").exists()
@@ -308,9 +308,9 @@ def test_a_run_of_parts_is_neither_opened_nor_trained_as_one_of_a_training(opene
 def test_runs_are_aligned_by_shared_images(scene) -> None:
     frame = Similarity.of((1, 2, 3), (10, 20, 30), 1.7)
     moved = with_cameras(scene, lambda cameras: editing.moved_cameras(cameras, frame.inverse))
-    found, error, count = editing.align(scene, moved, "run")
+    fitted, error, count = editing.align(scene, moved, "run")
     assert count == 8 and error < 1e-5
-    assert abs(found.scale - 1.7) < 1e-5 and torch.allclose(found.translation, frame.translation, atol=1e-4)
+    assert abs(fitted.scale - 1.7) < 1e-5 and torch.allclose(fitted.translation, frame.translation, atol=1e-4)
     others = replace(
         scene, train=replace(scene.train, names=tuple("abcdef")), test=replace(scene.test, names=tuple("gh"))
     )
@@ -325,16 +325,16 @@ def test_runs_are_aligned_by_shared_images(scene) -> None:
 
 @pytest.mark.parametrize("degrees", [(10, 20, 30), (200, 20, 30), (10, 200, 30), (10, 20, 200)])
 def test_cameras_of_one_height_are_aligned_without_a_mirror(scene, degrees) -> None:
-    """Which would move them as well."""
+    """Coplanar cameras are aligned by a rotation, although a mirroring would fit them as well."""
     frame = Similarity.of((1, 2, 3), degrees, 1.7)
     flat = with_cameras(scene, lambda cameras: placed(cameras, cameras.origins * torch.tensor([1.0, 1, 0])))
     moved = with_cameras(flat, lambda cameras: editing.moved_cameras(cameras, frame))
-    found, error, _ = editing.align(moved, flat, "run")
-    assert error < 1e-5 and torch.allclose(found.rotation, frame.rotation, atol=1e-4)
+    fitted, error, _ = editing.align(moved, flat, "run")
+    assert error < 1e-5 and torch.allclose(fitted.rotation, frame.rotation, atol=1e-4)
 
 
 def with_cameras(scene, change):
-    """A scene whose cameras are changed by a function."""
+    """Returns a scene whose cameras are mapped by a function."""
     parts = {"train": scene.train, "test": scene.test}
     return replace(scene, **{name: replace(part, cameras=change(part.cameras)) for name, part in parts.items()})
 
@@ -351,7 +351,7 @@ def test_an_unbounded_run_is_cut_and_gets_an_object(tmp_path, scene) -> None:
     small = {"steps": 40, "width": 8, "rays": 128, "samples": (16,), "evaluations": 1, "field_options": SMALL}
     config = TrainConfig(out=tmp_path / "wide", cells=(4,), **small)
     trained(config, open_space)
-    wide = altered(tmp_path / "wide", tmp_path / "dense", bias=4)  # so that there is something to cut
+    wide = altered(tmp_path / "wide", tmp_path / "dense", bias=4)  # dense enough to cut
     run = open_run(wide, scene=open_space)
     assert run.renderer.contraction is not None
     refuses("must lie within", lambda: cut_run(run, Solid(ball=(0, 0, 0, 99)), tmp_path / "no"), error=ConfigError)
@@ -361,18 +361,18 @@ def test_an_unbounded_run_is_cut_and_gets_an_object(tmp_path, scene) -> None:
     both = placed_run(run, thing, (0, 0, 0.5), tmp_path / "both", scale=0.4)
     assert both.scene.box is None and both.router[0].contraction is not None and both.renderer.occupancy is None
     points = torch.randn(300, 3)
-    asked = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(300, dtype=torch.int32)
-    alone = run.router(run.renderer.contraction.points(points), *asked[1:])[1]
+    inputs = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(300, dtype=torch.int32)
+    alone = run.router(run.renderer.contraction.points(points), *inputs[1:])[1]
     assert torch.allclose(
-        both.router(*asked)[1] - alone * (in_region(both.router[1], points) == 0),
-        both.router(*asked)[1] * (in_region(both.router[1], points) != 0),
+        both.router(*inputs)[1] - alone * (in_region(both.router[1], points) == 0),
+        both.router(*inputs)[1] * (in_region(both.router[1], points) != 0),
         atol=1e-4,
     )
     assert both.evaluate(lpips="off", views=1)["psnr"] > 5
     refuses("must have bounds to be joined", lambda: joined_run([thing, run], tmp_path / "no"), error=ConfigError)
 
 
-# On the command line --------------------------------------------------------------------------------------------------
+# Command line ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_commands(runs, tmp_path, capsys) -> None:

@@ -1,4 +1,4 @@
-"""Parts: several routers in one scene, each in its own frame."""
+"""Tests of parts: several routers in one scene, each in its own frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def torch_seed():
 
 
 def hashed(k: int, shift: float = 0.0, width: int = 8) -> VoronoiRouter:
-    """A router on a shared table, whose cells differ."""
+    """Returns a router whose cells differ and share one hash table."""
     router = VoronoiRouter(
         HashGridField(width=width, log2_entries=10, levels=2),
         torch.rand(k, 3) + torch.tensor([shift, 0, 0]),
@@ -58,24 +58,24 @@ def close(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 
 def test_one_part_gives_the_bits_of_its_router(torch_seed) -> None:
-    router, asked = hashed(5), queries()
-    alone = router(*asked)
+    router, inputs = hashed(5), queries()
+    alone = router(*inputs)
     for parts in (Parts([part_of(router)]), Parts([part_of(router, region=[Solid.box((-9, -9, -9), (9, 9, 9))])])):
-        found = parts.eval()(*asked)
-        assert torch.equal(found[0], alone[0]) and torch.equal(found[1], alone[1])
-        assert torch.equal(parts.assign(asked[0]), router.assign(asked[0]))
+        result = parts.eval()(*inputs)
+        assert torch.equal(result[0], alone[0]) and torch.equal(result[1], alone[1])
+        assert torch.equal(parts.assign(inputs[0]), router.assign(inputs[0]))
 
 
 def test_the_nearest_centre_of_all_parts_decides(torch_seed) -> None:
-    one, two, asked = hashed(4), plain(7, 1.0), queries()
+    one, two, inputs = hashed(4), plain(7, 1.0), queries()
     parts = Parts([part_of(one), part_of(two)]).eval()
-    nearest = torch.cdist(asked[0], torch.cat([one.diagram.centres, two.diagram.centres])).argmin(1)
-    assert torch.equal(parts.assign(asked[0]).long(), nearest)
-    colour, density = parts(*asked)
+    nearest = torch.cdist(inputs[0], torch.cat([one.diagram.centres, two.diagram.centres])).argmin(1)
+    assert torch.equal(parts.assign(inputs[0]).long(), nearest)
+    colour, density = parts(*inputs)
     first = nearest < 4
     assert 0 < int(first.sum()) < len(first)
-    for own, (c, d) in ((first, one(*asked)), (~first, two(*asked))):
-        assert close(colour[own], c[own]) and close(density[own], d[own])
+    for mask, (c, d) in ((first, one(*inputs)), (~first, two(*inputs))):
+        assert close(colour[mask], c[mask]) and close(density[mask], d[mask])
 
 
 @pytest.mark.parametrize("n", [0, 1])
@@ -132,27 +132,27 @@ def test_solids_move_with_their_frames(torch_seed) -> None:
 
 
 def test_leaves_of_several_routers(torch_seed) -> None:
-    router, asked = hashed(4), queries(width=1.0)
+    router, inputs = hashed(4), queries(width=1.0)
     owner = torch.tensor([1, 0, 1, 1])
     networks = [StoredRouter.of(router.part((owner == i).nonzero()[:, 0]), TrainConfig()) for i in (0, 1)]
     parts = Parts([Part(networks, router.diagram, owner)]).eval()
-    found, wanted = parts(*asked), router(*asked)
-    assert close(found[0], wanted[0]) and close(found[1], wanted[1])
-    assert torch.equal(parts.assign(asked[0]), router.assign(asked[0]))
+    result, wanted = parts(*inputs), router(*inputs)
+    assert close(result[0], wanted[0]) and close(result[1], wanted[1])
+    assert torch.equal(parts.assign(inputs[0]), router.assign(inputs[0]))
     fewer = parts[0].keep(torch.tensor([1, 2]))
     assert [network.router.num_cells for network in fewer.networks] == [1, 1]
 
 
 def test_cells_that_are_cut_away_show_nothing_and_leave_the_others(torch_seed) -> None:
-    router, asked = hashed(6), queries(width=1.0)
+    router, inputs = hashed(6), queries(width=1.0)
     part = part_of(router).keep(torch.tensor([1, 4]))
     assert (
         part.num_cells == 2
         and part.networks[0].router.num_cells == 2
         and part_of(router).keep(torch.tensor([], dtype=torch.int64)) is None
     )
-    colour, density = Parts([part]).eval()(*asked)
-    cells, wanted = router.assign(asked[0]), router(*asked)
+    colour, density = Parts([part]).eval()(*inputs)
+    cells, wanted = router.assign(inputs[0]), router(*inputs)
     kept = (cells == 1) | (cells == 4)
     assert torch.equal(colour[kept], wanted[0][kept]) and torch.equal(density[kept], wanted[1][kept])
     assert not density[~kept].any()
@@ -160,22 +160,22 @@ def test_cells_that_are_cut_away_show_nothing_and_leave_the_others(torch_seed) -
 
 
 def test_a_hole_goes_to_the_nearest_part_that_speaks(torch_seed) -> None:
-    one, two, asked = hashed(6), plain(3), queries(width=1.0)
+    one, two, inputs = hashed(6), plain(3), queries(width=1.0)
     hole = part_of(one).keep(torch.tensor([0, 1, 2, 3]))
     parts = Parts([hole, part_of(two)]).eval()
-    cells = one.assign(asked[0])
-    nearest = torch.cdist(asked[0], torch.cat([one.diagram.centres[:4], two.diagram.centres])).argmin(1)
-    assert torch.equal(parts.assign(asked[0]) < 4, (nearest < 4) & (cells < 4))
+    cells = one.assign(inputs[0])
+    nearest = torch.cdist(inputs[0], torch.cat([one.diagram.centres[:4], two.diagram.centres])).argmin(1)
+    assert torch.equal(parts.assign(inputs[0]) < 4, (nearest < 4) & (cells < 4))
     gone = cells > 3
     assert gone.any()
-    assert close(parts(*asked)[1][gone], two(*asked)[1][gone])
+    assert close(parts(*inputs)[1][gone], two(*inputs)[1][gone])
 
 
 def test_layers_add_up(torch_seed) -> None:
-    under, above, asked = hashed(3), plain(2), queries(width=1.0)
+    under, above, inputs = hashed(3), plain(2), queries(width=1.0)
     ball = Solid(ball=(0.5, 0.5, 0.5, 0.4))
-    colour, density = Parts([part_of(under), part_of(above, layer=1, region=[ball])]).eval()(*asked)
-    (c0, d0), (c1, d1), inside = under(*asked), above(*asked), ball.holds(asked[0])
+    colour, density = Parts([part_of(under), part_of(above, layer=1, region=[ball])]).eval()(*inputs)
+    (c0, d0), (c1, d1), inside = under(*inputs), above(*inputs), ball.holds(inputs[0])
     assert torch.equal(colour[~inside], c0[~inside]) and torch.equal(density[~inside], d0[~inside])
     assert close(density[inside], (d0 + d1)[inside])
     mixed = (c0 * d0[:, None] + c1 * d1[:, None]) / (d0 + d1)[:, None]

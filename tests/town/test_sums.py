@@ -1,4 +1,4 @@
-"""Partial sums of rays put together, against one composite of all samples."""
+"""Tests of merged partial sums of rays against one composite of all samples."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ from voronerf.ops.ray_runs.reference import own_samples, sum_runs
 
 @pytest.mark.parametrize("ranks", [1, 3])
 def test_partial_sums_are_one_composite(ranks):
-    """Colours and gradients in float64, whatever rank has which sample, with opaque and empty ones."""
+    """Merged sums give the colours and gradients of `composite` in float64, however samples are spread over ranks."""
     generator, rays, samples = seeded(), 40, 9
     density = torch.rand(rays, samples, generator=generator, dtype=torch.float64) * 3
     density[0, 2], density[1], density[2, 4] = 1e9, 0, torch.inf
@@ -30,16 +30,16 @@ def test_partial_sums_are_one_composite(ranks):
 
     parts = density.clone().requires_grad_(), colour.clone().requires_grad_()
     index = torch.arange(rays, dtype=torch.int32).repeat_interleave(samples)
-    found = []
+    partial_sums = []
     for rank in range(ranks):
-        own = (owner == rank).reshape(-1)
-        given = torch.zeros(rays * samples, 3), index, depths.reshape(-1), deltas.reshape(-1)
+        mask = (owner == rank).reshape(-1)
+        samples_of_rays = torch.zeros(rays * samples, 3), index, depths.reshape(-1), deltas.reshape(-1)
         numbers = torch.where(torch.arange(ranks) == rank, 0, -1)
-        mine = own_samples(*given, owner.reshape(-1), numbers, bent=False)
-        found.append(sum_runs(mine, parts[1].reshape(-1, 3)[own], parts[0].reshape(-1)[own]))
-    ray, start = torch.cat([runs.ray for runs in found]), torch.cat([runs.start for runs in found])
+        mine = own_samples(*samples_of_rays, owner.reshape(-1), numbers, bent=False)
+        partial_sums.append(sum_runs(mine, parts[1].reshape(-1, 3)[mask], parts[0].reshape(-1)[mask]))
+    ray, start = torch.cat([runs.ray for runs in partial_sums]), torch.cat([runs.start for runs in partial_sums])
     order = along_rays(ray, start)
-    sums = [torch.cat([getattr(runs, name) for runs in found])[order] for name in ("colour", "optical")]
+    sums = [torch.cat([getattr(runs, name) for runs in partial_sums])[order] for name in ("colour", "optical")]
     seen = compose(*(part.detach() for part in sums), ray[order], rays)
     behind = seen.behind(sums[0].detach(), ray[order], slopes, background)
     torch.autograd.backward(sums, (seen.front[:, None] * slopes[ray[order]], -behind))
@@ -55,12 +55,12 @@ def test_partial_sums_are_one_composite(ranks):
 @pytest.mark.parametrize("backend", ["native", "reference"])
 @pytest.mark.parametrize(("ranks", "robust"), [(1, 0.05), (3, 0.0), (3, 0.05)])
 def test_partial_sums_are_one_loss(ranks, robust, backend):
-    """Loss, gradients and weights of `render_loss`, whatever rank has which sample; long and empty rays."""
+    """Merged sums give the loss, gradients and weights of `render_loss`, also for long and empty rays."""
     reason = backends.why_not("run_sums", backend, torch.device("cpu"))
     if reason is not None:
         pytest.skip(reason)
     generator, counts = seeded(), torch.tensor([5, 0, 1, 300, 40, 0, 7])
-    n, rays, given = int(counts.sum()), len(counts), {"backend": backend}
+    n, rays, options = int(counts.sum()), len(counts), {"backend": backend}
     index = torch.repeat_interleave(counts).int()
     offsets = torch.cat((torch.zeros(1, dtype=torch.int64), counts.cumsum(0))).int()
     raw = torch.randn(n, 4, generator=generator)
@@ -74,42 +74,42 @@ def test_partial_sums_are_one_loss(ranks, robust, backend):
     expected.loss.backward()
     positions = torch.rand(n, 3, generator=generator)
 
-    own = [torch.where(torch.arange(ranks) == rank, 0, -1).int() for rank in range(ranks)]
+    numbers_by_rank = [torch.where(torch.arange(ranks) == rank, 0, -1).int() for rank in range(ranks)]
     kept = [(cells == rank).nonzero()[:, 0] for rank in range(ranks)]
-    samples = [keep_own(positions, index, depths, deltas, cells, numbers, **given) for numbers in own]
+    samples = [keep_own(positions, index, depths, deltas, cells, numbers, **options) for numbers in numbers_by_rank]
     assert all(mine.positions.equal(positions[rows]) for mine, rows in zip(samples, kept, strict=True))
-    sums = [run_sums(raw[rows], mine, density_scale=2.0, **given)[0] for mine, rows in zip(samples, kept, strict=True)]
+    sums = [run_sums(raw[rows], mine, density_scale=2.0, **options)[0] for mine, rows in zip(samples, kept, strict=True)]
     shown = {"background": background, "first": 0, "rays": rays, "robust": robust}
-    answers, loss = compose_runs(torch.cat(sums), target, **shown, **given)
+    answers, loss = compose_runs(torch.cat(sums), target, **shown, **options)
     assert torch.allclose(loss, expected.loss, rtol=1e-6)
     for mine, rows, told in zip(samples, kept, answers.split(list(map(len, sums))), strict=True):
-        gradient, weights = run_gradients(raw[rows], mine, told, **rest, **given)
+        gradient, weights = run_gradients(raw[rows], mine, told, **rest, **options)
         assert torch.allclose(gradient, leaf.grad[rows], rtol=1e-4, atol=1e-8)
         assert torch.allclose(weights, expected.weights[rows], rtol=1e-5, atol=1e-8)
         assert torch.allclose(
             told[:, 5], expected.error[mine.ray_index[mine.run_offsets[:-1].long()].long()], rtol=1e-5
         )
     with pytest.raises(ValueError, match="compose_runs: rays must be 1 to 7, got 0"):
-        compose_runs(sums[0], target, **{**shown, "first": 1}, **given)
+        compose_runs(sums[0], target, **{**shown, "first": 1}, **options)
 
 
 def test_a_gap_that_another_rank_may_fill_ends_a_run():
     depths, deltas = torch.tensor([0.1, 0.19, 0.5, 0.9]), torch.full((4,), 0.1)
-    given = torch.zeros(4, 3), torch.zeros(4, dtype=torch.int32), depths, deltas
-    cells, own = torch.tensor([0, 1, 2, 2]), torch.arange(3)
-    assert own_samples(*given, cells, own, bent=False).run_offsets.tolist() == [0, 2, 4]
-    assert own_samples(*given, cells, own * 0 - 1, bent=False).run_offsets.tolist() == [0]
+    samples = torch.zeros(4, 3), torch.zeros(4, dtype=torch.int32), depths, deltas
+    cells, numbers = torch.tensor([0, 1, 2, 2]), torch.arange(3)
+    assert own_samples(*samples, cells, numbers, bent=False).run_offsets.tolist() == [0, 2, 4]
+    assert own_samples(*samples, cells, numbers * 0 - 1, bent=False).run_offsets.tolist() == [0]
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])
 def test_runs_of_a_ray_that_begin_alike_keep_their_order(backend):
-    """The first hides the second: an opaque red one before a green one, and the other way round."""
+    """The first of two opaque runs of a ray hides the second if both have the same start depth."""
     reason = backends.why_not("compose_runs", backend, torch.device("cpu"))
     if reason is not None:
         pytest.skip(reason)
     red, green = torch.eye(3)[:2]
     for first, second in ((red, green), (green, red)):
-        rest = torch.tensor([50.0, 2.0, 0.0])  # optical depth, where they begin, ray
+        rest = torch.tensor([50.0, 2.0, 0.0])  # optical depth, start depth, ray
         sums = torch.stack((torch.cat((first, rest)), torch.cat((second, rest))))
         answers, loss = compose_runs(sums, first[None], first=0, rays=1, backend=backend)
         assert float(loss) < 1e-12 and answers[:, 4].tolist() == [0, 50]

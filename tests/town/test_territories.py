@@ -1,4 +1,4 @@
-"""Territories: where they are, what of space they reach, where rays go, and the loss of rays that cross them."""
+"""Tests of territories: their places and regions, the routing of rays, and the loss of rays across territories."""
 
 import math
 from dataclasses import replace
@@ -21,7 +21,7 @@ BOX = torch.tensor([[0.0, 0, 0], [4.0, 2, 2]])
 
 
 def line(count=2):
-    """Territories side by side along x, in a box of 4 x 2 x 2."""
+    """Returns territories side by side along x, in a box of 4 x 2 x 2."""
     middles = (torch.arange(count) + 0.5) * 4 / count
     centres = torch.stack((middles, torch.ones(count), torch.ones(count)), 1)
     boxes = torch.stack([torch.tensor([[m - 2 / count, 0, 0], [m + 2 / count, 2, 2]]) for m in middles.tolist()])
@@ -36,18 +36,18 @@ def city():
 @pytest.mark.parametrize("count", [1, 2, 5, 8])
 def test_the_views_of_a_city_are_shared_out(city, count):
     scene = city
-    found = cut_space(scene, count, None)
-    sizes = torch.bincount(found.train, minlength=count)
-    assert len(found) == count and int(sizes.max()) - int(sizes.min()) <= 1
+    territories = cut_space(scene, count, None)
+    sizes = torch.bincount(territories.train, minlength=count)
+    assert len(territories) == count and int(sizes.max()) - int(sizes.min()) <= 1
     points = torch.lerp(scene.box[0], scene.box[1], torch.rand(20_000, 3, generator=seeded()))
-    owner = VoronoiDiagram(found.centres).locate(points).long()
-    low, high = found.boxes[owner].unbind(1)
+    owner = VoronoiDiagram(territories.centres).locate(points).long()
+    low, high = territories.boxes[owner].unbind(1)
     assert ((points >= low - 1e-4) & (points <= high + 1e-4)).all(), "a point is in the box of its territory"
     for number in range(count):
-        place, inside = found.place(number), found.boxes[number]
-        own = points[((points >= inside[0]) & (points <= inside[1])).all(1)]
-        mine = place.own[place.cells(own, "auto").long()] == 0
-        assert torch.equal(mine, VoronoiDiagram(found.centres).locate(own) == number)
+        place, inside = territories.place(number), territories.boxes[number]
+        box_points = points[((points >= inside[0]) & (points <= inside[1])).all(1)]
+        mine = place.own[place.cells(box_points, "auto").long()] == 0
+        assert torch.equal(mine, VoronoiDiagram(territories.centres).locate(box_points) == number)
 
 
 def test_a_cut_that_cannot_be_made():
@@ -95,21 +95,21 @@ def test_which_territories_a_ray_meets():
 
 
 def members(count):
-    """Territories in a line, each with networks of its own."""
-    found = {}
+    """Returns territories in a line by number, each with its own networks."""
+    result = {}
     for number in range(count):
         torch.manual_seed(number)
         router = VoronoiRouter(NeRF(width=16, depth=2, density_scale=1.0), torch.zeros(1, 3), coords="first3")
         grid = OccupancyGrid(line(count).boxes[number], 4, threshold=1e-6)
         loss = RayLoss(Renderer({"field": router}, Occupancy(grid, 64 * SETTLING_PART)))
-        optimizer = Adam.of({"field": router}, lr=0.0)  # so that nothing moves
+        optimizer = Adam.of({"field": router}, lr=0.0)  # parameters do not move
         step = TrainingStep(Drawn(), loss, optimizer, generator=torch.Generator())
-        found[number] = Territory(line(count).place(number), step)
-    return found
+        result[number] = Territory(line(count).place(number), step)
+    return result
 
 
 class Drawn:
-    """In the place of `RayBatches`: the same rays in each step."""
+    """A stub of `RayBatches` with the same rays in each step."""
 
     device = place = torch.device("cpu")
     fetch = None
@@ -118,22 +118,22 @@ class Drawn:
         return self.batch
 
 
-def run(own, batches):
-    """What all territories find, and gradients, with the same random samples whenever it is called."""
-    away = torch.tensor([[-1.0, 1, 1]]), torch.tensor([[-1.0, 0, 0]])  # of those without rays
-    none = Batch(Rays(*away), torch.zeros(1), torch.full((1,), 9.0), torch.zeros(1, 3))
-    for number, member in own.items():
+def run(territories, batches):
+    """Runs a step of all territories with the same random samples in each call; returns their results."""
+    miss = torch.tensor([[-1.0, 1, 1]]), torch.tensor([[-1.0, 0, 0]])  # a ray that misses, for territories without rays
+    none = Batch(Rays(*miss), torch.zeros(1), torch.full((1,), 9.0), torch.zeros(1, 3))
+    for number, member in territories.items():
         member.step.generator.manual_seed(3)
         member.step.batches.batch = batches.get(number, none)
-    rays = {number: len(member.step.batches.batch.near) for number, member in own.items()}
+    rays = {number: len(member.step.batches.batch.near) for number, member in territories.items()}
     return step_together(
-        Group(torch.device("cpu")), own, [0] * len(own), line(len(own)).boxes, rays, dict.fromkeys(own, 1)
+        Group(torch.device("cpu")), territories, [0] * len(territories), line(len(territories)).boxes, rays, dict.fromkeys(territories, 1)
     )
 
 
-def fill(own, densities, colours):
-    """Makes every territory a fog."""
-    for number, member in own.items():
+def fill(territories, densities, colours):
+    """Gives every territory a constant density and colour."""
+    for number, member in territories.items():
         field = member.renderer.field.module
         with torch.no_grad():
             for p in field.parameters():
@@ -144,7 +144,7 @@ def fill(own, densities, colours):
 
 
 def rays_through(count):
-    """Rays from the left through all of the box."""
+    """Returns a batch of rays that cross the whole box from the left."""
     generator = seeded()
     origins = torch.stack((torch.full((count,), -1.0), *(torch.rand(2, count, generator=generator) + 0.5)), 1)
     aim = torch.stack((torch.full((count,), 5.0), *(torch.rand(2, count, generator=generator) + 0.5)), 1)
@@ -153,10 +153,10 @@ def rays_through(count):
 
 
 def test_gradients_are_those_of_the_loss():
-    """Along random directions of all parameters, the change of the sum of the losses is what the gradients say."""
-    own, batches = members(3), {0: rays_through(20), 1: rays_through(1), 2: rays_through(12)}
-    parameters = [p for member in own.values() for p in member.renderer.field.parameters()]
-    run(own, batches)
+    """The gradients match finite differences of the summed losses along random directions of all parameters."""
+    territories, batches = members(3), {0: rays_through(20), 1: rays_through(1), 2: rays_through(12)}
+    parameters = [p for member in territories.values() for p in member.renderer.field.parameters()]
+    run(territories, batches)
     gradients = [p.grad.clone() for p in parameters]
     assert all(bool(gradient.any()) for gradient in gradients[-2:]), "rays from elsewhere teach a territory"
     for seed in range(3):
@@ -167,7 +167,7 @@ def test_gradients_are_those_of_the_loss():
             with torch.no_grad():
                 for p, way in zip(parameters, ways, strict=True):
                     p.add_(way, alpha=side * 2e-3)
-            ends.append(float(sum(each.loss for each in run(own, batches).values())))
+            ends.append(float(sum(result.loss for result in run(territories, batches).values())))
         with torch.no_grad():
             for p, way in zip(parameters, ways, strict=True):
                 p.sub_(way, alpha=2e-3)
@@ -175,31 +175,31 @@ def test_gradients_are_those_of_the_loss():
 
 
 def test_colours_are_those_of_all_territories_in_turn():
-    """A fog of one colour in each: the light of a ray is that of the formula, whoever draws it."""
-    own, densities = members(2), (0.3, 0.7)
+    """Rays through two territories of constant fog have the colours of the formula, whichever territory owns them."""
+    territories, densities = members(2), (0.3, 0.7)
     colours = torch.tensor([[0.9, 0.1, 0.2], [0.2, 0.8, 0.4]])
-    fill(own, densities, colours)
+    fill(territories, densities, colours)
     origins, directions = torch.tensor([[-1.0, 1, 1], [5.0, 1, 1]]), torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]])
     light = [math.exp(-2 * density) for density in densities]
     mine = [(1 - through) * colour for through, colour in zip(light, colours, strict=True)]
     expected = torch.stack((mine[0] + light[0] * mine[1], mine[1] + light[1] * mine[0])) + light[0] * light[1]
     batch = Batch(Rays(origins, directions), torch.zeros(2), torch.full((2,), 9.0), expected, torch.ones(3))
-    found = run(own, {0: batch})
-    assert float(found[0].loss) < 1e-5 and found[1].samples == 128
-    whole = found[0].whole().output
+    results = run(territories, {0: batch})
+    assert float(results[0].loss) < 1e-5 and results[1].samples == 128
+    whole = results[0].whole().output
     assert torch.allclose(whole.colour, expected, atol=1e-3)
     assert torch.allclose(whole.weights, torch.full((2,), 1 - light[0] * light[1]), atol=1e-3)
 
 
 def test_a_ray_that_has_ended_goes_no_further():
-    own = members(3)
-    fill(own, (100.0,) * 3, torch.full((3, 3), 0.5))
-    found = run(own, {0: rays_through(30)})
-    assert [each.samples > 0 for each in found.values()] == [True, False, False]
+    territories = members(3)
+    fill(territories, (100.0,) * 3, torch.full((3, 3), 0.5))
+    results = run(territories, {0: rays_through(30)})
+    assert [result.samples > 0 for result in results.values()] == [True, False, False]
 
 
 def test_pixels_that_do_not_count_place_no_view():
-    """If one pixel of a view counts, the view lies where the ray of that pixel is half way through the scene."""
+    """If only one pixel of a view counts, the view is placed at the middle of this pixel's ray in the scene."""
     scene = builtin_scene(LATTICE, train_views=3, test_views=1)
     masks = torch.zeros(3, LATTICE, LATTICE, dtype=torch.bool)
     row, column = LATTICE // 2, LATTICE // 2 + 2

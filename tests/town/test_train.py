@@ -1,4 +1,4 @@
-"""Trainings in territories: the same run on any number of ranks, after a kill, and after damage; what is refused."""
+"""Tests of training in territories: equal runs on any number of ranks, killed ranks, damaged files, and refusals."""
 
 import os
 import shutil
@@ -35,13 +35,13 @@ def command(out, *more):
 
 
 def in_step(number, harm):
-    """A context in which rank 1 does something in a step."""
+    """Returns a context in which rank 1 calls `harm` before a step."""
     real, steps = rays.step_together, iter(range(10_000))
 
-    def step_together(group, *given):
+    def step_together(group, *arguments):
         if next(steps) == number and group.rank == 1:
             harm()
-        return real(group, *given)
+        return real(group, *arguments)
 
     return mock.patch.object(train, "step_together", step_together)
 
@@ -52,7 +52,7 @@ def dies(args, step):
 
 
 def dies_at_the_start(args):
-    """Rank 1, before it has met the others, who wait for it for some seconds."""
+    """Kills rank 1 before the rendezvous; the other ranks wait 3 s for it."""
     if os.environ["RANK"] == "1":
         os.kill(os.getpid(), signal.SIGKILL)
     with mock.patch.object(group, "PATIENCE", 3):
@@ -77,7 +77,7 @@ def same(first, second):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A run of one process, which nothing happened to."""
+    """The folder of an undisturbed run of one process."""
     out = tmp_path_factory.mktemp("whole") / "run"
     assert on_ranks(main, command(out), folder=out.parent, size=1)[0] == [0]
     return out
@@ -85,7 +85,7 @@ def whole(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def resumed(tmp_path_factory):
-    """A run that two ranks have stopped and continued, so that it has two checkpoints."""
+    """The folder of a run with two checkpoints, which two ranks have stopped and resumed."""
     folder = tmp_path_factory.mktemp("resumed")
     assert on_ranks(is_asked_to_stop, command(folder / "run"), 12, folder=folder)[0] == [130, 130]
     assert on_ranks(main, command(folder / "run", "--resume"), folder=folder)[0] == [0, 0]
@@ -122,7 +122,7 @@ def test_a_run_continues_on_another_number_of_ranks_that_need_not_name_its_terri
 
 @pytest.mark.slow
 def test_a_rank_that_is_killed(tmp_path, whole):
-    """The other says so; started again as by torchrun, the run ends bit for bit as one that nothing happened to."""
+    """The other rank reports it; after a restart as by torchrun, the run equals an undisturbed one bit for bit."""
     args = command(tmp_path / "run", "--checkpoint-every", "1e-6")
     codes, texts = on_ranks(dies, args, 19, folder=tmp_path)
     assert codes == [1, -signal.SIGKILL] and len(complaints(texts)) == 1
@@ -140,7 +140,7 @@ def test_a_rank_that_is_killed_before_the_others_meet_it(tmp_path):
 
 @pytest.mark.parametrize("harm", ["changed", slow("cut short"), slow("missing")])
 def test_a_damaged_part(tmp_path, whole, resumed, harm):
-    """All ranks take the checkpoint before, and say which file was no good."""
+    """All ranks take the previous checkpoint and name the damaged file."""
     shutil.copytree(resumed, tmp_path / "run")
     part = network_files(tmp_path / "run")[1]
     data = bytearray(part.read_bytes())
@@ -183,18 +183,18 @@ def test_a_full_disk(tmp_path):
     ],
 )
 def test_settings_that_territories_do_not_support(tmp_path, more, said):
-    """One rank says so at every start: what ranks of an earlier start have left in torchrun's store is not theirs."""
+    """One rank reports it at every start, whatever an earlier start has left in torchrun's store."""
     store = new_store()
     for restarts in range(1 + (more[0] == "--sampling")):
-        given = command(tmp_path / "run", *more)
-        codes, texts = on_ranks(main, given, folder=tmp_path, restarts=restarts, store=store)
+        args = command(tmp_path / "run", *more)
+        codes, texts = on_ranks(main, args, folder=tmp_path, restarts=restarts, store=store)
         assert codes == [1, 1] and not (tmp_path / "run").exists()
         assert len(complaints(texts)) == 1 and said in complaints(texts)[0]
 
 
 def test_ranks_that_differ(tmp_path):
-    each = [(command(tmp_path / "run"),), (command(tmp_path / "run", "--seed", "1"),)]
-    codes, texts = on_ranks(main, folder=tmp_path, each=each)
+    arguments = [(command(tmp_path / "run"),), (command(tmp_path / "run", "--seed", "1"),)]
+    codes, texts = on_ranks(main, folder=tmp_path, each=arguments)
     assert codes == [1, 1] and not (tmp_path / "run").exists()
     assert complaints(texts) == ["voronerf: error: --seed must be the same on all ranks, got 0 on 0 and 1 on 1"]
 
@@ -203,42 +203,42 @@ def test_a_training_learns(whole):
     index = load_checkpoint(checkpoint_path(whole))
     assert index.values["parts"][0]["networks"] and index.tensors["bounds"].shape == (3, 2, 3)
     for path in network_files(whole):
-        found = load_checkpoint(path)
-        assert found.values["step"] == 24 and found.values["skipped"] == 0
-        assert any(bool(t.any()) for name, t in found.tensors.items() if name.endswith("exp_avg"))
-        assert torch.isfinite(found.tensors["router.module.features"]).all()
+        checkpoint = load_checkpoint(path)
+        assert checkpoint.values["step"] == 24 and checkpoint.values["skipped"] == 0
+        assert any(bool(t.any()) for name, t in checkpoint.tensors.items() if name.endswith("exp_avg"))
+        assert torch.isfinite(checkpoint.tensors["router.module.features"]).all()
 
 
 def build_some(out, steps, count=3, **more):
-    """Small territories in this process."""
+    """Builds small territories in this process."""
     options = ("levels=4", "log2_entries=10")
-    given = {"width": 8, "rays": 24, "cells": (2,), "split_at": (0.85,), "field_options": options, **more}
-    config = TrainConfig(steps=steps, out=out, lpips=False, **given)
+    settings = {"width": 8, "rays": 24, "cells": (2,), "split_at": (0.85,), "field_options": options, **more}
+    config = TrainConfig(steps=steps, out=out, lpips=False, **settings)
     scene = builtin_scene(16, train_views=9, test_views=1)
     return train.build_town(config, scene, count, group.Group(torch.device("cpu")))
 
 
 @pytest.mark.slow
 def test_parts_of_steps_are_replayed(tmp_path, monkeypatch):
-    """With the same bits as steps that run as they are, beyond a split and looks at empty space."""
-    found = []
+    """Replayed parts of steps give the same bits as eager steps, also after a split and occupancy updates."""
+    results = []
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
     for expected in ("recorded and replayed", "a test"):
-        if found:
+        if results:
             monkeypatch.setattr(TrainingStep, "_standing_obstacle", lambda *of, **how: "a test")
         town = build_some(tmp_path / expected, 60)
         train.train(town)
-        found.append([v for state in town.states.values() for v in snapshot(state).tensors.values()])
+        results.append([v for state in town.states.values() for v in snapshot(state).tensors.values()])
         for state in town.states.values():
             assert expected in state.training_step.explain()
             assert "another segment" not in state.training_step.explain()
-            replayed = {name for name, each in state.training_step._segments.items() if each.replayed}
-            assert replayed >= ({"own rays: networks", "own rays: gradients beside 0"} if len(found) == 1 else set())
-    assert all(one.equal(other) for one, other in zip(*found, strict=True))
+            replayed = {name for name, segment in state.training_step._segments.items() if segment.replayed}
+            assert replayed >= ({"own rays: networks", "own rays: gradients beside 0"} if len(results) == 1 else set())
+    assert all(one.equal(other) for one, other in zip(*results, strict=True))
 
 
 def test_a_start_that_failed_begins_again(tmp_path, monkeypatch):
-    """Of all territories here; light that rays meet in others counts, too."""
+    """All territories restart if none learns; light from other territories counts as learnt."""
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
     monkeypatch.setattr("voronerf.app.train.start.JUDGED", 30)
     town, said = build_some(tmp_path, 70), []
@@ -259,7 +259,7 @@ def test_photographs_have_a_robust_loss(tmp_path):
     for robust in (0.0, 0.05):
         town = build_some(tmp_path / str(robust), 1)
         for state in town.states.values():
-            assert state.ray_loss.robust == 0  # of pictures that are computed
+            assert state.ray_loss.robust == 0  # computed pictures
             state.ray_loss.robust = robust
         train.train(town)
         losses.append([state.loss for state in town.states.values()])
@@ -267,8 +267,8 @@ def test_photographs_have_a_robust_loss(tmp_path):
 
 
 def test_one_territory_is_an_ordinary_training(tmp_path):
-    """Recorded as a whole; one that was stopped goes on to the same bits."""
-    found = []
+    """A single territory records whole steps; a stopped and resumed training gives the same bits."""
+    results = []
     for stops in (False, True):
         town = build_some(tmp_path / str(stops), 30, count=1)
         if stops:
@@ -278,13 +278,13 @@ def test_one_territory_is_an_ordinary_training(tmp_path):
             train.resume(town)
         train.train(town)
         assert "recorded and replayed" in town.first.training_step.explain()
-        found.append(snapshot(town.first))
-    assert found[1].values["step"] == 30
-    assert all(found[0].tensors[name].equal(tensor) for name, tensor in found[1].tensors.items())
+        results.append(snapshot(town.first))
+    assert results[1].values["step"] == 30
+    assert all(results[0].tensors[name].equal(tensor) for name, tensor in results[1].tensors.items())
 
 
 def test_one_territory_of_photographs_is_an_ordinary_training(tmp_path):
-    """With points of a sparse model and rays that no picture shows, to the bit."""
+    """A single territory trains as without territories, bit for bit, with sparse points and unseen rays."""
     computed, points = builtin_scene(16, train_views=9, test_views=1), SparseDepth(torch.arange(60), torch.ones(60))
     views = replace(computed.train, images=computed.train.images[..., :3].contiguous(), sparse_depth=points)
     scene = replace(computed, train=views, box=None, background=None, kind="unbounded")
@@ -295,8 +295,8 @@ def test_one_territory_of_photographs_is_an_ordinary_training(tmp_path):
     assert alone.batches.unseen > 0 and kinds == ["SparseDepth", "SmoothDepth", "Surface"]
     train.train(town)
     train_alone(alone)
-    found, expected = snapshot(town.first).tensors, snapshot(alone).tensors
-    assert found.keys() == expected.keys() and all(found[name].equal(expected[name]) for name in expected)
+    result, expected = snapshot(town.first).tensors, snapshot(alone).tensors
+    assert result.keys() == expected.keys() and all(result[name].equal(expected[name]) for name in expected)
 
 
 class Stops(Callback):

@@ -9,7 +9,7 @@ __all__ = ["Run", "open_run"]
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for, as those of the library."""
+    """Imports a public name on its first use."""
     if name not in __all__:
         raise AttributeError(f"module 'voronerf.app' has no attribute {name!r}")
     from voronerf.app import run

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic writes, locks and JSON files."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from typing import Any
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Writes a file atomically: a reader, or a crash at any moment, leaves the old content or the new, never a part.
+    """Writes a file atomically: after a crash, and for any reader, it has either the old or the new content.
 
     Raises:
-        OSError: When the disk is full or the folder cannot be written; it names the file, whose old content is then
-            untouched.
+        OSError: When the disk is full or the folder cannot be written; the error names the file, and the old content
+            stays.
     """
-    # A short name, since that of the file may be as long as the file system takes; each thread has its own.
+    # A short name, since the file's name may have the maximum length; it is unique for each thread.
     partial = path.with_name(f".{os.getpid()}-{threading.get_native_id()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             partial.unlink(missing_ok=True)
-            with open(partial, "xb") as file:  # which follows no link that lies there
+            with open(partial, "xb") as file:  # mode x follows no existing link
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
@@ -40,9 +40,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def rename(old: Path, new: Path) -> None:
-    """Renames a file, in the place of another where there is one, so that a power failure does not undo it."""
+    """Renames a file, replacing any existing one, so that a power failure does not undo the change."""
     os.replace(old, new)
-    if os.name == "posix":  # elsewhere a folder cannot be opened
+    if os.name == "posix":  # other systems cannot open a folder
         folder = os.open(new.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -52,92 +52,94 @@ def rename(old: Path, new: Path) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, busy: Callable[[], None]) -> Iterator[None]:
-    """Locks a folder against other processes; without effect on Windows, and on file systems without locks.
+    """Locks a folder against other processes; has no effect on Windows and on file systems without locks.
 
     Args:
-        folder: Which is there.
-        busy: Called where another process holds the lock, which is waited for unless this raises an error.
+        folder: An existing folder.
+        busy: Function that is called if another process holds the lock; unless it raises an error, the lock is awaited.
     """
     if sys.platform == "win32":
         yield
         return
     import fcntl
 
-    number = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
         try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             busy()
-            fcntl.flock(number, fcntl.LOCK_EX)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
         except OSError:
-            pass  # no locks here
+            pass  # the file system has no locks
         yield
     finally:
-        os.close(number)
+        os.close(descriptor)
 
 
 def leads_outside(path: Path, folder: Path) -> bool:
-    """Whether a path leaves a folder, as it is written (``..``, another root) or through a link."""
-    return any(not Path(of(path)).is_relative_to(of(folder)) for of in (os.path.abspath, os.path.realpath))
+    """Returns whether a path leaves a folder, by its text (``..``, another root) or through a link."""
+    return any(not Path(full(path)).is_relative_to(full(folder)) for full in (os.path.abspath, os.path.realpath))
 
 
 def cache_folder() -> Path:
-    """The folder of files that can be made again: VORONERF_CACHE, or `voronerf` in the user's folder of caches."""
+    """Returns the cache folder: VORONERF_CACHE, or `voronerf` in the user's caches."""
     return Path(
         os.environ.get("VORONERF_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "voronerf"
     ).expanduser()
 
 
 def private_folder(path: Path) -> Path:
-    """Makes a folder that its user alone may enter, and returns it; the folders above are made too.
+    """Makes a folder that only its user may enter, with its parents, and returns it.
 
     Raises:
-        OSError: When it cannot be made, or when what lies there is another user's, or a link that others may have laid.
+        OSError: When the folder cannot be made, belongs to another user, or is a link, which another user may have
+            made.
     """
     path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    there = path.lstat()
-    if hasattr(os, "getuid") and (there.st_uid != os.getuid() or not stat.S_ISDIR(there.st_mode)):
+    status = path.lstat()
+    if hasattr(os, "getuid") and (status.st_uid != os.getuid() or not stat.S_ISDIR(status.st_mode)):
         raise PermissionError(errno.EPERM, "must be a folder of your own; set VORONERF_CACHE to another", str(path))
     return path
 
 
 def remove_partial(folder: Path) -> None:
-    """Removes what processes that died left of files that they wrote below a folder."""
+    """Removes partial files of interrupted processes below a folder."""
     for partial in folder.rglob(".*.partial"):
         partial.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
-    """:func:`write_bytes` for text."""
+    """Writes a text file atomically, by :func:`write_bytes`."""
     write_bytes(path, text.encode())
 
 
 def json_text(value: Any, *, indent: int | None = None) -> str:
-    """A value as JSON, which has no infinity and no NaN: they become null, and the object that holds them tells which
-    by ``"not_finite": {"psnr": "inf"}``."""
+    """Returns a value as JSON; infinity and NaN become null, and their object gets an entry such as
+    ``"not_finite": {"psnr": "inf"}``."""
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
-        odd = {key: str(x) for key, x in value.items() if isinstance(x, float) and not math.isfinite(x)}
-        return {key: _finite(x) for key, x in value.items()} | ({"not_finite": odd} if odd else {})
+        not_finite = {key: str(x) for key, x in value.items() if isinstance(x, float) and not math.isfinite(x)}
+        return {key: _finite(x) for key, x in value.items()} | ({"not_finite": not_finite} if not_finite else {})
     if isinstance(value, (list, tuple)):
         return [_finite(x) for x in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-#: Bytes of a JSON file; parsed, it takes some twenty times its size. A frame of a capture takes about a kilobyte.
+#: The largest size of a JSON file in bytes; parsing takes about twenty times this memory. A frame of a capture has
+#: about a kilobyte.
 JSON_LIMIT = 2**25
 
 
 def read_json(path: Path) -> Any:
-    """The contents of a JSON file.
+    """Returns the contents of a JSON file.
 
     Raises:
-        ValueError: When it is too large or no JSON; names the file.
-        OSError: When it cannot be read.
+        ValueError: When the file is too large or not JSON; the message names the file.
+        OSError: When the file cannot be read.
     """
     with open(path, "rb") as file:
         data = file.read(JSON_LIMIT + 1)
@@ -151,10 +153,10 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """The value of JSON text.
+    """Returns the value of JSON text.
 
     Raises:
-        ValueError: When it is no JSON, or is nested deeper than Python reads.
+        ValueError: When the text is not JSON, or is nested too deeply for Python.
     """
     try:
         return json.loads(text)
@@ -163,10 +165,10 @@ def parse_json(text: str) -> Any:
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a file with one JSON object a line; [] when there is no file.
+    """Returns the objects of a file with one JSON object per line; [] if there is no file.
 
     Raises:
-        ValueError: When a line is no JSON object; names the file and the line.
+        ValueError: When a line is not a JSON object; the message names the file and the line.
     """
     if not path.is_file():
         return []

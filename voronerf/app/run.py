@@ -1,4 +1,4 @@
-"""A trained run, opened from its directory to be rendered and scored."""
+"""A trained run, opened from its directory for rendering and scoring."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.renderer import RenderedImage, Renderer
 from voronerf.nerf.samplers import Occupancy
 
-#: File of a run's crop: the lowest and the highest corner.
+#: The file of a run's crop box, with its lowest and highest corner.
 CROP = "crop.json"
-#: The rule of a box.
+#: The rule for boxes, for error messages.
 BOX = "x y z of a corner and of a larger one"
 
 
 class HasCells(Protocol):
-    """A field with cells, such as a router."""
+    """A field with Voronoi cells, such as a router."""
 
     @property
     def diagram(self) -> VoronoiDiagram:
-        """The cells."""
+        """The Voronoi diagram of the cells."""
         ...
 
     def assign(self, positions: Tensor) -> Tensor:
-        """The cells int32 [n] of positions [n, 3]."""
+        """Returns the cells int32 [n] of positions [n, 3]."""
         ...
 
 
@@ -51,11 +51,11 @@ class Run:
     """A trained run, which :func:`open_run` opens.
 
     Attributes:
-        path: Its directory.
-        config: The settings it was trained with; ``data`` and ``downscale`` are those of ``scene``.
-        scene: Images and cameras, and the space that the field fills.
-        router: The cells of the field.
-        renderer: How rays become colours.
+        path: The run directory.
+        config: The settings of the training, with ``data`` and ``downscale`` of ``scene``.
+        scene: Images and cameras, and the space of the field.
+        router: The field with its cells.
+        renderer: The renderer of the field.
 
     Examples:
         >>> from voronerf.app import Run
@@ -73,31 +73,31 @@ class Run:
 
     @property
     def diagram(self) -> VoronoiDiagram:
-        """The cells of the field."""
+        """The Voronoi diagram of the field's cells."""
         return self.router.diagram
 
     def cropped(self, box: Tensor | Sequence[Sequence[float]]) -> Run:
-        """This run, of which only what lies in a box [2, 3] is rendered.
+        """Returns a copy of this run that renders only inside a box [2, 3].
 
         Raises:
-            ConfigError: The box is empty or not finite.
+            ConfigError: If the box is empty or not finite.
         """
         return replace(self, scene=replace(self.scene, box=_box(box, "--crop")))
 
     def render(self, camera: int | Cameras, index: int = 0, *, heaviest: bool = True) -> RenderedImage:
-        """Renders a picture, without gradients and without randomness.
+        """Renders a picture, deterministically and without gradients.
 
         Args:
             camera: The number of a test view, or cameras of any kind.
-            index: Which of several cameras.
-            heaviest: Also find the place that each pixel shows, which takes a little longer.
+            index: The number of the camera in ``camera``.
+            heaviest: Also find the heaviest sample of each pixel's ray, which takes slightly longer.
 
         Returns:
-            Colour [h, w, 3] over the scene's background, opacity [h, w], depth [h, w] in scene units, and the heaviest
-            sample [h, w, 3] of each pixel's ray.
+            Colour [h, w, 3] over the scene's background, opacity [h, w], depth [h, w] in scene units, and the position
+            [h, w, 3] of the heaviest sample of each pixel's ray.
 
         Raises:
-            IndexError: If there is no such camera.
+            IndexError: If there is no camera with this number.
         """
         cameras, index = (self.scene.test.cameras, camera) if isinstance(camera, int) else (camera, index)
         if not 0 <= index < len(cameras):
@@ -105,10 +105,10 @@ class Run:
         return render_camera(self.renderer, self.scene, cameras, index, heaviest=heaviest)
 
     def find_lpips(self, weights: Path | str | None = None) -> tuple[Lpips | None, str]:
-        """The LPIPS network for the images of this run, or None; and where it was found, or why it was not.
+        """Returns the LPIPS network for the images of this run, or None, and a line on its source or its absence.
 
         Args:
-            weights: A file or folder, or "off"; None searches as in training, see ``TrainConfig.lpips``.
+            weights: A file or folder of weights, or "off"; None searches as in training, see ``TrainConfig.lpips``.
         """
         if weights is None:
             check_stored_paths(self.path, lpips=self.config.lpips)
@@ -118,16 +118,16 @@ class Run:
     def evaluate(
         self, *, views: int | None = None, lpips: Lpips | Path | str | None = None, track: Track = in_silence
     ) -> dict[str, Any]:
-        """Scores of the test views, and their means.
+        """Scores the test views.
 
         Args:
-            views: Number of test views, evenly spread; None for all.
-            lpips: The network, or the weights for :meth:`find_lpips`.
-            track: Shows progress: yields the items of a sequence, and is given its name.
+            views: Number of test views, evenly spaced; None for all.
+            lpips: The LPIPS network, or the weights for :meth:`find_lpips`.
+            track: Function that shows progress: it yields the items of a sequence, and takes the sequence's name.
 
         Returns:
-            "psnr" in dB, "ssim", "lpips" (None without its weights) and "psnr_of_mean_error" over all views, and
-            "views", a list with "name", "psnr", "ssim" and "lpips" of each.
+            A dict with the mean "psnr" in dB, "ssim" and "lpips" (None without weights), "psnr_of_mean_error", and
+            "views", a list with "name", "psnr", "ssim" and "lpips" of each view.
         """
         if not isinstance(lpips, Lpips):
             lpips, _ = self.find_lpips(lpips)
@@ -136,25 +136,25 @@ class Run:
 
 
 def read_crop(folder: Path) -> Tensor | None:
-    """The box [2, 3] that the viewer has saved in a run directory, or None."""
+    """Returns the crop box [2, 3] that the viewer has saved in a run directory, or None."""
     file = folder / CROP
     return _box(read_json(file), str(file)) if file.is_file() else None
 
 
 def write_crop(folder: Path, box: Tensor) -> None:
-    """Saves a box [2, 3] in a run directory, for ``--crop saved``."""
+    """Saves a crop box [2, 3] in a run directory, for ``--crop saved``."""
     write_text(folder / CROP, json_text(box.tolist()) + "\n")
 
 
 def _box(value: Any, where: str) -> Tensor:
-    """A box float32 [2, 3], the lowest and the highest corner."""
+    """Returns a box float32 [2, 3], lowest and highest corner, after checking it."""
     try:
         box = torch.as_tensor(value, dtype=torch.float32).cpu()
     except (TypeError, ValueError, RuntimeError):
         box = torch.empty(0)
     if box.shape != (2, 3) or not bool(box.isfinite().all()) or not bool((box[0] < box[1]).all()):
-        got = value.flatten().tolist() if isinstance(value, Tensor) else value
-        raise ConfigError(f"{where} must be {BOX}, got {as_typed(got):.200}")
+        actual = value.flatten().tolist() if isinstance(value, Tensor) else value
+        raise ConfigError(f"{where} must be {BOX}, got {as_typed(actual):.200}")
     return box
 
 
@@ -166,7 +166,7 @@ def shown_scene(
     downscale: int | None,
     allow_outside: bool,
 ) -> tuple[TrainConfig, Scene]:
-    """The settings of a run with what :func:`open_run` was given, and the scene, loaded where it was not given."""
+    """Returns a run's settings with the arguments of :func:`open_run`, and the scene, which is loaded if it is None."""
     if scene is None and data is None:
         check_stored_paths(path, data=config.data)
     config = replace(
@@ -193,25 +193,25 @@ def open_run(
 ) -> Run:
     """Opens a run that ``voronerf train`` has written.
 
-    On the CPU the networks are pages of the checkpoint's file: the system reads them when they are needed.
+    On the CPU, the networks are mapped from the checkpoint's file: the system reads their pages on first use.
 
     Args:
         path: The run directory.
         scene: The scene, if it is loaded already.
-        data: Scene folder; None for that of the training, if the user named it there, or it lies in the run directory,
-            the working directory or ``VORONERF_DATA``, since a run may be another person's.
-        downscale: Factor on the images; None for that of the training.
+        data: Scene folder; None for the folder of the training. Since a run may be another person's, the latter must
+            lie in the run directory, the working directory or ``VORONERF_DATA``, or the user must have named it once.
+        downscale: Downscale factor of the images; None for the factor of the training.
         allow_outside: Also read images that lie outside of the scene folder.
-        samples: Samples per ray of each pass; None for those of the training.
+        samples: Samples per ray of each pass; None for the numbers of the training.
         occupancy: Skip empty space, found by evaluating the field once. A run trained with occupancy always uses its
-            own grid, because its field has learnt nothing about empty space.
-        device: As for `--device`, such as "cpu", "cuda:0" or "auto".
+            own grid, because its field has learnt nothing in empty space.
+        device: The device, such as "cpu", "cuda:0" or "auto".
         backend: Backend of the operations.
 
     Raises:
         CheckpointError: If there is no usable checkpoint.
-        ConfigError: For an argument that cannot be used, occupancy for a run that cannot use a grid, a scene that
-            must be given, or a folder of the run that is a link to elsewhere.
+        ConfigError: For an unusable argument, occupancy for a run that cannot use a grid, a scene folder that must be
+            given, or a subfolder of the run that is a link out of it.
         SceneError: If the scene cannot be read.
 
     Examples:
@@ -251,8 +251,8 @@ def open_run(
     elif occupancy:
         grid = make_picture_grid(config, scene, renderer)
     if grid is not None:
-        sampler, chosen = renderer.sampler, None if samples is None else samples[0]
+        sampler, picture_samples = renderer.sampler, None if samples is None else samples[0]
         renderer.sampler = Occupancy(
-            grid, sampler.samples, picture_samples=chosen, space=sampler.space, backend=sampler.backend
+            grid, sampler.samples, picture_samples=picture_samples, space=sampler.space, backend=sampler.backend
         )
     return Run(path, config, scene, routers["field"], renderer)

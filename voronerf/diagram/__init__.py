@@ -1,4 +1,4 @@
-"""Voronoi diagrams of space: nested look-up, balancing, subdivision, and the kept samples."""
+"""Voronoi diagrams of space: nested look-up, balancing, subdivision, and a reservoir of samples."""
 
 from voronerf.diagram.balance import Balance, balance, imbalance, uniform_centres
 from voronerf.diagram.reservoir import SampleReservoir

@@ -2,8 +2,8 @@
 
 Letters: m samples, k centres, d coordinates (1 to 4), W [k] the total importance of the samples in each cell.
 
-Source: Elsner et al. 2023, "Adaptive Voronoi NeRFs", section 3.2. The figure of merit is the paper's: the standard
-deviation (of the population: divided by k, not k - 1) of `W / max W`; 0 is perfect balance.
+Source: Elsner et al. 2023, "Adaptive Voronoi NeRFs", section 3.2. The figure of merit is the paper's: the population
+    standard deviation (divided by k, not k - 1) of `W / max W`; 0 is perfect balance.
 
 Everything runs on the CPU in a fixed order, so the same samples and the same generator give the same diagram on every
 machine. For ten thousand samples a GPU would not help. Coordinates are in scene units.
@@ -19,8 +19,8 @@ from torch import Tensor
 from voronerf import ops
 from voronerf.ops._core import backends
 
-_STEPS = 200  # of Lloyd's iteration at most
-_TOLERANCE = 1e-5  # it ends when a step lowers the energy by less than this part of it
+_STEPS = 200  # most steps of Lloyd's iteration
+_TOLERANCE = 1e-5  # the iteration ends when a step lowers the energy by less than this fraction
 
 CENTRES = ("balanced", "random", "uniform", "centroidal")
 
@@ -31,10 +31,10 @@ class Balance:
 
     Attributes:
         centres: float32 [k, d], on the device of the samples.
-        before: float64 [k], importance of each cell with the first centres.
-        after: float64 [k], importance of each cell with the returned centres.
-        imbalance_before: std(W / max W) of `before`.
-        imbalance_after: std(W / max W) of `after`.
+        before: float64 [k], the importance of each cell with the first centres.
+        after: float64 [k], the importance of each cell with the returned centres.
+        imbalance_before: the figure of merit, std(W / max W), of `before`.
+        imbalance_after: the figure of merit, std(W / max W), of `after`.
 
     Examples:
         >>> import torch
@@ -54,10 +54,10 @@ class Balance:
 
 
 def imbalance(weights: Tensor) -> float:
-    """The population standard deviation of `W / max W` over the cells, the paper's figure of merit.
+    """Returns the population standard deviation of `W / max W` over the cells, the paper's figure of merit.
 
     Args:
-        weights: [k] importance per cell, k >= 1, at least one of them positive.
+        weights: the importance of each cell, [k], k >= 1, at least one positive.
 
     Raises:
         ValueError: wrong shape, or no positive value.
@@ -79,7 +79,7 @@ def imbalance(weights: Tensor) -> float:
 
 
 def cell_weights(cells: Tensor, importance: Tensor, k: int) -> Tensor:
-    """float64 [k]: the total importance of the samples in each cell, added up in the order of the samples."""
+    """Returns the total importance of the samples in each cell, float64 [k], summed in the order of the samples."""
     return torch.bincount(cells, weights=importance.double(), minlength=k)
 
 
@@ -95,24 +95,24 @@ def balance(
 ) -> Balance:
     """Places k centres so that their Voronoi cells hold equal importance.
 
-    Balanced centres begin as random ones and make `steps` updates, of all centres i at once,
+    Balanced centres start at random samples. Each of `steps` updates moves all centres i at once,
 
         v_i <- v_i + 0.05 * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i,
 
     where N(i) are the 8 closest centres (all others if there are fewer), and `norm_i` is the largest W of i and N(i).
     Light cells move towards heavy neighbours, and heavy cells away from light ones. Each update compares all pairs of
-    centres: balanced centres are for some hundreds of cells.
+    centres, so balanced centres suit up to some hundreds of cells.
 
     Args:
         points: floating [m, d], finite.
         importance: floating [m], finite, >= 0, not all 0.
-        k: number of cells, 1 <= k <= number of distinct points.
-        centres: "balanced", as published; "centroidal": the centroids of their cells, weighted by importance, which
-            makes compact cells of unequal importance (Du, Faber and Gunzburger 1999); or, not moved, "random":
-            distinct samples, all equally likely, or "uniform": `uniform_centres` over the bounding box of the samples.
-        steps: number of updates of balanced centres.
+        k: the number of cells, 1 <= k <= number of distinct points.
+        centres: "balanced", as published; "centroidal", the centroids of their cells, weighted by importance, which
+            makes compact cells of unequal importance (Du, Faber and Gunzburger 1999); "random", distinct samples, all
+            equally likely; or "uniform", `uniform_centres` over the bounding box of the samples.
+        steps: the number of updates of balanced centres.
         generator: CPU generator of the draws; None for torch's global one.
-        backend: of the ops, see `voronerf.ops._core.backends`.
+        backend: the backend of the ops, see `voronerf.ops._core.backends`.
 
     Raises:
         ValueError: a wrong shape, an unknown choice, a value that is not finite, a negative importance, no importance
@@ -168,14 +168,14 @@ def balance(
 
 
 def first_centres(samples: Tensor, masses: Tensor, k: int, centres: str, generator: torch.Generator | None) -> Tensor:
-    """float32 [k, d] first centres from CPU samples float32 [m, d] of masses [m], which centroidal ones follow."""
+    """Chooses first centres, float32 [k, d], from CPU samples float32 [m, d]; centroidal ones by masses [m]."""
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)
     if k > distinct.shape[0]:
         raise ValueError(f"balance: k must be at most the number of distinct points, {distinct.shape[0]}, got {k}")
     if centres == "uniform":
         return uniform_centres(torch.stack([samples.amin(0), samples.amax(0)]), k)
     # Sorting exponential variates divided by the weights draws without replacement in proportion to the weights
-    # (Efraimidis and Spirakis 2006). Of several samples in one place only the first counts, because two centres in one
+    # (Efraimidis and Spirakis 2006). Only the first of several samples in one place counts, because two centres in one
     # place would make an empty cell.
     keys = torch.empty(samples.shape[0], dtype=torch.float64).exponential_(generator=generator)
     order = torch.argsort(keys / masses if centres == "centroidal" else keys, stable=True)
@@ -185,7 +185,7 @@ def first_centres(samples: Tensor, masses: Tensor, k: int, centres: str, generat
 
 
 def uniform_centres(box: Tensor, k: int) -> Tensor:
-    """k centres spread evenly over a box, as close to a regular grid as k allows (the paper's "uniform" ablation).
+    """Spreads k centres evenly over a box, as close to a regular grid as k allows (the paper's "uniform" ablation).
 
     The box is cut across its longest side: into 2 equal parts if k is even, into 3 if k is divisible by 3, otherwise
     into 2 parts in proportion to their numbers of centres. Each part is cut in the same way, until it holds one centre,
@@ -194,7 +194,7 @@ def uniform_centres(box: Tensor, k: int) -> Tensor:
 
     Args:
         box: floating [2, d], lowest and highest corner; flat boxes are allowed.
-        k: number of centres, >= 1.
+        k: the number of centres, >= 1.
 
     Returns:
         [k, d] in the dtype and on the device of `box`.
@@ -243,12 +243,12 @@ def uniform_centres(box: Tensor, k: int) -> Tensor:
 
 
 def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
-    """Centres that are the centroids of their Voronoi cells, so that cells are compact.
+    """Moves centres to the centroids of their Voronoi cells, so that cells are compact.
 
-    They lower the energy E = sum_j m_j min_i |x_j - v_i|^2 of samples x_j of mass m_j by Lloyd's iteration: samples go
-    to the nearest centre, and centres to the centroids of their samples (Du, Faber and Gunzburger 1999, section 5; with
-    masses, section 2). A centre without mass in its cell is moved to the sample with the largest share
-    `m_j |x_j - v|^2` of the energy; it stays where it is if that is 0.
+    Lloyd's iteration lowers the energy E = sum_j m_j min_i |x_j - v_i|^2 of samples x_j of mass m_j: samples go to the
+    nearest centre, and centres to the centroids of their samples (Du, Faber and Gunzburger 1999, section 5; with
+    masses, section 2). A centre without mass in its cell is moved to the sample x_j with the largest share of the
+    energy; it stays in place if this share is 0.
     """
     k = centres.shape[0]
     precise, energy = samples.double(), float("inf")
@@ -273,8 +273,10 @@ def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "a
 
 
 def check_samples(op: str, points: Tensor, importance: Tensor) -> None:
-    """Raises ValueError or TypeError unless points [m, d] and importance [m] are finite, floating-point, and the latter
-    >= 0."""
+    """Raises ValueError or TypeError unless points [m, d] and importance [m] are finite and floating-point.
+
+    Raises ValueError for a negative importance too.
+    """
     if points.dim() != 2 or not 1 <= points.shape[1] <= 4:
         raise ValueError(f"{op}: points must have shape [m, d], d = 1 to 4, got {list(points.shape)}")
     if tuple(importance.shape) != (points.shape[0],):
@@ -289,11 +291,11 @@ def check_samples(op: str, points: Tensor, importance: Tensor) -> None:
 
 
 def in_space(points: Tensor) -> Tensor:
-    """Points [n, d] of 1 to 3 coordinates as the operations take them, [n, 3]: zeros change no distance."""
+    """Pads points [n, d], d = 1 to 3, with zeros to [n, 3] for the operations; distances stay the same."""
     d = points.shape[1]
     return points if d == 3 else torch.nn.functional.pad(points, (0, 3 - d))
 
 
 def in_torch(op: str, points: Tensor) -> Callable[..., Any]:
-    """The reference of an operation, which takes points of any number of coordinates."""
+    """Returns the reference of an operation, which takes points of any number of coordinates."""
     return backends.resolve(op, backend="reference", device=points.device, dtype=points.dtype)

@@ -1,4 +1,4 @@
-"""Leaves of a tree of diagrams drawn by their distances. n points, m centres of all diagrams together, g diagrams."""
+"""Draws leaves of a tree of diagrams at random by distances. n points, m centres of all diagrams, g diagrams."""
 
 from __future__ import annotations
 
@@ -8,30 +8,40 @@ from torch import Tensor
 from voronerf.ops.formulas import in_pieces
 
 _PIECE = {"cpu": 1 << 17}
-"""Distances held at a time on a device: what a core's second-level cache holds."""
+"""The most distances that a device holds at a time; on a CPU, they fit in a core's second-level cache."""
 _LARGE_PIECE = 1 << 22
-"""The same on other devices, where few launches count."""
+"""The most distances on other devices, where few launches matter more."""
 
 
 @torch.no_grad()
 def draw_cell(
     points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, uniforms: Tensor, temperature: float
 ) -> Tensor:
-    """A leaf for every point, drawn at random by its distances to the centres, level by level.
+    """Draws a leaf for every point at random, by its distances to the centres, level by level.
 
-    On each level the first centre is drawn up to which the probabilities sum to at least 1 - u, u being the uniform
-    number of the point for that level: uniforms [n, levels], in 0 to 1 (NaN counts as 0). A point that is not finite,
-    or whose squared distances overflow, goes to the first centre on every level. Points are float32 or float64 [n, 3],
-    the tree is as in `ops.locate_cell`, the temperature is positive and finite, in scene units. Leaves are int32 [n].
+    On each level, the drawn centre is the first one up to which the probabilities sum to at least 1 - u, where u is the
+    point's uniform number of the level. A point that is not finite, or whose squared distances overflow, goes to the
+    first centre on every level.
+
+    Args:
+        points: float32 or float64 [n, d].
+        centres: The centres [m, d] of the tree, as in `ops.locate_cell`.
+        child_offsets: int32 [g + 1], as in `ops.locate_cell`.
+        child: int32 [m], as in `ops.locate_cell`.
+        uniforms: Uniform numbers [n, levels] in 0 to 1; NaN counts as 0.
+        temperature: The temperature in scene units, positive and finite.
+
+    Returns:
+        int32 [n] leaf numbers.
     """
-    # Neither 0 nor infinite in float32: the nearest centre's mass is 1 at any temperature.
+    # The bounds keep it positive and finite in float32, so the nearest centre's mass is 1 at any temperature.
     temperature = min(max(temperature, 1e-37), 3e38)
     table = torch.arange(centres.shape[0], dtype=torch.int32, device=centres.device)
     owner = torch.searchsorted(child_offsets, table, right=True) - 1
 
     def run(points: Tensor, uniforms: Tensor) -> Tensor:
         distance = (points[:, None] - centres).square().sum(2).sqrt()
-        # How much of the distribution the drawn centre and those before it must hold: more than nothing, at most all.
+        # The share of the distribution that the drawn and all earlier centres must hold, in (0, 1].
         wanted = (1 - uniforms.nan_to_num(0.0)).clamp(torch.finfo(torch.float32).eps / 2, 1)
         # `state` is the diagram a point is in, or (negative) the leaf it has reached.
         state = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
@@ -40,8 +50,8 @@ def draw_cell(
             nearest = distance.masked_fill(elsewhere, torch.inf).amin(1, keepdim=True)
             # Infinity and NaN have no mass.
             mass = ((nearest - distance) / temperature).exp().masked_fill(elsewhere, 0).nan_to_num(0.0)
-            # A device sums as a tree, each place with roundings of its own: a sum may be below the one before it, and
-            # the last above that at the last centre with mass. Of those with mass the first counts that has enough.
+            # A device sums as a tree with a different rounding at each place. A sum may be below the previous sum, and
+            # the last sum above the sum at the last centre with mass. So only centres with mass are candidates.
             sums = mass.cumsum(1).masked_fill(mass == 0, 0)
             total = sums.amax(1, keepdim=True)
             drawn = (sums >= wanted[:, level, None] * total).to(torch.uint8).argmax(1)

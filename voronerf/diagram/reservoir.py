@@ -1,8 +1,8 @@
-"""Keeps the samples at which the picture is still wrong.
+"""Keeps the samples with the largest errors of the picture.
 
 The importance of a sample is `w * E(r)`: its contribution to its ray times the squared error of the colour of the ray
-(Elsner et al. 2023, section 3.1). About 10,000 samples an epoch are kept: the heaviest of every batch, the same number
-from each, so that no batch counts more than another.
+(Elsner et al. 2023, section 3.1). About 10,000 samples an epoch are kept: the same number of the heaviest samples from
+every batch, so that all batches count equally.
 """
 
 from collections.abc import Mapping
@@ -16,17 +16,17 @@ from voronerf.ops.keep_heaviest import keep_heaviest
 class SampleReservoir:
     """The heaviest samples of the last `batches` batches.
 
-    Every batch gives its `quota = ceil(capacity / batches)` heaviest samples, or all it has if they are fewer. At most
-    `batches * quota` samples of d coordinates are held; then each new batch replaces the oldest one. Samples with an
-    importance of 0, or with a position or importance that is not finite, are not kept; such a position leaves its place
-    among the heaviest empty.
+    Every batch gives its `quota = ceil(capacity / batches)` heaviest samples, or all of its samples if they are fewer.
+    At most `batches * quota` samples of d coordinates are held; then each new batch replaces the oldest batch. Samples
+    with an importance of 0, or with a position or importance that is not finite, are not kept. A heavy sample with a
+    position that is not finite still counts towards the quota.
 
     `add` reads no device value on the host, so the host of a training loop can run ahead of its GPU.
 
     Attributes:
-        capacity: number of samples asked for.
-        batches: number of batches that share it: those of one epoch, or of the time between two subdivisions.
-        quota: samples kept of each batch.
+        capacity: the requested number of samples.
+        batches: the number of batches that share the capacity: the batches of one epoch, or between two subdivisions.
+        quota: the number of samples kept of each batch.
 
     Examples:
         >>> import torch
@@ -44,7 +44,7 @@ class SampleReservoir:
     def __init__(
         self, capacity: int = 10_000, batches: int = 100, *, d: int = 3, device: torch.device | str = "cpu"
     ) -> None:
-        """Makes an empty reservoir for so many samples, of d coordinates and of so many batches.
+        """Makes an empty reservoir of `capacity` samples with d coordinates, for `batches` batches.
 
         Raises:
             ValueError: a number below 1.
@@ -56,7 +56,7 @@ class SampleReservoir:
         self.quota = -(-capacity // batches)
         self._points = torch.zeros(batches, self.quota, d, device=device)
         self._importance = torch.zeros(batches, self.quota, device=device)
-        self._added = torch.zeros(1, dtype=torch.int64, device=device)  # which the op reads, and no host
+        self._added = torch.zeros(1, dtype=torch.int64, device=device)  # the op reads it on the device
 
     @torch.no_grad()
     def add(
@@ -68,15 +68,15 @@ class SampleReservoir:
         ray_index: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
-        """Keeps the heaviest samples of one batch; of equal ones the first.
+        """Keeps the heaviest samples of one batch; among equal importances the first.
 
         Args:
             points: floating [..., d], scene units.
-            importance: floating [...]; any scale, since only ratios count. With ``error`` the weights w, which are
-                multiplied by it.
-            error: floating [r], E of the rays; None for 1.
-            ray_index: int32 [m], the ray of each of m samples; given with ``error``.
-            backend: of the op.
+            importance: floating [...]; any scale, since only ratios count. With ``error``, the weights w, which are
+                multiplied by the ray's error.
+            error: floating [r], the error E of each ray; None for 1.
+            ray_index: int32 [m], the ray of each of m samples; required with ``error``.
+            backend: the backend of the op.
 
         Raises:
             ValueError: shapes that do not match.
@@ -96,8 +96,11 @@ class SampleReservoir:
         keep_heaviest(*kept, points, importance, error=error, ray_index=index, backend=backend)
 
     def samples(self) -> tuple[Tensor, Tensor]:
-        """The kept samples, oldest batch first: points float32 [m, d] and importance float32 [m], all > 0; m = 0 before
-        the first batch."""
+        """Returns the kept samples, oldest batch first; m = 0 before the first batch.
+
+        Returns:
+            Points float32 [m, d], and importance float32 [m], all > 0.
+        """
         added = int(self._added)
         start = added % self.batches if added > self.batches else 0
         importance = self._importance.roll(-start, 0).reshape(-1)
@@ -108,7 +111,7 @@ class SampleReservoir:
         return int((self._importance > 0).sum())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The tensors from which `load_state_dict` restores the reservoir, bit for bit."""
+        """Returns the tensors from which `load_state_dict` restores the reservoir, bit for bit."""
         return {
             "points": self._points.clone(),
             "importance": self._importance.clone(),

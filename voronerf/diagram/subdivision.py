@@ -1,4 +1,4 @@
-"""Splits cells of a diagram by the samples that are still wrong: the first split and every nested one.
+"""Splits cells of a diagram by weighted samples, for the first split and for nested ones.
 
 Letters: m samples, k children of one cell.
 """
@@ -19,9 +19,9 @@ class Split:
     """The result of `split_diagram`.
 
     Attributes:
-        diagram: the refined diagram; the given one if no cell could be split.
-        parents: int64 [num_cells], for each cell of `diagram` the cell of the given diagram that it lies in.
-        balances: for each cell of the given diagram that was split, how its centres were balanced.
+        diagram: the refined diagram; the original diagram if no cell could be split.
+        parents: int64 [num_cells], the original cell in which each cell of `diagram` lies.
+        balances: the result of `balance` for each original cell that was split.
 
     Examples:
         >>> import torch
@@ -50,30 +50,30 @@ def split_diagram(
     backend: str = "auto",
     steps: int = 500,
 ) -> Split:
-    """Splits cells into k each, every cell by the samples that lie in it.
+    """Splits cells into k children each, every cell by the samples that lie in it.
 
     A cell with fewer than `max(k, min_samples)` distinct samples stays as it is, and so do all cells for k = 1. The
     first split starts from a diagram of one cell; its child becomes the root.
 
     Args:
         diagram: a diagram of any depth.
-        points: floating [m, d], the kept samples, finite; d coordinates as the diagram has.
+        points: floating [m, d], the samples, finite; d as in the diagram.
         importance: floating [m], finite, >= 0; samples of importance 0 do not count.
-        k: children of each cell that is split, >= 1.
-        cells: "all"; "worst", the one cell with the largest accumulated importance among those that hold enough
-            samples; or the numbers of the cells to split.
-        min_samples: number of distinct samples that a cell needs to be split.
-        centres: "centroidal", "balanced", "random" or "uniform", see `balance`. Some of the uniform ones may lie
-            outside of their cell and have no samples. "random" and "uniform" are ablations of the paper.
-        generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
-        backend: of the cell queries, see `voronerf.ops._core.backends`.
-        steps: of `balance`.
+        k: the number of children of a split cell, >= 1.
+        cells: "all"; "worst", the cell with the largest total importance among the cells with enough samples; or the
+            numbers of the cells to split.
+        min_samples: the number of distinct samples that a cell needs to be split.
+        centres: "centroidal", "balanced", "random" or "uniform", see `balance`. Uniform centres may lie outside of
+            their cell and have no samples. "random" and "uniform" are ablations of the paper.
+        generator: CPU generator of all draws; None for torch's global one. Cells use it in ascending order.
+        backend: the backend of the cell queries, see `voronerf.ops._core.backends`.
+        steps: the number of steps of `balance`.
 
     Returns:
-        The split. Cells that are too small stay leaves; `balances` has the cells that were split.
+        The split. Cells that are too small stay leaves; `balances` has an entry for each split cell.
 
     Raises:
-        ValueError: samples that `balance` does not accept, an unknown choice, a cell out of range or given twice, or k
+        ValueError: samples that `balance` does not accept, an unknown choice, a cell number out of range or twice, or k
             larger than the number of samples.
         TypeError: points or importance are not floating.
 
@@ -116,8 +116,8 @@ def split_diagram(
     balances: dict[int, Balance] = {}
     for cell in chosen if k > 1 else []:
         inside = leaves == cell
-        members = points[inside], importance[inside], k
-        balances[cell] = balance(*members, centres=centres, steps=steps, generator=generator, backend=backend)
+        arguments = points[inside], importance[inside], k
+        balances[cell] = balance(*arguments, centres=centres, steps=steps, generator=generator, backend=backend)
     refined, parents = diagram.refine({cell: result.centres for cell, result in balances.items()})
     return Split(refined if balances else diagram, parents, balances)
 
@@ -141,13 +141,19 @@ def finer_diagram(
     weights: Tensor | None,
     split: dict[str, Any],
 ) -> tuple[VoronoiDiagram, Tensor]:
-    """The diagram that ``VoronoiRouter.subdivide`` was asked for, and the parents of its cells.
+    """Returns the new diagram of ``VoronoiRouter.subdivide``, and the parents of its cells.
 
-    With a number of children for ``finer`` come points [m, d], their weights [m] or None for 1 each, and options of
-    :func:`split_diagram`; a diagram has parents int64 [new cells], or None for those that hold the new centres.
+    Args:
+        present: The diagram that is refined.
+        finer: The new diagram, or a number of children for each cell.
+        parents: With a diagram, the parent of each new cell, int64 [new cells]; None for the cells that hold the new
+            centres.
+        points: With a number of children, samples [m, d].
+        weights: With a number of children, the weights of the samples, [m]; None for 1 each.
+        split: Options of :func:`split_diagram`.
 
     Raises:
-        ValueError: For parents that do not fit, or points that are missing or too many.
+        ValueError: For parents that do not fit, or for points that are missing or not allowed.
         TypeError: When ``finer`` is neither a diagram nor a number, or ``parents`` are not int64.
     """
     if not isinstance(finer, VoronoiDiagram):
@@ -166,10 +172,10 @@ def finer_diagram(
         result = split_diagram(present, points, weights, finer, **split)
         finer, parents = result.diagram, result.parents
     elif points is not None or weights is not None or split.keys() - {"generator", "backend"}:
-        named = [n for n, v in (("points", points), ("weights", weights)) if v is not None]
-        named += [name for name in split if name not in ("generator", "backend")]
+        extra = [n for n, v in (("points", points), ("weights", weights)) if v is not None]
+        extra += [name for name in split if name not in ("generator", "backend")]
         raise ValueError(
-            f"VoronoiRouter.subdivide: {named[0]} must come with a number of children, got a VoronoiDiagram"
+            f"VoronoiRouter.subdivide: {extra[0]} must come with a number of children, got a VoronoiDiagram"
         )
     if parents is None:
         parents = present.locate(finer.leaf_centres.to(present.centres.device)).long()

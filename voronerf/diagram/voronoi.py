@@ -1,12 +1,12 @@
-"""Nested Voronoi diagrams: which cell of space a point belongs to.
+"""Nested Voronoi diagrams, which assign points of space to cells.
 
 Letters: n points, k centres of one diagram, m centres of all diagrams of a tree, g diagrams (internal nodes) of a tree,
 d coordinates, 1 to 4.
 
 A diagram gives each point of space to its nearest centre, `v(x) = argmin_i |x - v_i|` (Elsner et al. 2023, "Adaptive
-Voronoi NeRFs", section 3). A centre may be refined by a diagram of its own, and so on: a query goes down level by level
-until it reaches a centre that is not refined, a leaf. The leaves are the cells that own networks. They are numbered
-depth-first, so the leaves of one refined cell are contiguous and stand where their parent stood.
+Voronoi NeRFs", section 3). A centre may be refined by a diagram of its own, on any number of levels. A query descends
+level by level to a centre that is not refined, a leaf. The leaves are the cells that own networks. They are numbered
+depth-first, so the leaves of a refined cell are contiguous and take the place of their parent.
 
 Coordinates are in scene units, in the world frame of the query points.
 """
@@ -27,12 +27,12 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.checks import check_integer
 
 MANY_CELLS = 2048
-"""A flat diagram of as many cells keeps an index."""
-_DECIDE, _DECIDE_CELL = 20_000, 4  # samples at least, and for each cell, that place the centres of `from_points`
+"""The number of cells from which a flat diagram keeps an index."""
+_DECIDE, _DECIDE_CELL = 20_000, 4  # limits of points that `from_points` uses: in all, for each cell
 
 
 class VoronoiDiagram(nn.Module):
-    """A Voronoi diagram of any depth, as flat tables that `ops.locate_cell` reads.
+    """A Voronoi diagram of any depth, stored as flat tables that `ops.locate_cell` reads.
 
     No method changes a diagram in place: `refine` returns a new one. Its buffers stay float32 when a module around it
     is converted to another dtype, because rounded centres would move samples to networks that never saw them.
@@ -40,9 +40,9 @@ class VoronoiDiagram(nn.Module):
     Attributes:
         centres: float32 [m, d], the centres of all diagrams, diagram after diagram; diagram 0 is the root.
         child_offsets: int32 [g + 1]; diagram j owns rows `child_offsets[j] : child_offsets[j + 1]` of `centres`.
-        child: int32 [m]; a value c >= 0 says that diagram c refines this centre, c < 0 that it is leaf number `-c - 1`.
-        depth: number of levels; 1 for a flat diagram.
-        num_cells: number of leaves.
+        child: int32 [m]; if c >= 0, diagram c refines the centre; if c < 0, the centre is leaf number `-c - 1`.
+        depth: the number of levels; 1 for a flat diagram.
+        num_cells: the number of leaves.
 
     Examples:
         >>> import torch
@@ -69,7 +69,7 @@ class VoronoiDiagram(nn.Module):
     _indexed: tuple[Tensor, int, Tensor | None] | None = None
 
     def __init__(self, centres: Tensor) -> None:
-        """Makes a flat diagram. A single centre is allowed: one cell, all of space.
+        """Makes a flat diagram. A single centre is allowed; its cell is all of space.
 
         Args:
             centres: floating [k, d], k >= 1, d = 1 to 4, finite; copied to float32.
@@ -113,18 +113,18 @@ class VoronoiDiagram(nn.Module):
         centres: str = "centroidal",
         generator: torch.Generator | None = None,
     ) -> "VoronoiDiagram":
-        """A flat diagram of k cells whose centres are placed by samples.
+        """Makes a flat diagram of k cells whose centres are placed by samples.
 
         Args:
-            points: floating [..., d], finite, in the coordinates in which samples will be located: what the field is
-                given in a few batches of training. 20,000 of them, drawn at random, decide, or four for each cell.
-            k: cells, at most as many as there are distinct points.
-            importance: floating [...], >= 0, how much each of them counts; None for 1 each.
-            centres: how they are placed, see `balance`.
+            points: floating [..., d], finite, in the coordinates of the field's positions, such as the samples of a few
+                training batches. At most max(20,000, 4 k) points are used, drawn at random.
+            k: the number of cells, at most the number of distinct points.
+            importance: floating [...], >= 0, the weight of each point; None for 1 each.
+            centres: the method that places the centres, see `balance`.
             generator: CPU generator of the draws; None for torch's global one.
 
         Raises:
-            ValueError: more cells than distinct points, or what else `balance` refuses.
+            ValueError: more cells than distinct points, or other arguments that `balance` refuses.
             TypeError: points or importance that are not floating-point.
 
         Examples:
@@ -142,7 +142,7 @@ class VoronoiDiagram(nn.Module):
         if len(flat) > count and len(weights) == len(flat):
             drawn = torch.randperm(len(flat), generator=generator)[:count].to(flat.device)
             enough = len(torch.unique(flat[drawn], dim=0)) >= k and bool((weights[drawn] > 0).any())
-            if enough:  # else all of them are needed
+            if enough:  # otherwise all points are needed
                 flat, weights = flat[drawn], weights[drawn]
         return cls(balance(flat, weights, k, centres=centres, generator=generator).centres)
 
@@ -151,7 +151,7 @@ class VoronoiDiagram(nn.Module):
         """Makes the diagram of a `state_dict`, of any size and depth.
 
         Args:
-            state: a state dict of a diagram, or of a module that holds one under `prefix`.
+            state: the state dict of a diagram, or of a module that holds a diagram under `prefix`.
             prefix: the part of the names before "centres", for example "diagram.".
 
         Raises:
@@ -165,10 +165,10 @@ class VoronoiDiagram(nn.Module):
 
     @classmethod
     def without_centres(cls, k: int) -> "VoronoiDiagram":
-        """A diagram of k cells that have no place in space, `centres` [k, 0]: labels say what belongs to a cell.
+        """Makes a diagram of k cells without a place in space, `centres` [k, 0]: labels assign samples to cells.
 
         Args:
-            k: cells, at least 1.
+            k: the number of cells, at least 1.
 
         Raises:
             ValueError: k is below 1.
@@ -185,20 +185,20 @@ class VoronoiDiagram(nn.Module):
 
     @property
     def leaf_rows(self) -> Tensor:
-        """int64 [num_cells]: the row of `centres` of each leaf."""
+        """The row of each leaf in `centres`, int64 [num_cells]."""
         rows = torch.nonzero(self.child < 0).squeeze(1)
         return rows[torch.argsort(self.child[rows], descending=True)]
 
     @property
     def leaf_centres(self) -> Tensor:
-        """float32 [num_cells, d]: the centre of each leaf among its siblings."""
+        """The centre of each leaf, float32 [num_cells, d]."""
         return self.centres[self.leaf_rows]
 
     def paths(self) -> Tensor:
-        """int64 [num_cells, depth]: the path to each leaf, as the number of the child on each level.
+        """Returns the path to each leaf, int64 [num_cells, depth]: the number of the child on each level.
 
-        The last number is that of the leaf itself. Shorter branches of an uneven tree are filled up with -1.
-        `paths()[:, 0]` is the cell of the root diagram that a leaf lies in, useful as a colour in drawings.
+        The last number belongs to the leaf itself. Shorter paths of an uneven tree are padded with -1.
+        `paths()[:, 0]` is the cell of the root diagram in which each leaf lies, useful as a colour in drawings.
         """
         offsets, child = self.child_offsets.tolist(), self.child.tolist()
         paths = torch.full((self.num_cells, self.depth), -1, dtype=torch.int64)
@@ -214,14 +214,15 @@ class VoronoiDiagram(nn.Module):
         return paths.to(self.centres.device)
 
     def locate(self, points: Tensor, *, backend: str = "auto") -> Tensor:
-        """The leaf that each point lies in.
+        """Finds the leaf in which each point lies.
 
         Args:
             points: floating [..., d]; half types are compared in float32, float64 points in float64.
-            backend: see `voronerf.ops._core.backends`.
+            backend: the backend of the op, see `voronerf.ops._core.backends`.
 
         Returns:
-            int32 [...]. On each level, ties go to the lowest index, and points that are not finite to the first cell.
+            int32 [...], leaf numbers. On each level, ties go to the lowest index, and points that are not finite to the
+            first cell.
 
         Raises:
             ValueError: the last dimension of points is not d.
@@ -242,44 +243,50 @@ class VoronoiDiagram(nn.Module):
         return cells.reshape(points.shape[:-1])
 
     def index(self) -> Tensor | None:
-        """An index of the centres (`voronerf.ops.index_centres`), kept for later calls.
+        """Returns an index of the centres (`voronerf.ops.index_centres`), which is cached for later calls.
 
-        It is made anew where centres have changed: on the CPU they are compared, 12 bytes a centre; on a GPU, which
-        would be waited for, only their version counter and their address are.
+        The index is rebuilt if centres have changed. On the CPU their values are compared, 12 bytes a centre. On a GPU
+        only the version counter and the address are compared, to avoid a wait for the device.
 
         Returns:
-            int32 [w]; None for a nested diagram, less than `MANY_CELLS` cells, or centres that are traced.
+            int32 [w]; None for a nested diagram, fewer than `MANY_CELLS` cells, or traced centres.
         """
         centres = self.centres
         if self.depth > 1 or self.num_cells < MANY_CELLS or centres.shape[1] == 0 or torch.compiler.is_compiling():
             return None
         if type(centres) is not Tensor or centres.is_meta or torch._C._are_functorch_transforms_active():
             return None
-        with _disable_current_modes():  # a recorded step has nothing to do with it
-            now, kept = centres.detach().float().contiguous(), self._indexed
+        with _disable_current_modes():  # keeps the index out of a recorded step
+            current, kept = centres.detach().float().contiguous(), self._indexed
             version = centres._version if centres.is_cuda and not centres.is_inference() else 0
-            if kept is None or kept[1] != version or not _is_same(kept[0], now):
-                kept = self._indexed = now if now.is_cuda else now.clone(), version, ops.index_centres(now)
+            if kept is None or kept[1] != version or not _is_unchanged(kept[0], current):
+                kept = self._indexed = (
+                    current if current.is_cuda else current.clone(),
+                    version,
+                    ops.index_centres(current),
+                )
         return kept[2]
 
     def sample_cell(
         self, points: Tensor, *, temperature: float, generator: torch.Generator | None = None, backend: str = "auto"
     ) -> Tensor:
-        """Draws the leaf of each point at random; near centres are likelier (the paper's stochastic assignment).
+        """Draws the leaf of each point at random; near centres are more likely (the paper's stochastic assignment).
 
         The paper draws the cell "from the vector of distances" and does not give the distribution. Here, on each level
         of the tree, child i of the current diagram is drawn with probability
 
             p_i = exp(-d_i / temperature) / sum_j exp(-d_j / temperature),     d_i = |x - v_i|.
 
-        The probability of a leaf is the product of these along its path. The temperature is the same on every level: a
-        length in scene units, about the width of the band along the borders in which cells mix. A temperature of 0
-        gives `locate`. One uniform number in 0 to 1 is drawn for each point and level (`diagram.drawing`).
+        The probability of a leaf is the product of the probabilities along its path. The temperature is the same on
+        every level: a length in scene units, about the width of the band along borders in which cells mix. A
+        temperature of 0 gives `locate`. One uniform number in 0 to 1 is drawn for each point and level
+        (`diagram.drawing`).
 
         Args:
             points: floating [..., d]; compared in float32.
-            temperature: >= 0, in scene units.
-            generator: on any device; its numbers are moved to the device of `points`. None for torch's global one.
+            temperature: the temperature in scene units, >= 0.
+            generator: a generator on any device; its numbers are moved to the device of `points`. None for torch's
+                global one.
             backend: see `voronerf.ops._core.backends`.
 
         Returns:
@@ -301,19 +308,20 @@ class VoronoiDiagram(nn.Module):
         return cells.reshape(points.shape[:-1])
 
     def refine(self, children: Mapping[int, "Tensor | VoronoiDiagram"]) -> tuple["VoronoiDiagram", Tensor]:
-        """A new diagram in which the given leaves are refined; the other leaves stay as they are.
+        """Returns a new diagram in which some leaves are refined.
 
-        If a child has a single cell, its parent stays a leaf. Refining a diagram of a single cell gives the child
-        itself, without an additional level.
+        A leaf whose child has a single cell stays a leaf. Refining a diagram of a single cell returns the child itself,
+        without an additional level.
 
         Args:
-            children: leaf number -> centres [k, d] of the diagram inside it, or a `VoronoiDiagram` of any depth.
+            children: by leaf number, the centres [k, d] of the diagram inside the leaf, or a `VoronoiDiagram` of any
+                depth.
 
         Returns:
-            The refined diagram, and `parents`, int64 [new num_cells]: for each new leaf the old leaf that it lies in.
+            The refined diagram, and `parents`, int64 [new num_cells]: the old leaf in which each new leaf lies.
 
         Raises:
-            ValueError: a leaf out of range or given twice, or centres that `VoronoiDiagram` does not accept.
+            ValueError: a leaf number out of range or twice, or centres that `VoronoiDiagram` does not accept.
             TypeError: a leaf that is not an integer, or centres that are not a tensor.
         """
         device = self.centres.device
@@ -338,7 +346,7 @@ class VoronoiDiagram(nn.Module):
             copies = (table.to(device, copy=True) for table in (graft.centres, graft.child_offsets, graft.child))
             return VoronoiDiagram._from_tables(*copies), parents
 
-        # The grafts' rows and diagrams go behind the present ones; only leaf numbers and links have to be shifted.
+        # The grafts' rows and diagrams are appended, so only leaf numbers and links have to be shifted.
         first_leaf = (counts.cumsum(0) - counts).to(device, torch.int32)
         child = torch.where(self.child < 0, -1 - first_leaf[(-1 - self.child).clamp(min=0)], self.child)
         leaf_rows = self.leaf_rows.tolist()
@@ -356,10 +364,10 @@ class VoronoiDiagram(nn.Module):
         return VoronoiDiagram._from_tables(torch.cat(tables), torch.cat(offsets_all), torch.cat(links)), parents
 
     def part(self, cells: Tensor) -> "VoronoiDiagram":
-        """The diagram of some of the cells. A point that lies in one of them is located in it again.
+        """Returns a diagram with only some of the cells. Points in these cells are located in the same cells.
 
         Args:
-            cells: int64 [c], ascending numbers of cells, at least one; they become 0 to c - 1.
+            cells: int64 [c], ascending cell numbers, at least one; they become 0 to c - 1.
 
         Raises:
             ValueError: no cells, cells out of range, or cells that do not ascend.
@@ -380,16 +388,16 @@ class VoronoiDiagram(nn.Module):
             for row in range(offsets[node], offsets[node + 1]):
                 if -child[row] - 1 in number if child[row] < 0 else rows[child[row]]:
                     rows[node].append(row)
-        nodes = {node: i for i, node in enumerate(node for node, some in enumerate(rows) if some)}
-        kept = [row for some in rows for row in some]
+        nodes = {node: i for i, node in enumerate(node for node, node_rows in enumerate(rows) if node_rows)}
+        kept = [row for node_rows in rows for row in node_rows]
         links = [nodes[child[row]] if child[row] >= 0 else -1 - number[-child[row] - 1] for row in kept]
-        ends = torch.tensor([0, *(len(some) for some in rows if some)]).cumsum(0)
+        ends = torch.tensor([0, *(len(node_rows) for node_rows in rows if node_rows)]).cumsum(0)
         device = self.centres.device
         table = torch.tensor(links, dtype=torch.int32, device=device)
         return VoronoiDiagram._from_tables(self.centres[kept], ends.to(device, torch.int32), table)
 
     def extra_repr(self) -> str:
-        """What `print` shows."""
+        """Returns the text that `print` shows in parentheses."""
         return f"cells={self.num_cells}, depth={self.depth}"
 
     def _flatten(self, op: str, points: Tensor) -> Tensor:
@@ -413,7 +421,7 @@ class VoronoiDiagram(nn.Module):
         return self
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Takes on the size and depth of what is loaded, which torch would otherwise refuse."""
+        """Adopts the size and the depth of the loaded diagram, which torch would refuse."""
         if prefix + "centres" in state_dict:
             device = self.centres.device
             loaded = VoronoiDiagram.from_state(state_dict, prefix)
@@ -421,19 +429,19 @@ class VoronoiDiagram(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
-def _is_same(seen: Tensor, now: Tensor) -> bool:
-    """Whether centres are those that an index was made of; on a GPU by their address."""
-    if seen.device != now.device or seen.shape != now.shape:
+def _is_unchanged(seen: Tensor, centres: Tensor) -> bool:
+    """Returns whether centres are unchanged since an index was built; compares addresses on a GPU, else values."""
+    if seen.device != centres.device or seen.shape != centres.shape:
         return False
     native = backends.compiled()
     if seen.is_cuda or native is None:
-        return seen.data_ptr() == now.data_ptr()
-    same: bool = native.compiled.same_bits(seen, now, seen.numel())
+        return seen.data_ptr() == centres.data_ptr()
+    same: bool = native.compiled.same_bits(seen, centres, seen.numel())
     return same
 
 
 def _check_centres(centres: Tensor, least: int = 1) -> None:
-    """Raises ValueError or TypeError unless centres are floating and finite, [any number, `least` to 4]."""
+    """Raises ValueError or TypeError unless centres [k, d] are floating and finite, with d from `least` to 4."""
     if not isinstance(centres, Tensor) or not centres.is_floating_point():
         got = centres.dtype if isinstance(centres, Tensor) else type(centres).__name__
         raise TypeError(f"VoronoiDiagram: centres must be a floating-point tensor, got {got}")

@@ -1,4 +1,4 @@
-"""The pieces of a radiance-field training, each usable alone: cameras, samplers, rendering, the loss, splits."""
+"""The parts of a radiance-field training, each usable alone: cameras, samplers, rendering, the loss, splits."""
 
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches, RaySource

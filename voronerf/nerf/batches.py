@@ -16,17 +16,17 @@ from voronerf.ops._core.rows import following_count
 from voronerf.ops.draw_pixels import Known, Runs, draw_pixels
 from voronerf.ops.unseen_rays import unseen_rays
 
-#: Share of the rays that are drawn through points of a sparse model, where these are learnt from.
+#: The share of the rays that are drawn through the points of a sparse model, if there is one.
 SPARSE = 0.25
-#: Triples of unseen rays for each ray of a batch, and how far their directions are apart along each axis at most.
+#: Triples of unseen rays for each ray of a batch, and the largest difference of their directions along each axis.
 UNSEEN, TILT = 1 / 12, 0.15
 
 
 class RaySource(Protocol):
-    """A source of rays for a `TrainingStep`, which asks it once in each step, before all else.
+    """A source of training rays; a `TrainingStep` calls it once at the start of each step.
 
     Attributes:
-        device: The one on which its rays lie.
+        device: The device of its rays.
 
     Examples:
         >>> import torch
@@ -44,43 +44,43 @@ class RaySource(Protocol):
     device: torch.device
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
-        """The rays of a step, and their colours.
+        """Returns the rays of a step, and their colours.
 
         Args:
-            count: How many, at least 1.
-            generator: Draws random numbers, on the device.
+            count: The requested number of rays, at least 1.
+            generator: Random generator on the device.
 
         Returns:
-            As many rays or others; they may differ in number from step to step.
+            The batch; its number of rays may differ from ``count`` and from step to step.
         """
 
 
 @replayed
 class RayBatches:
-    """Draws rays uniformly from those pixels of pictures whose ray meets the box of the scene.
+    """A source of random rays through the pixels of pictures whose rays meet the box of the scene.
 
-    A ray that misses the box shows the background whatever the networks are, so there is nothing to learn from it.
-    Pixels that a mask leaves out are not drawn either.
+    The networks learn nothing from a ray that misses the box, since it shows the background. Masked pixels are not
+    drawn either. All other pixels are equally likely.
 
     Args:
         cameras: c cameras.
         images: uint8 [c, h, w, 3] opaque, or [c, h, w, 4] with straight alpha, on the device where pixels are drawn.
-        near: Distance along a ray at which the scene begins.
-        far: Distance along a ray at which it ends.
-        box: [2, 3] outside of which nothing is; None for none.
+        near: The distance along a ray at which the scene begins.
+        far: The distance along a ray at which the scene ends.
+        box: [2, 3], the box of the scene; None for no box.
         background: [3], the colour behind the scene; None for black.
-        random_background: Whether images with alpha, and photographs without a background, lie over a colour that is
-            drawn for each ray: what lets light through is never right, so surfaces become opaque.
-        masks: bool [c, h, w], False for pixels that are not drawn; None for none.
-        sparse: int64 [s] pixels, numbered through all images, that show points of a sparse model, and float32 [s], the
-            distances of the points. A share of the rays, `SPARSE`, is drawn from them. None for none.
-        unseen: How far from a camera along each axis, at most, the last rays of a batch begin, which are triples of
-            neighbours, `UNSEEN` of the batch; 0 for none. There must be no box.
-        views: int64, the pictures to draw from; None for all.
+        random_background: Whether to draw a background colour for each ray, for images with alpha and for photographs
+            without a background. A translucent surface then never has the right colour, so surfaces become opaque.
+        masks: bool [c, h, w], False for pixels that are not drawn; None for no masks.
+        sparse: int64 [s], flat indices of pixels over all images that show points of a sparse model, and float32 [s],
+            the distances of the points. The share `SPARSE` of the rays is drawn from them. None for no sparse model.
+        unseen: The largest distance along each axis between a camera and the origins of unseen rays, which are triples
+            of neighbours at the end of a batch (`UNSEEN` per ray); 0 for no unseen rays. There must be no box.
+        views: int64, the indices of the pictures to draw from; None for all.
         cones: Whether the rays have radii.
-        fetch: Called with the pixels of a batch, int64 [r], before they are read, as for images on disk.
-        device: Where batches live; None for that of the images.
-        backend: Of the ops.
+        fetch: Function that is called with the pixels int64 [r] of a batch before they are read, for images on disk.
+        device: The device of the batches; None for the device of the images.
+        backend: The backend of the ops.
 
     Examples:
         >>> import torch
@@ -131,7 +131,7 @@ class RayBatches:
             self.sparse = (pixels, distances) if len(pixels) else None
 
     def _useful_pixels(self, masks: Tensor | None, views: Tensor | None) -> Runs | None:
-        """The pixels to draw from; None when that is all of them."""
+        """Returns the pixels to draw from; None for all pixels."""
         cameras = self.cameras
         if self.box is None and masks is None and cameras.sizes is None and views is None:
             return None
@@ -150,22 +150,22 @@ class RayBatches:
             last = (edges == -1).nonzero(as_tuple=True)[1]
             runs.append(torch.stack(((image * cameras.height + row) * cameras.width + column, last - column)))
         start, length = torch.cat(runs, dim=1)
-        return Runs.of(start, length) if 0 < int(length.sum()) < self._pixels else None
+        return Runs.of(start, length) if 0 < int(length.sum()) < self._pixel_count else None
 
     @property
-    def _pixels(self) -> int:
+    def _pixel_count(self) -> int:
         return self.images.numel() // self.images.shape[-1]
 
     def __len__(self) -> int:
-        """Number of rays to draw from."""
-        return self._pixels if self.useful is None else self.useful.total
+        """Returns the number of rays to draw from."""
+        return self._pixel_count if self.useful is None else self.useful.total
 
     def end_unseen(self) -> None:
-        """Draws no more rays that no picture shows."""
+        """Stops drawing unseen rays."""
         self.unseen = 0.0
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
-        """A batch of ``count`` rays, drawn with replacement; the first ones through points of the sparse model."""
+        """Draws ``count`` rays with replacement; the first rays go through points of the sparse model."""
         seed = draw_seed(self.place, generator)
         known = None
         if self.sparse is not None and (several := following_count(count, lambda rays: int(SPARSE * rays))):

@@ -1,8 +1,8 @@
-"""Cameras with lens distortion: pixels to rays, points to pixels.
+"""Cameras with lens distortion, which map pixels to rays and points to pixels.
 
 c cameras, r rays, b chosen pixels, n points.
 
-Frames. A pose maps camera to world coordinates; camera axes are OpenGL's: x right, y up, the camera looks along -z. The
+Frames. A pose maps camera to world coordinates. Camera axes are OpenGL's: x right, y up, the camera looks along -z. The
 world is z up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the first pixel
 is at (0.5, 0.5). Distortion acts on image-plane coordinates u = (x - cx) / fx, v = (y - cy) / fy. See
 `voronerf.nerf.lenses.distort` for its models.
@@ -33,8 +33,8 @@ __all__ = [
     "turntable_cameras",
 ]
 
-#: Largest median of `axis_misses` of cameras around something: 24 degrees, within the pictures of most lenses. Captures
-#: around something have 0.06 to 0.13, those that are aimed 12 degrees off 0.22; 1 % of random walks have less than 0.4.
+#: The largest median of `axis_misses` of cameras around an object: 24 degrees, within the pictures of most lenses.
+#: Captures around an object have 0.06 to 0.13, captures aimed 12 degrees off 0.22; 1 % of random walks are below 0.4.
 AROUND = 0.4
 
 
@@ -43,9 +43,9 @@ class Rays:
     """A batch of rays in world coordinates.
 
     Attributes:
-        origins: float32 [r, 3].
-        directions: float32 [r, 3], unit length.
-        radii: float32 [r], radius at distance 1 of the cone around each ray, or None.
+        origins: float32 [r, 3], the origins of the rays.
+        directions: float32 [r, 3], unit directions.
+        radii: float32 [r], the radius of the cone around each ray at distance 1, or None.
 
     Examples:
         >>> import torch
@@ -67,24 +67,24 @@ class Rays:
         return Rays(self.origins[index], self.directions[index], radii)
 
     def to(self, device: torch.device | str) -> Rays:
-        """The same rays on a device."""
+        """Returns the same rays on a device."""
         radii = None if self.radii is None else self.radii.to(device)
         return Rays(self.origins.to(device), self.directions.to(device), radii)
 
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """c cameras.
+    """A set of c cameras with poses, intrinsics and lenses.
 
     Attributes:
         poses: float32 [c, 4, 4], camera to world.
         intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
-        width: of every image, in pixels; of the widest where they differ.
-        height: of every image, in pixels; of the highest where they differ.
-        distortion: float32 [c, 8], coefficients of the lenses, see `voronerf.nerf.lenses.distort`, or None for none.
-        models: int32 [c], the camera model of each: 0 perspective, 1 fisheye, 2 FOV, 3 equirectangular (360 degrees).
-            It needs coefficients. None is perspective for all.
-        sizes: int64 [c, 2], (width, height) of each image, or None if they are of one size. See `size`.
+        width: The width of the images in pixels; of the widest image if they differ.
+        height: The height of the images in pixels; of the highest image if they differ.
+        distortion: float32 [c, 8], coefficients of the lenses, see `voronerf.nerf.lenses.distort`; None for none.
+        models: int32 [c], the model of each camera: 0 perspective, 1 fisheye, 2 FOV, 3 equirectangular (360 degrees);
+            requires `distortion`. None if all are perspective.
+        sizes: int64 [c, 2], (width, height) of each image, or None if all have one size. See `size`.
 
     Examples:
         >>> import torch
@@ -122,7 +122,7 @@ class Cameras:
             raise ValueError(f"Cameras: width and height must be >= 1, got {self.width} x {self.height}")
 
     def moved(self, move: Tensor) -> Cameras:
-        """The cameras after a similarity [4, 4] of the world, such as the change from one frame to another."""
+        """Returns the cameras after a similarity [4, 4] of the world, such as a change of the frame."""
         scale = torch.linalg.det(move[:3, :3]).abs() ** (1 / 3)
         poses = (move @ self.poses.to(move)).clone()
         poses[:, :3, :3] /= scale
@@ -137,20 +137,20 @@ class Cameras:
         distortion: Tensor | None = None,
         models: Tensor | None = None,
     ) -> Cameras:
-        """Cameras of images whose (width, height) `sizes` int64 [c, 2] may differ; at least one."""
+        """Returns the cameras of at least one image, whose (width, height) `sizes` int64 [c, 2] may differ."""
         width, height = sizes.amax(0).tolist()
         differ = bool((sizes != sizes[:1]).any())
         return cls(poses, intrinsics, width, height, distortion, models, sizes if differ else None)
 
     @classmethod
     def joined(cls, several: Sequence[Cameras]) -> Cameras:
-        """The cameras of all, one after another."""
+        """Returns the concatenation of several sets of cameras."""
 
-        def every(name: str, missing: Callable[[int], Tensor]) -> Tensor | None:
-            there = [getattr(cameras, name) for cameras in several]
-            if all(tensor is None for tensor in there):
+        def concatenated(name: str, missing: Callable[[int], Tensor]) -> Tensor | None:
+            values = [getattr(cameras, name) for cameras in several]
+            if all(tensor is None for tensor in values):
                 return None
-            pairs = zip(several, there, strict=True)
+            pairs = zip(several, values, strict=True)
             return torch.cat([missing(len(cameras)) if tensor is None else tensor for cameras, tensor in pairs])
 
         sizes = [
@@ -161,19 +161,19 @@ class Cameras:
             torch.cat([cameras.poses for cameras in several]),
             torch.cat([cameras.intrinsics for cameras in several]),
             torch.cat(sizes),
-            every("distortion", lambda n: torch.zeros(n, 8)),
-            every("models", lambda n: torch.zeros(n, dtype=torch.int32)),
+            concatenated("distortion", lambda n: torch.zeros(n, 8)),
+            concatenated("models", lambda n: torch.zeros(n, dtype=torch.int32)),
         )
 
     def __len__(self) -> int:
         return self.poses.shape[0]
 
     def __getitem__(self, index: Tensor | slice | Sequence[int]) -> Cameras:
-        """The cameras chosen by a slice, a list or an index tensor."""
-        return self._each(lambda tensor: tensor[index])
+        """Returns the cameras of a slice, a list or an index tensor."""
+        return self._mapped(lambda tensor: tensor[index])
 
     def size(self, index: int) -> tuple[int, int]:
-        """(width, height) of one image."""
+        """Returns (width, height) of one image."""
         if self.sizes is None:
             return self.width, self.height
         width, height = self.sizes[index].tolist()
@@ -181,7 +181,7 @@ class Cameras:
 
     @property
     def smallest(self) -> tuple[int, int]:
-        """The least width and the least height of the images."""
+        """The smallest width and the smallest height of the images."""
         if self.sizes is None:
             return self.width, self.height
         width, height = self.sizes.amin(0).tolist()
@@ -189,20 +189,20 @@ class Cameras:
 
     @property
     def origins(self) -> Tensor:
-        """Camera centres, [c, 3]."""
+        """The camera centres, [c, 3]."""
         return self.poses[:, :3, 3]
 
     @property
     def forward(self) -> Tensor:
-        """Unit viewing directions (optical axes), [c, 3]."""
+        """The unit viewing directions (optical axes), [c, 3]."""
         return -self.poses[:, :3, 2]
 
     def to(self, device: torch.device | str) -> Cameras:
-        """The same cameras on a device."""
-        return self._each(lambda tensor: tensor.to(device))
+        """Returns the same cameras on a device."""
+        return self._mapped(lambda tensor: tensor.to(device))
 
-    def _each(self, change: Callable[[Tensor], Tensor]) -> Cameras:
-        """With another tensor for each; the tables of the lenses are shared."""
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Cameras:
+        """Returns cameras with every tensor replaced by `change` of it; the tables of the lenses are shared."""
         members = ((field.name, getattr(self, field.name)) for field in fields(self))
         changed: dict[str, Any] = {name: change(value) for name, value in members if isinstance(value, Tensor)}
         return replace(self, **changed)._with_lenses(change(self.lenses[0]), self.lenses[1])
@@ -213,9 +213,9 @@ class Cameras:
 
     @cached_property
     def lenses(self) -> tuple[Tensor, LensTables | None]:
-        """The lens of each camera, int32 [c], -1 for one without distortion; and the tables of the distinct ones.
+        """The index of each camera's lens, int32 [c], -1 for no distortion, and the tables of the distinct lenses.
 
-        Cameras that are indexed, moved or sent to a device share the tables.
+        Cameras share the tables with the cameras that they were indexed, moved or copied from.
 
         Raises:
             ValueError: The tables would take too much memory.
@@ -227,29 +227,29 @@ class Cameras:
         bent = (self.distortion != 0).any(1) | (models == FISHEYE) | (models == EQUIRECTANGULAR)
         if not bool(bent.any()):
             return lens, None
-        every = torch.cat((self.intrinsics, self.distortion, models[:, None].to(self.intrinsics)), dim=1)
-        distinct, of = every[bent].unique(dim=0, return_inverse=True)
-        lens[bent] = of.to(torch.int32)
+        parameters = torch.cat((self.intrinsics, self.distortion, models[:, None].to(self.intrinsics)), dim=1)
+        distinct, inverse = parameters[bent].unique(dim=0, return_inverse=True)
+        lens[bent] = inverse.to(torch.int32)
         return lens, LensTables(distinct, self.width, self.height)
 
     def perspective(self) -> Cameras:
-        """The cameras without their lenses; one that sees all around looks ahead, 90 degrees wide."""
+        """Returns the cameras without lens models; equirectangular cameras become 90-degree cameras looking ahead."""
         if self.models is None:
             return replace(self, distortion=None)
-        around = self.models == EQUIRECTANGULAR
+        panoramic = self.models == EQUIRECTANGULAR
         sizes = torch.tensor([self.size(index) for index in range(len(self))], device=self.poses.device)
         sides = (sizes[:, 1:] // 2).clamp_min(1).expand(-1, 2)
         ahead = torch.cat((sides, sides), 1).to(self.intrinsics) / 2
-        intrinsics = torch.where(around[:, None], ahead, self.intrinsics)
-        return Cameras.of_images(self.poses, intrinsics, torch.where(around[:, None], sides, sizes))
+        intrinsics = torch.where(panoramic[:, None], ahead, self.intrinsics)
+        return Cameras.of_images(self.poses, intrinsics, torch.where(panoramic[:, None], sides, sizes))
 
     @classmethod
     def all_around(cls, poses: Tensor, height: int) -> Cameras:
-        """Cameras that see all around, in equirectangular images of `height` x twice as many pixels.
+        """Returns equirectangular cameras, whose images are twice as wide as high and show all directions.
 
         Args:
-            poses: [c, 4, 4]; the middle of the image is what they look at, up is its upper edge.
-            height: of the images, in pixels.
+            poses: [c, 4, 4], camera to world; the viewing direction is in the middle of the image.
+            height: The height of the images in pixels.
 
         Examples:
             >>> import torch
@@ -264,13 +264,13 @@ class Cameras:
         return cls(poses, intrinsics, 2 * height, height, poses.new_zeros(count, 8), models)
 
     def downscaled(self, factor: int) -> Cameras:
-        """Cameras of the images averaged over blocks of `factor` x `factor` pixels.
+        """Returns the cameras of the images averaged over blocks of `factor` x `factor` pixels.
 
         Incomplete blocks at the right and at the bottom are dropped, so that focal lengths and the principal point are
         divided by exactly `factor`.
 
         Raises:
-            ValueError: `factor` is below 1, or no whole block is left.
+            ValueError: `factor` is below 1, or larger than an image.
         """
         if factor < 1:
             raise ValueError(f"downscaled: factor must be >= 1, got {factor}")
@@ -285,16 +285,16 @@ class Cameras:
         )
 
     def rays(self, image_index: Tensor | int, x: Tensor, y: Tensor, *, cones: bool = False) -> Rays:
-        """Rays through pixels.
+        """Returns the rays through pixels.
 
         Args:
             image_index: integer [b], the camera of each pixel, or one camera for all.
-            x: [b] column. Integers are pixels (the ray goes through their centre), floats are positions in the image.
-            y: [b] row, in pixels from the upper edge.
-            cones: give the rays radii of 2 / sqrt(12) of the width of a pixel, so that the variance of a cone across
-                its axis is that of the pixel (Barron et al. 2021, section 3.1). A pixel away from the optical axis is
-                farther away and so appears narrower, but that of a fisheye or a picture all around, which covers the
-                same angle. Lens distortion of the size of a pixel is ignored.
+            x: [b], columns. Integers are pixels (the ray goes through the centre), floats are positions in the image.
+            y: [b], rows, from the upper edge; integers or floats, as for ``x``.
+            cones: Whether the rays have radii, 2 / sqrt(12) of the width of a pixel. The variance of a cone across its
+                axis is then the variance of the pixel (Barron et al. 2021, section 3.1). A pixel away from the optical
+                axis appears narrower, except for fisheye and equirectangular cameras, whose pixels all cover the same
+                angle. The effect of lens distortion on the pixel width is ignored.
         """
         x, y = _position(x).to(self.poses.dtype), _position(y).to(self.poses.dtype)
         camera = torch.full_like(x, image_index, dtype=torch.int64) if isinstance(image_index, int) else image_index
@@ -310,16 +310,16 @@ class Cameras:
         return Rays(pose[:, :3, 3], directions, self.radii(directions, camera) if cones else None)
 
     def has_ray(self, index: int) -> Tensor | None:
-        """Which pixels of one image its lens gives a ray to, bool [h, w] on the CPU; None for all."""
+        """Returns the mask bool [h, w], on the CPU, of the pixels of an image that have a ray; None if all have one."""
         lenses, tables = self.lenses
         lens, (width, height) = int(lenses[index]), self.size(index)
-        return None if tables is None or lens < 0 else tables.there(lens)[:height, :width]
+        return None if tables is None or lens < 0 else tables.has_direction(lens)[:height, :width]
 
     def _model(self, index: int) -> int:
         return PERSPECTIVE if self.models is None else int(self.models[index])
 
     def radii(self, directions: Tensor, camera: Tensor) -> Tensor:
-        """The radii [b] of cones along `directions` [b, 3] of the cameras int [b]."""
+        """Returns the radii [b] of cones along `directions` [b, 3] of the cameras `camera` int [b]."""
         widths = self.intrinsics[:, :2].prod(-1).rsqrt() * (2 / math.sqrt(12))
         slant = (directions * self.forward[camera]).sum(-1)
         if self.models is not None:
@@ -328,24 +328,24 @@ class Cameras:
         return widths[camera] * slant
 
     def image_rays(self, index: int, *, cones: bool = False, backend: str = "auto") -> Rays:
-        """Rays through all pixel centres of one camera, row by row: [height * width], of its own image."""
+        """Returns the rays [height * width] through all pixel centres of one camera's image, row by row."""
         return self.image_rays_between(index, near=0.0, far=1.0, cones=cones, backend=backend)[0]
 
     def image_rays_between(
         self, index: int, *, cones: bool = False, backend: str = "auto", **bounds: Any
     ) -> tuple[Rays, Tensor, Tensor]:
-        """`image_rays`, and where they begin and end [r]; ``bounds`` are those of `voronerf.ops.pixel_rays`."""
+        """Returns the rays of `image_rays`, and their starts and ends [r]; for ``bounds`` see `ops.pixel_rays`."""
         device = self.poses.device
         width, height = self.size(index)
         pixels = torch.arange(height, device=device)[:, None] * self.width + torch.arange(width, device=device)
         blank = torch.zeros(1, self.height, self.width, 3, dtype=torch.uint8, device=device)
-        one = self[[index]]
-        rays = one.pixel_rays(blank, pixels.reshape(-1), **bounds, backend=backend)
-        radii = one.radii(rays.directions, torch.zeros_like(pixels.reshape(-1))) if cones else None
+        camera = self[[index]]
+        rays = camera.pixel_rays(blank, pixels.reshape(-1), **bounds, backend=backend)
+        radii = camera.radii(rays.directions, torch.zeros_like(pixels.reshape(-1))) if cones else None
         return Rays(rays.origins, rays.directions, radii), rays.near, rays.far
 
     def pixel_rays(self, images: Tensor, index: Tensor, **options: Any) -> PixelRays:
-        """`voronerf.ops.pixel_rays` of these cameras and their images, uint8 [c, height, width, 3 or 4]."""
+        """Calls `voronerf.ops.pixel_rays` for these cameras and their images, uint8 [c, height, width, 3 or 4]."""
         lens, tables = self.lenses
         if tables is not None:
             options |= {"lens": lens, "tables": tables.on(self.poses.device)}
@@ -355,13 +355,13 @@ class Cameras:
         """Projects points into the image of one camera.
 
         Args:
-            points: [n, 3], world.
-            index: the camera.
+            points: [n, 3], in world coordinates.
+            index: The index of the camera.
 
         Returns:
-            (pixels [n, 2], depth [n]): positions (x, y) in the image, and distance along the optical axis in world
-            units. Points with depth <= 0 are behind the camera, and their pixels are meaningless but for a fisheye. An
-            equirectangular camera sees all around, and depth is the distance.
+            (pixels [n, 2], depth [n]): positions (x, y) in the image, and distances along the optical axis in world
+            units. Points with depth <= 0 are behind the camera; their pixels are meaningless except for a fisheye. For
+            an equirectangular camera, depth is the distance from the camera.
         """
         pose = self.poses[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -385,7 +385,7 @@ class Cameras:
 
 
 def focus_point(cameras: Cameras) -> Tensor | None:
-    """The point closest to all optical axes (least squares), float32 [3].
+    """Returns the point closest to all optical axes (least squares), float32 [3].
 
     Returns:
         The point, or None if it is not in front of the cameras: the axes are nearly parallel, or point outwards.
@@ -407,10 +407,10 @@ def focus_point(cameras: Cameras) -> Tensor | None:
 
 
 def axis_misses(cameras: Cameras, point: Tensor) -> Tensor:
-    """Returns how far each optical axis passes from a point, as a share of the camera's distance from it, [c].
+    """Returns [c], the distance between a point and each optical axis, divided by the camera's distance from the point.
 
-    A camera that looks at the point has 0, one that looks past it at an angle of 30 degrees 0.5, and one that has it
-    behind itself 1.
+    It is 0 for a camera that looks at the point, 0.5 if the point is 30 degrees off the axis, and 1 if the point is
+    behind the camera.
 
     Examples:
         >>> import torch
@@ -427,17 +427,17 @@ def axis_misses(cameras: Cameras, point: Tensor) -> Tensor:
 
 
 def shared_focus(cameras: Cameras) -> Tensor | None:
-    """Returns the `focus_point` of cameras that stand around something, [3], or None for others.
+    """Returns the `focus_point` [3] of cameras that stand around an object, or None for other cameras.
 
-    The point closest to all optical axes of people who walk and look around lies ahead of most cameras by chance. Only
-    cameras around something look at it.
+    If a person walks and looks around, the focus point lies ahead of most cameras by chance, but they do not look at
+    it. Only cameras around an object look at it.
     """
     focus = focus_point(cameras)
     return focus if focus is not None and float(axis_misses(cameras, focus).median()) < AROUND else None
 
 
 def look_at(origins: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """Poses [c, 4, 4] of cameras at `origins` [c, 3] that look at `target` [3] with `up` [3] upwards in the image.
+    """Returns the poses [c, 4, 4] of cameras at `origins` [c, 3] that look at `target` [3], with `up` [3] upwards.
 
     A camera that looks along `up` uses another axis instead.
     """
@@ -462,17 +462,17 @@ def orbit_cameras(
     centre: Sequence[float] = (0.0, 0.0, 0.0),
     start: float = 0.0,
 ) -> Cameras:
-    """Cameras evenly spaced on a circle around the z axis, looking at `centre`.
+    """Returns cameras evenly spaced on a circle around the z axis, which look at `centre`.
 
     Args:
-        count: number of cameras, >= 1.
-        radius: distance to the centre, world units.
-        elevation: above the horizon, degrees.
-        width: pixels.
-        height: pixels.
-        focal: pixels; the principal point is the middle of the image.
-        centre: the point that the cameras look at.
-        start: azimuth of the first camera, degrees.
+        count: The number of cameras, >= 1.
+        radius: The distance of the cameras to the centre, in world units.
+        elevation: The angle above the horizon, in degrees.
+        width: The width of the images in pixels.
+        height: The height of the images in pixels.
+        focal: The focal length in pixels; the principal point is the middle of the image.
+        centre: The point that the cameras look at.
+        start: The azimuth of the first camera, in degrees.
 
     Examples:
         >>> from voronerf.nerf import orbit_cameras
@@ -498,9 +498,9 @@ def orbit_cameras(
 
 
 def turntable_cameras(cameras: Cameras, count: int) -> Cameras:
-    """An orbit like the given cameras: around their focus, at their mean distance, elevation and focal length.
+    """Returns an orbit around the focus of cameras, at their mean distance, elevation and focal length.
 
-    The pictures have the size of the first camera's.
+    The pictures have the size of the first camera's picture.
 
     Examples:
         >>> from voronerf.nerf import orbit_cameras, turntable_cameras

@@ -1,7 +1,7 @@
-"""Cones instead of rays, cut into conical frustums, as Gaussians. r rays, s frustums of a ray.
+"""Gaussians that approximate the conical frustums of cones. r rays, s frustums a ray.
 
-A Gaussian is [6]: its mean and the diagonal of its covariance, in world units and their squares. Source: Barron et al.
-2021, "Mip-NeRF", section 3.1.
+A Gaussian has 6 numbers: its mean in world units, and the diagonal of its covariance in squared world units. Source:
+Barron et al. 2021, "Mip-NeRF", section 3.1.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from voronerf.nerf.contraction import Contraction, Perspective
 
 
 def frustum_moments(edges: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and variances of conical frustums along their ray (equation 7 in its stable form, and equation 8).
+    """Returns mean and variances of conical frustums along their ray (equation 7 in its stable form, and equation 8).
 
     Args:
         edges: [r, s + 1] ascending distances along the ray.
-        radii: [r], radius of the cone at distance 1.
+        radii: [r], the radius of each cone at distance 1.
 
     Returns:
         (mean distance, variance along the ray, variance across it), each [r, s].
     """
     middle, half = (edges[:, 1:] + edges[:, :-1]) / 2, edges.diff(dim=1) / 2
     middle2, half2 = middle.square(), half.square()
-    # 0 only for a frustum that is a point at distance 0; its moments are all 0.
+    # The sum is 0 only for a frustum that is a point at distance 0; all its moments are 0.
     sum2 = (3 * middle2 + half2).clamp_min(torch.finfo(edges.dtype).tiny)
     share = half2 / sum2
     mean = middle + 2 * middle * share
@@ -35,15 +35,15 @@ def frustum_moments(edges: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def frustum_gaussians(rays: Rays, edges: Tensor, contraction: Contraction | Perspective | None = None) -> Tensor:
-    """Gaussians with the moments of conical frustums (equations 8 and 16).
+    """Returns the Gaussians [r, s, 6] that have the moments of conical frustums (equations 8 and 16).
 
     Args:
         rays: r rays with radii.
         edges: [r, s + 1] ascending distances along the rays.
-        contraction: applied to the Gaussians.
+        contraction: The contraction that is applied to the Gaussians; None for none.
 
     Returns:
-        [r, s, 6].
+        [r, s, 6], means and variances.
     """
     if rays.radii is None:
         raise ValueError("frustum_gaussians: rays must have radii, got none")

@@ -1,8 +1,8 @@
 """Contraction of unbounded space, into a ball or into a cube. n points.
 
-The ball: Barron et al. 2022, "Mip-NeRF 360", equation 10. Space inside a sphere stays as it is. Space outside is mapped
-into the shell between the sphere and one of twice its radius. Here the sphere has any centre and radius, in world
-units. The cube: Mildenhall et al. 2020, "NeRF", appendix C, for cameras that look the same way.
+The ball: Barron et al. 2022, "Mip-NeRF 360", equation 10. Space inside a sphere is unchanged. Space outside is mapped
+into the shell between this sphere and a sphere of twice the radius. Centre and radius are arbitrary, in world units.
+The cube: Mildenhall et al. 2020, "NeRF", appendix C, for cameras that all look in the same direction.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """``c + R f((x - c) / R)`` with ``f(x) = x`` up to length 1 and ``(2 - 1 / |x|) x / |x|`` beyond.
+    """The map ``c + R f((x - c) / R)`` with ``f(x) = x`` up to length 1 and ``(2 - 1 / |x|) x / |x|`` beyond.
 
     Attributes:
-        centre: [3], c. It should be on the device of the points, or it is copied at every call.
-        radius: R > 0.
+        centre: [3], c. If it is not on the device of the points, it is copied in each call.
+        radius: R > 0, in world units.
 
     Raises:
-        ValueError: a centre of another shape, or a radius that is not positive and finite.
+        ValueError: The centre has another shape, or the radius is not positive and finite.
 
     Examples:
         >>> import torch
@@ -45,13 +45,13 @@ class Contraction:
             )
 
     def points(self, points: Tensor) -> Tensor:
-        """Maps points [..., 3] to points [..., 3] less than 2 R from the centre."""
+        """Maps world points [..., 3] to points [..., 3] less than 2 R from the centre."""
         centre = self.centre.to(points)
         offset, length = self._offset(points, centre)
         return centre + self.radius * offset * ((2 - 1 / length) / length)
 
     def inverse(self, points: Tensor) -> Tensor:
-        """The points of the world that are contracted to points [..., 3]; at most 1,000 R from the centre."""
+        """Returns the world points [..., 3] of contracted points [..., 3]; at most 1,000 R from the centre."""
         centre = self.centre.to(points)
         offset = (points - centre) / self.radius
         length = offset.norm(dim=-1, keepdim=True)
@@ -59,37 +59,40 @@ class Contraction:
         return centre + self.radius * offset * torch.where(length > 1, far, 1)
 
     def stretch(self, points: Tensor) -> Tensor:
-        """World length of a unit of contracted length, [...], along rays from the centre at contracted points [..., 3];
-        at most 1,000,000."""
+        """Returns [...], the world length of a unit of contracted length at points [..., 3]; at most 1,000,000.
+
+        Lengths are along rays from the centre.
+        """
         length = (points - self.centre.to(points)).norm(dim=-1) / self.radius
         return (2 - length).clamp(1e-3, 1).square().reciprocal()
 
     @property
     def numbers(self) -> Tensor:
-        """[4], what `voronerf.ops.march_rays` takes: centre and radius."""
+        """The tensor [4] of centre and radius for `voronerf.ops.march_rays`."""
         return torch.cat((self.centre, self.centre.new_tensor([self.radius])))
 
     @property
     def cube(self) -> Tensor:
-        """The corners [2, 3] of a box around all of space."""
+        """The corners [2, 3] of the cube that holds all contracted points."""
         return torch.stack((self.centre - 2 * self.radius, self.centre + 2 * self.radius))
 
     def gaussians(self, means: Tensor, directions: Tensor, along: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
-        """Maps Gaussians with covariance ``S = along d d^T + across (1 - d d^T)`` by the linearised map (equation 9):
-        the new covariance is ``J S J^T``.
+        """Maps Gaussians by the linearised map (equation 9): the covariance ``S`` becomes ``J S J^T``.
+
+        The covariance is ``S = along d d^T + across (1 - d d^T)``.
 
         Args:
-            means: [..., 3].
-            directions: unit vectors d, [..., 3] or of a shape that broadcasts with it.
-            along: [..., 1], variance along d.
-            across: [..., 1], variance across d.
+            means: [..., 3], the means of the Gaussians.
+            directions: [..., 3] or a shape that broadcasts with it, the unit vectors d.
+            along: [..., 1], variances along d.
+            across: [..., 1], variances across d.
 
         Returns:
             (means [..., 3], variances [..., 3], the diagonal of the new covariance).
         """
         centre = self.centre.to(means)
         offset, length = self._offset(means, centre)
-        # J = a 1 + (b - a) u u^T for the unit vector u from the centre; inside of the sphere a = b = 1.
+        # J = a 1 + (b - a) u u^T for the unit vector u from the centre; inside the sphere a = b = 1.
         a, b = (2 - 1 / length) / length, 1 / length.square()
         u = offset / length
         bent = a * directions + (b - a) * u * (u * directions).sum(-1, keepdim=True)
@@ -103,16 +106,16 @@ class Contraction:
 
 @dataclass(frozen=True, eq=False)
 class Perspective:
-    """Normalised device coordinates: what a camera sees beyond its near plane becomes the cube [-1, 1]^3.
+    """A map to normalised device coordinates: the view beyond a near plane becomes the cube [-1, 1]^3.
 
-    A point at (x, y) across and at depth z becomes (x / (z a), y / (z b), 1 - 2 near / z). Only the positions that the
-    fields see are mapped; distances along rays are those of the world.
+    In camera coordinates, the point (x, y) at depth z becomes (x / (z a), y / (z b), 1 - 2 near / z). Only the inputs
+    of fields are mapped; distances along rays stay in world units.
 
     Attributes:
         centre: [3], the position of the camera.
-        axes: [3, 3], its rows are the directions right, up and ahead.
-        near: depth of the near plane, > 0.
-        slopes: (a, b), half the width and height of what is seen at depth 1.
+        axes: [3, 3], whose rows are the directions right, up and ahead.
+        near: The depth of the near plane, > 0, in world units.
+        slopes: (a, b), half the width and half the height of the view at depth 1.
 
     Examples:
         >>> import torch
@@ -130,34 +133,34 @@ class Perspective:
     slopes: tuple[float, float]
 
     def points(self, points: Tensor) -> Tensor:
-        """Maps points [..., 3]; those before half the near plane as if they were on it."""
+        """Maps world points [..., 3] to points [..., 3]; depths are clamped to at least half the near depth."""
         local, depth = self._local(points)
         across = local[..., :2] / (depth * depth.new_tensor(self.slopes))
         return torch.cat((across, 1 - 2 * self.near / depth), dim=-1)
 
     def inverse(self, points: Tensor) -> Tensor:
-        """The points of the world that are contracted to points [..., 3]; at most 2,000 near depths away."""
+        """Returns the world points [..., 3] of contracted points [..., 3]; at most 2,000 near depths away."""
         depth = 2 * self.near / (1 - points[..., 2:]).clamp_min(1e-3)
         across = points[..., :2] * depth * depth.new_tensor(self.slopes)
         return torch.cat((across, depth), dim=-1) @ self.axes.to(points) + self.centre.to(points)
 
     def stretch(self, points: Tensor) -> Tensor:
-        """World depth of a unit of contracted depth, [...], at contracted points [..., 3]; at most 2,000,000 near."""
+        """Returns [...], the world depth of a unit of contracted depth at points [..., 3]; at most 2,000,000 near."""
         return 2 * self.near / (1 - points[..., 2]).clamp_min(1e-3).square()
 
     @property
     def numbers(self) -> Tensor:
-        """[5, 3], what `voronerf.ops.march_rays` takes: centre, axes, and near with the slopes."""
+        """The tensor [5, 3] of centre, axes, and near with the slopes, for `voronerf.ops.march_rays`."""
         last = self.centre.new_tensor([[self.near, *self.slopes]])
         return torch.cat((self.centre[None], self.axes.to(self.centre), last))
 
     @property
     def cube(self) -> Tensor:
-        """The corners [2, 3] of a box around all that the camera sees."""
+        """The corners [2, 3] of the cube [-1, 1]^3."""
         return self.centre.new_tensor([[-1.0], [1.0]]).expand(2, 3)
 
     def gaussians(self, means: Tensor, directions: Tensor, along: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
-        """Maps Gaussians by the linearised map, as `Contraction.gaussians`."""
+        """Maps Gaussians by the linearised map, as in `Contraction.gaussians`."""
         local, depth = self._local(means)
         axes = self.axes.to(means)
         slopes = depth.new_tensor(self.slopes)[:, None]

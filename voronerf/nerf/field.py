@@ -1,4 +1,4 @@
-"""The form of a field that can be rendered."""
+"""The interface of a field that can be rendered."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class Field(Protocol):
-    """A callable that returns the colour and density of points seen along directions. All renderers take one.
+    """A callable that returns the colours and densities of points seen along directions; the input of all renderers.
 
     Examples:
         >>> import torch
@@ -19,7 +19,7 @@ class Field(Protocol):
     """
 
     def __call__(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions [n, 3], directions [r, 3] (unit), ray_index int32 [n] -> rgb [n, 3] in 0..1, sigma [n] >= 0."""
+        """Maps positions [n, 3], unit directions [r, 3], ray_index int32 [n] to rgb [n, 3] in 0..1, sigma [n] >= 0."""
         ...
 
 
@@ -27,7 +27,7 @@ class DirectionPerSample(nn.Module):
     """A field around a network that takes one direction for each sample.
 
     Args:
-        network: Called with positions [n, 3], or Gaussians [n, 6], and unit directions [n, 3]; returns a colour [n, 3]
+        network: Module that maps positions [n, 3], or Gaussians [n, 6], and unit directions [n, 3] to a colour [n, 3]
             in 0..1 and a density [n] or [n, 1] >= 0 per scene unit.
 
     Examples:

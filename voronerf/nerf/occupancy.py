@@ -1,10 +1,10 @@
-"""An occupancy grid: which voxels of the box of a scene are empty, so that rays can skip them.
+"""An occupancy grid, which marks the empty voxels of a scene's box so that rays can skip them.
 
-x, y, z voxels of the grid along each axis, q voxels to update, r rays, s strata of a ray. Densities are per world unit;
-with a contraction, those that a grid remembers are per unit of contracted space, so that a far voxel counts as dense as
-a near one that takes as much light.
+x, y, z voxels of the grid along each axis, q voxels to update, r rays, s strata of a ray. Densities are per world unit.
+With a contraction, the densities that a grid stores are per unit of contracted space, so a far and a near voxel that
+absorb the same light have the same density.
 Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (voxels keep the largest recent density,
-which decays). Learning it from the samples of a batch, and emptying what is hidden, are additions of this project.
+which decays). This project adds updates from the samples of a batch, and empties hidden voxels.
 """
 
 from __future__ import annotations
@@ -29,36 +29,37 @@ from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.render_opaque import RaysSeen, render_opaque
 
-#: Voxels of a grid along each axis, of a box and of contracted space, which is all the world.
+#: Voxels of a grid along each axis, for a box and for contracted space, which holds the whole world.
 RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
-#: A voxel is empty if a sample in it would take less of the light than this, were the voxel that dense throughout. More
-#: cuts away what is thin: masts, ropes and water.
+#: The opacity of an average stratum below which its voxel is empty. A larger value would remove thin things: masts,
+#: ropes and water.
 OPACITY = 0.02
-#: The same of a voxel of contracted space, for the light on its way through the whole voxel.
+#: The opacity of a whole voxel of contracted space below which it is empty.
 CONTRACTED_OPACITY = 0.1
-#: How many samples in a row empty a new voxel: about thirty steps, until which the field has said nothing about most.
-#: In contracted space fewer: what stays there is fog before the cameras, which explains one view and spoils the others.
+#: The number of samples in a row that empty a new voxel. 8 samples take about thirty steps, in which the field learns
+#: something about most voxels. Contracted space needs fewer: occupied voxels in front of the cameras keep fog that
+#: explains one view and spoils the others.
 PATIENCE, CONTRACTED_PATIENCE = 8, 4
-#: The factor in a training on what a voxel remembers for each sample of a batch in it.
+#: The factor on the stored density of a voxel for each sample of a batch in it, in a training.
 DECAY = 0.8
-CHUNK = 1 << 17  # points that a field evaluates at a time
+CHUNK = 1 << 17  # points in one evaluation of a field
 HIDDEN = 1e-3  # a sample is hidden if less than this share of the light reaches it
-# An empty voxel is a hole if so many of the 27 around and in it are occupied, and so many random points in it are all
-# denser than so many thresholds.
+# A hole is an empty voxel with at least HOLE_NEIGHBOURS occupied voxels in its 3 x 3 x 3 block, in which HOLE_POINTS
+# random points all have a density of at least HOLE_DENSITY thresholds.
 HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 9, 2, 2.0
 
 
 class OccupancyGrid:
-    """The largest recent density of every voxel of a box, and which voxels count as occupied.
+    """A grid of the largest recent densities in a box, whose dense voxels are occupied.
 
-    A new grid is occupied everywhere. `update` and `observe` empty voxels.
+    A new grid is occupied everywhere; `update` and `observe` empty voxels.
 
     Attributes:
         box: float32 [2, 3], lowest and highest corner.
-        density: float32 [x, y, z], the remembered density of each voxel.
+        density: float32 [x, y, z], the stored density of each voxel.
         occupied: bool [x, y, z], density >= threshold.
-        threshold: per world unit.
-        contraction: of the space that the box is in, or None.
+        threshold: The density from which a voxel is occupied, in the unit of `density`.
+        contraction: The contraction of the space of the box, or None.
 
     Examples:
         >>> import torch
@@ -86,13 +87,13 @@ class OccupancyGrid:
         """Makes a grid that is occupied everywhere.
 
         Args:
-            box: [2, 3], the second corner above the first.
-            resolution: voxels along each axis, one number for all or three.
-            threshold: density from which a voxel is occupied, per world unit, > 0 and finite.
-            remembered: density of a new voxel, in thresholds, >= 1. The larger it is, the more often a voxel has to be
-                found empty before it counts as empty.
-            contraction: of the space that the box and the positions are in. Rays stay those of the world.
-            device: of the grid; default that of the box.
+            box: [2, 3], the lowest and the highest corner.
+            resolution: The number of voxels along each axis, one number for all axes or three numbers.
+            threshold: The density from which a voxel is occupied, in the unit of `density`, > 0 and finite.
+            remembered: The density of a new voxel, in thresholds, >= 1. The larger it is, the more empty samples it
+                takes to empty a voxel.
+            contraction: The contraction of the space of box and positions, or None. Rays stay in world coordinates.
+            device: The device of the grid; None for the device of the box.
         """
         shape = (resolution,) * 3 if isinstance(resolution, int) else tuple(resolution)
         if tuple(box.shape) != (2, 3) or not bool((box[1] > box[0]).all()) or not bool(box.isfinite().all()):
@@ -121,21 +122,21 @@ class OccupancyGrid:
         opacity: float = OPACITY,
         device: torch.device | str | None = None,
     ) -> OccupancyGrid:
-        """A grid with the threshold and the memory of a training, over a box or over the cube of a contraction.
+        """Returns a grid with the threshold of a training, over a box or over the cube of a contraction.
 
-        A voxel is empty below the density with which an average stratum, the box's diagonal divided by the samples of a
-        ray, takes ``opacity`` of the light; in contracted space, with which the voxel takes `CONTRACTED_OPACITY`.
+        At the threshold, an average stratum has opacity ``opacity``; its length is the box's diagonal divided by the
+        samples of a ray. In contracted space, at the threshold a whole voxel has opacity `CONTRACTED_OPACITY`.
 
         Args:
-            box: [2, 3], of the scene; not used with a contraction.
+            box: [2, 3], the box of the scene; not used with a contraction.
             samples: Strata of a ray.
-            contraction: Of the space that the field sees; None for that of the world.
+            contraction: The contraction of space for the field; None for world coordinates.
             resolution: Voxels along each axis; None for `RESOLUTION`, or `CONTRACTED_RESOLUTION`.
-            opacity: See above.
-            device: Of the grid; None for that of the box.
+            opacity: The opacity of an average stratum at the threshold; not used with a contraction.
+            device: The device of the grid; None for the device of the box.
 
         Raises:
-            ValueError: Neither a box nor a contraction.
+            ValueError: There is neither a box nor a contraction.
 
         Examples:
             >>> import torch
@@ -157,22 +158,22 @@ class OccupancyGrid:
 
     @property
     def share(self) -> float:
-        """Share of the voxels that are occupied, 0..1. Waits for the device."""
+        """The share of occupied voxels, 0..1. The host waits for the device."""
         return float(self.occupied.float().mean())
 
     def points(self, voxels: Tensor, uniforms: Tensor | None = None) -> Tensor:
-        """Points in voxels.
+        """Returns a point in each voxel.
 
         Args:
-            voxels: int [q], flat numbers of voxels.
-            uniforms: [q, 3] in 0..1, where in the voxel; None for the middle.
+            voxels: int [q], flat indices of voxels.
+            uniforms: [q, 3] in 0..1, the position in the voxel; None for the middle.
 
         Returns:
-            float32 [q, 3], world.
+            float32 [q, 3], in the space of the box.
         """
         shape = torch.tensor(self.occupied.shape, dtype=torch.float32, device=self.box.device)
         _, y, z = self.occupied.shape
-        # In float64, since torch divides integers slowly; axis by axis, since its loops over three entries are slow.
+        # Computes in float64, since torch divides integers slowly, and axis by axis, since rows of three are slow.
         voxels = voxels.double()
         line = (voxels / z).floor()
         plane = (line / y).floor()
@@ -191,24 +192,24 @@ class OccupancyGrid:
         generator: torch.Generator | None = None,
         backend: str = "auto",
     ) -> None:
-        """Evaluates a field at a random point of each voxel, and keeps the larger of new and decayed old density.
+        """Evaluates a field at a random point of each voxel, and stores the larger of new and decayed old density.
 
         Args:
-            field: called without gradients.
-            voxels: int32 or int64 [q], flat numbers of the voxels to update; None for all.
-            decay: factor on the old densities of these voxels, 0..1; 0 forgets them.
-            generator: of the points, on any device.
-            backend: of the op.
+            field: The field, which is called without gradients.
+            voxels: int32 or int64 [q], flat indices of the voxels to update; None for all.
+            decay: Factor on the old densities of these voxels, 0..1; 0 forgets them.
+            generator: Random generator of the points, on any device.
+            backend: The backend of the op.
 
         Raises:
-            ValueError: a decay out of range; on the CPU voxels out of range.
+            ValueError: The decay is out of range, or, on the CPU, a voxel is.
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.update: decay must lie in 0..1, got {decay}")
         if voxels is None:
             voxels = torch.arange(self.occupied.numel(), device=self.box.device)
         check_range("OccupancyGrid.update", "voxels", voxels, self.occupied.numel())
-        # All points before the first is entered: `decay` is of the densities from before.
+        # Enters all points in one call, since each call decays the old densities.
         points = [self.points(part, random_uniforms(len(part), 3, self.box, generator)) for part in voxels.split(CHUNK)]
         densities = [_density_of(field, part) for part in points]
         if densities:
@@ -218,14 +219,14 @@ class OccupancyGrid:
     def revisit(
         self, field: Field, count: int, seed: Tensor, *, fixed: Tensor | None = None, backend: str = "auto"
     ) -> None:
-        """Evaluates a field at random points of random voxels, which keep the larger of new and old density.
+        """Evaluates a field at random points in the grid, and stores the larger of new and old density of their voxels.
 
         Args:
-            field: called without gradients.
-            count: of the points, at least 1.
-            seed: int32 [1], of the points, as from `draw_seed`.
-            fixed: bool [x, y, z], voxels that stay as they are; None for none.
-            backend: of the ops.
+            field: The field, which is called without gradients.
+            count: The number of points, at least 1.
+            seed: int32 [1], the seed of the points, from `draw_seed`.
+            fixed: bool [x, y, z], voxels that do not change; None for none.
+            backend: The backend of the ops.
         """
         points = draw_points(seed, count, self.box, backend=backend)
         self._enter(points, _density_of(field, points), decay=1.0, hidden=0.0, fixed=fixed, backend=backend)
@@ -242,23 +243,23 @@ class OccupancyGrid:
         fixed: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
-        """Updates voxels, in place, from samples that were rendered anyway.
+        """Updates voxels, in place, from samples that were already rendered.
 
-        A sample that receives less than the share `HIDDEN` of the light counts as density 0. So the inside of an opaque
-        object becomes empty like the space around it, which changes no picture. A surface that only few of the rays
-        through its voxel see fades too, until `update` evaluates it again.
+        A sample that less than the share `HIDDEN` of the light reaches counts as density 0. So the inside of an opaque
+        object becomes empty, which changes no picture. A surface that few of the rays through its voxel see is emptied
+        too, until `update` evaluates it again.
 
         Args:
             positions: float32 [m, 3] in the box; a position outside counts for the nearest voxel at the border.
-            density: [m], at the positions; NaN counts as infinite.
+            density: [m], the densities at the positions; NaN counts as infinite.
             deltas: [m], lengths of the strata of the samples.
             weights: [m], contributions of the samples to their rays, from `composite`.
-            decay: factor on the old densities of the voxels of these samples, 0..1.
-            fixed: bool [x, y, z], voxels that stay as they are; None for none.
+            decay: Factor on the old densities of the voxels of these samples, 0..1.
+            fixed: bool [x, y, z], voxels that do not change; None for none.
             backend: "auto", "reference", "native" or "warp".
 
         Raises:
-            ValueError: a decay out of range.
+            ValueError: The decay is out of range.
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
@@ -267,18 +268,18 @@ class OccupancyGrid:
 
     @torch.no_grad()
     def fill_holes(self, field: Field, *, generator: torch.Generator | None = None) -> None:
-        """Occupies empty voxels among occupied ones in which a field is dense: holes in surfaces that few rays meet.
+        """Fills holes in surfaces: occupies empty voxels in which a field is dense and many neighbours are occupied.
 
-        For a field that learns no more: before, each of these voxels would cost samples in every step. Where no ray
-        asks a field any more, it can be dense by chance. So voxels that stand alone, or are thin in places, stay empty.
+        Call it after the training, since filled voxels would cost samples in every step. The field can be dense by
+        chance where no ray samples it, so voxels without occupied neighbours, or with thin points, stay empty.
 
         Args:
-            field: called without gradients.
-            generator: of the points, on any device.
+            field: The trained field, which is called without gradients.
+            generator: Random generator of the points, on any device.
         """
-        beside = torch.nn.functional.avg_pool3d(self.occupied[None].float(), 3, 1, 1, divisor_override=1)[0]
-        holes = ((beside >= HOLE_NEIGHBOURS) & ~self.occupied).view(-1).nonzero()[:, 0]
-        least = HOLE_DENSITY * self.threshold
+        neighbours = torch.nn.functional.avg_pool3d(self.occupied[None].float(), 3, 1, 1, divisor_override=1)[0]
+        holes = ((neighbours >= HOLE_NEIGHBOURS) & ~self.occupied).view(-1).nonzero()[:, 0]
+        minimum = HOLE_DENSITY * self.threshold
         for _ in range(HOLE_POINTS):
             dense = [holes[:0]]
             for part in holes.split(CHUNK):
@@ -286,32 +287,32 @@ class OccupancyGrid:
                 density = density_of(field, points)
                 if self.contraction is not None:
                     density = density * self.contraction.stretch(points)
-                dense.append(part[density >= least])
+                dense.append(part[density >= minimum])
             holes = torch.cat(dense)
-        self.density.view(-1)[holes] = least
+        self.density.view(-1)[holes] = minimum
         self.occupied.view(-1)[holes] = True
 
     def _enter(self, *samples: Tensor, **rule: Any) -> None:
-        """Samples, in the units of the world, on their way into the grid; arguments as for `observe_occupancy`."""
+        """Enters samples, with densities in world units, into the grid; see `voronerf.ops.observe_occupancy`."""
         rule |= {"threshold": self.threshold, "contraction": self._numbers}
         observe_occupancy(self.density, self.occupied, self.box, *samples, **rule)
 
     def voxels(self, points: Tensor) -> Tensor:
-        """Flat numbers int32 [n] of the voxels that points [n, 3] lie in; outside the box the nearest at its border."""
+        """Returns int32 [n], the flat indices of the voxels of points [n, 3]; the nearest voxel for points outside."""
         return voxels_of(points, self.box, self.occupied.shape)
 
     def march(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> March:
-        """The samples of rays that lie in occupied voxels; other arguments are those of `voronerf.ops.march_rays`."""
+        """Returns the samples of rays in occupied voxels; the options are as in `voronerf.ops.march_rays`."""
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return march_rays(*arguments, contraction=self._numbers, **rule)
 
     def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaysSeen:
-        """Renders rays through networks in occupied voxels; other arguments as of `voronerf.ops.render_opaque`."""
+        """Renders rays by networks in occupied voxels; the options are as in `voronerf.ops.render_opaque`."""
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return render_opaque(*arguments, contraction=self._numbers, **rule)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The tensors from which `from_state` makes the same grid, bit for bit."""
+        """Returns the tensors from which `from_state` makes the same grid, bit for bit."""
         return {
             "box": self.box.clone(),
             "density": self.density.clone(),
@@ -320,10 +321,10 @@ class OccupancyGrid:
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Takes the box, the densities and the threshold of another grid's `state_dict`.
+        """Loads box, densities and threshold from another grid's `state_dict`.
 
         Raises:
-            ValueError: an entry is missing or has a wrong shape.
+            ValueError: An entry is missing or has a wrong shape.
         """
         other = OccupancyGrid.from_state(state, contraction=self.contraction, device=self.box.device)
         self.box, self.threshold = other.box, other.threshold
@@ -336,10 +337,10 @@ class OccupancyGrid:
         contraction: Contraction | Perspective | None = None,
         device: torch.device | str = "cpu",
     ) -> OccupancyGrid:
-        """A grid from its `state_dict`, and its contraction, which is not part of it.
+        """Returns a grid from its `state_dict`, and from its contraction, which the state does not hold.
 
         Raises:
-            ValueError: an entry is missing or has a wrong shape.
+            ValueError: An entry is missing or has a wrong shape.
         """
         missing = [name for name in ("box", "density", "occupied", "threshold") if name not in state]
         if missing:
@@ -360,21 +361,21 @@ class OccupancyGrid:
 
 
 def draw_seed(device: torch.device, generator: torch.Generator | None) -> Tensor:
-    """A seed of jitter for ``march_rays``, int32 [1]; the device is that of the rays."""
-    drawn_on = device if generator is None else generator.device
-    return torch.randint(-(2**31), 2**31, (1,), device=drawn_on, dtype=torch.int32, generator=generator).to(device)
+    """Draws a seed for ``march_rays``, int32 [1] on `device`, the device of the rays."""
+    source = device if generator is None else generator.device
+    return torch.randint(-(2**31), 2**31, (1,), device=source, dtype=torch.int32, generator=generator).to(device)
 
 
 def density_of(field: Field, points: Tensor) -> Tensor:
-    """Density [n] of a field at points [n, 3], float32, seen along the z axis; NaN becomes infinity."""
+    """Returns float32 [n], the density of a field at points [n, 3] seen along the z axis; NaN becomes infinity."""
     return _density_of(field, points).nan_to_num(nan=float("inf"), posinf=float("inf"))
 
 
 def _density_of(field: Field, points: Tensor) -> Tensor:
-    """Density as in `density_of`, but NaN stays NaN."""
+    """Returns the density as in `density_of`, but keeps NaN."""
     direction = _along_z(points.device)
-    known = radiance_of(field, (points, direction.expand(len(points), -1)))
-    sigma = None if isinstance(known, str) else known.density(points)
+    radiance = radiance_of(field, (points, direction.expand(len(points), -1)))
+    sigma = None if isinstance(radiance, str) else radiance.density(points)
     if sigma is None:
         _, sigma = field(points, direction, torch.zeros(len(points), dtype=torch.int32, device=points.device))
     return sigma.detach().float()
@@ -382,5 +383,5 @@ def _density_of(field: Field, points: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=8)
 def _along_z(device: torch.device) -> Tensor:
-    """A direction [1, 3]."""
+    """Returns the direction of the z axis, [1, 3]."""
     return torch.tensor(((0.0, 0.0, 1.0),), device=device)

@@ -1,4 +1,4 @@
-"""Fields as programs, for the operations that take networks, colours and loss together. n samples, r rays."""
+"""Fields as programs, for the ops that fuse networks, colours and loss. n samples, r rays."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.router import VoronoiRouter
 from voronerf.router.program import CellProgram
 
-_THRESHOLD = 20.0  # from which on softplus is its argument; above that of float32, where both are the same
+_THRESHOLD = 20.0  # the least supported threshold of softplus; in float32 softplus(x) == x above it
 
 
 class Networks(NamedTuple):
     """A radiance field as a program.
 
     Attributes:
-        program: Of positions [n, 3], or Gaussians [n, 6], and, if read, of directions [r, 3] with one row for each ray,
-            to colour and density, one output [n, 4].
-        density_scale: They come before the sigmoid of the colour and before the softplus of the density, which has this
-            factor; None for what is the colour and the density already.
-        density: Of positions alone, to the density [n, 1] itself; None if directions are read for it.
+        program: The program from positions [n, 3], or Gaussians [n, 6], and, if used, directions [r, 3] of the rays, to
+            one output [n, 4] of colour and density.
+        density_scale: The factor on the softplus of the density, if the output is before the sigmoid of the colour and
+            the softplus of the density; None if the output is after all activations.
+        density: The program from positions to the activated density [n, 1]; None if it uses directions.
     """
 
     program: Program
@@ -39,9 +39,9 @@ class Radiance(NamedTuple):
     """A radiance field whose program is known, with its parameters and cells.
 
     Attributes:
-        router: Whose networks they are.
-        cells: What a call of it computes.
-        networks: The same as a radiance field.
+        router: The router of the networks.
+        cells: The program of a call of the router.
+        networks: The programs of the radiance field.
     """
 
     router: VoronoiRouter
@@ -50,18 +50,18 @@ class Radiance(NamedTuple):
 
     @property
     def rule(self) -> dict[str, Any]:
-        """How `render_loss` shall read the outputs."""
+        """The options that tell `render_loss` how to read the outputs."""
         scale = self.networks.density_scale
         return {"activated": True} if scale is None else {"density_scale": scale}
 
     def arguments(self, inputs: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any]:
-        """The arguments of `forward_with_tape` for samples; see :class:`voronerf.nerf.Field` and :class:`Networks`."""
+        """Returns the arguments of `forward_with_tape`; see :class:`voronerf.nerf.Field` and :class:`Networks`."""
         places, rays = self.router.places(inputs), self.networks.program.rays
         tensors = {"inputs": [inputs, directions], "ray_index": ray_index} if rays else {"inputs": [inputs]}
         return {"program": self.networks.program, "parameters": self.cells.parameters, **tensors, **places}
 
     def density(self, points: Tensor) -> Tensor | None:
-        """[n], of points [n, 3], without the layers of the colour; None if it depends on the direction."""
+        """Returns the density [n] of points [n, 3] without the colour layers; None if it depends on the direction."""
         router, program = self.router, self.networks.density
         if program is None:
             return None
@@ -70,13 +70,13 @@ class Radiance(NamedTuple):
 
 
 def radiance_of(field: Field, samples: tuple[Tensor, Tensor] | None = None, *, inputs: int = 3) -> Radiance | str:
-    """The program of a field; or the reason why it is unknown.
+    """Returns the program of a field, or the reason why it is unknown.
 
     Args:
-        field: A router, or one in a `DirectionPerSample`.
-        samples: Positions [n, 3] or Gaussians [n, 6], and directions [n, 3], on which a module that has not been is
-            traced; None for no trace.
-        inputs: Columns of the former.
+        field: A router, or a router in a `DirectionPerSample`.
+        samples: Positions [n, 3] or Gaussians [n, 6], and directions [n, 3], with which an untraced module is traced;
+            None for no trace.
+        inputs: The number of columns of positions or Gaussians.
     """
     router = router_of(field)
     if router is None:
@@ -90,20 +90,20 @@ def radiance_of(field: Field, samples: tuple[Tensor, Tensor] | None = None, *, i
 
 
 def router_of(field: Field) -> VoronoiRouter | None:
-    """The router that is a field, or whose network is given a direction for each sample; None if there is none."""
+    """Returns the router of a field: the field itself, or its network in a `DirectionPerSample`; None if none."""
     inner = field.network if isinstance(field, DirectionPerSample) else field
     return inner if isinstance(inner, VoronoiRouter) else None
 
 
 @functools.lru_cache(maxsize=8)
 def _example(inputs: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Samples [2, inputs] and a direction for each of them."""
+    """Returns example samples [2, inputs] and directions [2, 3]."""
     return torch.zeros(2, inputs, device=device), torch.zeros(2, 3, device=device)
 
 
 @functools.lru_cache(maxsize=256)
 def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], ...], inputs: int) -> Networks | str:
-    """The networks of a `CellProgram`; or why it is no radiance field."""
+    """Returns the networks of a `CellProgram`, or why it is no radiance field."""
     program = Program.parse(text)
     if len(shapes) != 2 or shapes[0] != (3,) or shapes[1] not in ((), (1,)):
         return (
@@ -114,15 +114,17 @@ def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], 
     if (width := program.inputs[reads.index(0)]) != inputs:
         return f"the field takes {width} numbers for a sample, and there are {inputs}"
     colour, density = program.outputs
-    raw = _raw(program.steps, colour, density)
-    before, scale = raw if raw is not None else ([colour, density], None)
-    apart = _past_moves(program)
-    alone = _of_fields(apart, [apart.outputs[1]], reads, inputs)
-    return Networks(_of_fields(program, before, reads, inputs), scale, None if alone.rays else alone)
+    raw = _before_activations(program.steps, colour, density)
+    outputs, scale = raw if raw is not None else ([colour, density], None)
+    direct = _without_moves(program)
+    density_program = _field_program(direct, [direct.outputs[1]], reads, inputs)
+    return Networks(
+        _field_program(program, outputs, reads, inputs), scale, None if density_program.rays else density_program
+    )
 
 
-def _past_moves(program: Program) -> Program:
-    """A program that reads columns at their source, not where they were put side by side: density without colour."""
+def _without_moves(program: Program) -> Program:
+    """Returns the program without copies by "move" steps, so that the density does not depend on the colour."""
     moves = {step.out: step for step in program.steps if step.op == "move"}
 
     def source(columns: Columns) -> Columns:
@@ -136,8 +138,8 @@ def _past_moves(program: Program) -> Program:
     return replace(program, steps=tuple(steps), outputs=tuple(map(source, program.outputs)))
 
 
-def _of_fields(program: Program, outputs: Sequence[Columns], reads: tuple[int, ...], width: int) -> Program:
-    """A program with positions as its first input, directions of rays as its second if read, and one output."""
+def _field_program(program: Program, outputs: Sequence[Columns], reads: tuple[int, ...], width: int) -> Program:
+    """Returns a program with the inputs positions and, if used, directions of rays, and with one output."""
     needed, b = pruned(Builder(program).program(outputs)), Builder()
     read = {int(step.numbers[0]) for step in needed.steps if step.op == "input"}
     arguments = [b.input(width)]
@@ -147,21 +149,21 @@ def _of_fields(program: Program, outputs: Sequence[Columns], reads: tuple[int, .
     return b.program([b.side_by_side(values)])
 
 
-def _raw(steps: Sequence[Step], colour: Columns, density: Columns) -> tuple[list[Columns], float] | None:
-    """Columns before a sigmoid and before a softplus, and the factor on that; None for other activations."""
-    made = {step.out: step for step in steps}
+def _before_activations(steps: Sequence[Step], colour: Columns, density: Columns) -> tuple[list[Columns], float] | None:
+    """Returns the columns before sigmoid and softplus, and the softplus's factor; None for other activations."""
+    steps_by_output = {step.out: step for step in steps}
 
     def before(columns: Columns, name: str) -> tuple[Columns, float, float] | None:
-        step = made[columns.index] if columns.of == VALUE and not columns.spread else None
+        step = steps_by_output[columns.index] if columns.of == VALUE and not columns.spread else None
         if step is None or step.op != "function" or step.name != name or step.numbers[0] or len(step.operands) > 1:
             return None
         return step.operands[0].part(columns.start, columns.width), step.numbers[1], step.numbers[2]
 
-    scale, of_colour = 1.0, before(colour, "sigmoid")
+    scale, raw_colour = 1.0, before(colour, "sigmoid")
     scaled = before(density, "affine")
     if scaled is not None and scaled[2] == 0 and scaled[1] > 0:
         density, scale, _ = scaled
-    of_density = before(density, "softplus")
-    if of_colour is None or of_density is None or of_density[1] != 1 or of_density[2] < _THRESHOLD:
+    raw_density = before(density, "softplus")
+    if raw_colour is None or raw_density is None or raw_density[1] != 1 or raw_density[2] < _THRESHOLD:
         return None
-    return [of_colour[0], of_density[0]], scale
+    return [raw_colour[0], raw_density[0]], scale

@@ -1,4 +1,4 @@
-"""Rays against the scene's box. r rays; distances are along the unit direction, in world units."""
+"""Intersection of rays with the scene's box. r rays; distances are along the unit direction, in world units."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from voronerf.ops.formulas import meet_box
 def intersect_box(
     origins: Tensor, directions: Tensor, box: Tensor | None, near: float, far: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The part of each ray between `near` and `far` that lies in an axis-aligned box (slab method).
+    """Returns the part of each ray between `near` and `far` that lies in an axis-aligned box (slab method).
 
     Args:
-        origins: [r, 3].
-        directions: [r, 3]; components may be zero.
+        origins: [r, 3], the origins of the rays.
+        directions: [r, 3], unit directions; components may be zero.
         box: [2, 3], lowest and highest corner, or None for all of space.
-        near: nearest distance of interest, >= 0.
-        far: farthest.
+        near: The nearest distance of interest, >= 0.
+        far: The farthest distance of interest.
 
     Returns:
-        (near [r], far [r], hit bool [r]). A ray that misses has hit False and far == near, so that its samples have no
-        extent. A ray that only touches the box misses.
+        (near [r], far [r], hit bool [r]). A ray that misses the box has hit False and far == near, so its samples
+        have no extent. A ray that only touches the box misses it.
 
     Examples:
         >>> import torch

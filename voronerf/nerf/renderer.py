@@ -21,14 +21,14 @@ from voronerf.nerf.volume import RayColours, Rendered, Samples, per_ray, render_
 
 
 class RenderedImage(NamedTuple):
-    """A rendered picture, of `Renderer.image`.
+    """A rendered picture, the result of `Renderer.image`.
 
     Attributes:
         colour: [h, w, 3], the background included.
-        opacity: [h, w].
+        opacity: [h, w], 0..1.
         depth: [h, w], as in `Rendered`.
-        heaviest: [h, w, 3], position of the heaviest sample of each ray; its cell is the one that the pixel shows. A
-            ray without samples (opacity 0) has its far end.
+        heaviest: [h, w, 3], the position of the sample with the largest weight, whose cell the pixel shows. For a ray
+            without samples (opacity 0) it is the far end.
 
     Examples:
         >>> import torch
@@ -49,19 +49,19 @@ class RenderedImage(NamedTuple):
 
 @replayed
 class Renderer:
-    """Renders the rays of a scene: fields, asked where a sampler says.
+    """Renders the rays of a scene by fields, evaluated at the samples of a sampler.
 
     Attributes:
-        fields: By name.
-        sampler: Can be set at any time.
+        fields: The fields by name.
+        sampler: The sampler, which can be replaced at any time.
 
     Args:
-        fields: By the names of the sampler's networks; "field" has the colours.
-        sampler: Where along a ray they are asked.
-        backend: Of the ops.
+        fields: The fields under the names of the sampler's networks; "field" gives the colours.
+        sampler: The sampler, which chooses the points along each ray.
+        backend: The backend of the ops.
 
     Raises:
-        ValueError: Fields of other names.
+        ValueError: The names of the fields differ from the names of the sampler's networks.
 
     Examples:
         >>> import torch
@@ -76,29 +76,29 @@ class Renderer:
     """
 
     def __init__(self, fields: Mapping[str, Field], sampler: Sampler, *, backend: str = "auto") -> None:
-        wanted = sampler.networks(sampler.space.cones)
-        if set(fields) != set(wanted):
-            raise ValueError(f"Renderer: fields must be {' and '.join(wanted)}, got {sorted(fields)}")
+        names = sampler.networks(sampler.space.cones)
+        if set(fields) != set(names):
+            raise ValueError(f"Renderer: fields must be {' and '.join(names)}, got {sorted(fields)}")
         self.fields, self.sampler, self.backend = dict(fields), sampler, backend
 
     @property
     def field(self) -> Field:
-        """The field whose colours count."""
+        """The field that gives the colours of the picture."""
         return self.fields["field"]
 
     @property
     def occupancy(self) -> OccupancyGrid | None:
-        """Which space the sampler skips."""
+        """The occupancy grid of the sampler; None if it skips no space."""
         return self.sampler.grid
 
     @property
     def cones(self) -> bool:
-        """Whether fields are asked about Gaussians."""
+        """True if the fields are evaluated on Gaussians."""
         return self.sampler.space.cones
 
     @property
     def contraction(self) -> Contraction | Perspective | None:
-        """The contraction of the space that the fields work in."""
+        """The contraction of space for the fields; None for world coordinates."""
         return self.sampler.space.contraction
 
     @property
@@ -125,15 +125,15 @@ class Renderer:
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Rendered, ...]:
-        """Renders rays, with one result for each pass; the last has the colours. Differentiable.
+        """Renders rays, with one result for each pass; the last has the final colours. Differentiable.
 
         Args:
             rays: r rays, with radii for cones.
-            near: [r] or one for all, where the rays begin.
-            far: [r] or one for all, where the rays end.
-            background: [3] or [r, 3]; None is black.
-            jitter: random samples, for training.
-            generator: of the jitter.
+            near: [r] or one for all, the distance at which the rays begin.
+            far: [r] or one for all, the distance at which the rays end.
+            background: [3] or [r, 3], the colour behind the scene; None is black.
+            jitter: Whether the samples are random, for training.
+            generator: Random generator of the jitter.
         """
         near, far = per_ray(near, rays), per_ray(far, rays)
 
@@ -151,10 +151,10 @@ class Renderer:
 
         Args:
             rays: r rays.
-            near: [r].
-            far: [r].
-            background: [3] or [r, 3]; None is black.
-            heaviest: whether to find the heaviest samples; without it that part of the result means nothing.
+            near: [r], the distances at which the rays begin.
+            far: [r], the distances at which the rays end.
+            background: [3] or [r, 3], the colour behind the scene; None is black.
+            heaviest: Whether to find the samples with the largest weights; else `heaviest` of the result is undefined.
         """
         arguments = self.field, rays, near, far
         if (seen := self.sampler.see(*arguments, background=background, heaviest=heaviest)) is not None:
@@ -179,18 +179,18 @@ class Renderer:
         heaviest: bool = True,
         chunk: int | None = None,
     ) -> RenderedImage:
-        """The whole image of one camera, without gradients and without randomness.
+        """Renders the whole image of one camera, without gradients and without randomness.
 
         Args:
-            cameras: on the fields' device.
-            index: the camera.
-            near: nearest distance of interest.
-            far: farthest.
-            box: [2, 3] outside of which nothing is; rays that miss it show the background without asking the field.
-            background: [3], None is black.
-            heaviest: whether to look for each ray's heaviest sample; without it that part of the result means nothing.
-            chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples
-                of a ray, 131,072.
+            cameras: The cameras, on the device of the fields.
+            index: The index of the camera.
+            near: The nearest distance of interest.
+            far: The farthest distance of interest.
+            box: [2, 3], the box of the scene. Rays that miss it show the background and do not evaluate the field.
+            background: [3], the colour behind the scene; None is black.
+            heaviest: Whether to find the samples with the largest weights; else `heaviest` of the result is undefined.
+            chunk: The number of rays rendered at a time, which bounds the memory. Default 4,096, or 131,072 with a
+                grid, which leaves few samples a ray.
         """
         if chunk is None:
             chunk = 4096 if self.occupancy is None else 131_072
@@ -200,19 +200,21 @@ class Renderer:
         rays, first, last = cameras.image_rays_between(index, cones=self.cones, backend=self.backend, **bounds)
         missed = last <= first
         first, last = first.masked_fill(missed, far), last.masked_fill(missed, far)
-        # Through a grid a ray that misses the box costs nothing; without one the field would be asked about it.
-        count, asked = len(first), None if self.occupancy is not None else (~missed).nonzero()[:, 0]
+        # A ray that misses the box costs nothing with a grid; without a grid it would evaluate the field.
+        count, hits = len(first), None if self.occupancy is not None else (~missed).nonzero()[:, 0]
         parts = []
-        for start in range(0, max(1, count if asked is None else len(asked)), chunk):
-            rows = slice(start, start + chunk) if asked is None else asked[start : start + chunk]
+        for start in range(0, max(1, count if hits is None else len(hits)), chunk):
+            rows = slice(start, start + chunk) if hits is None else hits[start : start + chunk]
             parts.append(self.see(rays[rows], first[rows], last[rows], background, heaviest))
         seen = RayColours(*map(torch.cat, zip(*parts, strict=True)))
-        if asked is not None and len(asked) < count:
-            none = torch.zeros_like(rays.origins) if background is None else background.expand(count, 3)
+        if hits is not None and len(hits) < count:
+            behind = torch.zeros_like(rays.origins) if background is None else background.expand(count, 3)
             places = rays.origins + far * rays.directions
             places = places if self.contraction is None else self.contraction.points(places)
-            whole = none.to(rays.origins), torch.zeros_like(first), torch.full_like(first, far), places
-            seen = RayColours(*(to.clone().index_copy_(0, asked, part.to(to.dtype)) for to, part in zip(whole, seen)))
+            blank = behind.to(rays.origins), torch.zeros_like(first), torch.full_like(first, far), places
+            seen = RayColours(
+                *(values.clone().index_copy_(0, hits, part.to(values.dtype)) for values, part in zip(blank, seen))
+            )
         colour, opacity, depth, places = seen
         size = cameras.size(index)[::-1]
         return RenderedImage(
@@ -231,17 +233,17 @@ def render_rays(
     jitter: bool = False,
     generator: torch.Generator | None = None,
 ) -> Rendered:
-    """Colours of rays by quadrature of the volume rendering integral (Mildenhall et al. 2020, NeRF, eq. 3).
+    """Renders rays by quadrature of the volume rendering integral (Mildenhall et al. 2020, NeRF, eq. 3).
 
     Args:
-        field: called once, on all samples; the samples of a ray are consecutive.
+        field: The field, which is called once on all samples; the samples of a ray are consecutive.
         rays: r rays.
-        near: start of the integral, [r] or one for all.
-        far: end, [r] or one for all. A ray with far == near gets the background.
-        samples: s, one in each of s strata; or another sampler, such as `Occupancy`.
+        near: Start of the integral, [r] or one for all.
+        far: End of the integral, [r] or one for all. A ray with far == near gets the background.
+        samples: s, the number of strata with one sample each; or a sampler, such as `Occupancy`.
         background: [3] or [r, 3], the colour behind the scene; None is black.
-        jitter: random samples in the strata, else their middles.
-        generator: of the jitter.
+        jitter: Whether samples are random in their strata, else in the middles.
+        generator: Random generator of the jitter.
 
     Examples:
         >>> import torch

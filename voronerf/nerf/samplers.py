@@ -1,6 +1,6 @@
-"""Where along rays a field is asked: a sampler is a class here and a line in `SAMPLERS`.
+"""Samplers, which choose the points along rays at which a field is evaluated.
 
-r rays, m samples of all rays (packed), s samples a ray. All samplers give `Samples`.
+A new sampler is a class here and a line in `SAMPLERS`. r rays, m samples of all rays (packed), s samples a ray.
 """
 
 from __future__ import annotations
@@ -37,62 +37,64 @@ from voronerf.ops.formulas import Wave, walk
 from voronerf.ops.render_opaque import NETWORK
 from voronerf.ops.resample import resample
 
-#: Share of the first pass in the loss if one network is evaluated in two passes (mip-NeRF, section 3.2).
+#: The weight of the first pass in the loss if one network serves two passes (mip-NeRF, section 3.2).
 COARSE_SHARE = 0.1
-#: While an occupancy grid settles, a quarter of the strata are used.
+#: The divisor of the number of strata while an occupancy grid settles.
 SETTLING_PART = 4
-#: The first steps of a training, in which the grid learns nothing, in a contracted sphere; elsewhere they are as many
-#: as the learning rate may rise for. A young field is thin everywhere: a grid would take it for empty, and what is
-#: emptied no longer learns. The more samples a step has, the fewer steps would empty all.
+#: The number of first steps in which the grid learns nothing, in a contracted sphere; elsewhere it is `WARMUP_STEPS`.
+#: An untrained field is thin everywhere: the grid would take it for empty, and emptied voxels learn no more. The more
+#: samples a step has, the sooner the whole grid would be empty.
 SETTLING_STEPS = 400
-#: The share of all voxels of the occupancy grid that are evaluated at random before each `GROUP` of steps, and how many
-#: at most: as many as a few steps have samples.
+#: The share of the voxels that are evaluated at random before each `GROUP` of steps, and the most such voxels, which is
+#: about the number of samples of a few steps.
 REVISITED, MOST_REVISITED = 1 / 8, 32_768
-#: Samples of a ray of a picture for each of training, whose samples are jittered and so cover each stratum over time.
-#: At most so many: of the 256 of a long training, twice as many would make no picture more than 0.05 dB better.
+#: The factor on the strata of a ray in pictures, since training samples are jittered and cover each stratum over time;
+#: and the most strata. Twice the 256 strata of a long training would make no picture more than 0.05 dB better.
 PICTURE_SAMPLES, MOST_PICTURE_SAMPLES = 2, 384
-#: A ray of a picture ends when it lets less than this through: what is behind counts as of the colour before it.
+#: The transmittance below which a ray of a picture ends; the rest of the ray counts as having the colour so far.
 OPAQUE = 0.05
-#: Samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain. Pictures of
-#: contracted space, photographs, have so many rays that a wave's own costs count less.
+#: Samples of a ray in a wave. Small waves have more overhead, large waves evaluate samples behind the surface in vain.
+#: Pictures of contracted space, photographs, have more rays, so the overhead of a wave counts less.
 WAVE, CONTRACTED_WAVE = 12, 8
-#: The same where one operation takes all waves, which cost next to nothing then.
+#: Samples of a ray in a wave if one operation runs all waves, whose overhead is then negligible.
 FINE_WAVE = 4
-#: Samples of a ray through contracted space whose empty part is skipped, by the seconds of a training from which on it
-#: has them: shorter strata make steps dearer at first, and sharper pictures in the end.
+#: Strata of a ray through contracted space, by the least training time in seconds. Shorter strata make steps slower at
+#: first, and pictures sharper in the end.
 CONTRACTED_SAMPLES = {0.0: 128, LONG: 256, 90.0: 384}
-#: In a box a training is long from so many seconds for each pixel along it, and has at most so many samples of a ray.
+#: A training in a box is long from this many seconds per pixel along the box; it then has at most this many strata.
 LONG_IN_BOX, LONG_SAMPLES = 0.45, 256
-#: Renders samples through one of the networks of a cell, given by its name.
-Look = Callable[[str, Samples], Rendered]
+#: A function that renders samples with the field of a name.
+RenderPass = Callable[[str, Samples], Rendered]
 
 
 @replayed
 class Sampler:
-    """Where along rays a field is asked, and what becomes of that between the steps of a training.
+    """A rule that chooses the sample points of rays, and may learn from the steps of a training.
 
-    A subclass defines :meth:`sample`. One with several passes defines :meth:`draw` and :meth:`loss_before` too, one
-    that learns from a training the two methods of steps, and one that skips empty space ``grid``. Nothing asks for the
-    class of a sampler. A step of a training calls :meth:`step_pre_backward`, :meth:`sample` after its rays are drawn,
-    and :meth:`step_post_backward` after the optimiser, once each. They may change the sampler and its grid; what they
-    change of other objects counts from the next step on. Their tensors are the step's own memory, to be read before
-    they return. A recorded step calls those that a subclass overrides, and makes the calls of the others again.
+    A subclass defines :meth:`sample`. A subclass with several passes also defines :meth:`draw` and
+    :meth:`loss_before`. One that learns defines :meth:`step_pre_backward` and :meth:`step_post_backward`. One that
+    skips empty space defines ``grid``. No code checks the class of a sampler.
+
+    Each training step calls :meth:`step_pre_backward`, then :meth:`sample` after drawing its rays, then
+    :meth:`step_post_backward` after the optimiser. These hooks may change the sampler and its grid; changes to other
+    objects take effect in the next step. The tensors that a hook receives belong to the step, and must be read before
+    the hook returns. A replayed step calls the hooks that a subclass overrides, and replays the calls of the others.
 
     Attributes:
-        passes: How often a ray is sampled, each time with a number of samples of its own.
-        skips: Whether `Occupancy` takes its place where there is a grid.
-        samples: s, of the first pass.
-        space: How the field sees the scene.
-        backend: Of the ops.
-        settling_steps: The first steps of a training, in which the grid learns nothing.
+        passes: The number of passes over a ray, each with its own number of samples.
+        skips: Whether `Occupancy` replaces this sampler if there is a grid.
+        samples: s, the samples a ray of the first pass.
+        space: The coordinates in which rays are sampled and the field is evaluated.
+        backend: The backend of the ops.
+        settling_steps: The number of first training steps in which the grid learns nothing.
 
     Args:
-        samples: s, of the first pass, at least 1.
-        space: How the field sees the scene; None for the world, with even spacing.
-        backend: Of the ops.
+        samples: s, the samples a ray of the first pass, at least 1.
+        space: The coordinates of samples and field; None for world coordinates with even spacing.
+        backend: The backend of the ops.
 
     Raises:
-        ValueError: For fewer samples than 1.
+        ValueError: There are fewer samples than 1.
 
     Examples:
         >>> import torch
@@ -118,21 +120,21 @@ class Sampler:
 
     @staticmethod
     def networks(cones: bool) -> tuple[str, ...]:
-        """The names of a cell's networks; "field" gives the colours."""
+        """Returns the names of a cell's networks; "field" gives the colours."""
         return ("field",)
 
     @property
     def grid(self) -> OccupancyGrid | None:
-        """Which space is empty and skipped; None for a sampler that skips nothing."""
+        """The occupancy grid, whose empty space is skipped; None for a sampler that skips nothing."""
         return None
 
     @property
     def strata(self) -> int:
-        """The most samples of a ray of the next training step, of the first pass."""
+        """The most samples a ray of the first pass of the next training step."""
         return self.samples
 
     def explain(self) -> str:
-        """What is sampled, in a line."""
+        """Describes the sampler in one line."""
         return f"{type(self).__name__}, {self.samples} a ray"
 
     def sample(
@@ -144,20 +146,20 @@ class Sampler:
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> Samples:
-        """The samples of the first pass.
+        """Returns the samples of the first pass.
 
         Args:
             rays: r rays, with radii for cones.
-            near: [r], where they begin.
-            far: [r], where they end.
-            jitter: Random samples, for training; else the same each time.
-            generator: Of the jitter.
+            near: [r], the distances at which the rays begin.
+            far: [r], the distances at which the rays end.
+            jitter: Whether the samples are random, for training; else they are the same in each call.
+            generator: Random generator of the jitter.
         """
         raise NotImplementedError
 
     def draw(
         self,
-        look: Look,
+        look: RenderPass,
         rays: Rays,
         near: Tensor,
         far: Tensor,
@@ -165,54 +167,54 @@ class Sampler:
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Samples, tuple[Rendered, ...]]:
-        """The samples of the last pass, and what the passes before have rendered; other arguments as in :meth:`sample`.
+        """Returns the samples of the last pass, and the rendered results of the earlier passes.
 
         Args:
-            look: Renders the samples of a pass before.
+            look: Function that renders the samples of an earlier pass with the field of a name.
             rays: r rays.
-            near: [r].
-            far: [r].
-            jitter: Random samples.
-            generator: Of the jitter.
+            near: [r], the distances at which the rays begin.
+            far: [r], the distances at which the rays end.
+            jitter: Whether the samples are random.
+            generator: Random generator of the jitter.
         """
         return self.sample(rays, near, far, jitter=jitter, generator=generator), ()
 
     def see(
         self, field: Field, rays: Rays, near: Tensor, far: Tensor, *, background: Tensor | None, heaviest: bool
     ) -> RayColours | None:
-        """What rays of a picture see, where that needs fewer samples than :meth:`draw` gives; else None.
+        """Renders rays of a picture if that needs fewer samples than :meth:`draw`; else returns None.
 
         Args:
-            field: The field that has the colours.
+            field: The field that gives the colours.
             rays: r rays.
-            near: [r].
-            far: [r].
-            background: [3] or [r, 3]; None is black.
-            heaviest: Whether to find the heaviest samples; without it that part of the result means nothing.
+            near: [r], the distances at which the rays begin.
+            far: [r], the distances at which the rays end.
+            background: [3] or [r, 3], the colour behind the scene; None is black.
+            heaviest: Whether to find the samples with the largest weights; else `heaviest` of the result is undefined.
         """
         return None
 
     def loss_before(self, before: Rendered, last: Rendered, target: Tensor) -> Tensor:
-        """What a pass adds to the loss of the last one.
+        """Returns the loss [] that an earlier pass adds to the loss of the last pass.
 
         Args:
-            before: The pass.
-            last: The last one.
+            before: The rendered result of the earlier pass.
+            last: The rendered result of the last pass.
             target: [r, 3], the colours of the rays.
         """
         raise NotImplementedError
 
     def step_pre_backward(self, field: Field, step: int, generator: torch.Generator) -> None:
-        """Called before a training step draws its rays.
+        """Updates the sampler before a training step draws its rays.
 
         Args:
             field: The field that learns.
             step: The number of the step, from 0.
-            generator: Of random choices.
+            generator: Random generator of the choices.
         """
 
     def asks_at(self, step: int) -> bool:
-        """Whether :meth:`step_pre_backward` asks the field before a step.
+        """Returns whether :meth:`step_pre_backward` evaluates the field before a step.
 
         Args:
             step: The number of the step, from 0.
@@ -220,26 +222,26 @@ class Sampler:
         return False
 
     def steps_alike(self, step: int) -> int:
-        """How many steps may follow one call of :meth:`step_pre_backward`.
+        """Returns the number of steps that may follow one call of :meth:`step_pre_backward`.
 
         Args:
-            step: The number of the first of them.
+            step: The number of the first of these steps.
         """
         return 1
 
     def step_post_backward(self, output: RenderOutput) -> None:
-        """Called after the loss of a step was computed.
+        """Learns from a step after its loss was computed.
 
         Args:
-            output: What :class:`voronerf.nerf.RayLoss` gave.
+            output: The result of :class:`voronerf.nerf.RayLoss`.
         """
 
     def finish(self, field: Field, seed: int) -> None:
-        """Called after the last step of a training.
+        """Finishes the sampler after the last step of a training.
 
         Args:
-            field: The field that was trained.
-            seed: Of random choices.
+            field: The trained field.
+            seed: Seed of the random choices.
         """
 
 
@@ -269,38 +271,38 @@ class Stratified(Sampler):
     ) -> Samples:
         """See :meth:`Sampler.sample`."""
         space = self.space
-        given: dict[str, Any] = {"jitter": jitter, "spacing": space.spacing, "generator": generator}
+        options: dict[str, Any] = {"jitter": jitter, "spacing": space.spacing, "generator": generator}
         if space.cones:
-            edges = stratified_edges(near, far, self.samples, **given)
+            edges = stratified_edges(near, far, self.samples, **options)
             depths = (edges[:, 1:] + edges[:, :-1]) / 2
         else:
-            depths, _, edges = stratified_depths(near, far, self.samples, **given)
+            depths, _, edges = stratified_depths(near, far, self.samples, **options)
         return space.samples(rays, depths, edges)
 
 
 @replayed
 class Occupancy(Sampler):
-    """`Stratified` without the samples in empty voxels of a grid: rays have as many as are left.
+    """Stratified samples without the samples in empty voxels of a grid, so rays differ in their number of samples.
 
     In a training the grid learns from the samples of each step. Before each `GROUP` of steps the field is evaluated in
-    random voxels, so that what was wrongly found empty comes back.
+    random voxels, which restores voxels that were emptied by mistake.
 
     Attributes:
-        grid: Which space is empty; all space outside its box is.
-        settling: Whether the grid has learnt nothing yet. A training step then takes a part of the strata, since no
-            space is skipped, and since a young field finds its surfaces sooner by fewer and longer ones.
+        grid: The occupancy grid; all space outside its box is empty.
+        settling: Whether the grid has not learnt yet. A training step then uses a part of the strata, since no space is
+            skipped, and since an untrained field finds its surfaces sooner with fewer and longer strata.
 
     Args:
-        grid: Can be set at any time. With a contraction it is in contracted space.
+        grid: The occupancy grid, in contracted space if there is a contraction. It can be replaced at any time.
         samples: s, strata of a ray.
-        picture_samples: Strata of a ray of a picture; None for `PICTURE_SAMPLES` as many. A picture is walked to the
-            first surface alone, so that more of them cost little.
-        space: How the field sees the scene.
+        picture_samples: Strata of a ray of a picture; None for `PICTURE_SAMPLES` times ``samples``. Rays of a picture
+            end at the first surface, so additional strata cost little.
+        space: The coordinates in which rays are sampled and the field is evaluated.
         empty: bool [v], voxels that stay empty in a training; None for none.
-        backend: Of the ops.
+        backend: The backend of the ops.
 
     Raises:
-        ValueError: For cones, or a grid without the contraction of the space.
+        ValueError: The space has cones, or a contraction that the grid does not have, or the other way round.
 
     Examples:
         >>> import torch
@@ -335,7 +337,7 @@ class Occupancy(Sampler):
 
     @property
     def grid(self) -> OccupancyGrid:
-        """Which space is empty."""
+        """The occupancy grid."""
         return self._grid
 
     @grid.setter
@@ -345,27 +347,27 @@ class Occupancy(Sampler):
 
     @property
     def settling_steps(self) -> int:  # type: ignore[override]
-        """The first steps of a training, in which the grid learns nothing."""
+        """The number of first training steps in which the grid learns nothing."""
         return SETTLING_STEPS if isinstance(self.grid.contraction, Contraction) else WARMUP_STEPS
 
     @property
     def strata(self) -> int:
-        """Strata of a ray of a training step: `samples`, or a part of them while the grid settles."""
+        """The strata of a ray in a training step: `samples`, or a part of them while the grid settles."""
         return max(1, self.samples // SETTLING_PART) if self.settling else self.samples
 
     def explain(self) -> str:
-        """What is sampled, and what the grid leaves of it."""
+        """Describes the sampler and the occupied share of its grid in one line."""
         return f"{super().explain()}, of which {self.grid.share:.0%} of the grid are left"
 
     @torch.no_grad()
     def see(
         self, field: Field, rays: Rays, near: Tensor, far: Tensor, *, background: Tensor | None, heaviest: bool
     ) -> RayColours:
-        """Walks rays in waves, each until it is opaque; see :meth:`Sampler.see`.
+        """Renders rays in waves, each ray until it is opaque; see :meth:`Sampler.see`.
 
-        A wave is a few samples of every ray that is not opaque yet. So the field evaluates little more than the samples
-        in front of the first surface of each ray. A ray that has ended counts as opaque, with the colour that it has by
-        then. Samples are the middles of the strata for pictures.
+        A wave is a few samples of every ray that is not yet opaque, so the field evaluates few samples behind the first
+        surface of each ray. A ray that ends early counts as opaque with its colour at that point. The samples are the
+        middles of the ``picture_samples`` strata.
 
         Examples:
             >>> import torch
@@ -381,41 +383,43 @@ class Occupancy(Sampler):
             (tensor([[1., 1., 1.]]), tensor([2.1250]))
         """
         contraction = self.space.contraction
-        network = self._network(field, rays)
+        network = self._network_arguments(field, rays)
         if network is not None:
-            rule = {"spacing": self.space.spacing, "backend": self.backend, "heaviest": heaviest, "wave": FINE_WAVE}
-            rule |= {"opaque": OPAQUE, "background": None if background is None else background.to(near)}
-            seen = self.grid.see(rays, near, far, self.picture_samples, **network, **rule)
+            options = {"spacing": self.space.spacing, "backend": self.backend, "heaviest": heaviest, "wave": FINE_WAVE}
+            options |= {"opaque": OPAQUE, "background": None if background is None else background.to(near)}
+            seen = self.grid.see(rays, near, far, self.picture_samples, **network, **options)
         else:
             wave = WAVE if contraction is None else CONTRACTED_WAVE
 
             def look(live: Tensor, start: Tensor | None) -> Wave:
-                now = rays if start is None else rays[live]
-                samples, stop = self.march(now, near[live], far[live], start=start, most=wave, picture=True)
-                rgb, sigma = (each.to(near.dtype) for each in field(samples.inputs, now.directions, samples.ray_index))
-                along = samples.depths, samples.deltas
-                part = composite(sigma, rgb, *along, ray_offsets=samples.ray_offsets, backend=self.backend)
+                live_rays = rays if start is None else rays[live]
+                samples, stop = self.march(live_rays, near[live], far[live], start=start, most=wave, picture=True)
+                rgb, sigma = (
+                    values.to(near.dtype) for values in field(samples.inputs, live_rays.directions, samples.ray_index)
+                )
+                intervals = samples.depths, samples.deltas
+                part = composite(sigma, rgb, *intervals, ray_offsets=samples.ray_offsets, backend=self.backend)
                 return Wave(part, samples.ray_index, samples.ray_offsets, samples.depths, stop)
 
             seen = walk(look, far, self.picture_samples, wave, OPAQUE, background, heaviest)
-        places = rays.origins
+        positions = rays.origins
         if heaviest:
-            places = rays.origins + seen.heaviest[:, None] * rays.directions
-            places = places if contraction is None else contraction.points(places)
-        return RayColours(seen.colour, seen.opacity, seen.depth, places)
+            positions = rays.origins + seen.heaviest[:, None] * rays.directions
+            positions = positions if contraction is None else contraction.points(positions)
+        return RayColours(seen.colour, seen.opacity, seen.depth, positions)
 
-    def _network(self, field: Field, rays: Rays) -> dict[str, Any] | None:
-        """The arguments with which `render_opaque` asks a field; None for more than networks, for Warp and CUDA."""
+    def _network_arguments(self, field: Field, rays: Rays) -> dict[str, Any] | None:
+        """Returns the arguments of a field for `render_opaque`; None for fields that it cannot run, Warp and CUDA."""
         router = router_of(field)
         if router is None or not rays.origins.is_cpu or "warp" in (self.backend, router.backend):
             return None
-        known = radiance_of(field, (rays.origins, rays.directions))
-        if isinstance(known, str):
+        radiance = radiance_of(field, (rays.origins, rays.directions))
+        if isinstance(radiance, str):
             return None
-        arguments = known.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32))
-        if "cells" in arguments:  # which each sample has of its own
+        arguments = radiance.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32))
+        if "cells" in arguments:  # each sample has its own cell
             return None
-        return {"network": {name: value for name, value in arguments.items() if name in NETWORK}, **known.rule}
+        return {"network": {name: value for name, value in arguments.items() if name in NETWORK}, **radiance.rule}
 
     def _leave_empty(self) -> None:
         if self.empty is not None:
@@ -426,39 +430,39 @@ class Occupancy(Sampler):
         """Evaluates random voxels; see :meth:`Sampler.step_pre_backward`."""
         self.settling = step < self.settling_steps
         if step == 0:
-            self._leave_empty()  # of a grid that begins again
+            self._leave_empty()  # the grid was reset
         if not self.asks_at(step):
             return
-        every = self.grid.occupied.numel()
-        count = min(max(1, int(every * REVISITED)), MOST_REVISITED)
+        voxels = self.grid.occupied.numel()
+        count = min(max(1, int(voxels * REVISITED)), MOST_REVISITED)
         seed = draw_seed(self.grid.box.device, generator)
         with evaluating(field):
             self.grid.revisit(field, fixed_count(count), seed, fixed=self.empty, backend=self.backend)
 
     def asks_at(self, step: int) -> bool:
-        """Before each `GROUP` of steps, once the grid learns; see :meth:`Sampler.asks_at`."""
+        """Returns True before each `GROUP` of steps after settling; see :meth:`Sampler.asks_at`."""
         return step >= self.settling_steps and step % schedule.GROUP == 0
 
     def steps_alike(self, step: int) -> int:
-        """Up to the next evaluation of voxels; see :meth:`Sampler.steps_alike`."""
+        """Returns the steps up to the next evaluation of voxels; see :meth:`Sampler.steps_alike`."""
         settling = self.settling_steps - step
         return settling if settling > 0 else schedule.GROUP - step % schedule.GROUP
 
     def step_post_backward(self, output: RenderOutput) -> None:
-        """Teaches the grid what the samples of a step found; see :meth:`Sampler.step_post_backward`."""
+        """Updates the grid from the samples of a step; see :meth:`Sampler.step_post_backward`."""
         if not self.settling:
             samples = output.samples
-            found = samples.positions, output.density, samples.deltas, output.weights
-            self.grid.observe(*found, decay=DECAY, fixed=self.empty, backend=self.backend)
+            values = samples.positions, output.density, samples.deltas, output.weights
+            self.grid.observe(*values, decay=DECAY, fixed=self.empty, backend=self.backend)
 
     def finish(self, field: Field, seed: int) -> None:
-        """Occupies voxels that were emptied in the middle of surfaces; see `OccupancyGrid`.
+        """Fills holes in the surfaces of the grid; see `OccupancyGrid.fill_holes`.
 
-        In a contracted sphere alone: objects in a box and forward-facing scenes gain nothing by it.
+        Only grids of a contracted sphere are filled: objects in a box and forward-facing scenes gain nothing by it.
 
         Args:
-            field: The field that was trained.
-            seed: Of the points at which it is asked.
+            field: The trained field.
+            seed: Seed of the points at which the field is evaluated.
         """
         if isinstance(self.grid.contraction, Contraction):
             with evaluating(field):
@@ -474,8 +478,8 @@ class Occupancy(Sampler):
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> Samples:
-        """Samples of the occupied strata of each ray; arguments and result as in `Stratified.sample`."""
-        # The jitter of each ray is seeded with the seed plus its number.
+        """Returns the samples of the occupied strata of each ray; see :meth:`Sampler.sample`."""
+        # The jitter of a ray is seeded with the seed plus the number of the ray.
         seed = draw_seed(near.device, generator) if jitter else None
         return self.march(rays, near, far, seed=seed)[0]
 
@@ -490,39 +494,39 @@ class Occupancy(Sampler):
         most: int | None = None,
         picture: bool = False,
     ) -> tuple[Samples, Tensor]:
-        """Samples of rays in occupied voxels, and the stratum [r] behind the last of each; see `ops.march_rays`.
+        """Returns the samples in occupied voxels, and the stratum [r] after each ray's last; see `ops.march_rays`.
 
         Args:
             rays: r rays.
-            near: [r].
-            far: [r].
-            seed: int32 [1], of random samples; None for the middles of the strata.
-            start: int32 [r], the first stratum; None for 0.
-            most: Samples of a ray; None for all.
-            picture: Whether the strata are those of a picture.
+            near: [r], the distances at which the rays begin.
+            far: [r], the distances at which the rays end.
+            seed: int32 [1], the seed of random samples; None for the middles of the strata.
+            start: int32 [r], the first stratum of each ray; None for 0.
+            most: The most samples a ray; None for no limit.
+            picture: Whether rays have ``picture_samples`` strata instead of ``strata``.
         """
         samples = self.picture_samples if picture else self.strata
         options: dict[str, Any] = {"seed": seed, "start": start, "most": most, "backend": self.backend}
-        if seed is not None and start is None and not near.is_cpu:  # a training step waits for no device
+        if seed is not None and start is None and not near.is_cpu:  # a training step does not wait for the device
             options["capacity"] = max(1, len(near) * samples)
-        found = self.grid.march(rays, near, far, samples, spacing=self.space.spacing, **options)
-        rows = found.ray_offsets[-1:] if "capacity" in options else None
-        parts = found.positions, found.ray_index, found.ray_offsets, found.depths, found.deltas
-        return Samples(*parts, rows=rows), found.stop
+        result = self.grid.march(rays, near, far, samples, spacing=self.space.spacing, **options)
+        rows = result.ray_offsets[-1:] if "capacity" in options else None
+        parts = result.positions, result.ray_index, result.ray_offsets, result.depths, result.deltas
+        return Samples(*parts, rows=rows), result.stop
 
 
 @replayed
 class Hierarchical(Stratified):
-    """Two passes: the second samples where the first found something (NeRF, section 5.2; mip-NeRF, section 3.2).
+    """Two passes: the second samples by the weights of the first (NeRF, section 5.2; mip-NeRF, section 3.2).
 
-    Points have a network "coarse" for the first pass, and the second asks at the points of both. For cones "field" is
-    evaluated twice, the second time in new intervals; the first loss counts a tenth.
+    For points, a network "coarse" renders the first pass, and the second pass evaluates the points of both. For cones,
+    "field" is evaluated twice, the second time in new intervals, and the loss of the first pass counts a tenth.
 
     Args:
-        samples: s, of the first pass.
-        fine_samples: Of the second pass.
-        space: How the fields see the scene.
-        backend: Of the ops.
+        samples: s, the samples a ray of the first pass.
+        fine_samples: The new samples a ray of the second pass.
+        space: The coordinates in which rays are sampled and the fields are evaluated.
+        backend: The backend of the ops.
 
     Examples:
         >>> from voronerf.nerf import Hierarchical, Space
@@ -541,17 +545,17 @@ class Hierarchical(Stratified):
         *_, self.first = self.networks(self.space.cones)
 
     def explain(self) -> str:
-        """What is sampled in both passes."""
+        """Describes both passes in one line."""
         return f"{type(self).__name__}, {self.samples} and {self.fine_samples} a ray"
 
     @staticmethod
     def networks(cones: bool) -> tuple[str, ...]:
-        """Names of the networks; a field of cones serves both passes."""
+        """Returns the names of the networks; a field of cones serves both passes."""
         return ("field",) if cones else ("field", "coarse")
 
     def draw(
         self,
-        look: Look,
+        look: RenderPass,
         rays: Rays,
         near: Tensor,
         far: Tensor,
@@ -559,7 +563,7 @@ class Hierarchical(Stratified):
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Samples, tuple[Rendered, ...]]:
-        """Samples again where the coarse pass has seen something; as in `Stratified.draw`."""
+        """Draws the second pass by the weights of the first; see :meth:`Sampler.draw`."""
         first = self.sample(rays, near, far, jitter=jitter, generator=generator)
         before = look(self.first, first)
         edges, weights, count = first.edges, first.by_ray(before.weights.detach()), self.fine_samples
@@ -576,17 +580,17 @@ class Hierarchical(Stratified):
         return self.space.samples(rays, depths, edges), (before,)
 
     def loss_before(self, before: Rendered, last: Rendered, target: Tensor) -> Tensor:
-        """Loss of the colours of the coarse pass, []."""
+        """Returns the loss [] of the colours of the first pass."""
         return (COARSE_SHARE if self.space.cones else 1.0) * colour_loss(before.colour, target)
 
 
-#: By the names of ``--sampling``.
+#: The samplers by the names of ``--sampling``.
 SAMPLERS: dict[str, type[Sampler]] = {"stratified": Stratified, "hierarchical": Hierarchical}
 
 
 @contextmanager
 def evaluating(field: Field) -> Iterator[None]:
-    """Puts a field into evaluation mode, as long as the context lasts."""
+    """Puts a field into evaluation mode within the context."""
     training = isinstance(field, nn.Module) and field.training
     if isinstance(field, nn.Module):
         field.eval()
@@ -598,17 +602,17 @@ def evaluating(field: Field) -> Iterator[None]:
 
 
 def usual_samples(pixels: float, *, contracted: bool = False, seconds: float = 0.0) -> int:
-    """Strata of a ray whose empty space is skipped, for a field on a hash grid.
+    """Returns the strata of a ray for a field on a hash grid whose empty space is skipped.
 
-    In a box they grow with the square root of its pixels: 64 for the 100 x 100 images of Lego, 128 for those of 400 x
-    400. Every sample costs time, every pixel that a stratum is longer than costs sharpness. A long training, of 40
-    seconds for the former and 160 for the latter, has twice as many, at most 256. Contracted space has 128, or 256 in a
-    training of at least 25 seconds, or 384 in one of 90.
+    In a box the strata grow with the square root of its pixels: 64 for the 100 x 100 images of Lego, 128 for images of
+    400 x 400. More strata cost time; strata longer than a pixel cost sharpness. A long training, from 40 seconds at
+    100 x 100 and from 160 seconds at 400 x 400, has twice as many strata, at most 256. Contracted space has 128 strata,
+    256 in a training of at least 25 seconds, or 384 in a training of at least 90 seconds.
 
     Args:
-        pixels: Of the training views along the largest side of the box.
+        pixels: The pixels of the training views along the largest side of the box.
         contracted: Whether space is contracted.
-        seconds: Of the training, on two cores of an AMD EPYC (Zen 5).
+        seconds: The training time in seconds, on two cores of an AMD EPYC (Zen 5).
     """
     if contracted:
         return max(samples for least, samples in CONTRACTED_SAMPLES.items() if seconds >= least)

@@ -1,4 +1,4 @@
-"""Depths of the samples of a ray, and the loss of its colour. r rays, s samples a ray; distances in world units."""
+"""Sample depths along rays, and the loss of their colours. r rays, s samples a ray; distances in world units."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from voronerf.ops.formulas import SPACINGS, depth_of
 from voronerf.ops.resample import resample
 
-#: Added to the weights of all intervals before drawing from them (mip-NeRF, equation 18).
+#: The constant that `blurred_weights` adds to the weight of every interval (mip-NeRF, equation 18).
 PADDING = 0.01
 
 
@@ -21,24 +21,25 @@ def stratified_depths(
     spacing: str = "linear",
     generator: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One sample in each of s strata of [near, far] (Mildenhall et al. 2020, NeRF, eq. 2).
+    """Returns one sample in each of s strata of [near, far] (Mildenhall et al. 2020, NeRF, eq. 2).
 
     Args:
-        near: [r]; positive if spacing is "disparity". This is not checked, because the host would have to wait for the
-            device. A ray with near == 0 then gets finite depths, all 0 except for the far end.
-        far: [r], >= near.
+        near: [r], the start of each ray; must be positive for "disparity". This is not checked, because the host would
+            have to wait for the device. A ray with near == 0 gets finite depths, all 0 except for the far end.
+        far: [r], the end of each ray, >= near.
         samples: s, >= 1.
-        jitter: uniformly random inside each stratum, else in its middle (for "disparity", the middle in disparity).
-        spacing: "linear": strata of equal length; "disparity": equal steps of 1 / distance, dense near the camera, for
-            scenes with a far background.
-        generator: of the jitter, on any device; its numbers are moved to the device of the rays.
+        jitter: Whether a sample is uniformly random in its stratum, else in the middle (for "disparity", the middle in
+            disparity).
+        spacing: "linear" for strata of equal length, or "disparity" for equal steps of 1 / distance, which are dense
+            near the camera and suit scenes with a far background.
+        generator: Random generator of the jitter, on any device; its numbers are moved to the device of the rays.
 
     Returns:
-        (depths [r, s] ascending, deltas [r, s], edges [r, s + 1]). A sample stands for its whole stratum: deltas are
-        the widths of the strata, and sum to far - near.
+        (depths [r, s] ascending, deltas [r, s], edges [r, s + 1]). Deltas are the widths of the strata, and sum to
+        far - near.
 
     Raises:
-        ValueError: shapes, an unknown spacing, no samples.
+        ValueError: A wrong shape, an unknown spacing, or fewer samples than 1.
 
     Examples:
         >>> import torch
@@ -58,11 +59,11 @@ def stratified_depths(
         raise ValueError(f"stratified_depths: spacing must be one of {', '.join(SPACINGS)}, got {spacing!r}")
 
     steps = torch.arange(samples + 1, device=near.device, dtype=near.dtype) / samples
-    edges = _spaced(near[:, None], far[:, None], steps[None, :], spacing)
+    edges = _distance_at(near[:, None], far[:, None], steps[None, :], spacing)
     inside = random_uniforms(len(near), samples, near, generator) if jitter else near.new_full((1, samples), 0.5)
     fractions = (torch.arange(samples, device=near.device, dtype=near.dtype) + inside) / samples
-    depths = _spaced(near[:, None], far[:, None], fractions, spacing)
-    # rounding may put a sample a last bit outside its stratum
+    depths = _distance_at(near[:, None], far[:, None], fractions, spacing)
+    # Rounding may put a sample one bit outside its stratum.
     depths = torch.minimum(torch.maximum(depths, edges[:, :-1]), edges[:, 1:])
     return depths, edges.diff(dim=-1), edges
 
@@ -76,30 +77,31 @@ def stratified_edges(
     spacing: str = "linear",
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Ends of s intervals that cover [near, far], for cones.
+    """Returns the ends of s intervals that cover [near, far], for cones.
 
     Args:
-        near: [r], as for `stratified_depths`.
-        far: [r].
+        near: [r], the start of each ray, as for `stratified_depths`.
+        far: [r], the end of each ray.
         samples: s, >= 1.
-        jitter: every inner edge uniformly random between the middles of its strata, else evenly spaced.
+        jitter: Whether each inner edge is uniformly random between the middles of its two strata, else the edges are
+            evenly spaced.
         spacing: "linear" or "disparity".
-        generator: of the jitter, on any device.
+        generator: Random generator of the jitter, on any device.
 
     Returns:
-        [r, s + 1] ascending, the first near and the last far.
+        [r, s + 1] ascending, from near to far.
     """
     edges = stratified_depths(near, far, samples, jitter=False, spacing=spacing)[2]
     if not jitter:
         return edges
     shift = random_uniforms(len(near), samples - 1, near, generator)
     steps = (torch.arange(1, samples, device=near.device, dtype=near.dtype) - 0.5 + shift) / samples
-    inner = _spaced(near[:, None], far[:, None], steps, spacing)
+    inner = _distance_at(near[:, None], far[:, None], steps, spacing)
     return torch.cat((edges[:, :1], inner, edges[:, -1:]), dim=1)
 
 
 def random_uniforms(rows: int, columns: int, like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Random numbers [rows, columns] in 0..1, drawn on the device of the generator, and moved to that of `like`."""
+    """Returns random numbers [rows, columns] in 0..1, drawn on the generator's device and moved to `like`'s."""
     device = like.device if generator is None else generator.device
     return torch.rand(rows, columns, device=device, dtype=like.dtype, generator=generator).to(like.device)
 
@@ -107,9 +109,9 @@ def random_uniforms(rows: int, columns: int, like: Tensor, generator: torch.Gene
 def strata_uniforms(
     rays: int, count: int, like: Tensor, jitter: bool, generator: torch.Generator | None
 ) -> Tensor | None:
-    """Random numbers [r, count] in 0..1, one in each of `count` strata; None without jitter, which means the middles.
+    """Returns random numbers [r, count] in 0..1, one in each of `count` strata; None without jitter (the middles).
 
-    They are spread more evenly than independent numbers, with the same distribution.
+    The numbers are spread more evenly than independent ones, and have the same distribution.
     """
     if not jitter:
         return None
@@ -118,10 +120,9 @@ def strata_uniforms(
 
 
 def blurred_weights(weights: Tensor) -> Tensor:
-    """The weights [r, s] for drawing: maximum of two neighbours, blurred, plus a constant (mip-NeRF, equation 18).
+    """Returns weights [r, s] to draw from: maximum of two neighbours, blurred, plus a constant (mip-NeRF, equation 18).
 
-    The result is an upper bound of the weights, with room on both sides, so a second pass also samples beside a
-    surface.
+    The result is an upper bound of the weights and wider on both sides, so a second pass also samples beside a surface.
     """
     wide = torch.nn.functional.pad(weights[:, None, :], (1, 1), mode="replicate")[:, 0]
     largest = torch.maximum(wide[:, :-1], wide[:, 1:])
@@ -131,32 +132,31 @@ def blurred_weights(weights: Tensor) -> Tensor:
 def union_depths(
     depths: Tensor, edges: Tensor, weights: Tensor, count: int, *, uniforms: Tensor | None = None, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """The samples of a first pass together with new ones where it found something (NeRF, section 5.2).
+    """Returns the samples of a first pass and new ones drawn by their weights (NeRF, section 5.2).
 
     Args:
-        depths: [r, s], of the first pass.
-        edges: [r, s + 1], of its strata.
-        weights: [r, s].
+        depths: [r, s], the depths of the first pass.
+        edges: [r, s + 1], the edges of its strata.
+        weights: [r, s], the weights of its samples.
         count: f, the number of new samples.
-        uniforms: [r, f], of `strata_uniforms`; None takes the middles of strata of equal weight.
-        backend: of the op.
+        uniforms: [r, f], random numbers from `strata_uniforms`; None for the middles of strata of equal weight.
+        backend: The backend of the op.
 
     Returns:
-        (depths [r, s + f] ascending, edges [r, s + f + 1]). A sample stands for the part of the ray up to halfway to
-        its neighbours.
+        (depths [r, s + f] ascending, edges [r, s + f + 1]). The edges lie halfway between neighbouring samples.
     """
     drawn = resample(weights, edges, count, uniforms=uniforms, backend=backend)
-    every = torch.cat((depths, drawn), dim=1).sort(dim=1).values
-    return every, torch.cat((edges[:, :1], (every[:, 1:] + every[:, :-1]) / 2, edges[:, -1:]), dim=1)
+    merged = torch.cat((depths, drawn), dim=1).sort(dim=1).values
+    return merged, torch.cat((edges[:, :1], (merged[:, 1:] + merged[:, :-1]) / 2, edges[:, -1:]), dim=1)
 
 
 def colour_loss(colour: Tensor, target: Tensor) -> Tensor:
-    """The mean squared error of colours [r, 3] (NeRF, equation 6)."""
+    """Returns the mean squared error of colours [r, 3] (NeRF, equation 6)."""
     return (colour - target).square().mean()
 
 
-def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:
-    """Distance at a fraction of the way, exact at both ends."""
+def _distance_at(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:
+    """Returns the distance at a fraction of the way from near to far, exact at both ends."""
     if spacing == "linear":
         return torch.lerp(near, far, fraction)
     return torch.where(fraction < 1, depth_of(near, far, fraction, spacing), far)

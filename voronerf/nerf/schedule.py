@@ -1,56 +1,55 @@
-"""Schedules of a training: the learning rate, and the rays of a step."""
+"""Schedules of a training: the learning rate, and the number of rays of a step."""
 
 from __future__ import annotations
 
 import math
 
-#: The learning rate, the rays of a step, averaged weights and what is known of empty space change with every so many
-#: steps of a training, in between steps are replayed in one call. Longer groups gain little: in these, 3 % of the time
-#: is spent in between.
+#: The number of steps that are replayed in one call. The learning rate, the number of rays, the averaged weights and
+#: the revisited voxels change only between such groups. Longer groups gain little: 3 % of the time is spent in between.
 GROUP = 16
-#: The most steps that the learning rate rises for. While it is small the densities stay low, so that an occupancy grid,
-#: which forgets in eight to thirty steps, would empty itself for good: it learns only afterwards.
+#: The most steps of the warm-up, in which the learning rate rises. Densities stay low while the rate is small. An
+#: occupancy grid forgets in eight to thirty steps, and would empty all voxels for good, so it learns only afterwards.
 WARMUP_STEPS = 100
-#: The fraction of the training that it rises for, at most.
+#: The longest warm-up as a fraction of the training.
 WARMUP = 0.02
-#: Learning rate at the end, as a fraction of that at the start.
+#: The learning rate at the end, as a fraction of the rate at the start.
 FINAL = 0.05
-#: The share of a step's samples that are to be left once empty space is known, if more rays can bring them, and the
-#: samples of a ray, in a box and in contracted space, beyond which it grows with them: these go with larger tables,
-#: which larger steps keep cheap.
+#: The target share of a step's samples in occupied space, relative to the first step's samples; see `next_rays`.
+#: The share grows with the samples of a ray beyond `FILL_SAMPLES`, or `CONTRACTED_FILL_SAMPLES` in contracted space:
+#: fields with more samples have larger tables, whose update costs less per ray in a larger batch.
 FILL, FILL_SAMPLES, CONTRACTED_FILL_SAMPLES = 0.25, 64, 128
 
 
 def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0, began: int = 0) -> float:
-    """The learning rate of a step: a linear rise over `WARMUP` of the training, then ``lr``, then exponential decay.
+    """Returns the learning rate of a step: a linear warm-up over `WARMUP`, then ``lr``, then exponential decay.
 
-    It rises over `WARMUP_STEPS` at most, and over as many where the training began again from another draw.
+    The warm-up takes at most `WARMUP_STEPS`, and exactly as many after a restart of the training.
 
     Args:
         lr: The highest rate.
-        fraction: How much of the training is done, 0..1.
-        step: Steps done.
+        fraction: The completed fraction of the training, 0..1.
+        step: The number of steps done.
         hold: Fraction of the training after which the rate falls, down to ``lr * FINAL`` at the end.
-        began: The step at which it began again; 0 for never.
+        began: The step at which the training was restarted; 0 for never.
     """
-    risen = max((step - began) / WARMUP_STEPS, 0.0 if began else fraction / WARMUP)
-    rise = 0.01 + 0.99 * risen if risen < 1 else 1.0
-    fallen = max(0.0, fraction - hold) / (1 - hold)
-    return lr * rise * math.exp(math.log(FINAL) * fallen)
+    warmup = max((step - began) / WARMUP_STEPS, 0.0 if began else fraction / WARMUP)
+    factor = 0.01 + 0.99 * warmup if warmup < 1 else 1.0
+    decay = max(0.0, fraction - hold) / (1 - hold)
+    return lr * factor * math.exp(math.log(FINAL) * decay)
 
 
 def next_rays(now: int, taken: int, *, rays: int, samples: int, growth: float, contracted: bool = False) -> int:
-    """Rays of the next step: the more of the samples are left out as empty, the more rays a step takes.
+    """Returns the number of rays of the next step: more rays if more samples of the last step were in empty space.
 
     Args:
-        now: Rays of the last step.
-        taken: Samples that it had in occupied space.
-        rays: Rays of the first step, and the fewest.
+        now: The number of rays of the last step.
+        taken: The number of its samples in occupied space.
+        rays: The number of rays of the first step, which is the minimum.
         samples: Strata of a ray of the last step.
         growth: The most rays, as a multiple of ``rays``.
         contracted: Whether space is contracted.
     """
-    most = CONTRACTED_FILL_SAMPLES if contracted else FILL_SAMPLES
-    share = FILL * max(samples / most, 1.0)
-    wanted = now * share * rays * samples / max(taken, 1)
-    return int(min(max(wanted, rays), rays * growth))
+    limit = CONTRACTED_FILL_SAMPLES if contracted else FILL_SAMPLES
+    share = FILL * max(samples / limit, 1.0)
+    target = now * share * rays * samples / max(taken, 1)
+    return int(min(max(target, rays), rays * growth))

@@ -1,4 +1,4 @@
-"""Segments of a training step, whose compiled calls are recorded once and made again, and hooks in Python between."""
+"""Segments of a training step: their compiled calls are recorded once and replayed, with Python hooks in between."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from voronerf.ops._core.recording import Recording, entries_of, mapped
 
 T = TypeVar("T", bound=type)
 
-#: After a recording that no call has replayed, the next 1, 2, 4, ... calls run as they are, so many at most.
-LONGEST_WAIT = 64
+#: The most calls that run eagerly after a recording that no call could replay; the number doubles from 1.
+MAX_BACKOFF = 64
 _REPLAYED = set[type]()
 _HARMLESS = {
     *("__dict__", "__weakref__", "__init__", "__init_subclass__", "__class_getitem__"),
@@ -27,12 +27,12 @@ _HARMLESS = {
 
 
 def replayed(kind: T) -> T:
-    """Says of a class that a step may make the calls of its hooks again in their place (:class:`TrainingStep`).
+    """Marks a class whose hooks a :class:`TrainingStep` may record and replay instead of calling them.
 
-    All that its methods compute must be the work of ops, or of torch entry by entry; what changes from step to step
-    must lie in tensors. What Python does beside that is done once, while the step is recorded. The classes of this
-    package are so. A subclass that is not, and overrides a hook, has this hook called in each step; one that overrides
-    anything else has all of its hooks called. A step follows attributes of objects, not of classes.
+    Its methods must compute only with ops and elementwise functions of torch, and data that changes from step to step
+    must lie in tensors. Other Python code runs only once, while the step is recorded. All classes of this package are
+    marked. If an unmarked subclass overrides a hook, this hook is called in each step; if it overrides anything else,
+    all its hooks are called. A step tracks the attributes of objects, not of classes.
 
     Examples:
         >>> from voronerf.nerf import SplitStrategy, replayed
@@ -49,59 +49,61 @@ def replayed(kind: T) -> T:
 
 
 def in_python(part: Any, hook: str = "") -> bool:
-    """Whether a hook of an object must be called in each step, since its class is not `replayed`; "" for any."""
+    """Returns whether a hook (or "": any hook) of an object must be called in each step, not being `replayed`."""
     kind: Any = type(part)
     return hook in getattr(part, "__dict__", ()) or _overrides(kind, hook)
 
 
 @functools.lru_cache(maxsize=256)
 def _overrides(kind: Any, hook: str) -> bool:
-    """Whether a class overrides a hook of a `replayed` one, or what that may call."""
-    known = next((base for base in kind.__mro__ if base in _REPLAYED), None)
-    if known is None:
+    """Returns whether a class overrides a hook of a `replayed` class, or a member that the hook may use."""
+    replayed_base = next((base for base in kind.__mro__ if base in _REPLAYED), None)
+    if replayed_base is None:
         return True
     protocol, names = [base for base in kind.__mro__ if base in _REPLAYED][-1], _names_read(kind)
-    before = kind.__mro__[: kind.__mro__.index(protocol)]
-    own = [each for base in before if base not in _REPLAYED for each in vars(base).items()]
-    behaviour = {name for name, value in own if callable(value) or hasattr(value, "__get__")}
-    others = {name for name in behaviour - _HARMLESS if hasattr(known, name) or name in names or name == "__getattr__"}
-    return hook in others or any(not hook or not callable(getattr(protocol, name, None)) for name in others)
+    subclasses = kind.__mro__[: kind.__mro__.index(protocol)]
+    members = [each for base in subclasses if base not in _REPLAYED for each in vars(base).items()]
+    behaviour = {name for name, value in members if callable(value) or hasattr(value, "__get__")}
+    overridden = {
+        name for name in behaviour - _HARMLESS if hasattr(replayed_base, name) or name in names or name == "__getattr__"
+    }
+    return hook in overridden or any(not hook or not callable(getattr(protocol, name, None)) for name in overridden)
 
 
 def free_names(part: Any) -> list[str]:
-    """The attributes of an object that no `replayed` class reads, so that they may change from step to step."""
+    """Returns the attributes of an object that no `replayed` class reads, so they may change from step to step."""
     kind: Any = type(part)
-    known = _names_read(kind)
-    return [name for name in vars(part) if name not in known]
+    names_read = _names_read(kind)
+    return [name for name in vars(part) if name not in names_read]
 
 
 @functools.lru_cache(maxsize=256)
 def _names_read(kind: Any) -> frozenset[str]:
-    """The attributes of `self` in the code of a class and its bases, of those that are `replayed`."""
-    found, codes = set[str](), list[types.CodeType]()
+    """Returns the attributes of `self` that the code of the `replayed` classes among a class and its bases uses."""
+    names, codes = set[str](), list[types.CodeType]()
     for base in filter(_REPLAYED.__contains__, kind.__mro__):
         for value in vars(base).values():
-            held = (value.fget, value.fset) if isinstance(value, property) else (inspect.unwrap(value),)
-            codes += [each.__code__ for each in held if inspect.isfunction(each)]
+            functions = (value.fget, value.fset) if isinstance(value, property) else (inspect.unwrap(value),)
+            codes += [each.__code__ for each in functions if inspect.isfunction(each)]
     while codes:
         code = codes.pop()
-        for before, now in itertools.pairwise(dis.get_instructions(code)):
-            of_self = before.argrepr.rpartition(", ")[2] == "self"  # newer Pythons load two names at once
-            if of_self and now.opname in ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR"):
-                found.add(now.argval)
+        for previous, instruction in itertools.pairwise(dis.get_instructions(code)):
+            of_self = previous.argrepr.rpartition(", ")[2] == "self"  # newer Pythons load two names in one instruction
+            if of_self and instruction.opname in ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR"):
+                names.add(instruction.argval)
         codes += [each for each in code.co_consts if inspect.iscode(each)]
-    return frozenset(found)
+    return frozenset(names)
 
 
 class Stage(NamedTuple):
-    """A part of a step.
+    """A stage of a training step.
 
     Attributes:
-        name: The one that people see.
-        function: Takes what stages before have made; gives what it makes, by names, or None.
-        reads: The names of what it takes.
-        python: Whether it is called in each step, else it may be replayed.
-        lazy: Whether it is given, in Python, what was recorded, and asks itself for what replays have filled.
+        name: The name that users see.
+        function: Function from results of earlier stages to new results by name, or to None.
+        reads: The names of the results that it takes.
+        python: Whether it is called in each step; else it may be replayed.
+        lazy: Whether a stage in Python gets the recorded results, and asks for their current rows itself.
     """
 
     name: str
@@ -111,21 +113,21 @@ class Stage(NamedTuple):
     lazy: bool = False
 
 
-def run_stages(stages: Iterable[Stage], made: Mapping[str, Any]) -> dict[str, Any]:
-    """Runs stages as they are, and gives what was made before and by them."""
-    known = dict(made)
+def run_stages(stages: Iterable[Stage], earlier: Mapping[str, Any]) -> dict[str, Any]:
+    """Runs stages eagerly; returns the earlier results and the results of the stages."""
+    results = dict(earlier)
     for stage in stages:
-        known |= stage.function(*[known[name] for name in stage.reads]) or {}
-    return known
+        results |= stage.function(*[results[name] for name in stage.reads]) or {}
+    return results
 
 
-class Made(NamedTuple):
+class SegmentResult(NamedTuple):
     """The result of a segment, until its next call.
 
     Attributes:
-        value: The result of the recorded call, or of this one.
-        recording: The recording that made it; None where this call ran as it is.
-        times: How often its calls were made.
+        value: The result of the recorded call, or of this call.
+        recording: The recording that holds the result; None if this call ran eagerly.
+        times: The number of times that the calls were made.
     """
 
     value: Any
@@ -133,18 +135,18 @@ class Made(NamedTuple):
     times: int = 1
 
     def now(self, value: Any) -> Any:
-        """The value or a part of it, with as many rows as this call has filled."""
+        """Returns the value or a part of it with the rows that this call has filled."""
         return value if self.recording is None else self.recording.now(value)
 
 
 class Segment:
-    """A function that is recorded when it is first called; later calls make its compiled calls again.
+    """A function that is recorded in its first call; later calls replay its compiled calls.
 
     Attributes:
-        recording: The recorded calls; None before there is one.
-        replayed: Whether the last call was.
-        obstacle: The reason why the last recording was not replayed; "" for none.
-        left: The number of calls that run as they are, since the last recordings were not replayed.
+        recording: The recorded calls; None if there is no recording.
+        replayed: Whether the last call was replayed.
+        obstacle: The reason why the last recording cannot be replayed; "" for none.
+        eager_calls: The number of next calls that run eagerly, since the last recordings were not replayed.
 
     Examples:
         >>> import torch
@@ -159,72 +161,74 @@ class Segment:
     """
 
     def __init__(self) -> None:
-        self.replayed, self.obstacle, self.left, self._wait = False, "", 0, 0
-        self._numbers = list[int]()  # of rows, of this call
+        self.replayed, self.obstacle, self.eager_calls, self._backoff = False, "", 0, 0
+        self._numbers = list[int]()  # the row counts of this call
         self.forget()
 
     def forget(self) -> None:
-        """Records the next call anew."""
+        """Drops the recording, so the next call is recorded again."""
         self.recording: Recording | None = None
         self._value: Any = None
-        self._read, self._taken = list[Any](), list[Any]()
+        self._results, self._key = list[Any](), list[Any]()
 
-    def __call__(self, function: Callable[..., Any], *given: Any, times: int = 1) -> Made:
-        """The result of a function.
+    def __call__(self, function: Callable[..., Any], *arguments: Any, times: int = 1) -> SegmentResult:
+        """Returns the result of a function, by a replay if possible.
 
         Args:
-            function: Does the same in each call, but for what it is given.
-            given: Results of other segments (`Made`), whose memory stays; numbers of rows; or tensors in tuples,
-                dictionaries and dataclasses, which are copied. All of them may have other rows in each call.
-            times: How often to make its calls in a row; it is called once where they cannot be made.
+            function: The function, which does the same in each call apart from its arguments.
+            arguments: Results of other segments (`SegmentResult`), read in place; row counts; or tensors in tuples,
+                dictionaries and dataclasses, which are copied. Their numbers of rows may change from call to call.
+            times: The number of replays in a row; without a replay the function is called once.
         """
-        tensors, taken = _taken_apart(given)
-        self._numbers = [each for each in given if type(each) is int]
-        read = [each for each in given if isinstance(each, Made)]
-        known = self.recording
-        if known is not None and len(read) == len(self._read) and taken == self._taken:
-            same = all(each.value is value for each, value in zip(read, self._read))
-            if same and (made := known.replay(backends.threads(), times, tensors)):
-                self.replayed, self._wait, self.left = True, 0, 0
-                return Made(self._value, known, made)
+        tensors, key = _flatten(arguments)
+        self._numbers = [each for each in arguments if type(each) is int]
+        results = [each for each in arguments if isinstance(each, SegmentResult)]
+        recorded = self.recording
+        if recorded is not None and len(results) == len(self._results) and key == self._key:
+            same_results = all(each.value is value for each, value in zip(results, self._results))
+            if same_results and (times_made := recorded.replay(backends.threads(), times, tensors)):
+                self.replayed, self._backoff, self.eager_calls = True, 0, 0
+                return SegmentResult(self._value, recorded, times_made)
         self.replayed = False
-        if self.left or any(each.recording is None for each in read):
-            self.left = max(0, self.left - 1)
-            return Made(function(*(each.now(each.value) if isinstance(each, Made) else each for each in given)))
-        self.left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
-        with Recording(*(each.recording for each in read if each.recording is not None)) as recording:
-            value = function(*self._placed(recording, given))
+        if self.eager_calls or any(each.recording is None for each in results):
+            self.eager_calls = max(0, self.eager_calls - 1)
+            return SegmentResult(
+                function(*(each.now(each.value) if isinstance(each, SegmentResult) else each for each in arguments))
+            )
+        self.eager_calls, self._backoff = self._backoff, min(2 * self._backoff or 1, MAX_BACKOFF)
+        with Recording(*(each.recording for each in results if each.recording is not None)) as recording:
+            value = function(*self._in_recorded_memory(recording, arguments))
         self.forget()
         self.obstacle = recording.obstacle or ""
         if self.obstacle:
-            return Made(value)
+            return SegmentResult(value)
         self.recording, self._value = recording, value
-        self._read, self._taken = [each.value for each in read], taken
-        return Made(value, recording)
+        self._results, self._key = [each.value for each in results], key
+        return SegmentResult(value, recording)
 
-    def _placed(self, recording: Recording, given: Iterable[Any]) -> Iterator[Any]:
-        """The arguments, in memory where replays find them."""
+    def _in_recorded_memory(self, recording: Recording, arguments: Iterable[Any]) -> Iterator[Any]:
+        """Yields the arguments in the memory that replays read."""
 
-        def take(each: Any) -> Any:
-            if type(each) is int and each:
-                return recording.count(lambda: each)
-            return recording.take(each) if isinstance(each, Tensor) else mapped(take, each)
+        def take(argument: Any) -> Any:
+            if type(argument) is int and argument:
+                return recording.count(lambda: argument)
+            return recording.take(argument) if isinstance(argument, Tensor) else mapped(take, argument)
 
         place = itertools.count()
-        for each in given:
-            if isinstance(each, Made):
-                yield each.value if each.recording is None else each.recording.counted_now(each.value)
-            elif type(each) is int:
+        for argument in arguments:
+            if isinstance(argument, SegmentResult):
+                yield argument.value if argument.recording is None else argument.recording.counted_now(argument.value)
+            elif type(argument) is int:
                 yield recording.count(functools.partial(self._number, next(place)))
             else:
-                yield take(each)
+                yield take(argument)
 
     def _number(self, place: int) -> int:
         return self._numbers[place]
 
 
-def _taken_apart(given: Iterable[Any]) -> tuple[list[Tensor], list[Any]]:
-    """All tensors of what is given, and what it is but for their rows: types, dtypes, shapes, and whatever else."""
+def _flatten(arguments: Iterable[Any]) -> tuple[list[Tensor], list[Any]]:
+    """Returns all tensors of the arguments, and a key of everything else except row counts: types, dtypes, shapes."""
     tensors, kinds = list[Tensor](), list[Any]()
 
     def look(held: Any) -> None:
@@ -233,12 +237,12 @@ def _taken_apart(given: Iterable[Any]) -> tuple[list[Tensor], list[Any]]:
             kinds.append((held.dtype, held.dim(), *held.shape[1:]))
         elif (entries := entries_of(held)) is not None:
             kinds.append((type(held), [*held] if isinstance(held, dict) else len(entries)))
-            for each in entries:
-                look(each)
+            for argument in entries:
+                look(argument)
         else:
             kinds.append(held)
 
-    for each in given:
-        if not isinstance(each, Made) and type(each) is not int:
-            look(each)
+    for argument in arguments:
+        if not isinstance(argument, SegmentResult) and type(argument) is not int:
+            look(argument)
     return tensors, kinds

@@ -1,4 +1,4 @@
-"""When and where cells divide: samples are kept, the diagram is refined, the networks of new cells inherit.
+"""Cell splits in a training: samples are kept, the diagram is refined, new cells inherit their networks.
 
 m samples, k cells.
 """
@@ -19,24 +19,24 @@ from voronerf.nerf.segment import replayed
 from voronerf.nerf.volume import RenderOutput
 from voronerf.router import VoronoiRouter
 
-#: Default times as fractions of a run: of a single split, and of the first and last of several.
+#: Default times of splits as fractions of the training: a single split, and the first and last of several splits.
 ONLY, FIRST, LAST = 0.2, 0.15, 0.5
 #: A cell with fewer kept samples is not split further.
 MIN_SAMPLES = 64
-#: Samples that are kept (Elsner et al. 2023, section 3.1), and the latest batches that they come from.
+#: The number of kept samples (Elsner et al. 2023, section 3.1), and of the latest batches that they come from.
 RESERVOIR, BATCHES = 10_000, 500
-#: Steps between tries to split the worst cell, while no cell holds enough samples.
+#: Steps between attempts to split the worst cell while no cell holds enough samples.
 TRY_EVERY = 5
 
 
 @dataclass(frozen=True)
 class PlannedSplit:
-    """One split.
+    """A planned split of cells.
 
     Attributes:
-        at: When: below 1 a fraction of the training, from 1 on a number of steps.
-        children: Number of new cells for each cell that is split.
-        cells: "all" cells are split, or only the "worst", which has the largest accumulated error.
+        at: The time of the split: a fraction of the training if below 1, else a number of steps.
+        children: Number of new cells for each split cell.
+        cells: The cells to split: "all", or only the "worst", which has the largest accumulated error.
         most: Largest number of cells after the split, or None for no limit.
 
     Examples:
@@ -54,14 +54,14 @@ class PlannedSplit:
 def plan_splits(
     cells: Sequence[int], times: Sequence[float] | None = None, max_cells: int | None = None
 ) -> tuple[PlannedSplit, ...]:
-    """The splits of a training, in order.
+    """Returns the splits of a training, in order.
 
     Args:
-        cells: Children of a split, for each level.
-        times: One for each level, as ``PlannedSplit.at``; with ``max_cells`` those of the first and the last split.
-            None: a single split at 0.2, several evenly spaced from 0.15 to 0.5.
-        max_cells: After the first split, the worst cell is split into ``cells[-1]`` at evenly spaced times until there
-            are this many cells; the last split may have fewer children.
+        cells: The number of children of a split, for each level.
+        times: The time of each level, as ``PlannedSplit.at``; with ``max_cells`` the times of the first and the last
+            split. None for a single split at 0.2, or several splits evenly spaced from 0.15 to 0.5.
+        max_cells: The number of cells to reach by splitting the worst cell into ``cells[-1]`` at evenly spaced times
+            after the first split; the last split may have fewer children. None for no such splits.
     """
     levels = len(cells) if max_cells is None else 2
     if times is None:
@@ -78,7 +78,7 @@ def plan_splits(
 
 
 def final_cells(plan: Sequence[PlannedSplit]) -> int:
-    """Cells after all splits of a plan, if every cell holds enough samples to be split."""
+    """Returns the number of cells after all splits of a plan, if every cell holds enough samples to be split."""
     cells = 1
     for split in plan:
         cells = cells * split.children if split.cells == "all" else cells + split.children - 1
@@ -87,12 +87,12 @@ def final_cells(plan: Sequence[PlannedSplit]) -> int:
 
 
 class SplitDone(NamedTuple):
-    """A split that was made.
+    """The result of a split.
 
     Attributes:
         split: The refined diagram, parents and balances; without balances no cell held enough samples.
-        points: [m, 3], the samples that decided it.
-        importance: [m].
+        points: [m, 3], the samples from which the new cells were computed.
+        importance: [m], the importance of each sample.
     """
 
     split: Split
@@ -102,18 +102,18 @@ class SplitDone(NamedTuple):
 
 @replayed
 class Strategy:
-    """What a training asks of a rule when and where cells divide; this one never divides them.
+    """The base class of rules for splitting cells in a training; it never splits a cell.
 
-    Before each step the loop asks :meth:`is_due`, and :meth:`has_samples` where a split can wait, and calls
-    :meth:`step_pre_backward` where it is: networks and optimiser change there alone. After the optimiser each step
-    calls :meth:`step_post_backward`, which may change the strategy itself; tensors of the output are the step's own
-    memory, to be read before it returns. A recorded step calls what a subclass overrides, and makes the calls of the
-    others again.
+    Before each step the loop checks :meth:`is_due`, and :meth:`has_samples` if the split can wait. If a split is due,
+    it calls :meth:`step_pre_backward`, the only hook that may change networks and optimiser. After the optimiser, each
+    step calls :meth:`step_post_backward`, which may change only the strategy itself. The tensors of its argument belong
+    to the step, and must be read before the hook returns. A replayed step calls the hooks that a subclass overrides,
+    and replays the calls of the others.
 
     Attributes:
         inherit: Whether new cells start as copies of their parent.
-        splits: How many splits were made.
-        left: How many are still planned.
+        splits: The number of splits made.
+        left: The number of splits still planned.
 
     Examples:
         >>> from voronerf.nerf import Strategy
@@ -126,74 +126,74 @@ class Strategy:
 
     @property
     def left(self) -> int:
-        """How many splits are still planned."""
+        """The number of splits still planned."""
         return 0
 
     def is_due(self, fraction: float, step: int) -> bool:
-        """Whether the next split is to be made now; arguments as of :meth:`step_pre_backward`."""
+        """Returns whether the next split is due; the arguments are as in :meth:`step_pre_backward`."""
         return False
 
     def has_samples(self) -> bool:
-        """Whether enough samples were kept for the next split."""
+        """Returns whether enough samples were kept for the next split."""
         return True
 
     def step_pre_backward(
         self, optimizer: torch.optim.Optimizer | None, fraction: float, step: int
     ) -> SplitDone | None:
-        """Called before each step: makes the next split if it is due.
+        """Makes the next split if it is due; called before each step.
 
         Args:
-            optimizer: Of the networks; None for none.
-            fraction: How much of the training is done, 0..1.
-            step: Steps done.
+            optimizer: The optimiser of the networks; None for none.
+            fraction: The completed fraction of the training, 0..1.
+            step: The number of steps done.
 
         Returns:
-            What was split; None for nothing.
+            The split, or None if there was none.
         """
         return None
 
     def step_post_backward(self, output: RenderOutput) -> None:
-        """Called after the loss of a step was computed.
+        """Learns from a step after its loss was computed.
 
         Args:
-            output: What :class:`voronerf.nerf.RayLoss` gave.
+            output: The result of :class:`voronerf.nerf.RayLoss`.
         """
 
     def forget(self) -> None:
-        """Drops what was learnt for the next split."""
+        """Drops the data that was collected for the next split."""
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The tensors from which `load_state_dict` restores the strategy."""
+        """Returns the tensors from which `load_state_dict` restores the strategy."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restores what `state_dict` gave.
+        """Restores the strategy from a result of `state_dict`.
 
         Raises:
-            ValueError: The state is of another strategy.
+            ValueError: The state belongs to another strategy.
         """
 
 
 @replayed
 class SplitStrategy(Strategy):
-    """Splits the cells of routers at planned times by the samples that are still wrong (Elsner et al. 2023, section 3).
+    """A strategy that splits cells at planned times by their samples' errors (Elsner et al. 2023, section 3).
 
     Call :meth:`step_pre_backward` before each step of a training and :meth:`step_post_backward` after its loss.
 
     Attributes:
-        reservoir: The samples that are kept for the next split.
-        splits: How many were made.
+        reservoir: The kept samples for the next split.
+        splits: The number of splits made.
 
     Args:
-        routers: The networks by name, which are split alike; "field" decides the cells.
+        routers: The routers by name, which are all split in the same way; "field" holds the diagram.
         plan: The splits to make.
-        centres: Of the new cells, see `split_diagram`.
+        centres: The method that places the new centres, see `split_diagram`.
         inherit: Whether new cells start as copies of their parent, else from random parameters.
         min_samples: A cell with fewer kept samples is not split further.
-        reservoir: Samples that are kept.
-        batches: The latest batches that they come from.
-        generator: CPU generator of random choices; None for torch's global one.
-        backend: Of the operations.
+        reservoir: The number of samples to keep.
+        batches: The number of latest batches that the kept samples come from.
+        generator: CPU generator of random choices; None for torch's global generator.
+        backend: The backend of the ops.
 
     Examples:
         >>> import torch
@@ -235,25 +235,25 @@ class SplitStrategy(Strategy):
 
     @property
     def diagram(self) -> VoronoiDiagram:
-        """The cells."""
+        """The Voronoi diagram of the cells."""
         return self.routers["field"].diagram
 
     @property
     def planned(self) -> PlannedSplit | None:
-        """The next split; None after the last, when no samples are kept any more."""
+        """The next split; None after the last split, from which on no samples are kept."""
         return self.plan[self.splits] if self.splits < len(self.plan) else None
 
     @property
     def left(self) -> int:
-        """How many splits of the plan are still to be made."""
+        """The number of splits of the plan that are still to be made."""
         return len(self.plan) - self.splits
 
     def has_samples(self) -> bool:
-        """Whether the first split has a sample for each of its cells; later ones wait for them by themselves."""
+        """Returns whether there is a sample for each new cell of the first split; later splits wait by themselves."""
         return self.splits > 0 or len(self.reservoir) >= (self.planned.children if self.planned else 0)
 
     def is_due(self, fraction: float, step: int) -> bool:
-        """Whether the next split is to be made now; arguments as of :meth:`step_pre_backward`."""
+        """Returns whether the next split is due; the arguments are as in :meth:`step_pre_backward`."""
         planned = self.planned
         if planned is None or (planned.most is not None and step % TRY_EVERY):
             return False
@@ -262,18 +262,18 @@ class SplitStrategy(Strategy):
     def step_pre_backward(
         self, optimizer: torch.optim.Optimizer | None, fraction: float, step: int
     ) -> SplitDone | None:
-        """Makes the next split if it is due: diagram, networks and the optimiser's moments.
+        """Splits the diagram, the networks and the optimiser's moments if the next split is due.
 
         Args:
-            optimizer: Of the networks, whose moments are inherited, too; None for none.
-            fraction: How much of the training is done, 0..1.
-            step: Steps done.
+            optimizer: The optimiser of the networks, whose moments new cells inherit; None for none.
+            fraction: The completed fraction of the training, 0..1.
+            step: The number of steps done.
 
         Returns:
-            What was split; None where nothing was due, or where the worst cell does not hold enough samples yet.
+            The split; None if no split was due, or if the worst cell does not yet hold enough samples.
 
         Raises:
-            ValueError: When the first split has more cells than samples were kept.
+            ValueError: The first split has more cells than there are kept samples.
         """
         planned = self.planned
         if planned is None or not self.is_due(fraction, step):
@@ -310,7 +310,7 @@ class SplitStrategy(Strategy):
         return SplitDone(split, points, importance)
 
     def forget(self) -> None:
-        """Drops the samples that were kept for the next split."""
+        """Drops the kept samples."""
         kept, device = self.reservoir, self.diagram.centres.device
         self.reservoir = SampleReservoir(kept.capacity, kept.batches, device=device)
 
@@ -318,7 +318,7 @@ class SplitStrategy(Strategy):
         """Keeps the heaviest samples of a step, until the last split.
 
         Args:
-            output: What :class:`voronerf.nerf.RayLoss` gave.
+            output: The result of :class:`voronerf.nerf.RayLoss`.
         """
         if self.planned is not None:
             samples = output.samples
@@ -327,18 +327,18 @@ class SplitStrategy(Strategy):
                 output.weights,
                 error=output.error,
                 ray_index=samples.ray_index,
-                backend="auto" if self.backend == "native" else self.backend,  # which has no CUDA kernel for it
+                backend="auto" if self.backend == "native" else self.backend,  # native has no CUDA kernel
             )
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The tensors from which `load_state_dict` restores the kept samples and the number of splits, bit for bit."""
+        """Returns the tensors from which `load_state_dict` restores the kept samples and the split count exactly."""
         return {**self.reservoir.state_dict(), "splits": torch.tensor(self.splits)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restores what `state_dict` gave; cells and moments are those of the routers and of the optimiser.
+        """Restores a result of `state_dict`; cells are restored by the routers, moments by the optimiser.
 
         Raises:
-            ValueError: An entry is missing, or of another reservoir or plan.
+            ValueError: An entry is missing, or belongs to another reservoir or plan.
         """
         splits = int(state["splits"]) if "splits" in state else -1
         if not 0 <= splits <= len(self.plan):

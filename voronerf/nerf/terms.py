@@ -1,4 +1,4 @@
-"""Terms of the loss of rays, one after another: each adds to the loss, and to its gradient along the rays.
+"""Terms of the loss of rays; each term adds to the loss, and to its gradient along the rays.
 
 r rays, m samples of all rays (packed).
 """
@@ -22,20 +22,20 @@ from voronerf.ops.surface_gradient import surface_gradient
 
 
 class LossAlongRays(NamedTuple):
-    """The loss of rays, and its gradient to what the networks have put out for their samples: what a :class:`Term` has.
+    """The loss of rays and its gradient to the raw outputs of the networks: the input of a :class:`Term`.
 
     Attributes:
-        loss: [], to which terms add.
-        gradient: [m, 4], to ``raw``; to which terms add.
-        raw: [m, 4], of the networks, colour and density before their activations or ``activated``.
-        rule: How to read ``raw``: ``density_scale`` or ``activated`` of `voronerf.ops.render_loss`.
-        colour: [r, 3] of the rays, background included.
+        loss: [], the loss, to which terms add.
+        gradient: [m, 4], the gradient to ``raw``, to which terms add.
+        raw: [m, 4], the outputs of the networks: colour and density, before their activations or ``activated``.
+        rule: The option of `voronerf.ops.render_loss` for reading ``raw``: ``density_scale`` or ``activated``.
+        colour: [r, 3], the colours of the rays, background included.
         weights: [m], contributions of the samples to their rays.
-        density: [m], per scene unit.
+        density: [m], the density at each sample per scene unit.
         error: [r], the squared error of the colour of each ray, summed over the channels.
-        samples: Where the networks were asked.
-        hidden: Share of the light; samples that no more than it reaches need no gradient.
-        backend: Of the ops.
+        samples: The samples at which the networks were evaluated.
+        hidden: The share of the light up to which a sample counts as hidden and needs no gradient.
+        backend: The backend of the ops.
 
     Examples:
         >>> from voronerf.nerf import LossAlongRays
@@ -56,12 +56,12 @@ class LossAlongRays(NamedTuple):
     backend: str
 
     def add_gradient(self, batch: Batch, **slopes: Tensor) -> None:
-        """Adds to ``gradient`` what follows from gradients to what the rays show: see `voronerf.ops.rendered_gradient`.
+        """Backpropagates gradients of rendered values into ``gradient``; see `voronerf.ops.rendered_gradient`.
 
         Args:
             batch: The rays.
-            slopes: ``colour`` [r, 3], ``opacity`` [r], ``depth`` [r] that is not normalised, ``weights`` [m], ``rgb``
-                [m, 3], ``density`` [m].
+            slopes: The gradients to ``colour`` [r, 3], ``opacity`` [r], unnormalised ``depth`` [r], ``weights`` [m],
+                ``rgb`` [m, 3] and ``density`` [m].
         """
         samples = self.samples
         lengths = self.density, samples.depths, samples.deltas, self.weights, samples.ray_offsets
@@ -71,10 +71,10 @@ class LossAlongRays(NamedTuple):
 
 
 class Term(Protocol):
-    """A term of :class:`RayLoss` that knows its own gradient.
+    """A term of :class:`RayLoss` that computes its own gradient.
 
-    It is called once in each step, after the networks and the error of the colours, before the backward pass, and after
-    the terms before it. A class that is `replayed` is recorded with the step; another one is called in Python.
+    Each step calls it once, after the networks and the error of the colours, before the backward pass. Terms are called
+    in their order. A class that is `replayed` is recorded with the step; any other class is called in Python.
 
     Examples:
         >>> import torch
@@ -97,17 +97,19 @@ class Term(Protocol):
         """Adds, in place, to ``along.loss`` and to ``along.gradient``.
 
         Args:
-            along: What the rays have shown; all else of it stays as it is.
-            batch: The rays; for the last ``3 * batch.unseen`` no picture shows the colour.
+            along: The rendered rays; a term changes only their loss and gradient.
+            batch: The rays; the last ``3 * batch.unseen`` have no target colour.
         """
 
 
 @replayed
 class SparseDepth:
-    """Light that does not come from where the points of a sparse model are: see `voronerf.ops.sparse_depth_gradient`.
+    """A loss on light that does not come from the points of a sparse model.
+
+    See `voronerf.ops.sparse_depth_gradient`.
 
     Args:
-        factor: On the mean over the rays through points.
+        factor: The factor on the mean over the rays through points.
 
     Examples:
         >>> from voronerf import NeRF
@@ -123,18 +125,18 @@ class SparseDepth:
         samples, points = along.samples, batch.sparse_depths
         if points is not None:
             lengths = along.density, samples.depths, samples.deltas, along.weights, samples.ray_offsets
-            given = along.loss, along.gradient, *lengths, points
-            sparse_depth_gradient(*given, factor=self.factor, **along.rule, backend=along.backend)
+            arguments = along.loss, along.gradient, *lengths, points
+            sparse_depth_gradient(*arguments, factor=self.factor, **along.rule, backend=along.backend)
 
 
 @replayed
 class SmoothDepth:
-    """Depths of unseen rays that lie on no plane with those of their neighbours.
+    """A loss on the deviation of the depths of unseen rays from the plane through their neighbours.
 
     See `voronerf.ops.smooth_depth_gradient`.
 
     Args:
-        factor: On the mean over the triples of rays.
+        factor: The factor on the mean over the triples of rays.
 
     Examples:
         >>> from voronerf import NeRF
@@ -150,18 +152,18 @@ class SmoothDepth:
         samples = along.samples
         if batch.unseen:
             lengths = along.density, samples.depths, samples.deltas, along.weights, samples.ray_offsets
-            given = along.loss, along.gradient, *lengths, batch.far
+            arguments = along.loss, along.gradient, *lengths, batch.far
             options: dict[str, Any] = {"hidden": along.hidden, **along.rule, "backend": along.backend}
-            smooth_depth_gradient(*given, triples=batch.unseen, factor=self.factor, **options)
+            smooth_depth_gradient(*arguments, triples=batch.unseen, factor=self.factor, **options)
 
 
 @replayed
 class Surface:
-    """Light along a ray that does not come from one surface: see `voronerf.ops.surface_gradient`.
+    """A loss on light along a ray that does not come from one surface; see `voronerf.ops.surface_gradient`.
 
     Args:
-        distortion: Factor on the mean over the rays of the distortion loss of mip-NeRF 360.
-        orientation: The same on an orientation loss after Ref-NeRF.
+        distortion: The factor on the mean over the rays of the distortion loss of mip-NeRF 360.
+        orientation: The factor on the mean over the rays of an orientation loss after Ref-NeRF.
 
     Examples:
         >>> from voronerf import NeRF
@@ -177,15 +179,15 @@ class Surface:
         """See :class:`Term`."""
         samples = along.samples
         lengths = along.density, samples.depths, samples.deltas, along.weights, samples.ray_offsets
-        given = along.loss, along.gradient, *lengths, batch.near, batch.far
+        arguments = along.loss, along.gradient, *lengths, batch.near, batch.far
         options: dict[str, Any] = {"hidden": along.hidden, **along.rule, "backend": along.backend}
-        surface_gradient(*given, distortion=self.distortion, orientation=self.orientation, **options)
+        surface_gradient(*arguments, distortion=self.distortion, orientation=self.orientation, **options)
 
 
 class Seen:
-    """Rays as a term in torch sees them. What is read of them has gradients, but for the places of the samples.
+    """The rendered rays for a term in torch. All attributes have gradients except ``samples``.
 
-    Tensors are the step's own memory: they hold what they do until the next step, and nothing is to be written to them.
+    The tensors belong to the step: they are valid until the next step, and must not be written to.
 
     Examples:
         >>> from voronerf import NeRF
@@ -197,100 +199,106 @@ class Seen:
 
     def __init__(self, along: LossAlongRays, batch: Batch, now: Callable[[Any], Any]) -> None:
         self._along, self._batch, self._now = along, batch, now
-        self.leaves: dict[str, Tensor] = {}  # what was read, by name
+        self.leaves: dict[str, Tensor] = {}  # the leaf tensors that the term has read, by name
 
     def _leaf(self, name: str, value: Tensor) -> Tensor:
         self.leaves[name] = leaf = value.detach().requires_grad_()
         return leaf
 
     def _sum(self, values: Tensor) -> Tensor:
-        """Sums [r] of values of the samples."""
+        """Returns [r], the sum over the samples of each ray."""
         return torch.segment_reduce(values, "sum", offsets=self._now(self._along.samples.ray_offsets), unsafe=True)
 
     @functools.cached_property
     def colour(self) -> Tensor:
-        """[r, 3], the background included."""
+        """The colours of the rays [r, 3], the background included."""
         return self._leaf("colour", self._now(self._along.colour))
 
     @functools.cached_property
     def opacity(self) -> Tensor:
-        """[r], 0..1: the sum of the weights."""
+        """The opacities of the rays [r], 0..1: the sums of the weights."""
         return self._leaf("opacity", self._sum(self._now(self._along.weights)))
 
     @functools.cached_property
     def depth(self) -> Tensor:
-        """[r], expected distance, normalised by the opacity; the far end for a ray with opacity 0."""
+        """The expected depths [r], normalised by the opacity; the far end for a ray with opacity 0."""
         sums = self._sum(self._now(self._along.weights) * self._now(self._along.samples.depths))
         return normalised(self._leaf("depth", sums), self.opacity, self._now(self._batch.far))
 
     @functools.cached_property
     def weights(self) -> Tensor:
-        """[m], the contribution of each sample."""
+        """The contributions of the samples to their rays [m]."""
         return self._leaf("weights", self._now(self._along.weights))
 
     @functools.cached_property
     def rgb(self) -> Tensor:
-        """[m, 3], the colour of each sample."""
+        """The colours of the samples [m, 3]."""
         return self._leaf("rgb", activate(self._now(self._along.raw), **self._along.rule)[0])
 
     @functools.cached_property
     def density(self) -> Tensor:
-        """[m], per scene unit."""
+        """The densities at the samples [m], per scene unit."""
         return self._leaf("density", self._now(self._along.density))
 
     @functools.cached_property
     def samples(self) -> Samples:
-        """Where the networks were asked."""
-        found: Samples = self._now(self._along.samples)
-        return found
+        """The samples at which the networks were evaluated."""
+        samples: Samples = self._now(self._along.samples)
+        return samples
 
 
-class Differentiated:
+class DifferentiatedTerm:
     """A term that torch differentiates: a function of `Seen` rays and their batch.
 
-    Its lines alone run in Python, and torch differentiates no more than them. Their gradients to what they read are
-    taken further by an op, which a step replays.
+    Python runs, and torch differentiates, only the function itself. An op backpropagates its gradients further, and a
+    step replays this op.
 
     Args:
-        function: Gives a scalar.
+        function: The function, which returns a scalar.
     """
 
     def __init__(self, function: Callable[[Seen, Batch], Tensor]) -> None:
         self.function = function
 
     def differentiate(self, now: Callable[[Any], Any], along: LossAlongRays, batch: Batch) -> dict[str, Tensor]:
-        """Adds to the loss; gives the gradients to what was read, by its name."""
+        """Adds the term to the loss; returns its gradients to the attributes that it has read, by name."""
         seen = Seen(along, batch, now)
         with torch.enable_grad():
             term = self.function(seen, now(batch))
         if not isinstance(term, Tensor) or term.dim():
-            came = list(term.shape) if isinstance(term, Tensor) else repr(term)[:60]
-            raise ValueError(f"RayLoss: a term must give a scalar tensor, got {came}")
+            got = list(term.shape) if isinstance(term, Tensor) else repr(term)[:60]
+            raise ValueError(f"RayLoss: a term must give a scalar tensor, got {got}")
         now(along.loss).add_(term.detach())
         if not (term.requires_grad and seen.leaves):
             return {}
         slopes = torch.autograd.grad(term, [*seen.leaves.values()], allow_unused=True)
         return {name: slope for name, slope in zip(seen.leaves, slopes, strict=True) if slope is not None}
 
-    def take_further(self, along: LossAlongRays, batch: Batch, slopes: Mapping[str, Tensor]) -> None:
-        """Adds to the gradient what follows from gradients to what was read."""
+    def backpropagate(self, along: LossAlongRays, batch: Batch, slopes: Mapping[str, Tensor]) -> None:
+        """Backpropagates the gradients of `differentiate` to the raw outputs."""
         if slopes:
             along.add_gradient(batch, **slopes)
 
 
 def stages_of(number: int, term: Term | Callable[[Seen, Batch], Tensor], now: Callable[[Any], Any]) -> list[Stage]:
-    """What a step does of a term, which reads "along" and "batch".
+    """Returns the stages of a step that compute a term from "along" and "batch".
 
     Args:
-        number: Of the term, which is one of several.
-        term: That of :class:`RayLoss`.
-        now: Gives, in Python, what replays have filled.
+        number: The index of the term.
+        term: The term of :class:`RayLoss`.
+        now: Function that gives a stage in Python the current rows of a recorded tensor.
     """
     if hasattr(term, "add"):
         return [Stage(f"{type(term).__name__}.add", term.add, ("along", "batch"), in_python(term, "add"))]
-    own, slopes = Differentiated(term), f"slopes {number}"
+    differentiated, slopes = DifferentiatedTerm(term), f"slopes {number}"
     name = getattr(term, "__qualname__", type(term).__qualname__)
     return [
-        Stage(name, lambda *seen: {slopes: own.differentiate(now, *seen)}, ("along", "batch"), python=True, lazy=True),
-        Stage("gradients", own.take_further, ("along", "batch", slopes)),
+        Stage(
+            name,
+            lambda *seen: {slopes: differentiated.differentiate(now, *seen)},
+            ("along", "batch"),
+            python=True,
+            lazy=True,
+        ),
+        Stage("gradients", differentiated.backpropagate, ("along", "batch", slopes)),
     ]

@@ -1,7 +1,7 @@
-"""Volume rendering: samples of rays to colours through a field.
+"""Volume rendering: colours of rays from a field evaluated at their samples.
 
-r rays, m samples of all rays (packed), s samples a ray where all have as many. Colours are in 0..1, distances in world
-units along unit directions, densities per unit length.
+r rays, m samples of all rays (packed), s samples a ray where all rays have the same number. Colours are in 0..1,
+distances in world units along unit directions, densities per unit length.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from voronerf.ops.composite import composite
 
 
 class Samples(NamedTuple):
-    """Samples of rays, ray after ray and near to far: what every sampler gives, and what a field is asked about.
+    """The samples of a batch of rays, ray after ray and near to far: the output of a sampler, the input of a field.
 
     Attributes:
         inputs: [m, 3] points, or [m, 6] Gaussians, in the space of the field.
         ray_index: int32 [m], the ray of each sample.
         ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
-        depths: [m], their distances.
-        deltas: [m], the lengths of the parts of the ray that they stand for.
-        edges: [r, s + 1], the ends of these parts, where all rays have s samples; else None.
-        rows: int32 [1], how many of the samples belong to rays, where no host has read it; None for all.
+        depths: [m], the distances of the samples.
+        deltas: [m], the lengths of the intervals that the samples stand for.
+        edges: [r, s + 1], the ends of these intervals if all rays have s samples; else None.
+        rows: int32 [1] on the device, the number of samples that belong to rays, not read by the host; None for all.
 
     Examples:
         >>> import torch
@@ -52,27 +52,27 @@ class Samples(NamedTuple):
 
     @property
     def positions(self) -> Tensor:
-        """[m, 3], the points or the means of the Gaussians."""
+        """The points, or the means of the Gaussians, [m, 3]."""
         return self.inputs if self.inputs.shape[1] == 3 else self.inputs[:, :3]
 
     def counted(self) -> Samples:
-        """Without the rows that belong to no ray; the host waits for their number."""
+        """Returns the samples without the rows that belong to no ray; the host waits for their number."""
         if self.rows is None:
             return self
-        known = int(self.rows)
-        return self._taken(lambda values: values[:known], self.ray_offsets)
+        count = int(self.rows)
+        return self._selected(lambda values: values[:count], self.ray_offsets)
 
     def part(self, rows: Tensor) -> Samples:
-        """Some of the samples, bool [m]; all rays stay."""
-        kept = torch.nn.functional.pad(rows.cumsum(0, dtype=torch.int32), (1, 0))
+        """Returns the samples that the mask `rows`, bool [m], selects; all rays stay."""
+        counts = torch.nn.functional.pad(rows.cumsum(0, dtype=torch.int32), (1, 0))
         chosen = rows.nonzero()[:, 0]
-        return self._taken(lambda values: values.index_select(0, chosen), kept.index_select(0, self.ray_offsets))
+        return self._selected(lambda values: values.index_select(0, chosen), counts.index_select(0, self.ray_offsets))
 
-    def _taken(self, take: Callable[[Tensor], Tensor], offsets: Tensor) -> Samples:
+    def _selected(self, take: Callable[[Tensor], Tensor], offsets: Tensor) -> Samples:
         return Samples(take(self.inputs), take(self.ray_index), offsets, take(self.depths), take(self.deltas))
 
     def by_ray(self, values: Tensor) -> Tensor:
-        """Values [m, ...] as [r, s, ...], where all rays have as many samples; else as they are."""
+        """Reshapes values [m, ...] to [r, s, ...] if all rays have s samples; else returns them unchanged."""
         if self.edges is None:
             return values
         r, ends = self.edges.shape
@@ -81,15 +81,15 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True)
 class Space:
-    """How a scene is sampled and how a field sees it.
+    """The coordinates in which a scene is sampled and a field is evaluated.
 
     Args:
-        contraction: Of the space that the field works in; None for that of the world.
-        spacing: Of the strata of a ray, "linear" or "disparity".
-        cones: Whether the field is asked about Gaussians [m, 6], the frustums of cones, in place of points [m, 3].
-        full_gradient: Distance from which the gradients of samples are whole; nearer ones shrink with the square of
-            their distance. A camera sees the space before it with more rays, and more samples, than others do: fog
-            that only one view shows would be learnt there first. None: all gradients are whole.
+        contraction: The contraction of space for the field; None for world coordinates.
+        spacing: Spacing of the strata of a ray, "linear" or "disparity".
+        cones: Whether the field is evaluated on Gaussians [m, 6], the frustums of cones, in place of points [m, 3].
+        full_gradient: The distance below which the gradients of samples are scaled by (distance / full_gradient)^2;
+            None for no scaling. The space in front of a camera is sampled more densely by that camera than by others,
+            so without the scaling fog would be learnt there that only one view shows.
 
     Examples:
         >>> from voronerf.nerf import Space, Stratified
@@ -102,14 +102,14 @@ class Space:
     full_gradient: float | None = None
 
     def samples(self, rays: Rays, depths: Tensor, edges: Tensor) -> Samples:
-        """The samples of rays at depths [r, s], which stand for the parts between edges [r, s + 1]."""
+        """Returns the samples of rays at depths [r, s], which stand for the intervals between edges [r, s + 1]."""
         r, s = depths.shape
         if self.cones:
             inputs = frustum_gaussians(rays, edges, self.contraction)
         else:
             inputs = torch.addcmul(rays.origins[:, None, :], depths[:, :, None], rays.directions[:, None, :])
             inputs = inputs if self.contraction is None else self.contraction.points(inputs)
-        # A copy of an expanded view: repeat_interleave would gather.
+        # Copies an expanded view, since repeat_interleave would gather.
         index = torch.arange(r, device=depths.device, dtype=torch.int32)[:, None].expand(-1, s).reshape(-1)
         offsets = torch.arange(0, r * s + 1, s, device=depths.device, dtype=torch.int32)
         inputs, deltas = inputs.reshape(r * s, inputs.shape[-1]), edges.diff(dim=-1).reshape(-1)
@@ -117,7 +117,7 @@ class Space:
 
 
 class Rendered(NamedTuple):
-    """Rays seen through a field.
+    """The rendered colours of rays, with the field's outputs at the samples.
 
     Attributes:
         colour: [r, 3], the background included.
@@ -125,8 +125,8 @@ class Rendered(NamedTuple):
         depth: [r], expected distance, normalised by the opacity; the far end for a ray with opacity 0.
         weights: [m], the contribution of each sample.
         rgb: [m, 3], the colour of each sample.
-        density: [m].
-        samples: Where the field was asked.
+        density: [m], the density at each sample.
+        samples: The samples at which the field was evaluated.
 
     Examples:
         >>> import torch
@@ -153,7 +153,7 @@ class RayColours(NamedTuple):
 
     Attributes:
         colour: [r, 3], the background included.
-        opacity: [r].
+        opacity: [r], 0..1.
         depth: [r], as in `Rendered`.
         heaviest: [r, 3], the position of the heaviest sample of each ray, or its far end if it has no samples.
 
@@ -176,16 +176,16 @@ class RayColours(NamedTuple):
 
 @dataclass(frozen=True)
 class Batch:
-    """Rays [r], where they enter and leave the scene, and the colours to learn.
+    """A batch of r rays: their bounds in the scene, and their target colours.
 
     Attributes:
         rays: Origins and unit directions; radii for cones.
         near: [r], the depth at which each ray enters the scene.
         far: [r], the depth at which it leaves the scene.
         target: [r, 3], the colour of each ray's pixel over the background.
-        background: [3], or [r, 3] where it was drawn; None for black.
-        sparse_depths: [s], the distances of the points of a sparse model that the first s rays end at, or None.
-        unseen: Triples at the end that are `voronerf.ops.unseen_rays`, whose colours are not known.
+        background: [3], or [r, 3] if it was drawn for each ray; None for black.
+        sparse_depths: [s], the distances of the points of a sparse model at which the first s rays end, or None.
+        unseen: The number of triples of `voronerf.ops.unseen_rays` at the end of the batch; they have no target colour.
 
     Examples:
         >>> import torch
@@ -207,12 +207,12 @@ class RenderOutput(NamedTuple):
     """The result of :class:`RayLoss`. Only the loss has gradients.
 
     Attributes:
-        loss: [].
+        loss: [], the loss.
         error: [r], the squared error of the colour of each ray, summed over the channels.
         weights: [m], contributions of the samples to their rays.
-        density: [m], per scene unit.
-        samples: Those of the last pass.
-        colour: [r, 3], as the field shows the rays.
+        density: [m], the density at each sample per scene unit.
+        samples: The samples of the last pass.
+        colour: [r, 3], the rendered colours of the rays.
 
     Examples:
         >>> import torch
@@ -233,34 +233,34 @@ class RenderOutput(NamedTuple):
     colour: Tensor
 
     def importance(self) -> Tensor:
-        """[m]: the weight of each sample times the error of its ray (Elsner et al. 2023, section 3.1)."""
+        """Returns [m], the weight of each sample times the error of its ray (Elsner et al. 2023, section 3.1)."""
         return self.weights * self.error.index_select(0, self.samples.ray_index)
 
 
-def ask(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tensor, Tensor]:
-    """Colours [m, 3] and densities [m] of samples, in the dtype of their depths: a field under autocast gives others.
+def evaluate_field(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tensor, Tensor]:
+    """Returns colours [m, 3] and densities [m] of samples, cast to the dtype of the depths (autocast changes it).
 
-    Their gradients shrink near the camera as `Space` says.
+    Their gradients are scaled near the camera by `Space.full_gradient`.
     """
     outputs = field(samples.inputs, rays.directions, samples.ray_index)
     rgb, density = (values.to(samples.depths.dtype) for values in outputs)
     if space.full_gradient is not None:
-        share = shares_of(samples.depths, space.full_gradient)
-        for values, scale in ((rgb, share[:, None]), (density, share)):
+        factors = gradient_factors(samples.depths, space.full_gradient)
+        for values, scale in ((rgb, factors[:, None]), (density, factors)):
             if values.requires_grad:
                 values.register_hook(functools.partial(torch.mul, scale))
     return rgb, density
 
 
-def shares_of(depths: Tensor, full: float) -> Tensor:
-    """Returns the factors [m] on the gradients of samples, the squares of their distances from the camera, up to 1.
+def gradient_factors(depths: Tensor, full: float) -> Tensor:
+    """Returns the factors [m] on the gradients of samples: squared relative distances from the camera, at most 1.
 
     Source: Philip and Deschaintre 2023, "Floaters No More: Radiance Field Gradient Scaling for Improved Near-Camera
     Training".
 
     Args:
         depths: [m], the distances of the samples.
-        full: The distance from which gradients are whole, > 0.
+        full: The distance from which the factor is 1, > 0.
     """
     return (depths / full).square().clamp(max=1)
 
@@ -275,39 +275,39 @@ def render_samples(
     background: Tensor | None = None,
     backend: str = "auto",
 ) -> Rendered:
-    """Colours of rays from samples of a sampler (Mildenhall et al. 2020, NeRF, eq. 3).
+    """Renders rays from the samples of a sampler (Mildenhall et al. 2020, NeRF, eq. 3).
 
     Args:
-        field: Called once, on all samples, possibly none.
+        field: The field, which is called once on all samples, even if there are none.
         rays: r rays.
-        far: [r], their ends.
-        samples: Of the rays.
-        space: Of the sampler.
-        background: [3] or [r, 3]; None is black.
-        backend: Of the composite op.
+        far: [r], the ends of the rays.
+        samples: The samples of the rays.
+        space: The space of the sampler.
+        background: [3] or [r, 3], the colour behind the scene; None is black.
+        backend: The backend of the composite op.
     """
-    return composed(*ask(field, rays, samples, space), far, samples, background, backend)
+    return composite_rays(*evaluate_field(field, rays, samples, space), far, samples, background, backend)
 
 
-def composed(
+def composite_rays(
     rgb: Tensor, density: Tensor, far: Tensor, samples: Samples, background: Tensor | None, backend: str
 ) -> Rendered:
-    """Colours of rays from colours [m, 3] and densities [m] of samples; the rest as for `render_samples`."""
-    along = (samples.by_ray(values) for values in (density, rgb, samples.depths, samples.deltas))
+    """Composites colours [m, 3] and densities [m] of samples; the other arguments are as in `render_samples`."""
+    values_by_ray = (samples.by_ray(values) for values in (density, rgb, samples.depths, samples.deltas))
     offsets = samples.ray_offsets if samples.edges is None else None
-    seen = composite(*along, ray_offsets=offsets, background=background, backend=backend)
-    depth = normalised(seen.depth, seen.opacity, far)
-    return Rendered(seen.colour, seen.opacity, depth, seen.weights.reshape(-1), rgb, density, samples)
+    result = composite(*values_by_ray, ray_offsets=offsets, background=background, backend=backend)
+    depth = normalised(result.depth, result.opacity, far)
+    return Rendered(result.colour, result.opacity, depth, result.weights.reshape(-1), rgb, density, samples)
 
 
 def normalised(depth: Tensor, opacity: Tensor, far: Tensor) -> Tensor:
-    """Sums of weight times depth [r] divided by opacities [r]; the far end [r] where these are 0."""
+    """Returns [r], sums of weight times depth divided by the opacities; the far end for rays with opacity 0."""
     seen = opacity > 0
     return torch.where(seen, depth / torch.where(seen, opacity, 1), far)
 
 
 def per_ray(distance: Tensor | float, rays: Rays) -> Tensor:
-    """One distance for each ray, given as one for all or as a tensor."""
+    """Returns [r], a distance for each ray, from one number for all rays or from a tensor."""
     if isinstance(distance, Tensor):
         return distance.expand(len(rays))
     return torch.full_like(rays.origins[:, 0], distance)

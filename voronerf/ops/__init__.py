@@ -1,11 +1,11 @@
-"""The operations: each validates its arguments, chooses a backend, and calls it.
+"""The operations: each one validates its arguments, chooses a backend and calls it.
 
 Letters used throughout: n samples or points, k cells, d features, r rays, s samples of a ray, m packed samples, L
 octaves. Index tensors are int32. ``offsets`` is always [k + 1]: cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``
 of arrays sorted by cell.
 
-Each raises ValueError for shapes, devices, numbers out of range and an unknown backend, TypeError for dtypes, and
-`BackendUnavailable` where the named backend cannot run; what else an operation refuses stands beside it.
+Each operation raises ValueError for shapes, devices, numbers out of range and an unknown backend, TypeError for dtypes,
+and `BackendUnavailable` if the named backend cannot run. Further errors are documented at the operation.
 """
 
 import sys
@@ -103,14 +103,14 @@ __all__ = [
 
 
 class _Package(ModuleType):
-    """The package of an op, which its function hides in this one: the function has the modules of the package, too.
+    """The package of an op. It copies its submodules to the function of the same name, which hides the package here.
 
-    ``import voronerf.ops.adam.reference as reference`` looks for a module at what ``voronerf.ops.adam`` is.
+    ``import voronerf.ops.adam.reference as reference`` reads ``reference`` from ``voronerf.ops.adam``, the function.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
         super().__setattr__(name, value)
-        if isinstance(value, ModuleType):  # which has been imported
+        if isinstance(value, ModuleType):  # an imported submodule
             setattr(globals()[self.__name__.removeprefix(f"{__name__}.")], name, value)
 
 

@@ -1,7 +1,7 @@
-"""The cells of a routed module: stacked parameters, one cell taken out or put in, cells made from their parents.
+"""The cells of a routed module: stacking parameters, reading and writing one cell, making cells from their parents.
 
-k cells; ``[k, ...]`` under the module's own names. Parameters stay the same objects when cells are split or loaded, and
-get another shape.
+A stacked parameter of k cells is ``[k, ...]`` under the module's own name. When cells are split or loaded, parameters
+stay the same objects and get another shape.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ _OP = "VoronoiRouter"
 
 
 def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
-    """A deep copy, also of a module that keeps results of its last call (which torch refuses to copy)."""
+    """Returns a deep copy, even if the module keeps results of its last call, which torch does not copy."""
     memo = {} if memo is None else memo
     detach_results(module, memo)
-    before = dict(memo)
+    initial = dict(memo)
     try:
         return copy.deepcopy(module, memo)
     except Exception as error:
         for name, part in module.named_modules():
             for attribute, value in vars(part).items():
-                if attribute not in ("_parameters", "_buffers", "_modules") and not _is_copied(value, dict(before)):
+                if attribute not in ("_parameters", "_buffers", "_modules") and not _is_copied(value, dict(initial)):
                     raise TypeError(
                         f"{_OP}: module must be one that copy.deepcopy takes, but {_named(name, part)} keeps in "
                         f"`{attribute}` a {type(value).__name__}, which it refuses ({error}); make it outside of the "
@@ -62,7 +62,7 @@ def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
 
 
 def check_module(module: nn.Module) -> None:
-    """Raises TypeError for what cannot be one network for each cell."""
+    """Raises TypeError for a module that cannot be one network for each cell."""
     if not isinstance(module, nn.Module):
         raise TypeError(f"{_OP}: module must be an nn.Module, got {type(module).__name__}")
     for part in parts_of(module).values():
@@ -79,21 +79,23 @@ def check_module(module: nn.Module) -> None:
 
 
 def _check_reach(module: nn.Module) -> None:
-    """Raises TypeError where parameters are reached past their names, which are all that cells replace."""
+    """Raises TypeError if code reaches parameters other than by name, because cells replace parameters by name."""
     owner = {address: name for name, p in module.named_parameters() if (address := _address(p))}
     objects = {id(p): f"parameter `{name}`" for name, p in module.named_parameters()}
     objects |= {id(part): f"part `{name}`" if name else "module" for name, part in module.named_modules()}
     for name, part in module.named_modules():
-        kept = {key: value for key, value in vars(part).items() if key not in ("_parameters", "_buffers", "_modules")}
-        for attribute, value in (kept | dict(part.named_buffers(recurse=False))).items():
+        members = {
+            key: value for key, value in vars(part).items() if key not in ("_parameters", "_buffers", "_modules")
+        }
+        for attribute, value in (members | dict(part.named_buffers(recurse=False))).items():
             for leaf in _leaves(value):
                 reason = ""
                 if isinstance(leaf, Tensor) and _address(leaf) in owner:
                     reason = (
                         f"a view of the parameter `{owner[_address(leaf)]}`, which cells replace (make it in forward)"
                     )
-                elif isinstance(leaf, types.FunctionType) and (held := _held_by(leaf, objects)):
-                    reason = f"a function that holds the {held}, of which cells have their own (make it a method)"
+                elif isinstance(leaf, types.FunctionType) and (target := _held_by(leaf, objects)):
+                    reason = f"a function that holds the {target}, of which cells have their own (make it a method)"
                 if reason:
                     raise TypeError(
                         f"{_OP}: module must reach parameters by name, but {_named(name, part)} keeps in `{attribute}` "
@@ -102,7 +104,7 @@ def _check_reach(module: nn.Module) -> None:
 
 
 def _address(tensor: Tensor) -> int:
-    """Of a tensor's memory; 0 where it has none."""
+    """Returns the address of a tensor's memory; 0 if it has none."""
     try:
         return tensor.untyped_storage().data_ptr()
     except (RuntimeError, NotImplementedError):  # sparse, or without values
@@ -110,7 +112,7 @@ def _address(tensor: Tensor) -> int:
 
 
 def _leaves(value: Any) -> list[Any]:
-    """Tensors and functions in a value, in what it holds, and so on."""
+    """Lists the leaves of a nested value, such as tensors and functions, without modules."""
     leaves, seen, level = [], set[int](), [value]
     for _ in range(DEEPEST):
         items = [item for item in level if id(item) not in seen and not isinstance(item, nn.Module)]
@@ -122,11 +124,11 @@ def _leaves(value: Any) -> list[Any]:
 
 
 def _held_by(function: types.FunctionType, objects: dict[int, str]) -> str:
-    """Which of some objects a function reaches; a copy of the function is the same function."""
+    """Returns the description of an object that a function refers to, or an empty text; copies keep the reference."""
     names = function.__code__.co_names
     values = [function.__globals__[name] for name in names if name in function.__globals__]
     for cell in function.__closure__ or ():
-        with contextlib.suppress(ValueError):  # a cell that is still empty
+        with contextlib.suppress(ValueError):  # a closure cell that is still empty
             values.append(cell.cell_contents)
     values += [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
     for held in values:
@@ -154,7 +156,7 @@ def _refusal(part: nn.Module) -> str:
 
 
 def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
-    """Stacks every parameter of a module k times, in place, but for those that the patterns ``share`` name."""
+    """Stacks every parameter of a module k times, in place, except the parameters that match ``share``."""
     named = list(module.named_parameters(remove_duplicate=False))
     for pattern in share:
         if not any(fnmatch.fnmatchcase(name, pattern) for name, _ in named):
@@ -176,7 +178,7 @@ def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
 
 @torch.no_grad()
 def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None:
-    """Puts a plain module's parameters into one cell, or raises ValueError where names, shapes or buffers differ."""
+    """Copies a plain module's parameters into one cell; raises ValueError if names, shapes or buffers differ."""
     stacked = {id(parameter) for parameter in cell_parameters(routed)}
     ours, theirs = routed.state_dict(keep_vars=True), module.state_dict()
     odd = sorted(ours.keys() ^ theirs.keys())
@@ -196,8 +198,8 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
 def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
     """Gives a parameter values of another shape.
 
-    A graph of an earlier call that is still held would sum the gradients of the new cells to the old shape. With
-    another dtype in between torch forgets it.
+    Autograd's accumulator from an earlier call, if still alive, would reduce new gradients to the old shape. With
+    another dtype in between, torch drops it.
     """
     if values.is_floating_point():
         other = torch.float32 if values.dtype == torch.float64 else torch.float64
@@ -206,7 +208,7 @@ def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
 
 
 def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | None) -> dict[str, Tensor]:
-    """Newly drawn parameters [k, ...] of a plain module, by name."""
+    """Draws new parameters [k, ...] of a plain module, by name."""
     parts = {"": template} if hasattr(template, "reset_parameters") else dict(template.named_modules())
     for name, part in parts.items():
         if not hasattr(part, "reset_parameters") and any(p is not None for p in part._parameters.values()):
@@ -214,8 +216,8 @@ def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | No
                 f"{_OP}.subdivide: inherit=False needs a field with reset_parameters(), or layers that have it; "
                 f"`{name}`, a {type(part).__name__}, has not"
             )
-    drawn: dict[str, list[Tensor]] = {name: [] for name, _ in template.named_parameters()}
-    # Of GPUs as well, which manual_seed reaches. Without a generator torch's own goes on.
+    draws: dict[str, list[Tensor]] = {name: [] for name, _ in template.named_parameters()}
+    # fork_rng also saves the GPUs' states, which manual_seed changes. Without a generator, torch's own is used.
     with torch.random.fork_rng() if generator is not None else contextlib.nullcontext():
         if generator is not None:
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator, device=generator.device)))
@@ -224,12 +226,12 @@ def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | No
                 if hasattr(part, "reset_parameters"):
                     part.reset_parameters()  # type: ignore[operator]
             for name, parameter in template.named_parameters():
-                drawn[name].append(parameter.detach().clone())
-    return {name: torch.stack(values) for name, values in drawn.items()}
+                draws[name].append(parameter.detach().clone())
+    return {name: torch.stack(values) for name, values in draws.items()}
 
 
 def plain_cell(routed: nn.Module, index: int) -> nn.Module:
-    """A plain copy of one cell's module, with parameters of its own."""
+    """Returns a plain copy of one cell's module, with parameters of its own."""
     copies = {id(p): nn.Parameter(p.detach()[index].clone(), p.requires_grad) for p in cell_parameters(routed)}
     plain: nn.Module = clone_module(routed, copies)
     for part in plain.modules():
@@ -238,9 +240,9 @@ def plain_cell(routed: nn.Module, index: int) -> nn.Module:
 
 
 def apply_to_cells(routed: nn.Module, k: int, function: Callable[[nn.Module], Any]) -> None:
-    """Applies a function to the modules of each of k cells, and keeps what it makes of parameters and buffers.
+    """Applies a function to the modules of each of k cells, and keeps its changes of parameters and buffers.
 
-    What cells share is as the function leaves it in the first cell.
+    Shared parameters and buffers get their values from the first cell.
     """
     stacked = {id(parameter) for parameter in cell_parameters(routed)}
     for index in range(k):
@@ -262,14 +264,14 @@ def renew_cells(
 
     Args:
         routed: The module with stacked parameters.
-        parents: int64 [new cells], the present cell whose values each new one gets.
-        fresh: Values [new cells, ...] by the parameter's name, which the cells of ``new`` get instead.
-        new: bool [new cells], with ``fresh``.
+        parents: The present cell whose values each new cell gets, int64 [new cells].
+        fresh: Values [new cells, ...] by parameter name, for the cells of ``new``; None for copies alone.
+        new: The mask of the new cells that get ``fresh`` values, bool [new cells].
     """
     names = {id(p): name for name, p in routed.named_parameters()}
     for parameter in cell_parameters(routed):
         with torch.inference_mode(False):
-            # Without memory for values (meta), an index would import torch's compiler.
+            # index_select, because indexing a meta tensor would import torch's compiler.
             values = parameter.detach().index_select(0, parents.to(parameter.device))
             if fresh is not None and new is not None:
                 values[new.to(values.device)] = fresh[names[id(parameter)]][new].to(values)

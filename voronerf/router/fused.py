@@ -1,8 +1,9 @@
-"""A module whose ``forward`` is fixed, fused: whole, or in runs.
+"""Fuses a module whose ``forward`` is fixed: into one program, or into several runs.
 
-The module is traced once (:mod:`voronerf.router.trace`). What of it can be steps of a program (``router/lower.py``) is
-cut into the largest runs, each of which is one operation. What lies between, such as look-ups, runs for the rows of all
-cells at once, by the rules of :mod:`voronerf.router.rules` where it meets the parameters of cells.
+The module is traced once (:mod:`voronerf.router.trace`). Functions that can be steps of a program (``router/lower.py``)
+are joined into the largest possible runs, and each run is one operation. Functions between runs, such as look-ups, run
+in PyTorch for the rows of all cells at once. If they take parameters of cells, they run by the rules of
+:mod:`voronerf.router.rules`.
 
 Letters: n samples, k cells, w columns.
 """
@@ -29,47 +30,47 @@ from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiab
 from voronerf.router.watch import Inputs, lookup
 from voronerf.router.waves import with_encodings
 
-HALF = (torch.bfloat16, torch.float16)  # what a run computes in float32 and rounds at its end
+HALF = (torch.bfloat16, torch.float16)  # dtypes that a run computes in float32 and rounds at its end
 
 
 class ParameterEntries:
-    """A parameter of a program: numbered entries of a parameter, [o, i] or [w], which is a tensor or a node's value."""
+    """A parameter of a program: selected entries [o, i] or [w] of a source, which is a tensor or a node's value."""
 
     def __init__(self, of: Any, codes: Tensor) -> None:
         self.of, self._shape, numbers = of, codes.shape, codes.flatten()
-        self._of_cells = isinstance(of, fx.Node) and of.meta["on"] == CELLS
+        self._is_of_cells = isinstance(of, fx.Node) and of.meta["on"] == CELLS
         every = torch.arange((of.meta["value"] if isinstance(of, fx.Node) else of).numel())
-        self._whole = torch.equal(numbers, every)
-        self._turned = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
-        self._numbers = numbers.clone()  # which can be saved for a backward pass, also where it is of inference mode
+        self._is_whole = torch.equal(numbers, every)
+        self._is_transposed = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
+        self._numbers = numbers.clone()  # a copy can be saved for a backward pass, an inference tensor cannot
 
     def constants(self) -> list[float] | None:
-        """Its entries, if they are numbers."""
+        """Returns the entries as numbers if the source is a constant, or None."""
         values: list[float] | None = None
         if isinstance(self.of, Tensor):
             values = self.of.detach().flatten().cpu()[self._numbers].tolist()
         return values
 
-    def own(self, values: Mapping[Any, Any]) -> Tensor:
-        """The parameter itself, where these are all of its entries in its own shape; else as `of_values`."""
+    def resolve(self, values: Mapping[Any, Any]) -> Tensor:
+        """Returns the source itself if all of its entries are selected in its own shape; else as `select`."""
         value: Tensor = values.get(self.of, self.of)
-        whole = self._whole and value.shape[self._of_cells :] == self._shape
-        return value if whole else self.of_values(values)
+        whole = self._is_whole and value.shape[self._is_of_cells :] == self._shape
+        return value if whole else self.select(values)
 
-    def of_values(self, values: Mapping[Any, Any]) -> Tensor:
-        """Its entries, [k, ...], or [1, ...] where cells share it."""
+    def select(self, values: Mapping[Any, Any]) -> Tensor:
+        """Returns the entries, [k, ...], or [1, ...] if cells share the source."""
         value = values.get(self.of, self.of)
-        flat = value.reshape(value.shape[0] if self._of_cells else 1, -1)
-        if self._whole:
+        flat = value.reshape(value.shape[0] if self._is_of_cells else 1, -1)
+        if self._is_whole:
             return flat.reshape(-1, *self._shape)
-        if self._turned:
+        if self._is_transposed:
             return flat.reshape(-1, *self._shape[::-1]).transpose(1, 2)
         return flat.index_select(1, self._numbers.to(flat.device)).reshape(-1, *self._shape)
 
 
 @dataclass
 class Segment:
-    """One program and where its tensors come from and go to."""
+    """One program with the sources of its inputs and parameters, and its outputs."""
 
     program: Program
     inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier runs
@@ -77,8 +78,8 @@ class Segment:
     outputs: list[Any] = field(default_factory=list)
 
 
-class Whole(NamedTuple):
-    """One program of some arguments: their numbers, and shape and dtype of each result for one sample."""
+class WholeProgram(NamedTuple):
+    """A call as one program: the numbers of its arguments, and the shape and dtype of each result for one sample."""
 
     program: Program
     reads: tuple[int, ...]
@@ -88,12 +89,12 @@ class Whole(NamedTuple):
 class Fused:
     """A call of the routed module as runs of programs, and the functions between them.
 
-    It is traced on given rows of the arguments, for as many samples as ``rows_for`` gives. Raises :class:`Unfusable`
-    where nothing can be fused, or a step cannot be done again for other samples.
+    The call is traced on rows of its arguments, for ``rows_for`` samples. Raises :class:`Unfusable` if nothing can be
+    fused, or if a step cannot be repeated for other samples.
 
     Attributes:
-        inputs: Numbers and buffers that are looked up in each call.
-        reads: (place, name) of the attributes of parts that ``forward`` read.
+        inputs: The numbers and buffers that are looked up in each call.
+        reads: The attributes that ``forward`` reads, as (place of the submodule, name).
     """
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
@@ -109,9 +110,9 @@ class Fused:
         self._recorded = torch.is_grad_enabled() or any(node.meta.get("grad") for node in trace.graph.nodes)
         self._differentiates = any(node.target is torch.autograd.grad for node in trace.graph.nodes)
         self._lowering = Lowering(trace.rows)
-        self._entries: dict[fx.Node, Entries] = {}  # of values that steps make or move
-        self._ready: dict[fx.Node, int] = {}  # of what PyTorch makes: the first run that can read it
-        self._why: dict[fx.Node, str] = {}
+        self._entries: dict[fx.Node, Entries] = {}  # by value that steps compute or move
+        self._ready: dict[fx.Node, int] = {}  # by value of PyTorch: the first run that can read it
+        self._reasons: dict[fx.Node, str] = {}
         for node in trace.graph.nodes:
             self._add(node)
         needed = self._needed()
@@ -127,16 +128,18 @@ class Fused:
         self._writes = any(node.meta.get("inplace") for node in self._between)
         self._runs = self._cut()
         if not any(run.parameters for run in self._runs.values()):
-            first = next(iter(self._why.values()), "nothing that is returned comes from a layer")
+            first = next(iter(self._reasons.values()), "nothing that is returned comes from a layer")
             raise Unfusable(f"no layer can be part of a run: {first}")
         self._sorted = any(_meets_cells(node) for node in self._between)
-        lines: dict[str, dict[str, None]] = {}  # of the module, with the functions that are no steps
+        lines: dict[str, dict[str, None]] = {}  # functions that are not steps, by line of the module
         for node in self._between:
-            if node in self._why and node.target is not differentiable:
+            if node in self._reasons and node.target is not differentiable:
                 lines.setdefault(node.meta["line"], {})[name_of(node.target)] = None
-        said = [f"{', '.join(functions)}{line}" for line, functions in lines.items()]
-        self.name = "fused in runs" if len(self._runs) > 1 or said else "fused"
-        self.why = f"{len(self._runs)} run{'s' * (len(self._runs) > 1)}, between them {'; '.join(said)}" if said else ""
+        texts = [f"{', '.join(functions)}{line}" for line, functions in lines.items()]
+        self.name = "fused in runs" if len(self._runs) > 1 or texts else "fused"
+        self.why = (
+            f"{len(self._runs)} run{'s' * (len(self._runs) > 1)}, between them {'; '.join(texts)}" if texts else ""
+        )
         for node in trace.graph.nodes:
             if isinstance(node.meta.get("value"), Tensor):
                 node.meta["dtype"] = node.meta.pop("value").dtype
@@ -145,26 +148,26 @@ class Fused:
     # Cutting ----------------------------------------------------------------------------------------------------------
 
     def _add(self, node: fx.Node) -> None:
-        """Notes how a node is computed: by steps, or by PyTorch between runs."""
+        """Decides whether steps or PyTorch, between runs, compute a node."""
         if node.meta["on"] != SAMPLES or node.op == "placeholder" or isinstance(node.meta.get("value"), int):
             self._ready[node] = 0
             return
-        if "results" not in node.meta:  # a part of a result
+        if "results" not in node.meta:  # one of several results of a function
             return
         try:
             self._lower(node)
             if self._is_left_to_torch(node):
                 ready = max(self._ready[source] for source in node.all_input_nodes)
                 self._ready.update(dict.fromkeys((node, *node.meta["results"]), ready))
-        except Exception as error:  # NotAStep, or arguments of a form that nobody wrote steps for: PyTorch computes it
-            self._why[node] = f"{name_of(node.target)}{node.meta['line']}, which is no step: {error}"
+        except Exception as error:  # NotAStep, or an unforeseen form of arguments
+            self._reasons[node] = f"{name_of(node.target)}{node.meta['line']}, which is no step: {error}"
             self._ready[node] = max((self._at(source) for source in node.all_input_nodes), default=0)
             for value in node.meta["results"]:
                 self._ready[value] = self._ready[node]
                 self._entries.pop(value, None)
 
     def _is_left_to_torch(self, node: fx.Node) -> bool:
-        """Whether a node only moves entries of values that PyTorch computes, or is made of no tensor, as ``zeros``."""
+        """Returns whether a node only moves entries of PyTorch's values, or takes no tensors, like ``zeros``."""
         sources = node.all_input_nodes
         if not all(source in self._ready for source in sources):
             return False
@@ -172,13 +175,13 @@ class Fused:
         return values <= self._lowering.sources.keys() or all(isinstance(s.meta.get("value"), int) for s in sources)
 
     def _at(self, node: fx.Node) -> int:
-        """The first run that can read a value."""
+        """Returns the number of the first run that can read a value."""
         if node in self._ready:
             return self._ready[node]
         return max(map(self._lowering.level, self._lowering.values(self._entries[node].codes)), default=-1) + 1
 
-    def _known(self, node: fx.Node) -> Entries:
-        """Where the entries of a node's value come from."""
+    def _entries_of(self, node: fx.Node) -> Entries:
+        """Returns the sources of the entries of a node's value."""
         if node not in self._entries:
             value = node.meta["value"]
             if not value.is_floating_point():
@@ -193,7 +196,7 @@ class Fused:
     def _lower(self, node: fx.Node) -> None:
         values: dict[int, fx.Node] = {}
 
-        def own(source: fx.Node) -> Any:
+        def value_of(source: fx.Node) -> Any:
             value = source.meta["value"]
             if isinstance(value, Tensor) and not source.meta.get("counts"):
                 values[id(value)] = source
@@ -203,46 +206,46 @@ class Fused:
             raise NotAStep("a custom function, whose backward is its own; write it with functions of PyTorch")
         if node.target in (torch.autograd.grad, differentiable):
             raise NotAStep("a gradient")
-        args, kwargs = map_arg((node.args, node.kwargs), own)
+        args, kwargs = map_arg((node.args, node.kwargs), value_of)
 
-        def known(value: Tensor) -> Entries | None:
-            return self._known(values[id(value)]) if id(value) in values else None
+        def entries_of(value: Tensor) -> Entries | None:
+            return self._entries_of(values[id(value)]) if id(value) in values else None
 
         function: Any = node.target
         written: Any = node.args[0] if node.meta["inplace"] else None
-        before = written and Entries(self._known(written).codes.clone(), self._known(written).of)
-        # As an ordinary dict, of which a changed copy can be made.
-        result, args, entries = self._lowering.run(function, args, dict(kwargs), known)
-        made = [entries(tensor) for tensor in ([args[0]] if written else tensors_of(result))]
-        if written:  # what shares memory with the tensor has the codes of after, too
-            self._entries[written] = before
-        for value, known_as in zip(node.meta["results"], made, strict=True):
+        old_entries = written and Entries(self._entries_of(written).codes.clone(), self._entries_of(written).of)
+        # A plain dict, because map_tensors makes changed copies of its type.
+        result, args, entries = self._lowering.run(function, args, dict(kwargs), entries_of)
+        entry_list = [entries(tensor) for tensor in ([args[0]] if written else tensors_of(result))]
+        if written:  # the codes of views of the tensor change too
+            self._entries[written] = old_entries
+        for value, value_entries in zip(node.meta["results"], entry_list, strict=True):
             if self._recorded and not node.meta["grad"]:
-                places, numbers = self._lowering.order(known_as.codes)
+                places, numbers = self._lowering.order(value_entries.codes)
                 b = self._lowering.builder
                 stopped = b.apply("stop", self._lowering.operand(numbers))
-                codes = torch.empty_like(known_as.codes).flatten()
+                codes = torch.empty_like(value_entries.codes).flatten()
                 codes[places] = self._lowering._codes(stopped)
-                known_as = Entries(codes.reshape(known_as.codes.shape))
-            self._entries[value] = known_as
+                value_entries = Entries(codes.reshape(value_entries.codes.shape))
+            self._entries[value] = value_entries
 
     def _needed(self) -> set[fx.Node]:
-        """The nodes that PyTorch computes; collects the steps whose values they and the results read."""
+        """Returns the nodes that PyTorch computes, and collects the steps that those nodes and the results need."""
         needed: set[fx.Node] = set()
         lowering, steps = self._lowering, self._lowering.builder.steps
-        self._made: dict[fx.Node, Columns] = {}
+        self._columns: dict[fx.Node, Columns] = {}
         self._live: set[int] = set()
         waiting = list(self._outputs)
         while waiting:
             node = waiting.pop()
-            if node in needed or node in self._made:
+            if node in needed or node in self._columns:
                 continue
             if node in self._ready:
                 needed.add(node)
                 waiting += node.all_input_nodes
                 continue
-            self._made[node] = self._whole(node)
-            values = [self._made[node].index]
+            self._columns[node] = self._columns_of(node)
+            values = [self._columns[node].index]
             while values:
                 step = steps[values.pop()]
                 if step.out in self._live:
@@ -256,8 +259,8 @@ class Fused:
                 waiting += [source for source in sources if isinstance(source, fx.Node)]
         return needed
 
-    def _whole(self, node: fx.Node) -> Columns:
-        """The columns that make a node's value, and how they are laid out in it."""
+    def _columns_of(self, node: fx.Node) -> Columns:
+        """Returns the columns of a node's value, and stores their layout in the node."""
         codes = self._entries[node].codes
         shape, at = codes.shape, _sample_dimension(codes.shape, self._lowering.rows)
         turned = codes.movedim(at, 0).reshape(self._lowering.rows, -1)
@@ -268,7 +271,7 @@ class Fused:
         return columns if columns.index not in self._lowering.sources else self._lowering.builder.apply("copy", columns)
 
     def _cut(self) -> dict[int, Segment]:
-        """The steps in runs, by their level."""
+        """Groups the steps into runs, by their level."""
         lowering, steps = self._lowering, self._lowering.builder.steps
         live = self._live
         level = {value: lowering.level(value) for value in live}
@@ -277,23 +280,23 @@ class Fused:
             chosen = [steps[v] for v in sorted(live) if level[v] == number and v not in lowering.sources]
             later = {c.index for v in live if level[v] > number for c in steps[v].operands if c.of == VALUE}
             outputs: list[Any] = [step.out for step in chosen if step.out in later]
-            kept = [Columns(VALUE, v, 0, steps[v].width) for v in outputs]
-            for node, columns in self._made.items():
+            operands = [Columns(VALUE, v, 0, steps[v].width) for v in outputs]
+            for node, columns in self._columns.items():
                 if level[columns.index] == number:
                     outputs.append(node)
-                    kept.append(columns)
-            runs[number] = _renumbered(chosen, kept, lowering, outputs)
+                    operands.append(columns)
+            runs[number] = _renumbered(chosen, operands, lowering, outputs)
         return runs
 
     # Running ----------------------------------------------------------------------------------------------------------
 
     def run(self, call: Call, grouping: Grouping) -> Results:
-        """The method's results: in the order of the call, where nothing between runs needs rows by cell."""
+        """Returns the method's results, unsorted if no function between runs needs rows sorted by cell."""
         sort = self._sorted or grouping.rows is not None or not call.layout.n
         call = self._with_inputs(call, grouping.device)
         rows, shared = call.arranged(grouping if sort else None), call.shared()
         owned, places = self._owned, self._places
-        if call.module is not self.module:  # a copy of the module, with parameters of its own
+        if call.module is not self.module:  # the call is of a copy of the module
             owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
             parts = list(parts_of(call.module).values())
             places = [(parts[i], i, name) for _, i, name in places]
@@ -303,15 +306,15 @@ class Fused:
         for node, place in self._parameters.items():
             owner, name = owned[place]
             values[node] = owner._parameters[name]
-        recorded = torch.is_grad_enabled()
-        with torch.set_grad_enabled(recorded or self._differentiates):
+        is_recorded = torch.is_grad_enabled()
+        with torch.set_grad_enabled(is_recorded or self._differentiates):
             self._compute(values, grouping, sort)
-        outputs = [values[node] if recorded else values[node].detach() for node in self._outputs]
+        outputs = [values[node] if is_recorded else values[node].detach() for node in self._outputs]
         return Results(self.result, outputs, grouping if sort else None)
 
     @functools.cached_property
-    def whole(self) -> Whole | str:
-        """What a call computes, where that is one program on its arguments as they are; or what else there is."""
+    def whole_program(self) -> WholeProgram | str:
+        """The call as one program on its unchanged arguments, or the reason why it is not one."""
         if self.name != "fused":
             return self.why
         (run,) = self._runs.values()
@@ -324,57 +327,59 @@ class Fused:
         outputs = [run.program.outputs[run.outputs.index(node)] for node in self._outputs]
         reads = tuple(self._inputs.index(node) for node in run.inputs)
         results = tuple((tuple(node.meta["layout"][0]), node.meta["dtype"]) for node in self._outputs)
-        return Whole(Builder(run.program).program(outputs), reads, results)
+        return WholeProgram(Builder(run.program).program(outputs), reads, results)
 
     @functools.cached_property
     def encoded(self) -> Program:
-        """The program of :attr:`whole` with encodings as steps."""
-        (run,), whole = self._runs.values(), cast(Whole, self.whole)
-        constants = {i: taken.constants() for i, taken in enumerate(run.parameters)}
-        return with_encodings(whole.program, {i: numbers for i, numbers in constants.items() if numbers is not None})
+        """The program of :attr:`whole_program` with encodings as steps."""
+        (run,), whole_program = self._runs.values(), cast(WholeProgram, self.whole_program)
+        constants = {i: entries.constants() for i, entries in enumerate(run.parameters)}
+        return with_encodings(
+            whole_program.program, {i: numbers for i, numbers in constants.items() if numbers is not None}
+        )
 
     @property
     def computes(self) -> bool:
-        """Whether functions of the module make parameters of :attr:`whole`, or numbers are looked up."""
+        """True if parameters are computed in each call, by functions of the module or from looked-up numbers."""
         return bool(self._weights or self._places)
 
     @functools.cached_property
     def _sources(self) -> list[tuple[dict[str, Any], str, ParameterEntries | None]]:
-        """Where the parameters of :attr:`whole` are, and their entries that it takes; None for a parameter as it is."""
+        """(registry, name, selected entries) of each parameter of :attr:`whole_program`; None: the parameter itself."""
         (run,) = self._runs.values()
         sources = list[tuple[dict[str, Any], str, ParameterEntries | None]]()
-        for taken in run.parameters:
-            if isinstance(taken.of, Tensor):
-                sources.append(({"": taken.own({}).float()}, "", None))
+        for entries in run.parameters:
+            if isinstance(entries.of, Tensor):
+                sources.append(({"": entries.resolve({}).float()}, "", None))
                 continue
-            owner, name = self._owned[self._parameters[taken.of]]
+            owner, name = self._owned[self._parameters[entries.of]]
             parameter = cast(Tensor, owner._parameters[name])
-            as_it_is = parameter.dtype is torch.float32 and taken.own({taken.of: parameter}) is parameter
-            sources.append((owner._parameters, name, None if as_it_is else taken))
+            as_it_is = parameter.dtype is torch.float32 and entries.resolve({entries.of: parameter}) is parameter
+            sources.append((owner._parameters, name, None if as_it_is else entries))
         return sources
 
     def parameters(self, k: int, device: torch.device, backend: str) -> list[Tensor]:
-        """Those of :attr:`whole`, float32: the module's own where they are a parameter as it is, else made of them."""
+        """Returns the float32 parameters of :attr:`whole_program`: the module's own, or computed from them."""
         if not self.computes:
             return [
-                registry[name] if taken is None else taken.own({taken.of: registry[name]}).float()
-                for registry, name, taken in self._sources
+                registry[name] if entries is None else entries.resolve({entries.of: registry[name]}).float()
+                for registry, name, entries in self._sources
             ]
         tensors = [self.inputs.tensor(lookup(part, name), device) for part, _, name in self._places]
         values: dict[Any, Any] = dict(zip(self._shared, tensors, strict=True))
         for node, place in self._parameters.items():
             owner, name = self._owned[place]
             values[node] = owner._parameters[name]
-        none = torch.zeros(2, dtype=torch.int32, device=device)  # weights are of parameters alone, so of no samples
-        grouped = GroupedRun(Grouping(none, 2, k, device, backend), {})
+        cells = torch.zeros(2, dtype=torch.int32, device=device)  # placeholders: weights depend on no samples
+        grouped = GroupedRun(Grouping(cells, 2, k, device, backend), {})
         for node in self._weights:
             if node not in values:
                 _compute(node, values, grouped)
         (run,) = self._runs.values()
-        return [taken.own(values).float() for taken in run.parameters]
+        return [entries.resolve(values).float() for entries in run.parameters]
 
     def _with_inputs(self, call: Call, device: torch.device) -> Call:
-        """The call with tensors in the place of its numbers that are inputs."""
+        """Returns the call with tensors in the place of the numbers that are inputs."""
         names = {source for source in self.inputs.sources if isinstance(source, str)}
         return call.with_tensors(names, lambda value: self.inputs.tensor(value, device)) if names else call
 
@@ -397,8 +402,8 @@ class Fused:
         rows = [_flat(values[source], n) for source in run.inputs]
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
         half = torch.is_autocast_enabled(grouping.device.type) or any(x.dtype in HALF for x in rows)
-        parameters = [recordable(taken.of_values(values).to(dtype)) for taken in run.parameters]
-        with torch.autocast(grouping.device.type, enabled=False):  # rounded below, as in known calls
+        parameters = [recordable(entries.select(values).to(dtype)) for entries in run.parameters]
+        with torch.autocast(grouping.device.type, enabled=False):  # rounded below, as in cached calls
             outputs = grouped_program(
                 [x.to(dtype) for x in rows],
                 parameters,
@@ -415,8 +420,8 @@ class Fused:
             values[of] = tensor
 
 
-def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outputs: list[Any]) -> Segment:
-    """A program of some of the steps, with numbers of its own."""
+def _renumbered(steps: list[Step], results: list[Columns], lowering: Lowering, outputs: list[Any]) -> Segment:
+    """Makes a program of some of the steps, with its own numbering of values and parameters."""
     b, run = Builder(), Segment(Program((), (), (), ()), outputs=outputs)
     values: dict[int, int] = {}
     parameters: dict[int, int] = {}
@@ -430,7 +435,7 @@ def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outp
     def columns(c: Columns) -> Columns:
         if c.of != VALUE:
             return c._replace(index=parameter(c.index))
-        if c.index not in values:  # made before this run
+        if c.index not in values:  # computed before this run
             values[c.index] = b.input(lowering.builder.steps[c.index].width).index
             run.inputs.append(lowering.sources.get(c.index, c.index))
         return c._replace(index=values[c.index])
@@ -440,7 +445,7 @@ def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outp
         if step.op == "linear":
             numbers = (parameter(int(numbers[0])), *numbers[1:])
         values[step.out] = b.emit(step.op, step.width, operands, numbers, step.name).index
-    run.program = b.program([columns(c) for c in kept])
+    run.program = b.program([columns(c) for c in results])
     return run
 
 
@@ -449,39 +454,39 @@ def _meets_cells(node: fx.Node) -> bool:
 
 
 def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None:
-    """Calls the function of a node, for all cells at once where it meets their parameters."""
-    meets = _meets_cells(node)
+    """Calls the function of a node, for all cells at once if it takes their parameters."""
+    meets_cells = _meets_cells(node)
 
-    def given(source: fx.Node) -> Any:
-        if meets and source.meta["on"] == CELLS:
+    def argument(source: fx.Node) -> Any:
+        if meets_cells and source.meta["on"] == CELLS:
             return map_tensors(values[source], PerCell)
-        if meets and source.meta["on"] == SAMPLES:
+        if meets_cells and source.meta["on"] == SAMPLES:
             for tensor in tensors_of(values[source]):
                 grouped.mark(tensor)
         return values[source]
 
-    args, kwargs = map_arg((node.args, node.kwargs), given)
-    recorded = torch.is_grad_enabled() and node.meta.get("grad", True)
+    args, kwargs = map_arg((node.args, node.kwargs), argument)
+    is_recorded = torch.is_grad_enabled() and node.meta.get("grad", True)
     try:
-        with grouped if meets else contextlib.nullcontext(), torch.set_grad_enabled(recorded):
+        with grouped if meets_cells else contextlib.nullcontext(), torch.set_grad_enabled(is_recorded):
             result = node.target(*args, **kwargs)  # type: ignore[operator]
     except Ungroupable:
-        says = f"{name_of(node.target)}{node.meta['line']} meets parameters and has no rule for all cells at once"
-        raise Unfusable(says) from None
-    made = args[0] if node.meta.get("inplace") else result
-    values[node] = map_tensors(made, lambda own: own.stacked if isinstance(own, PerCell) else own)
+        message = f"{name_of(node.target)}{node.meta['line']} meets parameters and has no rule for all cells at once"
+        raise Unfusable(message) from None
+    written = args[0] if node.meta.get("inplace") else result
+    values[node] = map_tensors(written, lambda item: item.stacked if isinstance(item, PerCell) else item)
 
 
 def _flat(value: Tensor, n: int) -> Tensor:
-    """[n, w] of a tensor whose first dimension is n * m, or of one with n somewhere else."""
+    """Reshapes a tensor to [n, w]; its first dimension is n * m, or another dimension is n."""
     if value.shape[:1] != (n,) and (not value.shape or n == 0 or value.shape[0] % n):
-        at = next(d for d, size in enumerate(value.shape) if size == n)
-        value = value.movedim(at, 0)
+        dim = next(d for d, size in enumerate(value.shape) if size == n)
+        value = value.movedim(dim, 0)
     return value.reshape(n, -1) if n else value.reshape(0, max(value.shape[1:].numel(), 1))
 
 
 def _is_custom(node: fx.Node) -> bool:
-    """Whether it is a ``torch.autograd.Function`` of the module's."""
+    """Returns whether a node is a ``torch.autograd.Function`` of the module."""
     return getattr(node.target, "__name__", "") == "apply"
 
 

@@ -1,10 +1,10 @@
-"""Running a module's own ``forward`` once for the samples of all cells.
+"""Runs a module's own ``forward`` once for the samples of all cells.
 
-The rows are sorted by cell and :class:`PerCell` tensors stand in the place of the module's parameters.
-:class:`GroupedRun` sees every PyTorch function on the way. A function that meets a parameter is served by a rule
-(:func:`register`); a function of parameters alone runs for all cells at once; any other runs as it is. Which tensors
-depend on the samples is noted on the way, so that a rule knows rows from constants, and a value of samples that is read
-on the host is found. Where a step has no rule, :class:`Ungroupable` says which, and the call is a loop over cells.
+The rows are sorted by cell, and :class:`PerCell` tensors replace the module's parameters. :class:`GroupedRun`
+intercepts every PyTorch function. A function of rows and parameters runs by a rule (:func:`register`), a function of
+parameters alone is mapped over cells, and any other function runs unchanged. Tensors that depend on the samples are
+marked. By the marks, rules tell rows from constants, and host reads of samples' values are detected. If a step has no
+rule, :class:`Ungroupable` names it, and the call becomes a loop over cells.
 
 Letters: n samples, k cells; a tensor of rows is [n * m, ...], the m entries of a sample next to each other.
 """
@@ -37,7 +37,7 @@ _RULES: dict[Any, Rule] = {}
 
 
 def find(names: str, *places: Any) -> frozenset[Any]:
-    """The functions of these names that modules or classes have."""
+    """Returns the functions of these names in some modules or classes."""
     functions = (getattr(place, name, None) for place in places for name in names.split())
     return frozenset(function for function in functions if function is not None)
 
@@ -56,7 +56,7 @@ METADATA = frozenset(
     torch,
     torch.Tensor,
 )
-"""What reads no value: shapes, dtypes, devices."""
+"""The functions that read no values, only shapes, dtypes and devices."""
 RANDOM = find(
     """
     rand_like randn_like randint_like bernoulli normal_ uniform_ bernoulli_ exponential_ random_ cauchy_ log_normal_
@@ -66,9 +66,9 @@ RANDOM = find(
     torch.Tensor,
     torch.nn.functional,
 )
-"""What draws random numbers."""
+"""The functions that draw random numbers."""
 CREATE = find("zeros ones full empty rand randn randint", torch)
-"""New tensors of given sizes; with n of them in front they are rows."""
+"""The functions that make tensors from sizes; if the first size is n, the tensors are rows."""
 
 
 class Exact(TorchFunctionMode):
@@ -79,14 +79,14 @@ class Exact(TorchFunctionMode):
 
 
 class NoRandomness(TorchFunctionMode):
-    """Random numbers are 0 and dropout does nothing, so that two calls can be compared."""
+    """A mode in which random numbers are 0 and dropout does nothing, so that two calls can be compared."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return without_randomness(func, args, kwargs or {})
 
 
 def without_randomness(func: Any, args: Any, kwargs: Any) -> Any:
-    """What a function returns where random numbers are 0."""
+    """Calls a function with random numbers of 0 and without dropout."""
     if func not in RANDOM:
         return func(*args, **kwargs)
     if "dropout" in getattr(func, "__name__", ""):
@@ -95,16 +95,16 @@ def without_randomness(func: Any, args: Any, kwargs: Any) -> Any:
 
 
 def register(function: Any, rule: Rule) -> None:
-    """Registers how a function that takes parameters runs for all cells at once.
+    """Registers a rule by which a function that takes parameters runs for all cells at once.
 
-    Without a rule, a call of a module that uses the function is a loop over cells.
+    Without a rule, a module that uses the function runs cell by cell.
 
     Args:
-        function: What PyTorch's function modes see, such as ``torch.nn.functional.linear``, an operator of
-            ``torch.ops``, or a function of your own that calls ``torch.overrides.handle_torch_function``.
+        function: The function as PyTorch's function modes see it, such as ``torch.nn.functional.linear``, an operator
+            of ``torch.ops``, or a function of your own that calls ``torch.overrides.handle_torch_function``.
         rule: ``rule(run, *args, **kwargs)`` with the :class:`GroupedRun` and the function's own arguments: tensors of
             rows are sorted by cell, and a parameter is a :class:`PerCell`, whose ``stacked`` is [k, ...]. It returns
-            rows, or ``NotImplemented`` for arguments that it does not serve.
+            rows, or ``NotImplemented`` for arguments that it does not support.
 
     Examples:
         >>> import torch
@@ -130,26 +130,26 @@ def register(function: Any, rule: Rule) -> None:
 
 
 class Ungroupable(Exception):
-    """A module cannot be run on the samples of all cells at once; the message says where."""
+    """An error for a module that cannot run on the samples of all cells at once; the message says where."""
 
     def __init__(self, reason: str, of_batch: bool = False) -> None:
         super().__init__(reason)
-        self.of_batch = of_batch  # it may be otherwise for other samples
+        self.of_batch = of_batch  # another batch may be groupable
 
 
 class PerCell(torch.Tensor):
-    """k tensors, one for each cell, that look like one of them: what a routed module finds in place of a parameter.
+    """A stand-in for a parameter in a routed module: k tensors, one for each cell, that look like a single one.
 
     It has the shape of a single cell's tensor and no storage.
 
     Attributes:
-        stacked: [k, ...], one entry for each cell.
-        origin: The tensor of more cells that ``stacked`` is a part of, and its first cell there.
+        stacked: The tensors of all cells, [k, ...].
+        origin: The larger tensor that ``stacked`` is a part of, and the part's first cell in it.
     """
 
     stacked: Tensor
     origin: tuple[Tensor, int]
-    # Shape and dtype are answered by the wrapper itself.
+    # The wrapper itself has the shape and the dtype.
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     @staticmethod
@@ -167,7 +167,7 @@ class PerCell(torch.Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
-        """Raises TypeError for functions outside of a routed call."""
+        """Raises TypeError, because a function ran outside of a routed call."""
         raise TypeError(
             f"VoronoiRouter: {func} met the parameters of all cells outside of a routed call; call the router, or take "
             "one cell's module with cell(i)"
@@ -175,60 +175,60 @@ class PerCell(torch.Tensor):
 
 
 def for_all_cells(func: Any, args: Any, kwargs: Any, fail: Callable[[str], Exception] = Ungroupable) -> Any:
-    """A function of parameters and constants alone, for all cells at once; results are :class:`PerCell`."""
+    """Maps a function of parameters and constants over all cells; results are :class:`PerCell`."""
     stacks = [leaf.stacked for leaf in tensors_of((args, kwargs)) if isinstance(leaf, PerCell)]
     if func is torch.autograd.grad:
         raise fail("it differentiates with respect to parameters")
     function = _weight_norm if func is torch._weight_norm else func
 
-    def on_one(*single: Tensor) -> Any:
+    def run_cell(*single: Tensor) -> Any:
         following = iter(single)
         arguments = map_tensors((args, kwargs), lambda value: next(following) if isinstance(value, PerCell) else value)
         return function(*arguments[0], **arguments[1])
 
     try:
-        return map_tensors(torch.vmap(on_one, randomness="different")(*stacks), PerCell)
+        return map_tensors(torch.vmap(run_cell, randomness="different")(*stacks), PerCell)
     except Exception as error:
         raise fail(f"{name_of(func)} of parameters fails for all cells at once: {error}") from error
 
 
 def _weight_norm(v: Tensor, g: Tensor, dim: int = 0) -> Tensor:
-    """``torch._weight_norm`` of functions that can be mapped over cells."""
+    """Computes ``torch._weight_norm`` by functions that support vmap."""
     others = [d for d in range(v.dim()) if d != dim]
     return v * (g / torch.linalg.vector_norm(v, dim=others, keepdim=True))
 
 
 def name_of(function: Any) -> str:
-    """A function's name for messages."""
-    if isinstance(owner := getattr(function, "__self__", None), type):  # such as apply of a function of autograd
+    """Returns a function's name for messages."""
+    if isinstance(owner := getattr(function, "__self__", None), type):  # such as apply of an autograd function
         return f"{owner.__name__}.{function.__name__}"
     resolved = torch.overrides.resolve_name(function)
     return resolved or getattr(function, "__qualname__", None) or str(function)
 
 
 def writes_in_place(function: Any) -> bool:
-    """Whether a function writes to its first argument."""
+    """Returns whether a function writes to its first argument."""
     name = getattr(function, "__name__", "")
     return name == "__setitem__" or name in _INPLACE or (name.endswith("_") and not name.startswith("__"))
 
 
 def user_frame() -> FrameType | None:
-    """The frame of the routed module's code on the stack."""
-    frame, inside = inspect.currentframe(), False
+    """Returns the innermost stack frame of the routed module's code, or None."""
+    frame, has_left_router = inspect.currentframe(), False
     while frame is not None:
         file = frame.f_code.co_filename
-        ours = file.startswith(_HERE)
-        if ours and inside:
+        is_ours = file.startswith(_HERE)
+        if is_ours and has_left_router:
             return None  # the router that called the module
-        inside = inside or not ours
-        if inside and not ours and not file.startswith(_TORCH):
+        has_left_router = has_left_router or not is_ours
+        if has_left_router and not is_ours and not file.startswith(_TORCH):
             return frame
         frame = frame.f_back
     return None
 
 
 def line_of(frame: FrameType | None) -> str:
-    """File, line and code of a frame, or an empty text."""
+    """Returns file, line and code of a frame, or an empty text."""
     if frame is None:
         return ""
     file = frame.f_code.co_filename
@@ -237,12 +237,12 @@ def line_of(frame: FrameType | None) -> str:
 
 
 class GroupedRun(TorchFunctionMode):
-    """Active while a module runs on the n sorted rows of all cells; what a rule is given.
+    """A mode that is active while a module runs on the n sorted rows of all cells; rules get it as ``run``.
 
     Attributes:
-        tables: Those that parts of the call have looked up.
-        failed: Why the results are not valid, also where the module caught the error; None where they are.
-        widest: Bytes of the largest tensor of rows that was made.
+        tables: The tables that the call has looked up, shared by all parts of its rows.
+        failed: The reason why the results are invalid, even if the module caught the error; None if they are valid.
+        widest: The bytes of the largest tensor of rows in the run.
     """
 
     def __init__(self, grouping: Grouping, tables: dict[Any, Any], quiet: bool = False) -> None:
@@ -256,11 +256,11 @@ class GroupedRun(TorchFunctionMode):
     # For rules --------------------------------------------------------------------------------------------------------
 
     def is_rows(self, value: Any) -> bool:
-        """Whether a value is a tensor that depends on the samples."""
+        """Returns whether a value is a tensor that depends on the samples."""
         return isinstance(value, Tensor) and getattr(value, _MARK, (None,))[0] is self._token
 
     def entries(self, rows: Tensor) -> int:
-        """m of a tensor of rows [n * m, ...]."""
+        """Returns m of a tensor of rows [n * m, ...]."""
         if rows.dim() == 0 or not rows.shape[0] or rows.shape[0] % self.n:
             shape = list(rows.shape)
             reason = f"parameters meet a tensor of shape {shape}, which has no row for each of {self.n} samples"
@@ -268,19 +268,19 @@ class GroupedRun(TorchFunctionMode):
         return rows.shape[0] // self.n
 
     def rows_of(self, parameter: PerCell, m: int = 1) -> Tensor:
-        """[n * m, ...]: for each row the parameter of its cell."""
+        """Returns, for each row, the parameter of its cell: [n * m, ...]."""
         return self.grouping.expand(parameter.stacked, m)
 
     # Marks ------------------------------------------------------------------------------------------------------------
 
     def mark(self, tensor: Tensor, tag: str = "") -> Tensor:
-        """Marks a tensor as dependent on samples; ``tag`` is "any" or "all" for such a reduction of them."""
+        """Marks a tensor as dependent on samples; ``tag`` is "any" or "all" for the result of that reduction."""
         setattr(tensor, _MARK, (self._token, tag))
         self.widest = max(self.widest, tensor.numel() * tensor.element_size())
         return tensor
 
     def fail(self, reason: str, of_batch: bool = False) -> Ungroupable:
-        """The error to raise where the run cannot go on."""
+        """Records why the run cannot continue, and returns the error to raise."""
         self.failed = self.failed or Ungroupable(reason + line_of(user_frame()), of_batch)
         return self.failed
 
@@ -313,18 +313,18 @@ class GroupedRun(TorchFunctionMode):
         return result
 
     def _check_read(self, func: Any, result: Any, source: Tensor) -> None:
-        """Raises for values of samples read on the host, which a loop over cells reads for each cell alone."""
+        """Raises for a host read of samples' values, which a loop over cells reads separately for each cell."""
         if result is None or isinstance(result, (str, torch.dtype, torch.device, torch.Size)):
             return
-        # If no sample of all has a property, then no sample of any cell has it; if all have, all of each cell have.
+        # A false "any" or a true "all" of all samples holds for the samples of each cell too.
         if isinstance(result, bool) and getattr(source, _MARK)[1] == ("all" if result else "any"):
             return
         raise self.fail(f"{name_of(func)} reads values of the samples", of_batch=True)
 
     def _with_parameters(self, func: Any, args: Any, kwargs: Any, operands: list[Tensor], marked: list[Tensor]) -> Any:
         for tensor in operands:
-            unseen = type(tensor) is not PerCell and not hasattr(tensor, _MARK) and tensor.shape[:1] == (self.n,)
-            if unseen and not isinstance(tensor, torch.nn.Parameter):
+            is_unmarked = type(tensor) is not PerCell and not hasattr(tensor, _MARK) and tensor.shape[:1] == (self.n,)
+            if is_unmarked and not isinstance(tensor, torch.nn.Parameter):
                 raise self.fail(f"{name_of(func)} takes rows that no PyTorch function was seen to make")
         rule = _RULES.get(func)
         result = NotImplemented if rule is None else rule(self, *args, **kwargs)
@@ -343,36 +343,36 @@ class Way(Protocol):
 
     Attributes:
         name: "fused", "grouped" or "cell by cell".
-        why: Why no faster one runs, or empty.
+        why: The reason why no faster way runs, or an empty text.
     """
 
     name: str
     why: str
 
     def run(self, call: Call, grouping: Grouping) -> Results:
-        """The results of a call with the parameters of its module."""
+        """Returns the results of a call with the parameters of its module."""
         ...
 
 
 @dataclass
 class Grouped:
-    """The module's own ``forward`` once for the rows of all cells.
+    """The grouped way: the module's own ``forward`` runs once for the rows of all cells.
 
-    On a CPU it runs on pieces of rows, so that the cache holds their tensors.
+    On a CPU it runs on pieces of rows whose tensors fit in the cache.
     """
 
     piece: int = 1 << 16  # rows
     name: str = "grouped"
     why: str = ""
-    quiet: bool = False  # random numbers are 0, so that two runs can be compared
-    widest: int = 1  # bytes of the largest tensor of rows that the last call made
+    quiet: bool = False  # whether random numbers are 0, to compare two runs
+    widest: int = 1  # bytes of the largest tensor of rows in the last call
 
     def run(self, call: Call, grouping: Grouping) -> Results:
-        """Results in the order of the grouping; raises :class:`Ungroupable`."""
+        """Returns results in the order of the grouping; raises :class:`Ungroupable`."""
         arguments = call.arranged(grouping)
         parts = grouping.parts(self.piece) if grouping.device.type == "cpu" else [grouping]
-        # Parameters are split once for all parts: their gradient is then put together once, where that of a slice would
-        # fill a tensor of all cells for each part. Parts of one cell have the same piece.
+        # Parameters are split once for all parts, so their gradient is concatenated once. The gradient of a slice would
+        # be a zero-filled tensor of all cells for each part. Parts of one cell share a piece.
         sizes, pieces = {part.start: part.k for part in parts}, []
         for p in cell_parameters(call.module):
             pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
@@ -396,10 +396,10 @@ class Grouped:
 
 @dataclass
 class Loop:
-    """The module once for each cell that has samples: the definition of a routed call.
+    """The loop: the module runs once for each cell that has samples. It defines the result of a routed call.
 
-    Where its code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a double of the
-    module, which keeps the cell's parameters.
+    If the module's code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a double that
+    keeps the cell's parameters.
     """
 
     why: str = ""
@@ -407,11 +407,11 @@ class Loop:
     name: str = "cell by cell"
 
     def run(self, call: Call, grouping: Grouping) -> Results:
-        """Results in the order of the grouping."""
+        """Returns results in the order of the grouping."""
         return self.on(call, grouping, grouping.occupied)
 
     def on(self, call: Call, grouping: Grouping, bounds: list[tuple[int, int, int]]) -> Results:
-        """The same with one call of the module for each (cell, first row, row behind the last)."""
+        """Runs the module once for each (cell, first row, end row) of ``bounds``."""
         module, counts = call.module, [last - first for _, first, last in bounds]
         pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
         values, double = [], Double(module)

@@ -1,4 +1,4 @@
-"""Samples and parameters by cell: sorted rows, stacked tensors, and what stands in for them while a module runs.
+"""Samples and parameters by cell: sorted rows and stacked tensors.
 
 n samples, k cells, e entries of a table. A sorted tensor may have m entries a sample: its first dimension is then
 n * m, sample after sample.
@@ -17,29 +17,29 @@ from voronerf import ops
 from voronerf.ops._core.memory import LARGE, on_huge_pages
 
 SHARED = "_voronerf_shared"
-"""Where a part of a routed module keeps the names of its parameters that all cells share."""
+"""The attribute in which a submodule keeps the names of its parameters that all cells share."""
 
 
 class Grouping:
     """Entries of n samples in k cells, sorted by cell.
 
     Args:
-        cells: int32 [n], the cell of each entry; None where there is one cell.
-        n: Entries.
-        k: Cells.
-        device: Of the samples.
-        backend: Of the operations.
-        rows: int64 [n], the sample of each entry, any of them any number of times; None for each in turn.
+        cells: The cell of each entry, int32 [n]; None for a single cell.
+        n: The number of entries.
+        k: The number of cells.
+        device: The device of the samples.
+        backend: The backend of the operations.
+        rows: The sample of each entry, int64 [n]; samples may be missing or repeated. None: entry i is sample i.
 
     Attributes:
-        offsets: int32 [k + 1]; cell c owns sorted rows ``offsets[c]`` to ``offsets[c + 1]``.
+        offsets: The first sorted row of each cell and, last, n, int32 [k + 1].
     """
 
     def __init__(
         self, cells: Tensor | None, n: int, k: int, device: torch.device, backend: str, rows: Tensor | None = None
     ) -> None:
         self.cells, self.n, self.k, self.device, self.backend, self.rows = cells, n, k, device, backend, rows
-        self.start = 0  # of the cells of a part
+        self.start = 0  # first cell, if this is one of several parts
         self._order: Tensor | None = None
         if cells is None:
             self.offsets = torch.tensor([0, n], dtype=torch.int32, device=device)
@@ -47,48 +47,48 @@ class Grouping:
             self._order, self.offsets = ops.cell_sort(cells, k, backend=backend)
 
     def anew(self) -> Grouping:
-        """The same entries, sorted again."""
+        """Returns a grouping of the same entries, sorted again."""
         return Grouping(self.cells, self.n, self.k, self.device, self.backend, self.rows)
 
     @functools.cached_property
     def source(self) -> Tensor | None:
-        """int32 [n], the sample of each sorted row; None where they are not sorted."""
+        """The sample of each sorted row, int32 [n]; None if the rows are not reordered."""
         order = self._order
         return order if self.rows is None or order is None else self.rows.int().index_select(0, order)
 
     @functools.cached_property
     def _inverse(self) -> Tensor:
-        """int32 [n], the sorted row of each entry."""
+        """The sorted row of each entry, int32 [n]."""
         assert self._order is not None
         rows = torch.arange(self.n, dtype=torch.int32, device=self.device)
         return torch.empty_like(self._order).scatter_(0, self._order.long(), rows)
 
     @functools.cached_property
     def sorted_cells(self) -> Tensor:
-        """int64 [n], the cell of each sorted row."""
+        """The cell of each sorted row, int64 [n]."""
         cells = torch.arange(self.k, device=self.device)
         return cells.repeat_interleave(self.offsets.diff(), output_size=self.n)
 
     @functools.cached_property
     def occupied(self) -> list[tuple[int, int, int]]:
-        """(cell, first row, row behind the last) of every cell that has samples; reads them on the host."""
+        """(cell, first row, end row) of every cell that has samples; reads the offsets on the host."""
         pairs = enumerate(itertools.pairwise(self.offsets.tolist()))
         return [(cell, first, last) for cell, (first, last) in pairs if last > first]
 
     def parts(self, rows: int) -> list[Grouping]:
-        """Sorted rows in parts of whole cells, at most ``rows`` each; a cell of more is cut into parts of its own."""
+        """Splits the sorted rows into parts of complete cells with at most ``rows`` rows; larger cells are cut."""
         if self.n <= rows:
             return [self]
-        groups, start, begin = [], 0, 0
+        groups, start, first_row = [], 0, 0
         for cell, first, last in self.occupied:
-            if last - begin > rows and first > begin:
-                groups.append((start, cell, begin, first))
-                start, begin = cell, first
-        groups.append((start, self.k, begin, self.n))
+            if last - first_row > rows and first > first_row:
+                groups.append((start, cell, first_row, first))
+                start, first_row = cell, first
+        groups.append((start, self.k, first_row, self.n))
         parts = []
-        for start, stop, begin, end in groups:
-            count = -(-(end - begin) // rows)
-            edges = [begin + (end - begin) * i // count for i in range(count + 1)]
+        for start, stop, first_row, end in groups:
+            count = -(-(end - first_row) // rows)
+            edges = [first_row + (end - first_row) * i // count for i in range(count + 1)]
             for first, last in itertools.pairwise(edges):
                 part = Grouping(None, last - first, stop - start, self.device, self.backend)
                 part.offsets, part.start = self.offsets[start : stop + 1].clamp(first, last) - first, start
@@ -96,21 +96,21 @@ class Grouping:
         return parts
 
     def cells_of_rows(self, m: int) -> Tensor:
-        """int64 [n * m], the cell of each entry of tensors with m entries a sample."""
+        """Returns the cell of each row of tensors with m entries a sample, int64 [n * m]."""
         return self.sorted_cells if m == 1 else self.sorted_cells.repeat_interleave(m)
 
     def scaled_offsets(self, m: int) -> Tensor:
-        """``offsets`` of tensors with m entries a sample."""
+        """Returns the ``offsets`` of tensors with m entries a sample."""
         return self.offsets if m == 1 else self.offsets * m
 
     def sort(self, x: Tensor) -> Tensor:
-        """[samples, ...] -> [n, ...], the entries sorted by cell."""
+        """Gathers samples as entries sorted by cell: [samples, ...] -> [n, ...]."""
         if self.source is None:
             return x
         return self._permute(x) if self.rows is None else x.index_select(0, self.source)
 
     def unsort(self, x: Tensor) -> Tensor:
-        """[n, ...] sorted by cell -> the order of the entries."""
+        """Restores the order of the entries of rows [n, ...] that are sorted by cell."""
         return x if self.source is None else self._permute(x, back=True)
 
     def _permute(self, x: Tensor, back: bool = False) -> Tensor:
@@ -122,12 +122,12 @@ class Grouping:
         return x.index_select(0, self._inverse if back else order)
 
     def expand(self, stacked: Tensor, m: int = 1) -> Tensor:
-        """[k, ...] -> [n * m, ...]: the entry of each row's cell."""
-        # Copies under all settings: a product in TF32 would round them.
+        """Repeats the tensor of each row's cell: [k, ...] -> [n * m, ...]."""
+        # The rows must be exact copies, which a product in TF32 would round.
         rounds = stacked.is_cuda and torch.backends.cuda.matmul.fp32_precision == "tf32"
         if not stacked.is_floating_point() or stacked[0].numel() == 0 or rounds:
             return stacked.index_select(0, self.cells_of_rows(m))
-        # A grouped layer without inputs: its backward sums over each cell's rows, where that of indexing would scatter.
+        # A grouped layer with inputs of 1: its backward sums each cell's rows, without the scatter-add of indexing.
         ones = stacked.new_ones(self.n * m, 1)
         weight = stacked.reshape(self.k, -1, 1)
         with torch.autocast(stacked.device.type, enabled=False):
@@ -136,7 +136,7 @@ class Grouping:
 
 
 class _Permute(torch.autograd.Function):
-    """Rows in another order. The backward is a gather as well, where that of indexing would be a scatter-add."""
+    """A permutation of rows whose backward is a gather too, while the backward of indexing is a scatter-add."""
 
     generate_vmap_rule = True
 
@@ -155,15 +155,15 @@ class _Permute(torch.autograd.Function):
 
 
 class Assigned(NamedTuple):
-    """Samples in their cells, for other methods that are called with the same positions."""
+    """A cached grouping, for other methods that are called with the same positions."""
 
     grouping: Grouping
     positions: Tensor
-    key: Any  # of the diagram and the way of assigning
-    methods: set[str]  # that have been called with them
+    key: Any  # the diagram, its version and the kind of assignment
+    methods: set[str]  # names of the methods that have used this grouping
 
     def serves(self, method: str, positions: Tensor, key: Any, drawn: bool) -> bool:
-        """Whether these are the positions of a call. Cells that were drawn serve each method once."""
+        """Returns whether the grouping fits a call's positions; randomly drawn cells serve each method once."""
         if key != self.key or (drawn and method in self.methods) or positions.device != self.positions.device:
             return False
         self.methods.add(method)
@@ -174,7 +174,7 @@ class Assigned(NamedTuple):
 
 
 def parts_of(module: nn.Module, parts: dict[int, nn.Module] | None = None) -> dict[int, nn.Module]:
-    """All parts of a module tree by their id, in the order of ``modules()``, which takes three times as long."""
+    """Returns all submodules by id, in the order of ``modules()``, which takes three times as long."""
     parts = {} if parts is None else parts
     if id(module) not in parts:
         parts[id(module)] = module
@@ -185,7 +185,7 @@ def parts_of(module: nn.Module, parts: dict[int, nn.Module] | None = None) -> di
 
 
 def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Parameter]]:
-    """(owner, name, parameter) of every parameter of a module tree; one that is used twice comes twice."""
+    """Lists (owner, name, parameter) of every parameter of a module tree; a parameter with two owners appears twice."""
     return [
         (owner, name, parameter)
         for owner in parts_of(module).values()
@@ -195,20 +195,20 @@ def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Paramet
 
 
 def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
-    """The parameters that are stacked, [k, ...]; not those that all cells share."""
+    """Lists the stacked parameters, [k, ...], without the parameters that all cells share."""
     owned = [p for owner, name, p in owned_parameters(module) if name not in vars(owner).get(SHARED, ())]
     return list({id(parameter): parameter for parameter in owned}.values())
 
 
 def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
-    """[k, ...] -> the tensor of each cell."""
+    """Splits a stacked tensor [k, ...] into the tensor of each cell."""
     large = stacked.nbytes >= LARGE and stacked.requires_grad and torch.is_grad_enabled()
     cells: tuple[Tensor, ...] = _Cells.apply(stacked) if large else stacked.unbind(0)
     return cells
 
 
 class _Cells(torch.autograd.Function):
-    """The tensors of cells; their gradients are joined in memory of `on_huge_pages`."""
+    """Splits a stacked tensor by cell; the gradients are joined in memory of `on_huge_pages`."""
 
     generate_vmap_rule = True
 
@@ -224,9 +224,9 @@ class _Cells(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> Tensor:
         (stacked,) = ctx.saved_tensors
-        if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():  # these are differentiated again
-            return torch.stack([torch.zeros_like(stacked[0]) if own is None else own for own in gradients])
+        if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():  # for a second differentiation
+            return torch.stack([torch.zeros_like(stacked[0]) if part is None else part for part in gradients])
         result = on_huge_pages(torch.empty_like(stacked))
-        for own, gradient in zip(result.unbind(0), gradients, strict=True):
-            own.zero_() if gradient is None else own.copy_(gradient)
+        for part, gradient in zip(result.unbind(0), gradients, strict=True):
+            part.zero_() if gradient is None else part.copy_(gradient)
         return result

@@ -1,4 +1,4 @@
-"""Labels: the cells of samples, given to a call in the place of positions."""
+"""Labels: the cells of a call's samples, passed instead of positions."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Labels(NamedTuple):
     """The cells of a call's samples.
 
     Attributes:
-        cells: int32 [..., 1], where positions would be [..., d].
-        checked: Whether they are known to be 0 to k - 1.
+        cells: The labels as int32 [..., 1], in the place of positions [..., d].
+        checked: Whether all labels have been found to be 0 to k - 1.
     """
 
     cells: Tensor
@@ -27,18 +27,18 @@ class Labels(NamedTuple):
 
     @staticmethod
     def of(cells: Any, k: int, device: torch.device) -> Labels:
-        """Checks the labels of a call; on a GPU this waits until they are computed.
+        """Checks the labels of a call; on a GPU this waits for the device.
 
-        Compiled and captured graphs do not read the labels: there the operations refuse other ones on the CPU, and give
-        0 for them on a GPU.
+        Compiled and captured graphs do not read the labels. There the operations raise for invalid labels on the CPU,
+        and give results of 0 on a GPU.
 
         Args:
-            cells: int32 or int64 [...], one for each sample, 0 to k - 1.
-            k: Networks.
-            device: The one of their parameters.
+            cells: The labels, int32 or int64 [...], one for each sample, 0 to k - 1.
+            k: The number of networks.
+            device: The device of their parameters.
 
         Raises:
-            TypeError: For anything but such a tensor.
+            TypeError: For anything but an int32 or int64 tensor.
             ValueError: For a tensor without dimensions, on another device, or with other values.
         """
         if not isinstance(cells, Tensor) or cells.dtype not in (torch.int32, torch.int64):
@@ -49,18 +49,18 @@ class Labels(NamedTuple):
         if cells.device != device:
             raise ValueError(f"{_RULE} be on the device of the parameters, {device}, got {cells.device}")
         if torch.compiler.is_compiling() or (cells.is_cuda and torch.cuda.is_current_stream_capturing()):
-            inside = torch.where(cells < k, cells, -1).clamp(min=-1)  # else no cell
+            inside = torch.where(cells < k, cells, -1).clamp(min=-1)  # invalid labels become -1: no cell
             return Labels(inside.int().unsqueeze(-1), False)
         _check_values(cells, k)
         return Labels(as_plain(cells).int().unsqueeze(-1), True)
 
     def ensure(self, k: int) -> None:
-        """Raises ValueError for labels of a graph that are not 0 to k - 1, where the graph ends before the call."""
+        """Raises ValueError for labels out of range that a graph, which ended before the call, did not check."""
         if not self.checked:
             _check_values(self.cells, k)
 
     def widen(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Arguments whose first one has a row for each label, where it has one row for all.
+        """Returns the arguments with the first one expanded to a row for each label, if one row serves several labels.
 
         Raises:
             ValueError: For labels that cannot have the leading shape of the first argument.

@@ -1,4 +1,4 @@
-"""A call: how its arguments relate to its samples, and how they are brought into another order and results back.
+"""The arguments of a call: their relation to its samples, their rows sorted by cell, and the order of its results.
 
 Letters: n samples in leading dimensions ``lead``, for example (rays, samples of a ray); f features. Arguments and
 results may be of any structure: lists, tuples, named tuples, dicts, dataclasses, other objects.
@@ -31,7 +31,7 @@ SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
 
 
 def map_tree(value: Any, change: Callable[..., Any], name: str = "", nested: bool = False, depth: int = 0) -> Any:
-    """The same structure with every leaf changed, and the same object where no leaf is.
+    """Returns the structure with every leaf changed; the same object if no leaf changes.
 
     ``change`` gets a leaf's name ("x", "samples.origins", "views.0"), the leaf, and whether it is inside an object.
     """
@@ -44,7 +44,7 @@ def map_tree(value: Any, change: Callable[..., Any], name: str = "", nested: boo
 
 
 def contents(value: Any) -> dict[Any, Any] | None:
-    """What a container holds, by key, index or attribute; None for a leaf."""
+    """Returns the items of a container, by key, index or attribute; None for a leaf."""
     if isinstance(value, (Tensor, int, str)):
         return None
     if isinstance(value, dict):
@@ -61,7 +61,7 @@ def contents(value: Any) -> dict[Any, Any] | None:
 def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:
     kind: Any = tuple if isinstance(value, torch.Size) else type(value)
     if isinstance(value, dict):
-        rebuilt = kind.__new__(kind)  # no copy: dicts whose items are attributes have none
+        rebuilt = kind.__new__(kind)  # not copy.copy, which fails for dicts whose items are attributes
         rebuilt.update(new)
         return rebuilt
     if hasattr(value, "_fields"):
@@ -79,14 +79,14 @@ def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:
 
 
 def tensors_of(value: Any) -> list[Tensor]:
-    """All tensors of a structure, in the order of :func:`map_tree`."""
+    """Lists all tensors of a structure, in the order of :func:`map_tree`."""
     tensors: list[Tensor] = []
     _collect((value,), tensors, 0)
     return tensors
 
 
 def _collect(items: Iterable[Any], tensors: list[Tensor], depth: int) -> None:
-    # Every function of a grouped module comes here with its arguments: what holds no tensor is passed over at once.
+    # This runs for the arguments of every function of a grouped module, so common leaves are skipped first.
     for item in items:
         kind = type(item)
         if kind in _LEAVES:
@@ -98,7 +98,7 @@ def _collect(items: Iterable[Any], tensors: list[Tensor], depth: int) -> None:
 
 
 def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:
-    """The same structure with every tensor changed."""
+    """Returns the structure with every tensor changed."""
     return map_tree(value, lambda _, leaf, nested: change(leaf) if isinstance(leaf, Tensor) else leaf)
 
 
@@ -111,7 +111,7 @@ def as_plain(value: Any) -> Any:
 
 
 def rebuild(value: Any, tensors: Iterable[Any]) -> Any:
-    """A structure with other tensors in the order of :func:`tensors_of`."""
+    """Returns the structure with its tensors replaced, in the order of :func:`tensors_of`."""
     following = iter(tensors)
     return map_tensors(value, lambda tensor: next(following))
 
@@ -121,26 +121,27 @@ def rebuild(value: Any, tensors: Iterable[Any]) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """How the tensors of a call are laid out, and what the module sees of them.
+    """The layout of a call's tensors, and the shapes that the module gets.
 
-    A module of layout "flat" sees [n, f] for every argument with rows. One of layout "rays" sees [n, 1, f] for
-    [rays, samples, f] and [n, f] for what is per ray: n rays of one sample.
+    With ``flat`` the module gets [n, f] for every argument with rows. Otherwise it gets n rays of one sample: [n, 1, f]
+    for [rays, samples, f], and [n, f] for an argument per ray.
     """
 
     lead: tuple[int, ...]  # leading dimensions of a tensor with an entry for each sample
-    per_ray: frozenset[str] | None  # names of the arguments with an entry for each ray; None to tell by shapes
+    per_ray: frozenset[str] | None  # names of the arguments with an entry for each ray; None: by shapes
     shared: frozenset[str]  # names of the arguments that are the same for all samples
-    flat: bool = False  # the module sees [n, f]
+    flat: bool = False  # whether the module gets [n, f]
 
     @functools.cached_property
     def n(self) -> int:
-        """Samples."""
+        """The number of samples."""
         return math.prod(self.lead)
 
     def kind(self, name: str, tensor: Tensor, nested: bool) -> str:
-        """Whether a tensor has an entry for each sample, for each ray, or is shared.
+        """Returns the kind of a tensor: an entry for each sample, for each ray, broadcast, or shared.
 
-        Raises ValueError for one that fits two readings, or nothing and is not ``nested``, inside an object.
+        Raises ValueError for an ambiguous shape, and for a shape of no kind unless the tensor is ``nested`` in an
+        object.
         """
         shape, lead, d = tuple(tensor.shape), self.lead, len(self.lead)
         if not shape or _named(name, self.shared):
@@ -177,7 +178,7 @@ class Layout:
         )
 
     def flatten(self, tensor: Tensor, kind: str) -> Tensor:
-        """[n, ...] of a tensor per sample, [rays, ...] of one per ray."""
+        """Returns [n, ...] for a tensor per sample, [rays, ...] for a tensor per ray."""
         d = len(self.lead)
         if kind == RAY:
             return tensor.reshape(math.prod(self.lead[:-1]), *tensor.shape[d - 1 :])
@@ -186,12 +187,12 @@ class Layout:
         return tensor.reshape(self.n, *tensor.shape[d:])
 
     def shown(self, rows: Tensor, kind: str) -> Tensor:
-        """Rows [n, ...] as the module sees them."""
+        """Returns rows [n, ...] in the shape that the module gets."""
         ones = [1] * (0 if self.flat else len(self.lead) - (2 if kind == RAY else 1))
         return rows.reshape(rows.shape[0], *ones, *rows.shape[1:]) if ones else rows
 
     def restore(self, rows: Tensor) -> Tensor:
-        """Rows of a result in the original order, with the leading dimensions of the call."""
+        """Reshapes rows of a result, in the call's order, to the leading dimensions of the call."""
         ones = 0 if self.flat else len(self.lead) - 1
         if rows.shape[1 : 1 + ones] != (1,) * ones:
             raise ValueError(
@@ -202,7 +203,7 @@ class Layout:
 
 
 def _named(name: str, names: Iterable[str]) -> bool:
-    return any(name == known or name.startswith(f"{known}.") for known in names)
+    return any(name == prefix or name.startswith(f"{prefix}.") for prefix in names)
 
 
 def _sizes(shape: Sequence[int], empty: str = "") -> str:
@@ -219,25 +220,25 @@ class Call:
     module: nn.Module
     method: str
     layout: Layout
-    names: list[str]  # of positional arguments first
+    names: list[str]  # of the arguments, positional ones first
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
-    kinds: dict[str, str] = dataclasses.field(default_factory=dict)  # what each tensor has an entry for, by name
-    like: Any = None  # of `kind_of`
+    kinds: dict[str, str] = dataclasses.field(default_factory=dict)  # the kind of each tensor (`Layout.kind`), by name
+    key: Any = None  # cache key from `call_key`
 
     @property
     def name(self) -> str:
-        """Of the method, for messages."""
+        """The method's name in messages."""
         return f"{type(self.module).__name__}.{self.method}"
 
     def run(self, rows: Iterable[Tensor]) -> Any:
-        """Calls the method for rows in the place of its arguments'; ``forward`` with the hooks of the module."""
+        """Calls the method on other rows than its arguments'; ``forward`` runs with the module's hooks."""
         following = iter(rows)
         args, kwargs = self.changed(lambda tensor, kind: next(following))
         return (self.module if self.method == "forward" else getattr(self.module, self.method))(*args, **kwargs)
 
     def changed(self, change: Callable[[Tensor, str], Tensor]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        """The arguments with the tensors changed that have rows; ``change`` gets a tensor and its kind."""
+        """Returns the arguments with every tensor that has rows changed; ``change`` gets a tensor and its kind."""
 
         def changed(name: str, value: Any, nested: bool) -> Any:
             if not isinstance(value, Tensor):
@@ -251,7 +252,7 @@ class Call:
         return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
 
     def constants(self) -> dict[str, Any]:
-        """What is no tensor among the arguments and inside of them, by name."""
+        """Returns the leaves of the arguments that are not tensors, by name."""
         constants: dict[str, Any] = {}
 
         def note(name: str, value: Any, nested: bool) -> Any:
@@ -264,7 +265,7 @@ class Call:
         return constants
 
     def with_tensors(self, names: Container[str], make: Callable[[Any], Tensor]) -> Call:
-        """The same with tensors that all samples share in the place of numbers."""
+        """Returns the call with shared tensors in the place of the named numbers."""
         arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
         values = [map_tree(v, lambda name, leaf, _: make(leaf) if name in names else leaf, n) for n, v in arguments]
         args, kwargs = tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
@@ -279,9 +280,9 @@ class Call:
         return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)
 
     def part(self, most: int) -> tuple[Call, Tensor] | None:
-        """A call with some of the samples, and int64 [m], which; None where all of them are few enough.
+        """Returns a call with at most ``most`` of the samples and their numbers, int64 [m]; None if all are few enough.
 
-        They are spread evenly along the longest leading dimension, so that rays stay whole where there are many.
+        The samples are spread evenly along the longest leading dimension, so that many rays stay complete.
         """
         lead = self.layout.lead
         if self.layout.n <= most:
@@ -291,17 +292,17 @@ class Call:
         first = next(t for t in tensors_of((self.args, self.kwargs)))
         index = torch.arange(count, device=first.device) * lead[dim] // count
 
-        def taken(tensor: Tensor, kind: str) -> Tensor:
+        def select(tensor: Tensor, kind: str) -> Tensor:
             whole = kind == RAY and dim == len(lead) - 1
             return tensor if whole or tensor.shape[dim] == 1 else tensor.index_select(dim, index.to(tensor.device))
 
-        args, kwargs = self.changed(taken)
+        args, kwargs = self.changed(select)
         small = dataclasses.replace(self.layout, lead=(*lead[:dim], count, *lead[dim + 1 :]))
         rows = torch.arange(self.layout.n, device=index.device).reshape(lead).index_select(dim, index)
         return dataclasses.replace(self, layout=small, args=args, kwargs=kwargs), rows.flatten()
 
     def shared(self) -> list[Tensor]:
-        """The tensors that are the same for all samples; known after :meth:`changed`."""
+        """Lists the tensors that are the same for all samples; call :meth:`changed` first, which finds them."""
         tensors: list[Tensor] = []
 
         def note(name: str, value: Any, nested: bool) -> Any:
@@ -314,26 +315,26 @@ class Call:
         return tensors
 
     def arranged(self, grouping: Grouping | None) -> list[Tensor]:
-        """The rows of the arguments as the module sees them, in the order of a grouping, or for None as they came."""
+        """Lists the rows of the arguments in the module's shapes, sorted by a grouping unless it is None."""
         layout, n = self.layout, self.layout.n if grouping is None else grouping.n
         tensors: list[Tensor] = []
 
         @functools.cache
-        def rays(device: torch.device) -> Tensor:
+        def ray_rows(device: torch.device) -> Tensor:
             rows = None if grouping is None else grouping.source
             rows = torch.arange(n, dtype=torch.int32, device=device) if rows is None else rows
             return torch.div(rows, layout.lead[-1], rounding_mode="floor")
 
         def arrange(tensor: Tensor, kind: str) -> Tensor:
             rows = recordable(layout.flatten(tensor, kind))
-            if not layout.n:  # no module is called without rows: placeholders give the shapes of its results
+            if not layout.n:  # placeholders give the shapes of results, since no module runs without rows
                 empty = rows.new_full((n, *rows.shape[1:]), 0.5 if rows.is_floating_point() else 0)
-                rows = torch.cat([rows[:0], empty])  # joined, so that results depend on the argument as ever
+                rows = torch.cat([rows[:0], empty])  # joined, so that the autograd tape has the argument
             elif kind == RAY:
-                rows = rows.index_select(0, rays(rows.device))
+                rows = rows.index_select(0, ray_rows(rows.device))
             elif grouping is not None:
                 rows = grouping.sort(rows)
-            tensors.append(layout.shown(rows.view_as(rows), kind))  # an object of its own, which is marked
+            tensors.append(layout.shown(rows.view_as(rows), kind))  # a new object, since rows get marks
             return tensor
 
         self.changed(arrange)
@@ -341,26 +342,26 @@ class Call:
 
 
 def recordable(tensor: Tensor) -> Tensor:
-    """A tensor that can be saved for a backward pass: a copy of one of inference mode, outside of it."""
+    """Returns a tensor that autograd can save: a copy if the tensor is of inference mode and the mode is off."""
     return tensor.clone() if tensor.is_inference() and not torch.is_inference_mode_enabled() else tensor
 
 
 def split_rows(rows: list[Tensor], sizes: list[int]) -> list[Sequence[Tensor]]:
-    """The rows of arguments in parts of so many."""
+    """Splits the rows of all arguments into parts of these sizes."""
     return [rows] if len(sizes) == 1 else list(zip(*[tensor.split(sizes) for tensor in rows], strict=True))
 
 
 @dataclasses.dataclass
 class Results:
-    """What a method returned for rows."""
+    """The results of a method for rows."""
 
     value: Any  # of any structure
     tensors: list[Tensor]  # its tensors, [n, ...]
-    order: Grouping | None = None  # by which the rows are sorted; None for the order of the call
+    order: Grouping | None = None  # the grouping that sorted the rows; None: in the order of the call
 
     @staticmethod
     def joined(values: list[Any], counts: list[int], order: Grouping | None) -> Results:
-        """What a method returned for parts of the rows, as one."""
+        """Joins the results of a method for parts of the rows."""
         parts = [tensors_of(value) for value in values]
         if any(len(part) != len(parts[0]) for part in parts):
             raise ValueError(f"{_OP}: module must return as many tensors for every cell, got different numbers")
@@ -372,8 +373,8 @@ class Results:
             if as_plain(tensor) is not tensor:
                 kind = type(tensor).__name__
                 raise TypeError(f"{_OP}: results must be plain tensors, got a {kind}; make it of the router's results")
-        joined = [torch.cat(pieces) if len(pieces) > 1 else pieces[0] for pieces in zip(*parts, strict=True)]
-        return Results(values[0], joined, order)
+        tensors = [torch.cat(pieces) if len(pieces) > 1 else pieces[0] for pieces in zip(*parts, strict=True)]
+        return Results(values[0], tensors, order)
 
     @property
     def unsorted(self) -> list[Tensor]:
@@ -381,12 +382,12 @@ class Results:
         return self.tensors if self.order is None else [self.order.unsort(tensor) for tensor in self.tensors]
 
     def restored(self, layout: Layout) -> Any:
-        """The results in the order of the call, with its leading dimensions."""
+        """Returns the results in the order of the call, with its leading dimensions."""
         return rebuild(self.value, [layout.restore(rows if layout.n else rows[:0]) for rows in self.unsorted])
 
 
 def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
-    """The first tensor among the arguments of a call."""
+    """Returns the first tensor among the arguments of a call, or None."""
     for value in (*args, *kwargs.values()) if kwargs else args:
         if isinstance(value, Tensor) and value.dim():
             return value if type(value) is Tensor else as_plain(value)
@@ -394,7 +395,7 @@ def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
 
 
 def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: int = 3) -> Tensor:
-    """The positions of a call's samples, [..., d], by a rule or as a tensor."""
+    """Returns the positions of a call's samples, [..., d], found by the rule ``coords`` or given as its tensor."""
     if rule is None:
         raise ValueError(
             f"{_OP}: coords must say where the positions are, since a module's arguments do not: pass "
@@ -430,14 +431,14 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: in
     raise TypeError(f"{_OP}: {what} must be floating-point, got {positions.dtype}")
 
 
-_MANY = 4  # cells, of which one that has nearly all samples is suspicious
+_MANY = 4  # fewest cells for a warning that one of them has nearly all samples
 
 
 @torch.no_grad()
-def doubt_of(rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor, centres: Tensor) -> str:
-    """Why the positions [n, d] that a rule took from the first tensor may not be positions; or an empty text.
+def position_warning(rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor, centres: Tensor) -> str:
+    """Returns the reason why positions [n, d] taken by a rule may not be positions, or an empty text.
 
-    ``counts``, [k], are the samples in each cell.
+    ``source`` is the call's first tensor; ``counts``, [k], are the numbers of samples in each cell.
     """
     flat, k, d = positions.detach().flatten(0, -2), len(counts), positions.shape[-1]
     if isinstance(rule, str) and source is not None:
@@ -461,7 +462,7 @@ def doubt_of(rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor
 
 
 def argument_names(function: Callable[..., Any]) -> list[str]:
-    """Names of the positional arguments of a function, of a class's methods found out once."""
+    """Returns the names of a function's positional arguments; for methods they are cached."""
     return list(
         _names(function.__func__)[1:] if isinstance(function, types.MethodType) else _names.__wrapped__(function)
     )
@@ -474,7 +475,7 @@ def _names(function: Callable[..., Any]) -> list[str]:
 
 
 def accepted_names(functions: Iterable[Callable[..., Any]]) -> list[str] | None:
-    """The names of the arguments that any of some functions take; None where one takes any name."""
+    """Returns the names of all arguments of some functions; None if one of them takes any keyword."""
     parameters = [p for function in functions for p in inspect.signature(function).parameters.values()]
     if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
         return None

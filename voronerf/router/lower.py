@@ -1,9 +1,9 @@
-"""Functions of PyTorch as steps of a program.
+"""Lowers PyTorch functions to steps of a program.
 
-A function of the trace runs once on a few samples, and what it calls of ATen is recorded. A tensor that depends on
-samples has a code for each of its entries, the number of its sample and of its column; what only moves entries (views,
-``cat``, ``permute``) runs on the codes. A parameter has the number of the entry. Entries of one sample that are
-computed from others become a value of the program.
+A function of the trace runs once on a few samples, and its ATen calls are recorded. Every entry of a tensor that
+depends on samples has a code: the numbers of its sample and of its column. Functions that only move entries (views,
+``cat``, ``permute``) run on the codes. The code of a parameter's entry is its number. Computed entries of a sample
+become columns of a new value of the program.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from voronerf.router.grouped import find
 from voronerf.router.layout import map_tensors, tensors_of
 
 _LOW = (1 << 32) - 1
-_FEW, _PRODUCTS = 3, 16  # parts of an input that a layer reads one by one; layers that one function makes
-_SMALL = 64  # products of a small matrix with another
+_FEW, _PRODUCTS = 3, 16  # most parts of an input that a layer reads separately, most layers of a function
+_SMALL = 64  # most multiplications of two matrices of samples
 
 _MOVERS = frozenset(
     """
@@ -65,7 +65,7 @@ _FUNCTIONS: dict[str, Callable[..., list[tuple[str, float, float]]]] = {
     "logical_not": lambda: [("affine", -1, 1)],
     "bitwise_not": lambda: [("affine", -1, 1)],
 }
-"""Functions of one tensor and numbers, as functions of programs in turn."""
+"""Functions of one tensor and numbers, as a sequence of the program's functions (name, a, b)."""
 _BINARY = {
     **{name: name for name in ("add", "sub", "mul", "div")},
     **dict.fromkeys(("bitwise_and", "logical_and"), "mul"),
@@ -77,26 +77,26 @@ _BY_SHAPE = frozenset(
 _EMPTY = find("empty empty_like new_empty", torch, torch.Tensor)
 
 
-def _folded(join: Callable[[Tensor, Tensor], Tensor], x: Tensor, dims: Any = None, keep: bool = False) -> Tensor:
-    """All entries along dimensions joined, half of them with the other half as long as there are two."""
+def _reduced(combine: Callable[[Tensor, Tensor], Tensor], x: Tensor, dims: Any = None, keep: bool = False) -> Tensor:
+    """Reduces dimensions by a binary function, pairwise: one half with the other, repeatedly."""
     dims = [dims] if isinstance(dims, int) else list(dims or ())
     if not dims:
         raise NotAStep("it mixes samples")
     for dim in dims:
         while (size := x.shape[dim]) > 1:
             half = size // 2
-            joined = join(x.narrow(dim, 0, half), x.narrow(dim, half, half))
-            x = torch.cat([joined, x.narrow(dim, size - 1, 1)], dim) if size % 2 else joined
+            combined = combine(x.narrow(dim, 0, half), x.narrow(dim, half, half))
+            x = torch.cat([combined, x.narrow(dim, size - 1, 1)], dim) if size % 2 else combined
     return x if keep else x.squeeze(dims)
 
 
 def _maximum(x: Tensor, y: Tensor) -> Tensor:
-    # Where they are equal each has half of the gradient.
+    # Equal operands get half of the gradient each.
     return torch.where(x > y, x, torch.where(x < y, y, (x + y) / 2))
 
 
 def _below_largest(x: Tensor, dim: int) -> Tensor:
-    return x - _folded(_maximum, x.detach(), dim, True)
+    return x - _reduced(_maximum, x.detach(), dim, True)
 
 
 def _softmax(x: Tensor, dim: int, _: bool) -> Tensor:
@@ -119,8 +119,8 @@ def _norm(x: Tensor, order: float = 2, dim: Any = None, keepdim: bool = False, *
         return x.abs().sum(dim, keepdim=keepdim)
     if order != 2:
         raise NotAStep(f"a norm of order {order}")
-    total = x.square().sum(dim, keepdim=keepdim)  # where it is 0, the gradient is 0 too, and not that of the root
-    return torch.where(total > 0, torch.where(total > 0, total, 1.0).sqrt(), 0.0)
+    squares = x.square().sum(dim, keepdim=keepdim)  # at 0 the gradient is 0, not that of the root
+    return torch.where(squares > 0, torch.where(squares > 0, squares, 1.0).sqrt(), 0.0)
 
 
 def _variance(x: Tensor, dim: Any = None, correction: float | None = None, keepdim: bool = False) -> Tensor:
@@ -138,12 +138,12 @@ def _layer_norm(x: Tensor, shape: Sequence[int], weight: Any, bias: Any, eps: fl
 
 
 def _convolution(x: Tensor, weight: Tensor, bias: Any, *rule: Any) -> Tensor:
-    """A kernel of one place, at every place [n, c, ...]; or one that covers all places, which leaves one."""
-    (stride, padding, dilation, turned, _, groups), size, more = rule, weight.shape[2:], x.shape[2:]
-    whole = size == more and set(dilation) == {1}
-    if turned or groups != 1 or any(padding) or not (whole or set(size) == {1}):
+    """Writes out a convolution of [n, c, ...] whose kernel has one place, or covers all places and gives one."""
+    (stride, padding, dilation, transposed, _, groups), size, more = rule, weight.shape[2:], x.shape[2:]
+    covers_all = size == more and set(dilation) == {1}
+    if transposed or groups != 1 or any(padding) or not (covers_all or set(size) == {1}):
         raise NotAStep("a convolution of several places")
-    if whole:
+    if covers_all:
         return F.linear(x.flatten(1), weight.flatten(1), bias).reshape(len(x), -1, *[1] * len(size))
     if set(stride) != {1}:
         raise NotAStep("a convolution that leaves out places")
@@ -151,7 +151,7 @@ def _convolution(x: Tensor, weight: Tensor, bias: Any, *rule: Any) -> Tensor:
 
 
 def _written(x: Tensor, indices: Sequence[Any], value: Tensor, accumulate: bool = False) -> Tensor:
-    """``x[mask] = number``."""
+    """Writes out ``x[mask] = number``."""
     mask = indices[0]
     if len(indices) != 1 or mask.dtype != torch.bool or value.numel() != 1 or accumulate:
         raise NotAStep("a write at places that depend on values, unless x[mask] = number; write it with torch.where")
@@ -159,19 +159,19 @@ def _written(x: Tensor, indices: Sequence[Any], value: Tensor, accumulate: bool 
 
 
 def _products(x: Tensor, y: Tensor) -> Tensor:
-    """Small matrices of samples with each other, [n, i, j] and [n, j, k]."""
+    """Multiplies small matrices of samples, [n, i, j] by [n, j, k]."""
     if math.prod(x.shape[1:]) * y.shape[2] > _SMALL:
         raise NotAStep("a product of two tensors of samples")
     return (x.unsqueeze(2) * y.transpose(1, 2).unsqueeze(1)).sum(3)
 
 
-_WRITTEN_OUT: dict[str, Callable[..., Any]] = {
+_DECOMPOSED: dict[str, Callable[..., Any]] = {
     "maximum": _maximum,
     "minimum": lambda x, y: -_maximum(-x, -y),
-    "amax": lambda x, dim=None, keepdim=False: _folded(_maximum, x, dim, keepdim),
-    "amin": lambda x, dim=None, keepdim=False: -_folded(_maximum, -x, dim, keepdim),
-    "all": lambda x, dim=None, keepdim=False: _folded(torch.bitwise_and, x, dim, keepdim),
-    "any": lambda x, dim=None, keepdim=False: ~_folded(torch.bitwise_and, ~x, dim, keepdim),
+    "amax": lambda x, dim=None, keepdim=False: _reduced(_maximum, x, dim, keepdim),
+    "amin": lambda x, dim=None, keepdim=False: -_reduced(_maximum, -x, dim, keepdim),
+    "all": lambda x, dim=None, keepdim=False: _reduced(torch.bitwise_and, x, dim, keepdim),
+    "any": lambda x, dim=None, keepdim=False: ~_reduced(torch.bitwise_and, ~x, dim, keepdim),
     "mean": _mean,
     "var": _variance,
     "std": lambda *args, **kwargs: _variance(*args, **kwargs).sqrt(),
@@ -195,19 +195,20 @@ _WRITTEN_OUT: dict[str, Callable[..., Any]] = {
     "index_put": _written,
     "mv": lambda x, y: torch.mm(x, y.unsqueeze(1)).squeeze(1),
 }
-"""Functions of ATen as others."""
+"""ATen functions, written out by other functions."""
 
 
 class NotAStep(Exception):
-    """A function is no step of a program; the message says why."""
+    """An error for a function that is no step of a program; the message says why."""
 
 
 class Entries:
-    """Where the entries of a tensor come from.
+    """The sources of a tensor's entries.
 
     Attributes:
-        codes: like the tensor: (sample << 32) + column of samples, or the number of the entry of a parameter.
-        of: None for samples, else the parameter: a node of the trace, or a tensor.
+        codes: A code for each entry, in the tensor's shape: (sample << 32) + column for a tensor of samples, else the
+            number of the parameter's entry.
+        of: The parameter, a node of the trace or a tensor; None for a tensor of samples.
     """
 
     def __init__(self, codes: Tensor, of: Any = None) -> None:
@@ -215,14 +216,14 @@ class Entries:
 
 
 class Lowering:
-    """Steps of all functions of a trace so far, as of one program; later they are shared out among runs.
+    """The steps of a trace, as one program; later they are divided into runs.
 
     Attributes:
-        rows: the samples of the trace.
-        levels: of each value: the number of the run that makes it.
-        sources: of each input, the node of the trace whose rows it is.
-        columns: (value, column) of each number of a column.
-        parameters: of each parameter of the program: the node or tensor, numbers of entries, whether they are a matrix.
+        rows: The number of samples of the trace.
+        levels: The number of the run that computes each value.
+        sources: The node of the trace whose rows each input reads.
+        columns: (value, column in it), by the column's number in codes.
+        parameters: The source of each parameter of the program: a node or tensor, and the numbers of its entries.
     """
 
     def __init__(self, rows: int) -> None:
@@ -232,14 +233,14 @@ class Lowering:
         self.sources: dict[int, Any] = {}
         self.columns: list[tuple[int, int]] = []
         self.parameters: list[tuple[Any, Tensor]] = []
-        self._known: dict[Any, int] = {}
+        self._parameter_numbers: dict[Any, int] = {}
         self._numbered: dict[int, int] = {}
         self._leveled = 0
 
     # Values -----------------------------------------------------------------------------------------------------------
 
     def input(self, node: Any, shape: Sequence[int], level: int) -> Entries:
-        """The rows of a node as an input of the program, [rows * m, ...] for m entries of a sample."""
+        """Adds the rows of a node as an input of the program, [rows * m, ...] for m entries of a sample."""
         if not shape or shape[0] % self.rows or math.prod(shape) == 0:
             at = next((d for d, size in enumerate(shape) if size == self.rows), None)
             if at is None or math.prod(shape) == 0:
@@ -252,7 +253,7 @@ class Lowering:
         return Entries(self._codes(x).reshape(list(shape)))
 
     def _codes(self, x: Columns) -> Tensor:
-        """[rows, w] of a whole value."""
+        """Returns the codes of columns, [rows, w]."""
         if x.index not in self._numbered:
             self._numbered[x.index] = len(self.columns)
             self.columns += [(x.index, i) for i in range(x.start + x.width)]
@@ -260,7 +261,7 @@ class Lowering:
         return (torch.arange(self.rows)[:, None] << 32) + torch.arange(first, first + x.width)
 
     def level(self, value: int) -> int:
-        """The number of the run that makes a value."""
+        """Returns the number of the run that computes a value."""
         for step in self.builder.steps[self._leveled :]:
             self.levels.setdefault(
                 step.out, max((self.levels[c.index] for c in step.operands if c.of == VALUE), default=0)
@@ -269,7 +270,7 @@ class Lowering:
         return self.levels[value]
 
     def order(self, codes: Tensor) -> tuple[Tensor, Tensor]:
-        """The places of a tensor's entries sample by sample, [rows, w], and the numbers of the columns, [w]."""
+        """Returns the flat places of a tensor's entries by sample, [rows, w], and the numbers of their columns, [w]."""
         rows = (codes >> 32).flatten()
         if rows.numel() % self.rows or not rows.numel():
             raise NotAStep("entries of a tensor do not belong to single samples")
@@ -283,11 +284,11 @@ class Lowering:
         return places, columns[0]
 
     def values(self, codes: Tensor) -> set[int]:
-        """The values that a tensor of samples has columns of."""
+        """Returns the values whose columns a tensor of samples has."""
         return {self.columns[number][0] for number in (codes & _LOW).unique().tolist()}
 
     def parts(self, numbers: Tensor) -> list[tuple[Columns, int]]:
-        """Columns by their numbers, in as few pieces as may be, each with its place."""
+        """Lists the pieces of columns, given by their numbers, each with its place; as few pieces as possible."""
         parts: list[tuple[Columns, int]] = []
         for at, number in enumerate(numbers.tolist()):
             value, column = self.columns[number]
@@ -303,21 +304,21 @@ class Lowering:
         return parts
 
     def operand(self, numbers: Tensor) -> Columns:
-        """Columns by their numbers, as an operand."""
+        """Returns columns, given by their numbers, as an operand."""
         parts = self.parts(numbers)
         return parts[0][0] if len(parts) == 1 else self.builder.move(len(numbers), parts)
 
     def parameter(self, entries: Entries, matrix: bool = False) -> int:
-        """The number of a parameter that holds these entries, [w] or [o, i]."""
+        """Returns the number of the program's parameter with these entries, [w] or [o, i]."""
         shape = tuple(entries.codes.shape) if matrix else (entries.codes.numel(),)
         key = (id(entries.of), shape, bytes(entries.codes.contiguous().numpy()))
-        if key not in self._known:
-            self._known[key] = self.builder.parameter(*shape)
+        if key not in self._parameter_numbers:
+            self._parameter_numbers[key] = self.builder.parameter(*shape)
             self.parameters.append((entries.of, entries.codes.reshape(shape).clone()))
-        return self._known[key]
+        return self._parameter_numbers[key]
 
     def vector(self, entries: Entries, codes: Tensor) -> Columns:
-        """Entries of a parameter as an operand, ``codes`` [w]."""
+        """Returns the entries ``codes`` [w] of a parameter as an operand."""
         low, width = int(codes.min()), len(codes)
         if bool((codes == low).all()):
             one = Entries(codes[:1], entries.of)
@@ -326,26 +327,28 @@ class Lowering:
 
     # Functions --------------------------------------------------------------------------------------------------------
 
-    def run(self, function: Callable[..., Any], args: Any, kwargs: Any, known: Callable[[Any], Entries | None]) -> Any:
-        """Runs a function and gives its result, its arguments, and a look-up of what a tensor is made of.
+    def run(
+        self, function: Callable[..., Any], args: Any, kwargs: Any, entries_of: Callable[[Any], Entries | None]
+    ) -> Any:
+        """Runs a function and returns its result, the copied arguments, and a function from a tensor to its entries.
 
-        ``known`` gives the entries of a tensor among the arguments. Raises :class:`NotAStep`.
+        ``entries_of`` returns the entries of a tensor among the arguments. Raises :class:`NotAStep`.
         """
         device = next((t.device.type for t in tensors_of((args, kwargs))), "cpu")
         with torch.inference_mode(), torch.autocast(device, enabled=False):
             mode = _EntryMode(self)
 
-            def own(value: Tensor) -> Tensor:
+            def copy(value: Tensor) -> Tensor:
                 copied = value.detach().clone()
                 copied = copied.float() if copied.dtype in (torch.float16, torch.bfloat16) else copied
-                entries = known(value)
-                if entries is not None and 0 in entries.codes.stride():  # a copy of what is expanded is no more
+                entries = entries_of(value)
+                if entries is not None and 0 in entries.codes.stride():  # the copy is not expanded
                     entries = Entries(entries.codes.contiguous(), entries.of)
                 mode.keep(copied, entries)
                 mode.originals[id(copied)] = value
                 return copied
 
-            args, kwargs = map_tensors((args, kwargs), own)
+            args, kwargs = map_tensors((args, kwargs), copy)
             with mode:
                 result = function(*args, **kwargs)
             if function in _EMPTY:
@@ -354,29 +357,29 @@ class Lowering:
 
 
 class _EntryMode(TorchDispatchMode):
-    """Records the ATen functions that a function calls."""
+    """A mode that records the ATen functions that a function calls, as steps."""
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        """The default, True, imports torch.compile at the first call, which takes a second."""
+        """Returns False, because True, the default, imports torch.compile at the first call, which takes a second."""
         return False
 
     def __init__(self, lowering: Lowering) -> None:
         super().__init__()
         self.lowering, self.b = lowering, lowering.builder
-        self._kept: dict[int, tuple[Tensor, Entries | None]] = {}
-        self.originals: dict[int, Tensor] = {}  # of the copies of arguments
+        self._entries: dict[int, tuple[Tensor, Entries | None]] = {}
+        self.originals: dict[int, Tensor] = {}  # the arguments, by the id of their copies
 
     def keep(self, tensor: Tensor, entries: Entries | None) -> None:
-        """Notes where the entries of a tensor come from; None for a constant."""
-        self._kept[id(tensor)] = tensor, entries
+        """Records the entries of a tensor; None for a constant."""
+        self._entries[id(tensor)] = tensor, entries
 
     def entries(self, tensor: Tensor) -> Entries | None:
-        """The source of each entry of a tensor; None for a constant."""
-        return self._kept.get(id(tensor), (None, None))[1]
+        """Returns the entries of a tensor; None for a constant."""
+        return self._entries.get(id(tensor), (None, None))[1]
 
     def of_result(self, tensor: Tensor) -> Entries:
-        """Entries of a tensor as one of samples."""
+        """Returns the entries of a result, as a tensor of samples."""
         entries = self.entries(tensor)
         return entries if entries is not None and entries.of is None else self.of_samples(tensor, entries)
 
@@ -392,25 +395,27 @@ class _EntryMode(TorchDispatchMode):
                 return func.decompose(*args, **kwargs)
         inplace = name.endswith("_") and not name.startswith("_")
         base = name.rstrip("_") if inplace else name
-        both = base == "bmm" and all(e is not None and e.of is None for e in operands)
-        written = _products if both else _WRITTEN_OUT.get(base)
-        if written is not None:
+        is_product_of_samples = base == "bmm" and all(e is not None and e.of is None for e in operands)
+        decomposed = _products if is_product_of_samples else _DECOMPOSED.get(base)
+        if decomposed is not None:
             with self:
-                made = [self.entries(tensor) for tensor in tensors_of(written(*args, **kwargs))]
+                result_entries = [self.entries(tensor) for tensor in tensors_of(decomposed(*args, **kwargs))]
             result = func(*args, **kwargs)
         else:
             result = func(*args, **kwargs)
-            made = self._made(base, func, args, kwargs, result, rows)
-        for tensor, entries in zip(tensors_of(result), made, strict=True):
-            before = self.entries(tensor)
-            if inplace and before is not None and entries is not None:
-                before.codes.copy_(entries.codes)  # of the tensor that this one is a part of, too
+            result_entries = self._result_entries(base, func, args, kwargs, result, rows)
+        for tensor, entries in zip(tensors_of(result), result_entries, strict=True):
+            old_entries = self.entries(tensor)
+            if inplace and old_entries is not None and entries is not None:
+                old_entries.codes.copy_(entries.codes)  # also changes the tensor of which this is a view
             else:
                 self.keep(tensor, entries)
         return result
 
-    def _made(self, name: str, func: Any, args: Any, kwargs: Any, result: Any, rows: bool) -> list[Entries | None]:
-        """The sources of the entries of a function's results."""
+    def _result_entries(
+        self, name: str, func: Any, args: Any, kwargs: Any, result: Any, rows: bool
+    ) -> list[Entries | None]:
+        """Lists the entries of a function's results."""
         if name in _MOVERS and func.overloadpacket.__name__ == name:
             return self._moved(func, args, kwargs, rows, name)
         if not rows:
@@ -418,18 +423,18 @@ class _EntryMode(TorchDispatchMode):
         if name == "_to_copy":
             if not result.is_floating_point() or args[0].dtype not in (result.dtype, torch.bool):
                 raise NotAStep(f"a conversion from {args[0].dtype} to {result.dtype}")
-            return [self._known(args[0])]
+            return [self._sample_entries(args[0])]
         if name in _BY_SHAPE:
             return [None]
         if name in ("copy", "fill") and result is args[0]:
-            return [self._copied(args[0], args[1])]
+            return [self._overwritten(args[0], args[1])]
         if not isinstance(result, Tensor):
             raise NotAStep(f"{name} is no step")
         if name in ("mm", "linear", "addmm", "bmm", "baddbmm"):
             return [self._product(name, args, kwargs, result)]
         numbers = [v for v in args if not isinstance(v, Tensor)]
         if name in _FUNCTIONS and isinstance(args[0], Tensor) and not any(isinstance(v, Tensor) for v in args[1:]):
-            places, columns = self.lowering.order(self._known(args[0]).codes)
+            places, columns = self.lowering.order(self._sample_entries(args[0]).codes)
             return [self._chain(self.lowering.operand(columns), _FUNCTIONS[name](*numbers, **kwargs), places, result)]
         if name in _BINARY:
             return [self._binary(name, args, kwargs, result)]
@@ -439,15 +444,15 @@ class _EntryMode(TorchDispatchMode):
             return [self._summed(args[0], args[1] if len(args) > 1 else kwargs.get("dim"), result)]
         raise NotAStep(f"{name} is no step")
 
-    def _known(self, tensor: Tensor) -> Entries:
-        """Entries of a tensor of samples."""
+    def _sample_entries(self, tensor: Tensor) -> Entries:
+        """Returns the entries of a tensor of samples; raises NotAStep for others."""
         entries = self.entries(tensor)
         if entries is None or entries.of is not None:
             raise NotAStep("a product with a tensor that does not depend on samples")
         return entries
 
-    def _of_constant(self, tensor: Tensor) -> Entries:
-        """Entries of a tensor that depends on nothing."""
+    def _constant(self, tensor: Tensor) -> Entries:
+        """Returns the entries of a constant tensor."""
         with torch.inference_mode(False):
             of = self.originals[id(tensor)] if id(tensor) in self.originals else tensor.clone()
         return Entries(torch.arange(tensor.numel()).reshape(tensor.shape), of)
@@ -474,7 +479,7 @@ class _EntryMode(TorchDispatchMode):
         return [Entries(t, of) for t in tensors_of(func(*args, **kwargs))]
 
     def of_samples(self, tensor: Tensor, entries: Entries | None) -> Entries:
-        """A parameter or a constant, which is the same for each sample, as a tensor of samples."""
+        """Returns a parameter or a constant that is equal for all samples as a tensor of samples."""
         shape, rows = tensor.shape, self.lowering.rows
         at = next((d for d, size in enumerate(shape) if size and size % rows == 0), None)
         if at is None or not tensor.numel() or not (tensor.is_floating_point() or tensor.dtype == torch.bool):
@@ -485,17 +490,17 @@ class _EntryMode(TorchDispatchMode):
         if entries is None and bool((by_sample == by_sample[0, 0]).all()):
             column = self.b.apply("affine", self.b.move(1, []), 0.0, float(by_sample[0, 0]))
         else:
-            of, codes = (entries, by_sample[0]) if entries else ((e := self._of_constant(by_sample[0])), e.codes)
+            of, codes = (entries, by_sample[0]) if entries else ((e := self._constant(by_sample[0])), e.codes)
             column = self.lowering.vector(of, codes)
             column = self.b.rows(column.part(0, 1) if column.spread else column)
         moved = [shape[at], *shape[:at], *shape[at + 1 :]]
         numbers = self.lowering._codes(column).expand(rows, tensor.numel() // rows)
         return Entries(numbers.reshape(moved).movedim(0, at).contiguous())
 
-    def _copied(self, target: Tensor, source: Any) -> Entries:
-        """The entries of a tensor after another is written into it."""
-        before = self.entries(target)
-        if before is None or before.of is not None:
+    def _overwritten(self, target: Tensor, source: Any) -> Entries:
+        """Returns the entries of a tensor after a write from another tensor or number."""
+        target_entries = self.entries(target)
+        if target_entries is None or target_entries.of is not None:
             raise NotAStep("a write into a parameter or a constant")
         value = source if isinstance(source, Tensor) else torch.full_like(target, source)
         entries = self.entries(value)
@@ -505,10 +510,10 @@ class _EntryMode(TorchDispatchMode):
         return self.of_samples(value.expand(target.shape), entries)
 
     def _placed(self, value: Columns, places: Tensor, shape: Sequence[int]) -> Entries:
-        """A value's entries at their places in a tensor."""
+        """Returns a value's columns as the entries of a tensor at ``places``."""
         codes = torch.empty(math.prod(shape), dtype=torch.int64)
-        whole = self.b.rows(value)
-        codes[places] = self.lowering._codes(whole).expand(places.shape) if whole.width > 0 else 0
+        columns = self.b.rows(value)
+        codes[places] = self.lowering._codes(columns).expand(places.shape) if columns.width > 0 else 0
         return Entries(codes.reshape(list(shape)))
 
     def _chain(self, x: Columns, functions: Any, places: Tensor, result: Tensor) -> Entries:
@@ -523,7 +528,7 @@ class _EntryMode(TorchDispatchMode):
         return self._placed(x, places, result.shape)
 
     def _operands(self, tensors: Sequence[Any], shape: Sequence[int]) -> tuple[list[Columns], Tensor]:
-        """Operands of one width from tensors that are broadcast to a shape, and the places of entries."""
+        """Returns operands of one width from tensors broadcast to a shape, and the places of their entries."""
         columns: list[Columns] = []
         first = next(e for t in tensors if isinstance(t, Tensor) and (e := self.entries(t)) and e.of is None)
         places, _ = self.lowering.order(first.codes.expand(list(shape)))
@@ -536,7 +541,7 @@ class _EntryMode(TorchDispatchMode):
                 columns.append(self.lowering.operand(numbers))
                 continue
             if entries is None:
-                entries = self._of_constant(tensor)
+                entries = self._constant(tensor)
             by_sample = entries.codes.expand(list(shape)).flatten()[places]
             if not (by_sample == by_sample[:1]).all():
                 raise NotAStep("a constant with other numbers for each sample")
@@ -554,7 +559,7 @@ class _EntryMode(TorchDispatchMode):
         x, y = (v.item() if single else v for v, single in zip((x, y), numbers))
         kind = _BINARY[name]
         if not isinstance(x, Tensor) or not isinstance(y, Tensor):
-            places, columns = self.lowering.order(self._known(x if isinstance(x, Tensor) else y).codes)
+            places, columns = self.lowering.order(self._sample_entries(x if isinstance(x, Tensor) else y).codes)
             operand = self.lowering.operand(columns)
             steps: dict[str, Any] = {
                 "add": lambda: [("affine", 1, alpha * y)] if isinstance(x, Tensor) else [("affine", alpha, x)],
@@ -570,24 +575,24 @@ class _EntryMode(TorchDispatchMode):
             b = self.b.apply("affine", b, alpha)
         if kind in ("gt", "ge", "lt", "le"):
             a, b = (a, b) if kind[0] == "g" else (b, a)
-            made = self.b.apply("step" if kind[1] == "t" else "at_least", self.b.binary("sub", a, b))
+            column = self.b.apply("step" if kind[1] == "t" else "at_least", self.b.binary("sub", a, b))
         else:
-            made = self.b.binary(kind, a, b)
-        return self._placed(made, places, result.shape)
+            column = self.b.binary(kind, a, b)
+        return self._placed(column, places, result.shape)
 
     def _where(self, args: Any, result: Tensor) -> Entries:
         (condition, yes, no), places = self._operands(args, result.shape)
-        other = self.b.apply("affine", condition, -1, 1)
-        made = self.b.binary("add", self.b.binary("gate", yes, condition), self.b.binary("gate", no, other))
-        return self._placed(made, places, result.shape)
+        inverse = self.b.apply("affine", condition, -1, 1)
+        column = self.b.binary("add", self.b.binary("gate", yes, condition), self.b.binary("gate", no, inverse))
+        return self._placed(column, places, result.shape)
 
     def _summed(self, tensor: Tensor, dims: Any, result: Tensor) -> Entries:
-        """Sums over entries of a sample; those of one sum are first put next to each other."""
+        """Sums over entries of a sample; the terms of a sum become adjacent columns first."""
         dims = [dims] if isinstance(dims, int) else dims or range(tensor.dim())
         dims = [d % tensor.dim() for d in dims]
         kept = [d for d in range(tensor.dim()) if d not in dims]
         group = math.prod(tensor.shape[d] for d in dims)
-        codes = self._known(tensor).codes.permute([*kept, *dims]).reshape(-1, group)
+        codes = self._sample_entries(tensor).codes.permute([*kept, *dims]).reshape(-1, group)
         rows = codes[:, :1] >> 32
         if not torch.equal(codes >> 32, rows.expand_as(codes)):
             raise NotAStep("it sums over samples")
@@ -598,7 +603,7 @@ class _EntryMode(TorchDispatchMode):
         return self._placed(self.b.total(self.lowering.operand(numbers[0].flatten()), group), places, result.shape)
 
     def _product(self, name: str, args: Any, kwargs: Any, result: Tensor) -> Entries:
-        """Rows times a matrix of the cell, in any of the ways to write it."""
+        """Multiplies rows by a matrix of the cell, for all ATen functions of products."""
         bias = None
         if name == "linear":
             x, weight, bias = (*args, None)[:3]
@@ -608,41 +613,41 @@ class _EntryMode(TorchDispatchMode):
                 raise NotAStep("a product with factors")
         else:
             x, weight = args[:2]
-        of_x, of_weight = self.entries(x), self.entries(weight)
-        if of_x is None and x.shape[0] == self.lowering.rows:  # zeros of a first state, say
-            of_x = self.of_samples(x, None)
-        if of_x is None or of_x.of is not None:  # W x^T
-            if name != "mm" or of_weight is None or of_weight.of is not None:
+        x_entries, weight_entries = self.entries(x), self.entries(weight)
+        if x_entries is None and x.shape[0] == self.lowering.rows:  # for example the zeros of a first state
+            x_entries = self.of_samples(x, None)
+        if x_entries is None or x_entries.of is not None:  # W x^T
+            if name != "mm" or weight_entries is None or weight_entries.of is not None:
                 raise NotAStep("a product of parameters with samples")
-            turned = self._rows_times(
-                of_weight.codes.t(), self._matrix(x, of_x), None, (result.shape[1], result.shape[0])
+            transposed = self._rows_times(
+                weight_entries.codes.t(), self._matrix(x, x_entries), None, (result.shape[1], result.shape[0])
             )
-            return Entries(turned.codes.t().clone())
-        matrix = self._matrix(weight, of_weight)
+            return Entries(transposed.codes.t().clone())
+        matrix = self._matrix(weight, weight_entries)
         if name in ("mm", "addmm", "bmm", "baddbmm"):
             matrix = Entries(matrix.codes.transpose(-1, -2), matrix.of)
-        added = None if bias is None else self.entries(bias) or self._matrix(bias, None)
-        if added is not None and added.of is None:
+        bias_entries = None if bias is None else self.entries(bias) or self._matrix(bias, None)
+        if bias_entries is not None and bias_entries.of is None:
             raise NotAStep("a product that is added to samples")
         if name in ("bmm", "baddbmm"):
-            if added is not None or len(x) > _PRODUCTS:
+            if bias_entries is not None or len(x) > _PRODUCTS:
                 raise NotAStep("a product of many matrices")
-            each = [
+            products = [
                 self._rows_times(row, Entries(codes, matrix.of), None, result.shape[1:]).codes
-                for row, codes in zip(of_x.codes, matrix.codes, strict=True)
+                for row, codes in zip(x_entries.codes, matrix.codes, strict=True)
             ]
-            return Entries(torch.stack(each))
-        return self._rows_times(of_x.codes, matrix, added, result.shape)
+            return Entries(torch.stack(products))
+        return self._rows_times(x_entries.codes, matrix, bias_entries, result.shape)
 
     def _matrix(self, tensor: Tensor, entries: Entries | None) -> Entries:
         if entries is None:
-            return self._of_constant(tensor)
+            return self._constant(tensor)
         if entries.of is None:
             raise NotAStep("a product of two tensors of samples")
         return entries
 
     def _rows_times(self, codes: Tensor, matrix: Entries, bias: Entries | None, shape: Sequence[int]) -> Entries:
-        """Codes [..., i] times a matrix [o, i]."""
+        """Multiplies a tensor of samples, codes [..., i], by a matrix [o, i]."""
         flat = codes.reshape(-1, codes.shape[-1])
         m = len(flat) // self.lowering.rows
         rows = flat[:, :1] >> 32

@@ -1,6 +1,6 @@
-"""A layer norm with right derivatives of any order.
+"""A layer norm whose derivatives of any order are correct.
 
-PyTorch's own takes the mean and the deviation for constants in its third derivative.
+PyTorch's third derivative treats the mean and the deviation as constants.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from voronerf.router.transforms import transformed
 def native_layer_norm(
     input: Tensor, normalized_shape: Sequence[int], weight: Tensor | None, bias: Tensor | None, eps: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns ``torch.native_layer_norm`` of the same arguments; of half precision it is PyTorch's own."""
+    """Returns ``torch.native_layer_norm`` of the same arguments; for half precision this is PyTorch's function."""
     dtypes = {tensor.dtype for tensor in (input, weight, bias) if tensor is not None}
     plain = torch.is_autocast_enabled(input.device.type) or dtypes not in ({torch.float32}, {torch.float64})
     if plain or not torch.is_grad_enabled():
@@ -71,10 +71,10 @@ class _LayerNorm(torch.autograd.Function):
         shape, (to_x, _, to_weight, to_bias, _) = ctx.shape, ctx.needs_input_grad
         if not torch.is_grad_enabled():
             native = torch.ops.aten.native_layer_norm_backward
-            own = native(
+            gradients = native(
                 gradient.contiguous(), x.contiguous(), shape, mean, scale, weight, bias, [to_x, to_weight, to_bias]
             )
-            return own[0], None, own[1], own[2], None
+            return gradients[0], None, gradients[1], gradients[2], None
         dims = list(range(-len(shape), 0))
         centred = x - x.mean(dims, keepdim=True)
         scale = (centred.square().mean(dims, keepdim=True) + ctx.eps).rsqrt()
@@ -85,5 +85,5 @@ class _LayerNorm(torch.autograd.Function):
         return scale * inner, None, by_weight, gradient.sum_to_size(shape) if to_bias else None, None
 
 
-#: ``_LayerNorm.apply`` without its look at signatures, which takes 50 us.
+#: ``_LayerNorm.apply`` without its check of signatures, which takes 50 us.
 _apply_directly: Any = super(torch.autograd.Function, _LayerNorm).apply

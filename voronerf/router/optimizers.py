@@ -1,4 +1,4 @@
-"""What optimisers keep for the parameters of cells: when cells are split, moved or loaded, and when they are frozen."""
+"""The state of optimisers for the parameters of cells, when cells are split, loaded or frozen."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from voronerf.router.grouping import cell_parameters
 
 _OP = "VoronoiRouter"
-PATIENCE = 64  # calls without a step; where gradients are accumulated there are some
+PATIENCE = 64  # calls without a step; gradient accumulation makes several calls a step
 
 
 def check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, method: str) -> None:
@@ -27,11 +27,18 @@ def check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, 
 def move_state(
     optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, fresh: Tensor | None
 ) -> None:
-    """Gives every cell the state of its parent among k cells, int64 [new cells], or zero to cells of ``fresh``, bool.
+    """Gives every new cell its parent's optimiser state.
 
-    The parameters have their new shapes already. A state that is not of cells begins anew.
+    The parameters have their new shapes already. If some state has no row for each cell, all state is reset.
+
+    Args:
+        optimizer: The optimiser.
+        module: The routed module.
+        parents: The parent of each new cell among the k old cells, int64 [new cells].
+        k: The number of old cells.
+        fresh: The new cells whose state becomes 0, bool [new cells]; None for no cells.
     """
-    lost = False
+    is_reset = False
     for parameter in cell_parameters(module):
         state = optimizer.state.get(parameter, {})
         for key, value in state.items():
@@ -40,8 +47,8 @@ def move_state(
                 if fresh is not None:
                     state[key][fresh.to(value.device)] = 0
             else:
-                lost |= isinstance(value, list) or (isinstance(value, Tensor) and value.dim() > 0)
-    if lost:
+                is_reset |= isinstance(value, list) or (isinstance(value, Tensor) and value.dim() > 0)
+    if is_reset:
         _begin_anew(optimizer)
         warnings.warn(
             f"{_OP}.subdivide: the state of {type(optimizer).__name__} cannot be inherited by cells and begins anew",
@@ -50,12 +57,12 @@ def move_state(
 
 
 def drop_state(optimizer: torch.optim.Optimizer) -> None:
-    """Resets the state of an optimiser where its shapes are not those of the parameters."""
+    """Resets the optimiser state of the parameters whose shapes it does not match."""
     for group in optimizer.param_groups:
         for parameter in group["params"]:
             if is_stale(optimizer, parameter):
                 optimizer.state.pop(parameter)
-                if isinstance(optimizer, torch.optim.Adagrad):  # which makes its state when it is made
+                if isinstance(optimizer, torch.optim.Adagrad):  # it creates its state in its constructor
                     total = torch.full_like(parameter, group["initial_accumulator_value"])
                     optimizer.state[parameter].update(step=torch.tensor(0.0), sum=total)
     if isinstance(optimizer, torch.optim.LBFGS):
@@ -69,22 +76,22 @@ def _begin_anew(optimizer: torch.optim.Optimizer) -> None:
 
 
 def is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
-    """Whether an optimiser has a state of another shape than a parameter."""
+    """Returns whether an optimiser holds state of another shape than the parameter."""
     state = optimizer.state.get(parameter, {})
     return any(isinstance(v, Tensor) and v.dim() > 0 and v.shape != parameter.shape for v in state.values())
 
 
 def watch_optimizers(module: nn.Module, line: str) -> list[Any]:
-    """Makes the optimisers of a module raise at their next step if they hold state of other cells than it now has.
+    """Makes the optimisers of a module raise at their next step if their state does not match its number of cells.
 
-    The fused ones of PyTorch would write past the end of that state. PyTorch keeps no list of optimisers, the garbage
-    collector does. The message says to write ``line``. The handles' ``remove()`` ends the watch.
+    PyTorch's fused optimisers would write past the end of stale state. PyTorch keeps no list of optimisers, so the
+    garbage collector's objects are searched. The error suggests the code ``line``. Returns the hooks' handles.
     """
     watched = {id(parameter): weakref.ref(parameter) for parameter in cell_parameters(module)}
 
     def ours(optimizer: torch.optim.Optimizer) -> list[Any]:
-        held = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched]
-        return [p for p in held if watched[id(p)]() is p]
+        own = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched]
+        return [p for p in own if watched[id(p)]() is p]
 
     def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         if any(is_stale(optimizer, parameter) for parameter in ours(optimizer)):
@@ -99,8 +106,10 @@ def watch_optimizers(module: nn.Module, line: str) -> list[Any]:
 
 
 class Untrained:
-    """Finds out whether a module gets gradients but no optimiser changes it, such as one of its parameters before it
-    was routed. It is asked in each call, since a hook on a parameter would keep gradients from being added at once.
+    """A check whether a module gets gradients but no optimiser changes it.
+
+    The usual cause is an optimiser of the parameters from before the module was wrapped. The check runs in each call,
+    since a hook on a parameter would prevent gradients from being accumulated in place.
 
     Args:
         module: The routed module.
@@ -108,15 +117,15 @@ class Untrained:
 
     def __init__(self, module: nn.Module) -> None:
         self._parameters = [p for p in module.parameters() if p.requires_grad]
-        self._were, self._calls = [_some(p).clone() for p in self._parameters], 0
+        self._initial, self._calls = [_some(p).clone() for p in self._parameters], 0
 
     def is_over(self, warn: Callable[[str, str], None]) -> bool:
-        """Whether there is nothing more to find out; takes a topic and a message for a warning."""
+        """Returns whether the check is finished; calls ``warn(topic, message)`` if it fails."""
         self._calls += 1
         if self._calls <= PATIENCE:
             return False
         have = any(parameter.grad is not None for parameter in self._parameters)
-        if have and all(torch.equal(_some(p), was) for p, was in zip(self._parameters, self._were, strict=True)):
+        if have and all(torch.equal(_some(p), was) for p, was in zip(self._parameters, self._initial, strict=True)):
             message = (
                 f"no optimizer has changed the parameters in {PATIENCE} calls, but they have gradients; make it of "
                 "router.parameters(), since those that the module had before it was wrapped are not trained"
@@ -126,24 +135,24 @@ class Untrained:
 
 
 def _some(parameter: Tensor) -> Tensor:
-    """Up to two thousand of a parameter's values."""
+    """Returns up to about two thousand of a parameter's values."""
     return parameter.detach().flatten()[:: max(1, parameter.numel() // 1000)]
 
 
 # Frozen cells ---------------------------------------------------------------------------------------------------------
 
-#: The frozen cells, bool [k], of every routed module that has some, and the runs of the others.
+#: The frozen cells of each routed module that has some, bool [k], and slices of its other cells.
 _FROZEN: weakref.WeakKeyDictionary[nn.Module, tuple[Tensor, list[slice]]] = weakref.WeakKeyDictionary()
-#: The optimisers whose steps put frozen cells back.
+#: The optimisers whose steps restore frozen cells.
 _KEEPING: weakref.WeakSet[torch.optim.Optimizer] = weakref.WeakSet()
 
 
 def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
-    """Notes the frozen cells of a routed module, bool [k]; None for no cells.
+    """Records the frozen cells of a routed module, bool [k]; None for no cells.
 
-    A stacked parameter is one tensor to an optimiser, which moves all of its cells: by weight decay and momentum also
-    those without a gradient. An optimiser with ``leaves_frozen`` passes over frozen cells by itself, others by
-    :func:`keep_frozen`.
+    A stacked parameter is one tensor to an optimiser, which changes all of its cells: weight decay and momentum also
+    change cells without a gradient. An optimiser with an attribute ``leaves_frozen`` skips frozen cells by itself; for
+    other optimisers there is :func:`keep_frozen`.
     """
     if frozen is None:
         _FROZEN.pop(module, None)
@@ -154,31 +163,31 @@ def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
 
 
 def keep_frozen(optimizer: torch.optim.Optimizer) -> None:
-    """Makes each step of an optimiser put back what it has changed in frozen cells, parameters and state.
+    """Makes each step of an optimiser restore the parameters and the state of frozen cells.
 
-    A wrapper of the optimiser would do the same, but schedulers and scalers do not take one.
+    A wrapper of the optimiser would do the same, but schedulers and scalers accept no wrapper.
     """
     if optimizer in _KEEPING or getattr(optimizer, "leaves_frozen", False):
         return
     _KEEPING.add(optimizer)
-    held: list[tuple[Tensor, Tensor, Tensor]] = []  # tensors, their frozen cells, and the values of those before
+    saved: list[tuple[Tensor, Tensor, Tensor]] = []  # (tensor, mask of frozen cells, their values before the step)
 
     def before(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        held.clear()
+        saved.clear()
         for parameter, frozen in _frozen_parameters(optimizer):
-            for tensor in (parameter.detach(), *_of_cells(optimizer, parameter)):
-                held.append((tensor, frozen, tensor[frozen]))
+            for tensor in (parameter.detach(), *_cell_state(optimizer, parameter)):
+                saved.append((tensor, frozen, tensor[frozen]))
 
     @torch.no_grad()
     def after(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        for tensor, frozen, values in held:
+        for tensor, frozen, values in saved:
             tensor[frozen] = values
-        known = {tensor.data_ptr() for tensor, _, _ in held}
+        restored = {tensor.data_ptr() for tensor, _, _ in saved}
         for parameter, frozen in _frozen_parameters(optimizer):
-            for tensor in _of_cells(optimizer, parameter):
-                if tensor.data_ptr() not in known:  # made in this step
+            for tensor in _cell_state(optimizer, parameter):
+                if tensor.data_ptr() not in restored:  # state created in this step
                     tensor[frozen] = 0
-        held.clear()
+        saved.clear()
 
     optimizer.register_step_pre_hook(before)
     optimizer.register_step_post_hook(after)
@@ -190,32 +199,32 @@ def _frozen_parameters(optimizer: torch.optim.Optimizer) -> list[tuple[Tensor, T
     return [(p, frozen[id(p)]) for p in every if id(p) in frozen]
 
 
-def _of_cells(optimizer: torch.optim.Optimizer, parameter: Tensor) -> list[Tensor]:
+def _cell_state(optimizer: torch.optim.Optimizer, parameter: Tensor) -> list[Tensor]:
     state = optimizer.state.get(parameter, {}).values()
     return [value for value in state if isinstance(value, Tensor) and value.shape == parameter.shape]
 
 
 class FrozenRows:
-    """The parameters of frozen cells, to find out whether an optimiser that was not given changes them.
+    """A check whether an optimiser that was not passed to ``freeze`` changes frozen cells.
 
     Args:
         module: The routed module.
-        frozen: bool [k], its frozen cells.
+        frozen: The mask of its frozen cells, bool [k].
     """
 
     def __init__(self, module: nn.Module, frozen: Tensor) -> None:
         self._frozen, self._calls = frozen, 0
-        self._were = [(p, p.detach()[frozen]) for p in cell_parameters(module)]
+        self._initial = [(p, p.detach()[frozen]) for p in cell_parameters(module)]
 
     def is_over(self, warn: Callable[[str, str], None]) -> bool:
-        """Whether there is nothing more to find out; looks in every call whose number is a power of 2.
+        """Returns whether the check is finished; compares the parameters in calls 2, 4, 8 and so on.
 
         Raises:
-            ValueError: If the parameters have changed.
+            ValueError: If the parameters of frozen cells have changed.
         """
         self._calls += 1
         looks = self._calls > 1 and not self._calls & (self._calls - 1)
-        if looks and not all(torch.equal(parameter.detach()[self._frozen], rows) for parameter, rows in self._were):
+        if looks and not all(torch.equal(parameter.detach()[self._frozen], rows) for parameter, rows in self._initial):
             self._calls -= 1
             raise ValueError(
                 f"{_OP}.freeze: an optimizer that was not given has changed frozen cells; write "
@@ -225,7 +234,7 @@ class FrozenRows:
 
 
 def trained_parts(parameters: Sequence[Tensor]) -> list[list[Any]]:
-    """For each parameter the parts of its first dimension that an optimiser may change: those of cells not frozen."""
+    """Lists, for each parameter, the slices of its first dimension that optimisers may change."""
     parts: dict[int, list[Any]] = {}
     for module, (_, pieces) in _FROZEN.items() if _FROZEN else ():
         parts.update((id(parameter), pieces) for parameter in cell_parameters(module))

@@ -1,4 +1,4 @@
-"""The plan of calls of one kind: the ways that compute the same, and what was measured of them. n samples, k cells."""
+"""The plan of calls of one kind: the ways that give the same results, and their timings. n samples, k cells."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from voronerf.router.grouped import Way
 from voronerf.router.probe import FEWEST
 from voronerf.router.watch import Source, Watch, same
 
-SLICE = 8192  # samples of a batch that are measured
+SLICE = 8192  # samples of a timing
 
 
 @dataclass
 class CallPlan:
-    """How the calls of one kind run.
+    """A plan of the calls of one kind.
 
     Attributes:
-        ways: Those that give what the loop gives, the most promising first and the loop last.
-        measured: Whether the first batch of each size decides between the ways; else the first one runs.
-        open: Whether another batch may run grouped, though the first did not.
-        few: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another.
-        chosen: The fastest way and why, by the size of a batch and the number of cells.
-        lost: Measurements that the fused way has lost, by the same key: count, time of the next one, explanation.
-        constants: What is no tensor among the arguments of the call that it was made for, if it is fused.
-        watch: Values of the module that its trace read.
-        skip: The next calls that run cell by cell before another way is tried again.
-        wait: ``skip`` after the next batch that cannot be grouped.
+        ways: The ways that agree with the loop, the most promising first and the loop last.
+        measured: Whether timings on the first batch of each size choose the way; else the first way runs.
+        open: Whether another batch may run grouped although the first did not.
+        few: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another plan.
+        chosen: The number of the fastest way and the reason, by the size of a batch and the number of cells.
+        lost: The lost timings of the fused way, by the same key: count, time of the next timing, explanation.
+        constants: The arguments of the traced call that are not tensors, by name; only for the fused way.
+        watch: The values of the module that its trace read.
+        skip: The number of calls that run cell by cell before another way is tried again.
+        wait: The value of ``skip`` after the next batch that cannot be grouped.
     """
 
     ways: list[Way]
@@ -46,11 +46,11 @@ class CallPlan:
 
     @property
     def fused(self) -> Fused | None:
-        """The way that a call takes as it was traced."""
+        """The fused way, or None."""
         return self.ways[0] if isinstance(self.ways[0], Fused) else None
 
     def takes_first(self, n: int, k: int) -> bool:
-        """Whether n samples in k cells are known to go the first way."""
+        """Returns whether the first way is already chosen for n samples in k cells."""
         if self.skip or (self.few and n >= FEWEST):
             return False
         if not self.measured or len(self.ways) == 1 or n < FEWEST:
@@ -58,23 +58,23 @@ class CallPlan:
         return self.chosen.get(self.size(n, k), (1, ""))[0] == 0
 
     def size(self, n: int, k: int) -> tuple[int, int]:
-        """The key of ``chosen``: batches of up to four times as many samples."""
+        """Returns the key of ``chosen``, which is the same for sizes within a factor of four."""
         return min(n, self._most).bit_length() // 2, k
 
     def changed(self, constants: dict[str, Any]) -> list[Source]:
-        """The arguments, attributes and buffers that have changed since the module was traced."""
+        """Lists the arguments, attributes and buffers that have changed since the module was traced."""
         fused = self.fused
         if fused is None:
             return []
-        now = constants.keys() | self.constants.keys() if constants.keys() != self.constants.keys() else constants
-        names = [n for n in now if not same(constants.get(n), self.constants.get(n)) and n not in fused.inputs.sources]
+        both = constants.keys() | self.constants.keys() if constants.keys() != self.constants.keys() else constants
+        names = [n for n in both if not same(constants.get(n), self.constants.get(n)) and n not in fused.inputs.sources]
         return [*names, *self.watch.changed()]
 
     def postpone(self) -> None:
-        """Runs the next calls cell by cell, twice as many each time."""
+        """Makes the next calls run cell by cell, twice as many after each failure."""
         self.skip, self.wait = self.wait, 2 * self.wait or 1
 
 
 def measured_samples(ways: list[Way]) -> int:
-    """Most samples on which ways are measured: more where PyTorch computes a part, whose tensors outgrow the cache."""
+    """Returns the most samples of a timing: more for fused runs, between which tensors outgrow the cache."""
     return SLICE * 8 if any(way.name == "fused in runs" for way in ways) else SLICE

@@ -1,7 +1,7 @@
-"""Which ways give what the loop over cells gives.
+"""Finds the ways whose results agree with the loop over cells.
 
-Each runs once on a few samples of the first batch, in a copy of the module whose cells have parameters of their own;
-results and gradients are compared.
+Each way runs once on a few samples of the first batch, in a copy of the module whose cells have different parameters.
+Results and gradients are compared.
 """
 
 from __future__ import annotations
@@ -25,43 +25,43 @@ from voronerf.router.trace import Unfusable, rows_for
 from voronerf.router.watch import Inputs
 
 _OP = "VoronoiRouter"
-FEWEST = 8  # samples; a batch of fewer is probed with others close to them
-_SAMPLES, _CELLS = (41, 43, 47, 53), 3  # numbers of samples of a probe, of which one is taken, and their cells
-_FEW = 8  # rows that show whether a module needs a subclass of tensors
-_PIECE = 8 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
+FEWEST = 8  # samples; a smaller batch is probed with more samples near its own
+_SAMPLES, _CELLS = (41, 43, 47, 53), 3  # candidate numbers of samples of a probe, and its number of cells
+_FEW = 8  # rows for the check whether a module needs a subclass of tensors
+_PIECE = 8 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones leave the cache
 
-Outcome = tuple[Results, list[Tensor]]  # and gradients
+Outcome = tuple[Results, list[Tensor]]  # results and gradients
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the user asked for."""
+    """The user's options."""
 
-    fuse: bool  # ``forward`` does the same in every call
-    way: str  # "fastest", or the way that is taken without measuring: "fused", "grouped" or "loop"
-    several: bool  # methods besides ``forward`` are routed; one that cannot be fused leaves the others fused
-    names: tuple[str, ...]  # of the parameters that the module was wrapped with
+    fuse: bool  # user promises that ``forward`` is a pure function
+    way: str  # "fastest", or a way without timing: "fused", "grouped" or "loop"
+    several: bool  # whether several methods are routed; then one that cannot be fused is no error
+    names: tuple[str, ...]  # names of the parameters that the module was wrapped with
 
 
 class Probe:
     """A copy of a module and a few samples of a call, in cells of their own whose parameters differ."""
 
     def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
-        self._made_of = call, grouping
-        self.refused = ""  # why what changed cannot be an input
+        self._source = call, grouping
+        self.refused = ""  # why a changed value cannot be an input
         device, generator = grouping.device, torch.Generator().manual_seed(0)
         call = _widened(call, generator) if call.layout.n < FEWEST else call
         self._n = n = rows_for(call.module, tensors_of((call.args, call.kwargs)), _SAMPLES)
         picked = torch.arange(n, device=device) * call.layout.n // n
         cells = (torch.arange(n, device=device) * 7 % 5 // 2).int()
         self._entries = Grouping(cells, n, _CELLS, device, grouping.backend, rows=picked)
-        self._entries.source, self._entries.occupied  # noqa: B018  found here: under a mode torch imports its compiler
+        self._entries.source, self._entries.occupied  # noqa: B018  cached, since a mode would import torch's compiler
         memo = {id(p): _perturbed(p, generator) for p in cell_parameters(call.module)}
         module = clone_module(call.module, memo).to(dtype)
         self._leaves: list[Tensor] = []
 
         def leaf(value: Tensor) -> Tensor:
-            """An argument with a gradient of its own, where it takes one."""
+            """Returns a detached copy of an argument, as a leaf tensor with a gradient if the argument has one."""
             copied = value.detach().to(dtype if value.is_floating_point() else None)
             if value.requires_grad and torch.is_grad_enabled():
                 self._leaves.append(copied.requires_grad_())
@@ -71,15 +71,16 @@ class Probe:
         self._call = replace(call, module=module, args=args, kwargs=kwargs)
 
     def find_ways(
-        self, options: Options, warn_once: Callable[[str, str], None], inputs: Sequence[Inputs], over: str = ""
+        self, options: Options, warn_once: Callable[[str, str], None], inputs: Sequence[Inputs], too_many: str = ""
     ) -> tuple[list[Way], bool]:
-        """The ways that give what the loop gives, the loop last; and whether another batch may have more of them.
+        """Returns the ways that agree with the loop, the loop last, and whether another batch may run grouped.
 
-        The first of ``inputs`` is taken with which the module can be fused; ``over`` says why it is not to be any more.
+        The module is fused with the first of ``inputs`` that is possible. If ``too_many``, a reason, is not empty, the
+        module is not fused.
 
         Raises:
-            TypeError: Where the module changes its parameters or mixes samples.
-            ValueError: Where the one method cannot be fused, though it must be.
+            TypeError: If the module changes its parameters or mixes samples.
+            ValueError: If the only method must be fused and cannot be.
         """
         call = self._call
         for loop in (Loop(), Loop(again=True)):
@@ -88,11 +89,11 @@ class Probe:
                 break
             except Forbidden:
                 raise
-            except Exception as error:  # perhaps its code runs again in the backward pass
+            except Exception as error:  # perhaps code runs again in the backward pass
                 why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
         else:
             return [Loop(why)], False
-        ways, is_open, unfused = list[Way](), False, over
+        ways, may_group, unfused = list[Way](), False, too_many
         if unfused:
             warn_once(f"changes {call.method}", f"{call.name} is {unfused}")
         elif options.fuse and options.way in ("fastest", "fused"):
@@ -101,33 +102,33 @@ class Probe:
             except Exception as error:
                 self._check_rows(loop)
                 why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
-                says = f"fuse=True needs a network that can be fused, but in {call.name} {why}"
+                message = f"fuse=True needs a network that can be fused, but in {call.name} {why}"
                 if not options.several:
-                    raise ValueError(f"{_OP}: {says}") from error
+                    raise ValueError(f"{_OP}: {message}") from error
                 unfused = f"not fused, since {why}"
-                warn_once(f"fuse {call.method}", says)
+                warn_once(f"fuse {call.method}", message)
         if options.way in ("fastest", "grouped") or (options.way == "fused" and not ways):
             try:
-                tried = Grouped(quiet=True)
-                if self._agrees(tried, loop, expected):
-                    piece = min(max(_PIECE * self._n // tried.widest, 1 << 10), 1 << 16)
+                grouped = Grouped(quiet=True)
+                if self._agrees(grouped, loop, expected):
+                    piece = min(max(_PIECE * self._n // grouped.widest, 1 << 10), 1 << 16)
                     ways.append(Grouped(piece, why=unfused))
                 else:
                     loop.why = "its forward on the samples of all cells gives other results than on those of one cell"
             except BackendUnavailable:
                 raise
             except Ungroupable as error:
-                loop.why, is_open = str(error), error.of_batch
+                loop.why, may_group = str(error), error.of_batch
             except Exception as error:
                 loop.why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
         if not ways:
             self._check_rows(loop)
         elif loop.again:
-            ways = ways[:1]  # cannot be measured, since some checkpoints refuse torch.autograd.grad
-        return [*ways, loop], is_open and not ways
+            ways = ways[:1]  # no timing, since some checkpoints refuse torch.autograd.grad
+        return [*ways, loop], may_group and not ways
 
     def is_groupable(self) -> bool:
-        """Whether the module runs for all cells at once on this batch, right or wrong."""
+        """Returns whether the module runs for all cells at once on this batch, whatever the results."""
         try:
             with torch.no_grad():
                 self._run(Grouped(quiet=True))
@@ -136,21 +137,21 @@ class Probe:
         return True
 
     def _run(self, way: Way) -> Results:
-        """The results of a way, with random numbers of 0."""
+        """Returns the results of a way, with random numbers of 0."""
         with NoRandomness() if isinstance(way, Loop) else contextlib.nullcontext():  # a fused network draws none
             return way.run(self._call, self._entries)
 
     def _outcome(self, way: Way) -> Outcome:
-        """Results, and gradients of a weighted sum of them."""
+        """Returns the results of a way, and the gradients of a weighted sum of them."""
         results, generator, total = self._run(way), torch.Generator().manual_seed(7), []
         for tensor in results.tensors:
             tensor = torch.view_as_real(tensor) if tensor.is_complex() else tensor
-            weights = torch.randn(tensor.shape, generator=generator)  # also of a constant, for which ways may differ
+            weights = torch.randn(tensor.shape, generator=generator)  # drawn for constants too
             if tensor.requires_grad:
                 total.append((tensor * weights.to(tensor)).sum().float())
         if not total or not torch.is_grad_enabled():
             return results, []
-        torch.stack(total).sum().backward()  # not torch.autograd.grad, which some checkpoints refuse
+        torch.stack(total).sum().backward()  # some checkpoints refuse torch.autograd.grad
         leaves = [t for t in (*self._call.module.parameters(), *self._leaves) if t.requires_grad]
         gradients = [torch.zeros_like(t) if t.grad is None else t.grad for t in leaves]
         for leaf in leaves:
@@ -158,10 +159,10 @@ class Probe:
         return results, gradients
 
     def _agrees(self, way: Way, loop: Way, expected: Outcome) -> bool:
-        """Whether a way gives what the loop gives; where it does not, whether it does without autocast or in float64.
+        """Returns whether a way agrees with the loop, if necessary without autocast or in float64.
 
-        Autocast rounds more than ways may differ, and a deep network of fast sines makes its own rounding as large as
-        its results.
+        Rounding by autocast exceeds the tolerance. In a deep network of fast sines, rounding errors reach the size of
+        the results.
         """
         outcome, device = self._outcome(way), self._entries.device.type
         if _same(outcome, expected):
@@ -172,42 +173,42 @@ class Probe:
         with torch.autocast(device, enabled=False):
             for dtype in dtypes:
                 with contextlib.suppress(Exception):
-                    exact = Probe(*self._made_of, dtype=dtype)
+                    exact = Probe(*self._source, dtype=dtype)
                     if _same(exact._outcome(way), exact._outcome(loop)):
                         return True
         return False
 
     def _fused(self, loop: Way, expected: Outcome, inputs: Sequence[Inputs]) -> Way:
-        """The network as one operation; raises where something stands in the way."""
-        for tried in inputs:
+        """Returns the fused way; raises an exception if the network cannot be fused."""
+        for candidate in inputs:
             try:
                 with NoRandomness():
-                    module, tensors = self._made_of[0].module, self._call.arranged(self._entries)
+                    module, tensors = self._source[0].module, self._call.arranged(self._entries)
                     count = rows_for(module, tensors)
-                    way = Fused(replace(self._call, module=module), [rows[:count] for rows in tensors], tried)
+                    way = Fused(replace(self._call, module=module), [rows[:count] for rows in tensors], candidate)
                 if not self._agrees(way, loop, expected):
                     raise Unfusable("the traced network gives other results than its forward")
                 return way
             except Exception as error:
-                if tried is inputs[-1]:
+                if candidate is inputs[-1]:
                     raise
                 self.refused = str(error)
         raise AssertionError
 
     def _check_rows(self, loop: Loop) -> None:
-        """Raises TypeError where results for samples change when others are left out."""
+        """Raises TypeError if results for a sample depend on the other samples."""
         bounds = [(cell, first, (first + last) // 2, last) for cell, first, last in self._entries.occupied]
         halves = [half for cell, a, b, c in bounds for half in ((cell, a, b), (cell, b, c))]
         with NoRandomness():
             apart = loop.on(self._call, self._entries, halves)
-        once, again = self._run(loop).tensors, self._run(loop).tensors
+        results, again = self._run(loop).tensors, self._run(loop).tensors
         name = type(self._call.module).__name__
-        if not all(map(agree, once, again)):
+        if not all(map(agree, results, again)):
             raise TypeError(
                 f"{_OP}: module must give the same results for the same samples, but {name} makes layers or draws "
                 "numbers inside of its forward; make layers in __init__, and pass numbers as an argument"
             )
-        if not all(map(agree, apart.tensors, once)):
+        if not all(map(agree, apart.tensors, results)):
             raise TypeError(
                 f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when other "
                 "samples are left out: it mixes samples (attention or statistics over a batch)"
@@ -215,9 +216,9 @@ class Probe:
 
 
 def _same(outcome: Outcome, expected: Outcome) -> bool:
-    (a, ours), (b, theirs) = outcome, expected
-    alike = len(a.tensors) == len(b.tensors) and len(ours) == len(theirs)
-    return alike and all(map(agree, a.tensors, b.tensors)) and agree_gradients(ours, theirs)
+    (a, our_gradients), (b, their_gradients) = outcome, expected
+    same_counts = len(a.tensors) == len(b.tensors) and len(our_gradients) == len(their_gradients)
+    return same_counts and all(map(agree, a.tensors, b.tensors)) and agree_gradients(our_gradients, their_gradients)
 
 
 def _kinds(outcome: Outcome) -> list[tuple[torch.Size, torch.dtype]]:
@@ -226,18 +227,18 @@ def _kinds(outcome: Outcome) -> list[tuple[torch.Size, torch.dtype]]:
 
 @torch.no_grad()
 def _widened(call: Call, generator: torch.Generator) -> Call:
-    """Returns a call of at least ``FEWEST`` different samples near those of a call that has fewer.
+    """Returns a call of at least ``FEWEST`` different samples, near the samples of a smaller call.
 
-    A module that mixes its samples could not be told by identical ones.
+    Identical samples could not show that a module mixes samples.
     """
     lead = call.layout.lead
     count = -(-FEWEST // call.layout.n)
 
     def widen(tensor: Tensor, kind: str) -> Tensor:
-        if tensor.shape[0] == 1 != lead[0]:  # the same for all of the first dimension
+        if tensor.shape[0] == 1 != lead[0]:  # broadcast along the first dimension
             return tensor
         rows = tensor.detach().repeat(count, *[1] * (tensor.dim() - 1))
-        if rows.is_floating_point():  # towards a number in the boxes that positions are in, [0, 1] or [-1, 1]
+        if rows.is_floating_point():  # towards 0.3, which lies in the usual boxes of positions, [0, 1] and [-1, 1]
             rows = rows.lerp(torch.full_like(rows, 0.3), 0.1 * torch.rand(rows.shape, generator=generator).to(rows))
         return rows.requires_grad_(tensor.requires_grad)
 
@@ -247,7 +248,7 @@ def _widened(call: Call, generator: torch.Generator) -> Call:
 
 @torch.no_grad()
 def _perturbed(parameter: Tensor, generator: torch.Generator) -> nn.Parameter:
-    """Entries for the cells of a probe, [3, ...], each some way off the router's own."""
+    """Returns a parameter for the cells of a probe, [3, ...]: the router's own values with noise."""
     with torch.inference_mode(False):
         values = parameter.detach()[torch.arange(_CELLS, device=parameter.device) % parameter.shape[0]].clone()
         if (values.is_floating_point() or values.is_complex()) and values.numel():
@@ -258,9 +259,9 @@ def _perturbed(parameter: Tensor, generator: torch.Generator) -> nn.Parameter:
 
 
 def check_rays(call: Call) -> None:
-    """Raises ValueError where [n, 1, f] gives other results than [rays, samples, f], for a few samples of one cell."""
+    """Raises ValueError if [n, 1, f] gives other results than [rays, samples, f], for a few samples of one cell."""
     lead = call.layout.lead
-    for samples in (6, lead[-1]):  # a module may be made for a number of samples
+    for samples in (6, lead[-1]):  # a module may need a certain number of samples
         try:
             whole, alone = _of_few(call, (*[1] * (len(lead) - 2), min(lead[-2], 2), min(lead[-1], samples)))
         except Exception:
@@ -275,7 +276,7 @@ def check_rays(call: Call) -> None:
 
 
 def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
-    """What the first cell's module returns for a few samples as rays, and as the router passes them."""
+    """Returns the first cell's results for a few samples, once as rays and once in the router's shapes."""
     tensors: list[Tensor] = []
 
     def first(tensor: Tensor, kind: str) -> Tensor:
@@ -292,7 +293,7 @@ def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
 
 
 def check_subclasses(call: Call, plain: Call) -> None:
-    """Raises TypeError where a call gives something else for a few plain tensors than for those of a subclass."""
+    """Raises TypeError if a call gives other results for a few plain tensors than for tensors of a subclass."""
     rows: list[Tensor] = []
 
     def first(tensor: Tensor, kind: str) -> Tensor:
@@ -302,7 +303,7 @@ def check_subclasses(call: Call, plain: Call) -> None:
     cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
     with torch.no_grad(), NoRandomness():
         expected = None
-        with contextlib.suppress(Exception):  # a piece of a tensor may lack what its class needs
+        with contextlib.suppress(Exception):  # a slice of a subclass may be invalid
             call.changed(first)
             expected = tensors_of(Double(call.module).run(call, rows, cell))
         try:
@@ -315,7 +316,7 @@ def check_subclasses(call: Call, plain: Call) -> None:
             why = "" if same else "its results differ"
         except Exception as error:
             if expected is None and not isinstance(error, AttributeError):
-                return  # the call itself says what is wrong
+                return  # the call itself raises a better error
             why = f"{type(error).__name__}: {error}"
     if why:
         kind = next(type(x).__name__ for x in tensors_of((call.args, call.kwargs)) if as_plain(x) is not x)

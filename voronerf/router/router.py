@@ -22,6 +22,7 @@ from voronerf.diagram.subdivision import finer_diagram
 from voronerf.diagram.voronoi import MANY_CELLS
 from voronerf.ops._core.backends import BACKENDS
 from voronerf.ops._core.compiler import not_compiled
+from voronerf.router.call_cache import CachedCall, call_key
 from voronerf.router.cells import (
     apply_to_cells,
     check_module,
@@ -35,9 +36,16 @@ from voronerf.router.cells import (
 )
 from voronerf.router.dispatch import Dispatch
 from voronerf.router.grouping import Assigned, Grouping
-from voronerf.router.known import KnownCall, kind_of
 from voronerf.router.labels import Labels
-from voronerf.router.layout import Call, Layout, accepted_names, argument_names, doubt_of, find_positions, first_tensor
+from voronerf.router.layout import (
+    Call,
+    Layout,
+    accepted_names,
+    argument_names,
+    find_positions,
+    first_tensor,
+    position_warning,
+)
 from voronerf.router.optimizers import (
     FrozenRows,
     Untrained,
@@ -49,84 +57,86 @@ from voronerf.router.optimizers import (
     watch_optimizers,
 )
 from voronerf.router.probe import Options
-from voronerf.router.program import CellProgram, Given, each_direction
+from voronerf.router.program import CellProgram, FieldProgram, each_direction
 from voronerf.router.transforms import outside, refuse_transforms, transformed, unwrapped
 
 _NO_GRAPH = (
     "VoronoiRouter: a routed module runs as it is, between two graphs of torch.compile; omit fullgraph=True, or call a "
     "router with fuse=True once beforehand, with gradients on or off as in the graph"
 )
-_READ = ("backend", "coords", "layout", "methods", "per_ray", "shared", "way")  # for what is known of calls
-_LARGE = 512  # samples of a batch that shows whether centres and positions fit
+_READ = ("backend", "coords", "layout", "methods", "per_ray", "shared", "way")  # attributes that cached calls depend on
+_LARGE = 512  # fewest samples of a batch whose positions are checked
 Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first1", "first2", "first3", "first4"] | slice | Callable[..., Tensor]
 
 
 class VoronoiRouter(nn.Module):
-    """k copies of a module, one for each cell of a Voronoi diagram or label; that of its cell evaluates each sample.
+    """k copies of a module, one for each cell of a Voronoi diagram or label; a sample is evaluated by its cell's copy.
 
     ``router(...)`` takes the arguments of the module's ``forward`` and returns what it returns, in the same order and
     with the same leading dimensions. Every cell starts as a copy of the module (the inheritance of Adaptive Voronoi
     NeRFs). Positions stay global, so identical copies give exactly the result of the module, and no seam appears at a
-    split. The parameters of all copies are stacked, ``[k, ...]``, under the module's own names below ``module.``: an
-    optimiser sees as many tensors as for one module. Buffers are shared by all cells.
+    split. The parameters of all copies are stacked, ``[k, ...]``, under the module's own names with the prefix
+    ``module.``: an optimiser sees as many tensors as for one module. Buffers are shared by all cells.
 
-    The loop over cells defines the result. A call runs in the fastest of these ways, after one comparison with the loop
-    for each kind of call; :meth:`explain` says which, why, and what was measured:
+    A loop that runs every cell's copy on its samples defines the result. A call runs in the fastest of these ways; for
+    each kind of call, its results are compared with the loop once. :meth:`explain` reports the way, the reason and the
+    measured times:
 
     - fused: one operation for the whole network. This needs a field with a method ``program``
       (:func:`voronerf.router.layered_program`), or ``fuse=True``.
-    - grouped: the module's own ``forward`` runs once, on the samples of all cells sorted by cell. Functions that meet
+    - grouped: the module's own ``forward`` runs once, on the samples of all cells sorted by cell. Functions that take
       parameters have a rule for all cells at once: linear layers (also ``F.linear``, ``@``, ``einsum``), embeddings,
       normalisation layers, scales. :func:`voronerf.router.register` adds a rule.
-    - cell by cell: the module runs once for each cell that has samples. A warning names the step that needs it.
+    - cell by cell: the module runs once for each cell that has samples. A warning names the step that has no faster
+      way.
 
     A module that mixes samples (BatchNorm, attention across samples) is refused.
 
-    With a number of networks in the place of a diagram, cells have no places: every call says the cell of each sample,
-    ``router(x, cells=labels)``, such as its speaker, station, object or image. A router with a diagram takes ``cells=``
-    too, instead of looking for them. Labels have the leading shape of the samples, ``[n]`` beside ``[n, f]``. A row of
-    ``[images, pixels, f]`` beside labels ``[images]`` is one sample, which the module sees whole. ``x[:, None]`` beside
-    labels ``[n, m]`` gives each of n rows to m networks, results ``[n, m, ...]``.
+    With a number of networks instead of a diagram, cells have no centres. Every call passes the cell of each sample,
+    ``router(x, cells=labels)``, such as its speaker, station, object or image. A router with a diagram accepts
+    ``cells=`` too, and then looks up no cells. Labels have the leading shape of the samples, ``[n]`` beside ``[n, f]``.
+    With labels ``[images]``, a row of ``[images, pixels, f]`` is one sample, which the module gets as a whole. With
+    labels ``[n, m]``, ``x[:, None]`` gives each of n rows to m networks; results are ``[n, m, ...]``.
 
     Arguments are per sample ``[..., f]``; per ray ``[rays, f]`` beside ``[rays, samples, f]``; numbers, flags, None and
     tensors of one element, which are passed on; and objects that hold tensors, such as nerfstudio's ``RaySamples``.
-    Tensors of a subclass are taken as plain ones; a module that gives other results for those is refused.
+    Tensors of a subclass are converted to plain tensors; a module whose results would change is refused.
 
     Args:
         module: Any ``nn.Module`` that treats samples one by one; it is copied and never changed.
         diagram: A VoronoiDiagram (:meth:`VoronoiDiagram.from_points` places its centres), or centres [k, d], in the
             coordinates of the positions; or k, the number of networks that labels choose from.
-        coords: Where the positions are: ``"first3"``, the first three features of the first tensor (``"first2"`` for
+        coords: The place of the positions: ``"first3"``, the first three features of the first tensor (``"first2"`` for
             d = 2 and so on); a slice of its features; or a function of the call's arguments that returns positions
-            [..., d]. They can be given at the call instead, ``router(x, coords=positions)``, unless the module itself
-            has an argument ``coords``. For a field with a ``program`` they are its first argument.
-        per_ray: Names or numbers of the arguments that have one row for each ray. None decides by shapes, and refuses
-            shapes that fit both readings.
+            [..., d]. A call can pass positions instead, ``router(x, coords=positions)``, unless the module itself has
+            an argument ``coords``. For a field with a ``program`` they are its first argument.
+        per_ray: Names or numbers of the arguments that have one row for each ray. If None, shapes decide, and ambiguous
+            shapes are refused.
         shared: Names or numbers of tensor arguments that are the same for all samples.
         methods: Names of further methods to route, ``router.density(x)``. Methods that are called with the same
             positions share one assignment to cells.
-        share: Names of parameters that all cells have in common, with wildcards: ``["encoder.*"]``. There is one copy
-            of them, with ordinary gradients; the others are per cell. Steps with shared parameters run once for all
+        share: Names of parameters that all cells share, with wildcards: ``["encoder.*"]``. A shared parameter has one
+            copy, with ordinary gradients; other parameters are per cell. Steps with shared parameters run once for all
             samples, also with ``fuse``.
-        fuse: Promises that ``forward`` depends on its arguments and on what its parts hold alone. Its network is
-            traced and runs as one operation, or is refused with the line that stands in the way. Numbers, attributes
-            and buffers that change are followed.
-        way: "fastest" measures the ways of a call on some of the first batch of its kind and, within a factor of four,
-            size; it leaves the fused way only if another one is clearly faster in each of three measurements, a second
-            or more apart. "fused", "grouped" and "loop" take that way, or the next in this order where it is not
-            possible, and do not depend on timings.
-        layout: How the module sees samples ``[rays, samples, f]``: "rays" as ``[n, 1, f]``, with what is per ray as
-            ``[n, f]``; "flat" as ``[n, f]``, for modules that squeeze or flatten.
-        assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell by the distances
-            while training (:meth:`VoronoiDiagram.sample_cell`), and is "nearest" in eval mode.
-        temperature: Of the stochastic assignment, in scene units.
-        backend: Of every operation, see ``voronerf info``.
+        fuse: A promise that ``forward`` depends only on its arguments and on the state of its submodules. The network
+            is traced and runs as one operation; if this is impossible, an error names the line. Changed numbers,
+            attributes and buffers take effect.
+        way: "fastest" times the ways on a part of the first batch of each kind of call and each size (within a factor
+            of four). It keeps the fused way unless another one is clearly faster in three measurements, at least a
+            second apart. "fused", "grouped" and "loop" choose a way without timing; if it is impossible, the next one
+            in this order runs.
+        layout: The shape in which the module gets samples ``[rays, samples, f]``: "rays" for ``[n, 1, f]``, with
+            per-ray arguments as ``[n, f]``; "flat" for ``[n, f]``, for modules that squeeze or flatten.
+        assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell at random by the
+            distances in training mode (:meth:`VoronoiDiagram.sample_cell`), and acts as "nearest" in eval mode.
+        temperature: The temperature of the stochastic assignment, in scene units.
+        backend: The backend of every operation; see ``voronerf info``.
 
     Raises:
         TypeError: For a module that mixes samples, or that cannot be one network for each cell.
         ValueError: For bad centres, coords, methods or layout, an unknown assignment, or a temperature that is not
-            positive; for less than one network; for coords or a stochastic assignment without centres.
+            positive; for fewer than one network; for coords or a stochastic assignment without centres.
 
     Examples:
         >>> import torch
@@ -147,7 +157,7 @@ class VoronoiRouter(nn.Module):
         torch.Size([5, 2])
     """
 
-    @torch.inference_mode(False)  # in which parameters could never be trained
+    @torch.inference_mode(False)  # inference-mode parameters could never be trained
     def __init__(
         self,
         module: nn.Module,
@@ -165,7 +175,7 @@ class VoronoiRouter(nn.Module):
         temperature: float = 0.05,
         backend: str = "auto",
     ) -> None:
-        module = getattr(module, "_orig_mod", module)  # of torch.compile, which would not see the parameters of cells
+        module = getattr(module, "_orig_mod", module)  # unwrap torch.compile, which would not see the cells' parameters
         check_module(module)
         options = {"coords": coords, "assignment": assignment, "temperature": temperature, "layout": layout, "way": way}
         lists = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
@@ -174,48 +184,48 @@ class VoronoiRouter(nn.Module):
         cells = _diagram_of(diagram)
         if cells.centres.shape[1] == 0:
             _refuse_places(coords, assignment)
-        first = next(module.parameters(), None)
-        self.diagram = cells if first is None or first.is_meta else cells.to(first.device)
+        parameter = next(module.parameters(), None)
+        self.diagram = cells if parameter is None or parameter.is_meta else cells.to(parameter.device)
         self.module: nn.Module = clone_module(module)
         stack_parameters(self.module, cells.num_cells, share)
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
-        self._watches: list[Any] = []  # of optimisers that hold the state of other cells
-        self._doubts: list[Untrained | FrozenRows] = [Untrained(self.module)]  # asked in the first training calls
+        self._watches: list[Any] = []  # hooks on optimisers with stale state
+        self._training_checks: list[Untrained | FrozenRows] = [Untrained(self.module)]
         self.assignment, self.temperature = assignment, temperature
-        given = Given.of(self.module)
-        if coords is None and given is not None and cells.centres.shape[1]:
+        field_program = FieldProgram.of(self.module)
+        if coords is None and field_program is not None and cells.centres.shape[1]:
             coords = cast(Coordinates, f"first{cells.centres.shape[1]}")
         self.backend, self.coords, self.fuse, self.way, self.layout = backend, coords, fuse, way, layout
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._names = tuple(name for name, _ in self.module.named_parameters())
-        self._own = {name: argument_names(getattr(self.module, name)) for name in ("forward", *self.methods)}
-        taken = [name for name, arguments in self._own.items() if "cells" in arguments]
-        if taken and not cells.centres.shape[1]:
-            where = f"{type(module).__name__}.{taken[0]}"
+        self._argument_names = {name: argument_names(getattr(self.module, name)) for name in ("forward", *self.methods)}
+        conflicts = [name for name, arguments in self._argument_names.items() if "cells" in arguments]
+        if conflicts and not cells.centres.shape[1]:
+            where = f"{type(module).__name__}.{conflicts[0]}"
             raise ValueError(f"VoronoiRouter: {where} has an argument cells of its own, so labels cannot be told")
         self._dispatch = Dispatch()
-        self._assigned: Assigned | None = None  # the last samples, if several methods are routed
-        self._unseen = True  # no large batch has shown whether the centres fit the positions
-        self._resized = False  # parameters have other sizes than where they were wrapped, perhaps
+        self._assigned: Assigned | None = None  # cells of the last batch, if several methods are routed
+        self._positions_unchecked = True  # until the first large training batch
+        self._resized = False  # parameters may have other sizes than when DistributedDataParallel wrapped them
         self.register_buffer("frozen_cells", None, persistent=False)
-        self._given = given
-        if given is not None:
-            given.look(self.module)  # before a compiler
+        self._field_program = field_program
+        if field_program is not None:
+            field_program.look(self.module)  # before torch.compile traces a call
 
     @classmethod
     def from_modules(
         cls, modules: Sequence[nn.Module], diagram: VoronoiDiagram | Tensor | int | None = None, **options: Any
     ) -> VoronoiRouter:
-        """One module for each cell, in the order of the centres, as Mega-NeRF trains them, or of the labels.
+        """Makes a router from one module for each cell, for example separately trained networks as in Mega-NeRF.
 
         Args:
-            modules: k modules of one architecture.
-            diagram: A VoronoiDiagram of k cells, or centres [k, d]; None for cells that labels tell.
-            **options: Those of the constructor.
+            modules: k modules of one architecture, in the order of the centres or labels.
+            diagram: A VoronoiDiagram of k cells, or centres [k, d]; None for cells that are chosen by labels.
+            **options: The options of the constructor.
 
         Raises:
-            ValueError: Other than k modules, or modules that differ in parameters' names or shapes or in buffers.
+            ValueError: For other than k modules, or modules that differ in parameters' names or shapes or in buffers.
         """
         modules, rule = list(modules), "VoronoiRouter.from_modules: modules must hold a module for each"
         if not modules:
@@ -229,13 +239,13 @@ class VoronoiRouter(nn.Module):
 
     @torch.no_grad()
     def part(self, cells: Sequence[int] | Tensor) -> VoronoiRouter:
-        """A router with some of the cells, and a copy of what all cells share; it gives the same results in them.
+        """Returns a router with only the chosen cells. Their results stay the same; shared parameters are copied.
 
         Args:
-            cells: [c], ascending numbers, at least one; they become 0 to c - 1.
+            cells: Ascending cell numbers [c], at least one; they become 0 to c - 1.
 
         Raises:
-            ValueError: No cells, cells out of range, or cells that do not ascend.
+            ValueError: For no cells, cells out of range, or cells that do not ascend.
 
         Examples:
             >>> import torch
@@ -245,26 +255,26 @@ class VoronoiRouter(nn.Module):
             torch.Size([2, 1, 3])
         """
         chosen = torch.as_tensor(cells, dtype=torch.int64, device=self.diagram.centres.device)
-        taken = copy.deepcopy(self)
-        taken.diagram = self.diagram.part(chosen)
-        renew_cells(taken.module, chosen)
-        taken._set_frozen(self.frozen[chosen])
-        return taken
+        result = copy.deepcopy(self)
+        result.diagram = self.diagram.part(chosen)
+        renew_cells(result.module, chosen)
+        result._set_frozen(self.frozen[chosen])
+        return result
 
     # Cells ------------------------------------------------------------------------------------------------------------
 
     @property
     def num_cells(self) -> int:
-        """Cells of the diagram, networks of the router."""
-        diagram: Any = self._modules["diagram"]  # as an attribute it takes six times as long
+        """The number of cells, which is the number of networks."""
+        diagram: Any = self._modules["diagram"]  # attribute access is six times slower
         count: int = diagram.num_cells
         return count
 
     def cell(self, index: int) -> nn.Module:
-        """A plain copy of one cell's module, with parameters of its own.
+        """Returns a plain copy of one cell's module, with parameters of its own.
 
         Raises:
-            IndexError: If there is no such cell.
+            IndexError: If there is no cell of this index.
         """
         return plain_cell(self.module, self._check_index("cell", index))
 
@@ -272,20 +282,20 @@ class VoronoiRouter(nn.Module):
         """Copies the parameters of a plain module into one cell. Parameter objects and optimisers stay the same.
 
         Raises:
-            IndexError: If there is no such cell.
+            IndexError: If there is no cell of this index.
             ValueError: For parameters of other names or shapes, or buffers that differ from the shared ones.
         """
         fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
-        self._trust_frozen()
+        self._drop_frozen_checks()
 
     def apply(self, fn: Callable[[nn.Module], Any]) -> VoronoiRouter:
         """Applies a function to the modules of each cell in turn, such as one that initialises layers.
 
-        It sees weights of one cell, [o, i], where ``router.module.apply`` shows it stacked ones, [k, o, i], whose fans
-        an initialisation takes for those of a convolution. What it changes beside parameters and buffers is not kept.
+        The function gets the weights of one cell, [o, i]. ``router.module.apply`` would pass stacked weights, [k, o,
+        i], from which initialisers compute the fans of a convolution. Only changes of parameters and buffers are kept.
 
         Raises:
-            ValueError: Where it changes names or shapes of parameters.
+            ValueError: If the function changes names or shapes of parameters.
 
         Examples:
             >>> import torch
@@ -297,7 +307,7 @@ class VoronoiRouter(nn.Module):
             True
         """
         apply_to_cells(self.module, self.num_cells, fn)
-        self._trust_frozen()
+        self._drop_frozen_checks()
         return self
 
     def _check_index(self, method: str, index: int) -> int:
@@ -307,7 +317,7 @@ class VoronoiRouter(nn.Module):
 
     @property
     def frozen(self) -> Tensor:
-        """The cells that :meth:`freeze` keeps as they are, bool [k]."""
+        """The mask of frozen cells, bool [k]; see :meth:`freeze`."""
         device = self.diagram.centres.device
         none = torch.zeros(self.num_cells, dtype=torch.bool, device=device)
         return none if self.frozen_cells is None else self.frozen_cells.clone()
@@ -315,24 +325,24 @@ class VoronoiRouter(nn.Module):
     def freeze(
         self, cells: Sequence[int] | Tensor | None = None, *, optimizer: torch.optim.Optimizer | None = None
     ) -> None:
-        """Keeps the parameters of some cells as they are: the same bits after any step of the optimiser.
+        """Freezes some cells: their parameters keep the same bits after any step of the optimiser.
 
         Results of samples in frozen cells are constants: they have no gradient, neither to parameters nor to arguments,
-        and take no part in the backward pass. Momentum, weight decay and the moments of Adam leave frozen cells alone.
-        Other cells train as ever. Parameters that all cells share (``share=``, such as the table of a hash grid) cannot
-        be frozen for some cells: they learn from the samples in the other cells, and what frozen cells give changes
-        with them.
+        and take no part in the backward pass. Momentum, weight decay and the moments of Adam do not change frozen
+        cells. Other cells train as usual. Parameters that all cells share (``share=``, such as the table of a hash
+        grid) cannot be frozen for some cells. They learn from the samples in the other cells, so the results of frozen
+        cells change with them.
 
         Args:
             cells: Numbers of cells, or bool [k]; None for all. Cells that were frozen before stay frozen.
-            optimizer: The optimiser that holds this router's parameters; from now on its steps put back what they have
-                changed in frozen cells. :class:`voronerf.nerf.Adam` leaves them by itself. If another one that is not
-                given changes frozen cells in its first step, the next call raises.
+            optimizer: The optimiser that holds this router's parameters; each later step restores the values of frozen
+                cells. :class:`voronerf.nerf.Adam` skips frozen cells by itself. If an optimiser that was not passed
+                changes frozen cells in its first step, the next call raises.
 
         Raises:
             ValueError: For a cell number out of range, a mask of another length, or an optimiser that holds none of the
                 router's parameters.
-            TypeError: For what are neither numbers of cells nor a mask.
+            TypeError: If ``cells`` are neither numbers of cells nor a mask.
 
         Examples:
             >>> import torch
@@ -351,14 +361,14 @@ class VoronoiRouter(nn.Module):
         if optimizer is not None:
             keep_frozen(optimizer)
         elif self.frozen_cells is not None:
-            self._doubts.append(FrozenRows(self.module, self.frozen_cells))
+            self._training_checks.append(FrozenRows(self.module, self.frozen_cells))
 
     def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
-        """Lets frozen cells learn again, with the optimiser's moments that they had; takes cells as `freeze` does."""
+        """Unfreezes cells, which keep the optimiser's moments from before; takes cells as `freeze` does."""
         self._set_frozen(self.frozen & ~self._mask("unfreeze", cells))
 
     def _mask(self, method: str, cells: Sequence[int] | Tensor | None) -> Tensor:
-        """bool [k] of cells."""
+        """Returns the cells as a mask, bool [k]."""
         device, k = self.diagram.centres.device, self.num_cells
         if cells is None:
             return torch.ones(k, dtype=torch.bool, device=device)
@@ -376,7 +386,7 @@ class VoronoiRouter(nn.Module):
         return torch.zeros(k, dtype=torch.bool, device=device).index_fill(0, chosen.long(), True)
 
     def _set_frozen(self, frozen: Tensor | None) -> None:
-        self._trust_frozen()
+        self._drop_frozen_checks()
         self.frozen_cells = frozen if frozen is not None and bool(frozen.any()) else None
         freeze_cells(self.module, self.frozen_cells)
 
@@ -394,22 +404,22 @@ class VoronoiRouter(nn.Module):
     ) -> Tensor:
         """Replaces the diagram by a finer one; every new cell starts as a copy of its parent.
 
-        Parameters are copied from the parent and, with ``optimizer``, so is the state of Adam, AdamW, RAdam, SGD and
-        similar optimisers; others start afresh, with a warning. The parameter objects stay the same, so groups,
-        learning rates and schedules continue. A wrapper with parameters of its own, such as
+        Parameters are copied from the parent. With ``optimizer``, so is the state of Adam, AdamW, RAdam, SGD and
+        similar optimisers; the state of other optimisers is reset, with a warning. The parameter objects stay the same,
+        so groups, learning rates and schedules continue. A wrapper with parameters of its own, such as
         ``DistributedDataParallel``, has to be made again.
 
         Args:
-            diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children that
-                :func:`voronerf.split_diagram` gives each cell that has enough samples. Without centres, for new
-                labels, :meth:`VoronoiDiagram.without_centres`, with ``parents``.
-            parents: int64 [new cells], the present cell that each new cell lies in; None for the cell that holds the
+            diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children of each
+                cell that has enough samples (:func:`voronerf.split_diagram`). A router without centres takes
+                :meth:`VoronoiDiagram.without_centres` together with ``parents``.
+            parents: The present cell that each new cell lies in, int64 [new cells]; None for the cell that holds the
                 new centre.
             optimizer: The optimiser that holds this router's parameters.
-            inherit: False draws new parameters for the children of every cell that is split, with moments of zero: the
-                ablation that shows ghosting.
-            points: [m, d], samples in scene units, if ``diagram`` is a number of children.
-            weights: [m], the importance of the samples, by which the new cells are balanced; None for 1 each.
+            inherit: Whether children start as copies. If False, the children of a split cell get newly drawn parameters
+                and zero moments: the ablation that shows ghosting.
+            points: Samples [m, d] in scene units, if ``diagram`` is a number of children.
+            weights: The importance of the samples, [m], by which the new cells are balanced; None for 1 each.
             **split: Further options of ``split_diagram``, such as cells, centres, min_samples.
 
         Returns:
@@ -432,20 +442,20 @@ class VoronoiRouter(nn.Module):
         split = {"backend": self.backend, "generator": self.generator, **split}
         check_optimizer(optimizer, self.module, "subdivide")
         k = self.num_cells
-        placed = not isinstance(diagram, VoronoiDiagram) or diagram.centres.shape[1] > 0
-        if not self._d and (placed or parents is None):
+        has_centres = not isinstance(diagram, VoronoiDiagram) or diagram.centres.shape[1] > 0
+        if not self._d and (has_centres or parents is None):
             raise ValueError(
                 "VoronoiRouter.subdivide: diagram must be VoronoiDiagram.without_centres(k) for a router without "
                 "centres, with parents, the present label of each new one"
             )
-        if self._d and not placed:
+        if self._d and not has_centres:
             raise ValueError("VoronoiRouter.subdivide: diagram must have centres, as the router's has, got none")
         finer, parents = finer_diagram(self.diagram, diagram, parents, points, weights, split)
-        # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
+        # Marks the children of split cells. Other cells keep their values, with or without inheritance.
         new = torch.bincount(parents, minlength=k)[parents] > 1
         fresh = None if inherit else draw_parameters(plain_cell(self.module, 0), len(new), self.generator)
         renew_cells(self.module, parents, fresh, new)
-        self.diagram, self._unseen = copy.deepcopy(finer).to(self.diagram.centres.device), True
+        self.diagram, self._positions_unchecked = copy.deepcopy(finer).to(self.diagram.centres.device), True
         self._resized = True
         if self.frozen_cells is not None:
             self._set_frozen(self.frozen_cells[parents.to(self.frozen_cells.device)])
@@ -456,7 +466,7 @@ class VoronoiRouter(nn.Module):
         return parents
 
     def _watch_optimizers(self, line: str) -> None:
-        """Makes an optimiser with the state of other cells raise at its next step, with the ``line`` to write."""
+        """Makes an optimiser with stale state raise at its next step; the error suggests the code ``line``."""
         for watch in self._watches:
             watch.remove()
         self._watches = watch_optimizers(self.module, line)
@@ -469,21 +479,21 @@ class VoronoiRouter(nn.Module):
         *,
         optimizer: torch.optim.Optimizer | None = None,
     ) -> Any:
-        """Loads a state of any number of cells; the parameter objects stay, so an optimiser goes on with them.
+        """Loads a state with any number of cells. Parameter objects stay the same, so an optimiser keeps them.
 
         Args:
-            state_dict: What ``state_dict()`` of a router around the same module gave.
+            state_dict: The ``state_dict()`` of a router around the same module.
             strict: See ``nn.Module``.
             assign: See ``nn.Module``; parameters are new objects then.
-            optimizer: The optimiser that holds this router's parameters. Where the number of cells changes, its state
-                begins anew, if its own ``load_state_dict`` does not follow. Without it an optimiser that has state of
-                the cells before raises at its next step.
+            optimizer: The optimiser that holds this router's parameters. If the number of cells changes, its state is
+                reset; its own ``load_state_dict`` can then restore one. An optimiser that is not passed and has state
+                of the old cells raises at its next step.
 
         Returns:
             Missing and unexpected keys.
 
         Raises:
-            TypeError: If the state is no mapping, or one of its keys no string.
+            TypeError: If the state is not a mapping, or one of its keys is not a string.
             ValueError: If the optimiser holds none of the router's parameters.
         """
         if not isinstance(state_dict, Mapping):
@@ -497,7 +507,7 @@ class VoronoiRouter(nn.Module):
         return result
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """Takes over the stored diagram first, so that parameters of any number of cells fit."""
+        """Loads the stored diagram first, so that parameters of any number of cells fit."""
         if f"{prefix}diagram.centres" not in state_dict:
             names = self.module.state_dict().keys()
             if names and any(all(f"{prefix}{part}{name}" in state_dict for name in names) for part in ("", "module.")):
@@ -513,18 +523,18 @@ class VoronoiRouter(nn.Module):
                 renew_cells(self.module, torch.zeros(diagram.num_cells, dtype=torch.int64))
                 self._set_frozen(None)
                 self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
-        self._trust_frozen()
+        self._drop_frozen_checks()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # Calls ------------------------------------------------------------------------------------------------------------
 
     @property
     def field(self) -> nn.Module:
-        """The field with stacked parameters; its own ``forward`` cannot be called any more."""
+        """The field with stacked parameters, whose own ``forward`` cannot be called."""
         return self.module
 
     def assign(self, positions: Tensor) -> Tensor:
-        """The cell that evaluates each position: positions [n, d] -> int32 [n]."""
+        """Returns the cell that evaluates each position: positions [n, d] -> int32 [n]."""
         if self.assignment == "stochastic" and self.training and self.num_cells > 1:
             return self.diagram.sample_cell(
                 positions, temperature=self.temperature, generator=self.generator, backend=self.backend
@@ -535,23 +545,23 @@ class VoronoiRouter(nn.Module):
         """Evaluates each sample in its cell; results are in the order of the samples.
 
         Args:
-            *args: Those of the module's ``forward``. For a field with a ``program``: positions [n, 3] in scene units,
-                directions, unit vectors [n, 3] or [r, 3] together with ray_index, int32 [n], the row of ``directions``
-                that belongs to each sample.
-            coords: Positions [..., d] in scene units that decide the cells, instead of the router's own rule.
-            cells: int32 or int64 [...], the cell of each sample, 0 to k - 1, instead of positions. On a GPU the check
-                of the values waits for the device. Compiled and captured graphs leave it to the operations, which
-                raise on the CPU, and give 0 for other values on a GPU. A module that has an argument ``cells`` of its
-                own gets this one, as it gets ``coords``.
-            **kwargs: Those of the module's ``forward``.
+            *args: The arguments of the module's ``forward``. A field with a ``program`` takes positions [n, 3] in scene
+                units and directions, unit vectors [n, 3]. Directions may be [r, 3] instead, together with ray_index,
+                int32 [n]: the row of ``directions`` of each sample.
+            coords: Positions [..., d] in scene units that choose the cells, instead of the router's own rule.
+            cells: The cell of each sample, 0 to k - 1, int32 or int64 [...], instead of positions. On a GPU the check
+                of the values waits for the device. In compiled and captured graphs the operations check labels: invalid
+                ones raise on the CPU, and give results of 0 on a GPU. If the module's method has an argument ``cells``
+                itself, it gets this one; the same holds for ``coords``.
+            **kwargs: The keyword arguments of the module's ``forward``.
 
         Returns:
-            What the module returns, of a radiance field (colour [n, 3], density [n]).
+            The module's results; for a radiance field (colour [n, 3], density [n]).
 
         Raises:
-            ValueError: For shapes that disagree, positions that are not given, arguments that are neither per sample
-                nor per ray or could be both, or missing directions; for labels out of range, or missing.
-            TypeError: For a module that mixes samples, or labels that are no integers.
+            ValueError: For shapes that disagree, for missing positions or directions, for arguments that are neither
+                per sample nor per ray or could be both, and for labels that are missing or out of range.
+            TypeError: For a module that mixes samples, or labels that are not integers.
         """
         return self._route("forward", args, kwargs, coords, cells)
 
@@ -562,7 +572,7 @@ class VoronoiRouter(nn.Module):
         return d
 
     def _positions(self, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None) -> Tensor:
-        """The positions [..., d] that decide the cells of a call, or labels, int32 [..., 1]; coords as given to it."""
+        """Returns the positions [..., d] that choose the cells of a call, or its labels, int32 [..., 1]."""
         if isinstance(coords, Labels):
             return coords.cells
         if not self._d:
@@ -571,37 +581,41 @@ class VoronoiRouter(nn.Module):
                 "integers of the leading shape of the samples"
             )
         positions = find_positions(self.coords if coords is None else coords, args, kwargs, self._d)
-        if self._unseen:
-            self._look_at(positions, args, kwargs, coords)
+        if self._positions_unchecked:
+            self._check_positions(positions, args, kwargs, coords)
         return positions
 
-    def _look_at(self, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> None:
-        """Warns, at the first large batch of a training, if what was taken for positions may not be positions."""
+    def _check_positions(
+        self, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None
+    ) -> None:
+        """Warns, at the first large batch of a training, if the positions look like another quantity or unit."""
         few = positions.numel() < _LARGE * positions.shape[-1]
         if few or not torch.is_grad_enabled() or torch.compiler.is_compiling():
             return
-        self._unseen = False
+        self._positions_unchecked = False
         with outside():
             flat = unwrapped(positions).detach().reshape(-1, self._d)
             counts = self.diagram.locate(flat, backend=self.backend).bincount(minlength=self.num_cells)
             source = first_tensor(args, kwargs)
             source = None if source is None else unwrapped(source)
-            doubt = doubt_of(self.coords if coords is None else coords, source, flat, counts, self.diagram.centres)
-        if doubt:
-            self._dispatch.warn_once("positions", doubt)
+            warning = position_warning(
+                self.coords if coords is None else coords, source, flat, counts, self.diagram.centres
+            )
+        if warning:
+            self._dispatch.warn_once("positions", warning)
 
     def places(self, positions: Tensor, coords: Tensor | None = None) -> dict[str, Any]:
-        """The arguments of `routed_mlp` that tell the cells of samples, and which are frozen.
+        """Returns the arguments of `routed_mlp` that choose the cells of samples and name the frozen cells.
 
         Args:
-            positions: [n, 3] in scene units, or [n, 6] Gaussians.
-            coords: [..., d], positions that decide the cells, or labels, int32 [..., 1]; None for the positions of the
+            positions: Positions [n, 3] in scene units, or Gaussians [n, 6].
+            coords: Positions [..., d] that choose the cells, or labels, int32 [..., 1]; None for the positions of the
                 samples.
         """
         diagram: Any = self._modules["diagram"]
         k, centres, frozen = diagram.num_cells, diagram._buffers["centres"], self._buffers["frozen_cells"]
-        if not torch.compiler.is_compiling() and self._doubts:
-            self._ask_doubts()
+        if not torch.compiler.is_compiling() and self._training_checks:
+            self._run_training_checks()
         if k == 1:
             return {"frozen": frozen}
         if coords is not None and not coords.is_floating_point():
@@ -618,22 +632,22 @@ class VoronoiRouter(nn.Module):
         return {"frozen": frozen, "centres": centres, "coords": coords, **tables}
 
     def _places_of(self, method: str, positions: Tensor) -> dict[str, Any]:
-        """The same for a call of a method at positions [..., d]; methods that share positions share their cells."""
+        """Returns :meth:`places` for a call of a method; methods with the same positions share their cells."""
         if self.methods:
-            self._ask_doubts()
+            self._run_training_checks()
             return {"frozen": self.frozen_cells, "cells": self._group(method, positions).cells}
         flat = positions if positions.dim() == 2 else positions.flatten(0, -2)
         return self.places(flat, flat)
 
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
-        """The program of ``forward``; or the reason why it is unknown.
+        """Returns the program of ``forward``, or the reason why it is unknown.
 
-        A field's own, of its method ``program``, is known at once; that of a module with ``fuse=True`` from a call with
-        such arguments on, which traces it.
+        A field's method ``program`` gives it at once. For a module with ``fuse=True`` it is known after a first call
+        with arguments of the same kind, which traces the module.
 
         Args:
-            *args: Tensors [n, w] of the kinds that ``forward`` gets, of two samples or more.
-            trace: Whether a module that was not is traced on these, which are 8 samples or more.
+            *args: Tensors [n, w] as ``forward`` gets them, n >= 2.
+            trace: Whether to trace a module that has not been traced, on these arguments; needs n >= 8.
 
         Examples:
             >>> import torch
@@ -650,9 +664,9 @@ class VoronoiRouter(nn.Module):
         if callable(self.coords) or isinstance(self.coords, slice):
             return "other positions than those of the samples decide the cells"
         k, dispatch = self.num_cells, self._dispatch
-        program = "" if self._given is None else self._given.whole(self.module)
-        if isinstance(program, str) and (self.fuse or self._given is None):
-            arguments = args if self._given is None else (*args, None)
+        program = "" if self._field_program is None else self._field_program.with_activation(self.module)
+        if isinstance(program, str) and (self.fuse or self._field_program is None):
+            arguments = args if self._field_program is None else (*args, None)
             positions, device, grouping = args[0][:, : self._d], args[0].device, None
             if trace and self.fuse:
                 cells = None if k == 1 else self.diagram.locate(positions, backend=self.backend)
@@ -669,7 +683,7 @@ class VoronoiRouter(nn.Module):
         )
 
     def explain(self) -> str:
-        """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
+        """Returns a line for each method: the way in which its calls ran (fused, grouped or cell by cell), and why.
 
         Examples:
             >>> import torch
@@ -678,25 +692,25 @@ class VoronoiRouter(nn.Module):
             >>> router.explain()
             'forward: not called yet'
         """
-        given = self._given is not None and not isinstance(self._given.look(self.module), str)
-        known = {"forward": "fused"} if given else {}
-        return self._dispatch.explain(("forward", *self.methods), known)
+        is_fused = self._field_program is not None and not isinstance(self._field_program.look(self.module), str)
+        default_ways = {"forward": "fused"} if is_fused else {}
+        return self._dispatch.explain(("forward", *self.methods), default_ways)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Refuses attributes of the module, which would have no effect here."""
+        """Raises AttributeError for attributes of the module, which would have no effect on the router."""
         members = self.__dict__
-        known = hasattr(type(self), name) or any(name in names for names in (members, self._modules, self._buffers))
-        if "_given" in members and not known and hasattr(self.module, name):
+        is_own = hasattr(type(self), name) or any(name in names for names in (members, self._modules, self._buffers))
+        if "_field_program" in members and not is_own and hasattr(self.module, name):
             raise AttributeError(
                 f"VoronoiRouter: {name} belongs to {type(self.module).__name__}; set router.module.{name}"
             )
         if name in _READ and "_dispatch" in members:
-            self._dispatch.known = {}
+            self._dispatch.cached = {}
         super().__setattr__(name, value)
 
     def __getattr__(self, name: str) -> Any:
-        """The routed methods, beside what a module has."""
-        for registry in ("_modules", "_buffers"):  # without the calls of ``super``, which each call would wait for
+        """Returns a routed method, or an attribute of ``nn.Module``."""
+        for registry in ("_modules", "_buffers"):  # faster than ``super().__getattr__``
             if name in (entries := self.__dict__.get(registry, ())):
                 return entries[name]
         methods = self.__dict__.get("methods", ())
@@ -708,12 +722,12 @@ class VoronoiRouter(nn.Module):
             module = self.__dict__.get("_modules", {}).get("module")
             if module is None or name not in dir(module):
                 raise
-            has, there = f"VoronoiRouter: {name} of {type(module).__name__}", f"router.module.{name}"
+            has, place = f"VoronoiRouter: {name} of {type(module).__name__}", f"router.module.{name}"
             if not callable(inspect.getattr_static(module, name, None)):
-                raise AttributeError(f"{has} is {there}, where parameters are of all cells, [k, ...]") from None
+                raise AttributeError(f"{has} is {place}, where parameters are of all cells, [k, ...]") from None
             raise AttributeError(
                 f"{has} is not routed; pass methods={[*methods, name]!r} to the router if it evaluates samples, else "
-                f"call {there}"
+                f"call {place}"
             ) from None
 
     def _routed(
@@ -729,12 +743,12 @@ class VoronoiRouter(nn.Module):
         coords: Tensor | Labels | None,
         cells: Tensor | None,
     ) -> Any:
-        """One call of a method of the module; one that is not known breaks a graph of ``torch.compile``."""
+        """Runs one call of a method. A call that is not in the cache breaks a graph of ``torch.compile``."""
         if cells is not None:
-            own = self._own.get(method, ())
-            if coords is not None and "coords" in own:
+            names = self._argument_names.get(method, ())
+            if coords is not None and "coords" in names:
                 kwargs, coords = {**kwargs, "coords": coords}, None
-            if "cells" in own:
+            if "cells" in names:
                 kwargs = {**kwargs, "cells": cells}
             elif coords is not None:
                 raise ValueError("VoronoiRouter: coords must be None where cells are given, got both")
@@ -743,16 +757,16 @@ class VoronoiRouter(nn.Module):
                 args = args if self.shared or self.per_ray else coords.widen(args)
         if self._resized and not torch.compiler.is_compiling():
             self._check_wrapper()
-        if method == "forward" and self._given is not None:
-            results = self._given.run(self, args, kwargs, coords)
+        if method == "forward" and self._field_program is not None:
+            results = self._field_program.run(self, args, kwargs, coords)
             if results is not None:
                 return results
-        known: KnownCall | None = None
+        cached: CachedCall | None = None
         if self.fuse:
             module: Any = self._modules["module"]
-            kind = kind_of(method, module.training, args, kwargs, coords)
-            known = None if kind is None else self._dispatch.find(kind, self.num_cells)
-        if known is not None and (results := known.run(self, args, kwargs, coords)) is not None:
+            key = call_key(method, module.training, args, kwargs, coords)
+            cached = None if key is None else self._dispatch.find(key, self.num_cells)
+        if cached is not None and (results := cached.run(self, args, kwargs, coords)) is not None:
             return results
         if torch.compiler.is_exporting():
             raise RuntimeError(
@@ -764,7 +778,7 @@ class VoronoiRouter(nn.Module):
         return run(method, args, kwargs, coords)
 
     def _check_wrapper(self) -> None:
-        """Raises RuntimeError in a call of a ``DistributedDataParallel`` that has been made for other sizes."""
+        """Raises RuntimeError in a ``DistributedDataParallel`` that was made for parameters of other sizes."""
         wrapper: Any = nn.parallel.DistributedDataParallel._active_ddp_module
         if wrapper is None:
             return
@@ -781,39 +795,41 @@ class VoronoiRouter(nn.Module):
     ) -> Any:
         """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
         refuse_transforms()
-        self._ask_doubts()
+        self._run_training_checks()
         if isinstance(coords, Labels):
             coords.ensure(self.num_cells)
-        called, like = getattr(self.module, method), kind_of(method, self.module.training, args, kwargs, coords)
-        field = method == "forward" and self._given is not None
-        if field and (each := each_direction(args, kwargs)) is not None:
-            (args, kwargs), like = each, None
+        function, key = getattr(self.module, method), call_key(method, self.module.training, args, kwargs, coords)
+        has_program = method == "forward" and self._field_program is not None
+        if has_program and (expanded := each_direction(args, kwargs)) is not None:
+            (args, kwargs), key = expanded, None
         placed = coords is not None and not isinstance(coords, Labels)
-        if placed and "coords" in (accepted_names([called]) or ()):  # the method's own argument
-            kwargs, coords, like = {**kwargs, "coords": coords}, None, None
+        if placed and "coords" in (accepted_names([function]) or ()):  # coords is an argument of the method
+            kwargs, coords, key = {**kwargs, "coords": coords}, None, None
         positions = self._positions(args, kwargs, coords)
         call = self._call(method, positions, args, kwargs)
-        call.like = like
+        call.key = key
         grouping = self._group(method, positions)
         return self._dispatch.evaluate(call, grouping, self._options, self.frozen_cells).restored(call.layout)
 
-    def _ask_doubts(self) -> None:
-        """Warns or raises, in the first training calls, where optimisers do not do what is expected of them."""
+    def _run_training_checks(self) -> None:
+        """Warns in the first training calls if parameters are not trained; raises if frozen cells change."""
         if torch.is_grad_enabled():
-            self._doubts = [doubt for doubt in self._doubts if not doubt.is_over(self._dispatch.warn_once)]
+            self._training_checks = [
+                check for check in self._training_checks if not check.is_over(self._dispatch.warn_once)
+            ]
 
-    def _trust_frozen(self) -> None:
-        """Frozen cells may be others from now on."""
-        self._doubts = [doubt for doubt in self._doubts if not isinstance(doubt, FrozenRows)]
+    def _drop_frozen_checks(self) -> None:
+        """Drops the checks of frozen cells, whose set or values may change after this call."""
+        self._training_checks = [check for check in self._training_checks if not isinstance(check, FrozenRows)]
 
     @property
     def _options(self) -> Options:
         return Options(self.fuse, self.way, bool(self.methods), self._names)
 
     def _call(self, method: str, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
-        """A call of a method for samples at positions [..., d], or with labels, int32 [..., 1]."""
-        known = argument_names(getattr(self.module, method))
-        names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
+        """Describes a call of a method, for samples at positions [..., d] or with labels, int32 [..., 1]."""
+        positional = argument_names(getattr(self.module, method))
+        names = [*positional[: len(args)], *map(str, range(len(positional), len(args)))]
 
         def named(item: str | int) -> str:
             return item if isinstance(item, str) else names[item] if item < len(names) else str(item)
@@ -829,28 +845,28 @@ class VoronoiRouter(nn.Module):
     _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)
 
     def _group(self, method: str, positions: Tensor) -> Grouping:
-        """The samples in their cells; other methods that are called with the same positions share it."""
+        """Groups the samples by cell; methods that are called with the same positions share the grouping."""
         labelled, centres = not positions.is_floating_point(), self.diagram.centres
         drawn = self.assignment == "stochastic" and self.training and not labelled
-        version = object() if centres.is_inference() else centres._version  # inference tensors have no version
+        version = object() if centres.is_inference() else centres._version  # no version counter
         key = self.diagram, version, drawn, labelled, self.temperature, self.backend
-        kept = bool(self.methods) and not transformed()
-        known = self._assigned if kept else None
-        if known is not None and known.serves(method, positions, key, drawn):
-            return known.grouping
+        keeps = bool(self.methods) and not transformed()
+        assigned = self._assigned if keeps else None
+        if assigned is not None and assigned.serves(method, positions, key, drawn):
+            return assigned.grouping
         with outside():
             flat, k = unwrapped(positions).detach().flatten(0, -2), self.num_cells
             if flat.shape[0]:
                 cells = None if k == 1 else flat[:, 0] if labelled else self.assign(flat)
-            else:  # the module runs on placeholders, since it may not take an empty batch
+            else:  # placeholders, since the module may not take an empty batch
                 cells = torch.zeros(2, dtype=torch.int32, device=flat.device)
             grouping = Grouping(cells, flat.shape[0] or 2, k, flat.device, self.backend)
-        if kept:
+        if keeps:
             self._assigned = Assigned(grouping, positions.detach().clone(), key, {method})
         return grouping
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_watches": [], "_doubts": [], "_assigned": None}
+        return {**self.__dict__, "_watches": [], "_training_checks": [], "_assigned": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -867,19 +883,19 @@ class VoronoiRouter(nn.Module):
         self._dispatch.forget()
         self._assigned = None
         super()._apply(fn, recurse)
-        self._doubts = [Untrained(self.module)]
+        self._training_checks = [Untrained(self.module)]
         freeze_cells(self.module, self.frozen_cells)
         return self
 
     def extra_repr(self) -> str:
-        """What ``print(router)`` shows beside the field's modules."""
+        """Returns the line that ``print(router)`` shows above the submodules."""
         if not self._d:
             return f"num_cells={self.num_cells}, without centres"
         return f"num_cells={self.num_cells}, depth={self.diagram.depth}, assignment={self.assignment!r}"
 
 
 def _diagram_of(cells: Any) -> VoronoiDiagram:
-    """A diagram of the router's own, of what it was given: a diagram, centres [k, d], or a number of cells."""
+    """Returns the router's own diagram, from a diagram, centres [k, d] or a number of cells."""
     count = None if isinstance(cells, bool) else cells
     if isinstance(count, numbers.Integral):
         return VoronoiDiagram.without_centres(int(count))
@@ -890,7 +906,7 @@ def _diagram_of(cells: Any) -> VoronoiDiagram:
 
 
 def _refuse_places(coords: Any, assignment: str) -> None:
-    """Raises ValueError for options that speak of positions, where labels tell the cells."""
+    """Raises ValueError for options about positions, in a router whose cells are chosen by labels."""
     if coords is not None:
         raise ValueError(f"VoronoiRouter: coords must be None without centres, since labels tell cells, got {coords!r}")
     if assignment != "nearest":
@@ -898,7 +914,7 @@ def _refuse_places(coords: Any, assignment: str) -> None:
 
 
 def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> None:
-    """Raises ValueError or TypeError for an option that is wrong; ``lists`` are per_ray and the like."""
+    """Raises ValueError or TypeError for a wrong option; ``lists`` are the options that must be lists, by name."""
     coords = options["coords"]
     rules = {
         "assignment": (options["assignment"] in ("nearest", "stochastic"), "'nearest' or 'stochastic'"),
@@ -923,10 +939,10 @@ def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> 
             raise ValueError(f"VoronoiRouter: methods must name methods of {kind}, got {name!r}")
         if hasattr(VoronoiRouter, name):
             raise ValueError(f"VoronoiRouter: methods must not name what a router has itself, got {name!r}")
-    known = accepted_names(getattr(module, name) for name in ("forward", *methods))
+    accepted = accepted_names(getattr(module, name) for name in ("forward", *methods))
     for item in (*(lists["per_ray"] or ()), *lists["shared"]):
-        if isinstance(item, str) and known is not None and item.split(".")[0] not in known:
+        if isinstance(item, str) and accepted is not None and item.split(".")[0] not in accepted:
             raise ValueError(
-                f"VoronoiRouter: per_ray and shared must name arguments of {kind}, one of {', '.join(known)}, "
+                f"VoronoiRouter: per_ray and shared must name arguments of {kind}, one of {', '.join(accepted)}, "
                 f"got {item!r}"
             )

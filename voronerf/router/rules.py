@@ -1,7 +1,7 @@
-"""The rules for PyTorch's own functions where they meet the parameters of all cells.
+"""The rules by which PyTorch's functions run on the parameters of all cells at once.
 
-Products go to ``grouped_linear``, scales and shifts are repeated for each cell's rows, tables are looked up in the
-cell's part. A rule returns ``NotImplemented`` for arguments that have no form for all cells at once.
+Products use ``grouped_linear``, scales and shifts are repeated for each cell's rows, and look-ups read the cell's part
+of a table. A rule returns ``NotImplemented`` for arguments that it does not support.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _ELEMENTWISE = """
     __mod__ __pow__ __rpow__ __lt__ __le__ __gt__ __ge__ __eq__ __ne__
 """
 _INTEGERS = (torch.int32, torch.int64)
-_FEW = 1 << 12  # most values a cell that are read from planes in one look-up
+_FEW = 1 << 12  # most values a cell that planes give in one joint look-up
 
 
 def rule(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Registers a rule for some functions."""
+    """Returns a decorator that registers a rule for some functions."""
 
     def decorate(rule: Callable[..., Any]) -> Callable[..., Any]:
         for function in functions:
@@ -46,7 +46,7 @@ def rule(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 def _spellings(names: str) -> frozenset[Any]:
-    """The functions and methods of these names, in-place ones too."""
+    """Returns the functions and methods of these names, including in-place ones."""
     return find(" ".join(f"{name} {name}_" for name in names.split()), torch, torch.Tensor)
 
 
@@ -55,43 +55,43 @@ def _spellings(names: str) -> frozenset[Any]:
 
 @rule(F.linear)
 def linear(run: GroupedRun, input: Tensor, weight: Tensor, bias: Tensor | None = None) -> Any:
-    """Rows [n * m, ..., i] with a weight [o, i]."""
+    """Multiplies rows [n * m, ..., i] by a weight [o, i]."""
     if not run.is_rows(input) or input.dim() < 2 or weight.dim() != 2 or run.is_rows(bias) or run.is_rows(weight):
         return NotImplemented
     if input.shape[-1] != weight.shape[1]:
         raise RuntimeError(
             f"VoronoiRouter: a linear layer of the module takes {weight.shape[1]} features, got {list(input.shape)}"
         )
-    # Contiguous here: the layer keeps what it is given, and would copy it once more for its gradients.
+    # Contiguous, because the layer saves its input, and would copy a strided one again for its gradients.
     flat = (input if input.dim() == 2 else input.reshape(-1, input.shape[-1])).contiguous()
     m = run.entries(input) * (flat.shape[0] // input.shape[0])
-    together = isinstance(weight, PerCell) and (bias is None or isinstance(bias, PerCell))
+    is_joint = isinstance(weight, PerCell) and (bias is None or isinstance(bias, PerCell))
     if isinstance(weight, PerCell):
         y = _product(run, flat, m, weight.stacked, bias.stacked if isinstance(bias, PerCell) else None)
     else:
         y = F.linear(flat, weight)
-    if bias is not None and not together:
+    if bias is not None and not is_joint:
         y = y + (run.rows_of(bias, m) if isinstance(bias, PerCell) else bias)
-    # Not a view of rows that are these already: what is written into a view takes the gradient along a slow way.
+    # No view if the shape is right already, because writes into a view make the backward slow.
     return y if input.dim() == 2 else y.reshape(*input.shape[:-1], weight.shape[0])
 
 
 def _product(run: GroupedRun, x: Tensor, m: int, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """Rows [n * m, i] with weights [k, o, i] and biases [k, o]; complex ones as real ones of twice the features."""
+    """Multiplies rows [n * m, i] by weights [k, o, i] and adds biases [k, o]; complex as real of twice the features."""
     offsets, backend = run.grouping.scaled_offsets(m), run.grouping.backend
     if not weight.is_complex():
         return grouped_linear(x, offsets, weight, bias, backend=backend)
     real, imaginary = weight.real, weight.imag
     weight = torch.cat([torch.cat([real, -imaginary], 2), torch.cat([imaginary, real], 2)], 1)
     bias = None if bias is None else torch.cat([bias.real, bias.imag], 1)
-    with torch.autocast(x.device.type, enabled=False):  # which leaves complex numbers as they are
+    with torch.autocast(x.device.type, enabled=False):  # autocast does not convert complex numbers
         y = grouped_linear(torch.cat([x.real, x.imag], 1), offsets, weight, bias, backend=backend)
     return torch.complex(*y.chunk(2, 1))
 
 
 @rule(torch.matmul, torch.Tensor.matmul, torch.mm, torch.Tensor.mm, torch.Tensor.__matmul__)
 def matmul(run: GroupedRun, input: Tensor, other: Tensor) -> Any:
-    """Rows [n * m, ..., i] with [i, o]."""
+    """Multiplies rows [n * m, ..., i] by a matrix [i, o]."""
     if not isinstance(other, PerCell) or other.dim() != 2:
         return NotImplemented
     return linear(run, input, PerCell(other.stacked.transpose(1, 2)))
@@ -102,7 +102,7 @@ register(torch.Tensor.__rmatmul__, lambda run, other, input: matmul(run, input, 
 
 @rule(torch.addmm, torch.Tensor.addmm)
 def addmm(run: GroupedRun, input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: float = 1, alpha: float = 1) -> Any:
-    """A shift and rows [n * m, i] with [i, o], without factors."""
+    """Multiplies rows [n * m, i] by a matrix [i, o] and adds a shift, without factors."""
     product = matmul(run, mat1, mat2) if beta == alpha == 1 else NotImplemented
     return product if product is NotImplemented else _elementwise(torch.add, run, run.mark(product), input)
 
@@ -112,7 +112,7 @@ _PAIR = re.compile(r"(\w+),(\w+)->(\w+)")
 
 @rule(torch.einsum)
 def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
-    """Rows with a parameter, their common letters all summed or all kept: ``"bid,iod->bo"``, ``"bi,oi->bio"``."""
+    """Multiplies rows by a parameter, with all common letters summed or kept: ``"bid,iod->bo"``, ``"bi,oi->bio"``."""
     operands = tuple(operands[0]) if isinstance(operands[0], (list, tuple)) else operands
     match = _PAIR.fullmatch(equation.replace(" ", ""))
     if match is None or len(operands) != 2:
@@ -121,9 +121,9 @@ def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
     if isinstance(x, PerCell):
         x, weight, of_x, of_weight = weight, x, of_weight, of_x
     summed = "".join(letter for letter in of_x if letter not in out)
-    alone = set(of_x) ^ set(of_weight)
-    twice = any(len(set(letters)) != len(letters) for letters in (of_x, of_weight, out))
-    if not run.is_rows(x) or twice or not alone <= set(out) or out[0] in of_weight:
+    unshared = set(of_x) ^ set(of_weight)
+    repeats = any(len(set(letters)) != len(letters) for letters in (of_x, of_weight, out))
+    if not run.is_rows(x) or repeats or not unshared <= set(out) or out[0] in of_weight:
         return NotImplemented
     if not summed:
 
@@ -131,7 +131,7 @@ def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
             tensor = tensor.permute([letters.index(letter) for letter in out if letter in letters])
             return tensor[tuple(slice(None) if letter in letters else None for letter in out)]
 
-        factor = PerCell(spread(weight.stacked, out[0] + of_weight))  # cells come where samples do
+        factor = PerCell(spread(weight.stacked, out[0] + of_weight))  # cells come first, like samples
         return _elementwise(torch.mul, run, run.mark(spread(x, of_x)), factor)
     if set(of_x) & set(of_weight) != set(summed):
         return NotImplemented
@@ -154,44 +154,44 @@ def convolution(
     dilation: Any = 1,
     groups: int = 1,
 ) -> Any:
-    """Kernels of one place: rows [n * m, i, ...], or [i, ...] or [1, i, ...] with n places along one dimension."""
+    """Convolves rows [n * m, i, ...] with kernels of one place; [i, ...] or [1, i, ...] have n in another dimension."""
     places, channel = weight.dim() - 2, input.dim() - weight.dim() + 1
     if not run.is_rows(input) or set(weight.shape[2:]) != {1} or groups != 1:
         return NotImplemented
     if stride not in (1, (1,) * places) or padding not in (0, (0,) * places):
         return NotImplemented
-    of_samples = [d for d in range(channel + 1, input.dim()) if input.shape[d] == run.n]
-    of_samples = of_samples if channel == 0 or input.shape[0] % run.n else [0]
-    if len(of_samples) != 1:
+    sample_dims = [d for d in range(channel + 1, input.dim()) if input.shape[d] == run.n]
+    sample_dims = sample_dims if channel == 0 or input.shape[0] % run.n else [0]
+    if len(sample_dims) != 1:
         return NotImplemented
     flat = PerCell(weight.stacked.flatten(2)) if isinstance(weight, PerCell) else weight.flatten(1)
-    y = linear(run, run.mark(input.movedim((of_samples[0], channel), (0, -1))), flat, bias)
-    return y if y is NotImplemented else y.movedim((0, -1), (of_samples[0], channel))
+    y = linear(run, run.mark(input.movedim((sample_dims[0], channel), (0, -1))), flat, bias)
+    return y if y is NotImplemented else y.movedim((0, -1), (sample_dims[0], channel))
 
 
 # Scales and shifts ----------------------------------------------------------------------------------------------------
 
 
 def _elementwise(func: Any, run: GroupedRun, *args: Any, **kwargs: Any) -> Any:
-    """A function of entries, for rows [n * m, ...] and parameters that broadcast to them."""
+    """Runs an elementwise function on rows [n * m, ...] and parameters that broadcast to them."""
     tensors = tensors_of((args, kwargs))
     rows = [tensor for tensor in tensors if run.is_rows(tensor)]
-    if not rows or (isinstance(args[0], PerCell) and writes_in_place(func)):  # which writes samples into a parameter
+    if not rows or (isinstance(args[0], PerCell) and writes_in_place(func)):  # no writes into a parameter
         return NotImplemented
     dim, m = max(tensor.dim() for tensor in rows), run.entries(rows[0])
     if any(tensor.dim() != dim or run.entries(tensor) != m for tensor in rows):
         return NotImplemented
     if any(t.dim() > dim or (t.dim() == dim and t.shape[0] != 1) for t in tensors if not run.is_rows(t)):
         return NotImplemented
-    wide = [tensor.dtype for tensor in tensors if tensor.dim() > 0 and tensor.is_floating_point()]
+    dtypes = [tensor.dtype for tensor in tensors if tensor.dim() > 0 and tensor.is_floating_point()]
 
     def expanded(value: Tensor) -> Tensor:
         if not isinstance(value, PerCell):
             return value
         shape = value.shape[value.dim() == dim :]
         parameter = run.rows_of(value, m).reshape(-1, *[1] * (dim - 1 - len(shape)), *shape)
-        # A tensor without dimensions does not decide the dtype of a result, and its repetition must not either.
-        return parameter.to(functools.reduce(torch.promote_types, wide)) if value.dim() == 0 and wide else parameter
+        # A zero-dimensional tensor does not affect the result's dtype, so its repetition must not either.
+        return parameter.to(functools.reduce(torch.promote_types, dtypes)) if value.dim() == 0 and dtypes else parameter
 
     args, kwargs = map_tensors((args, kwargs), expanded)
     return func(*args, **kwargs)
@@ -203,7 +203,7 @@ for _function in _spellings(_ELEMENTWISE):
 
 @rule(*_spellings("expand broadcast_to"))
 def expand(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
-    """A parameter repeated once a sample, ``p.expand(n, -1)``."""
+    """Repeats a parameter once a sample, ``p.expand(n, -1)``."""
     sizes = tuple(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes
     if not isinstance(source, PerCell) or len(sizes) <= 1 or sizes[0] != run.n:
         return NotImplemented
@@ -216,19 +216,19 @@ def expand(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
 
 @rule(torch.Tensor.expand_as)
 def expand_as(run: GroupedRun, source: Tensor, other: Tensor) -> Any:
-    """A parameter repeated as rows are, ``p.expand_as(x)``."""
+    """Repeats a parameter once for each row, ``p.expand_as(x)``."""
     return expand(run, source, *other.shape) if run.is_rows(other) else NotImplemented
 
 
 @rule(torch.Tensor.data.__get__)  # type: ignore[attr-defined]
 def data(run: GroupedRun, source: Tensor) -> Any:
-    """The values of a parameter without its gradient."""
+    """Detaches a parameter, ``p.data``."""
     return PerCell(source.stacked.detach()) if isinstance(source, PerCell) else NotImplemented
 
 
 @rule(torch.Tensor.repeat, torch.tile, torch.Tensor.tile)
 def repeat(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
-    """A parameter repeated once a sample, ``p.repeat(n, 1)``."""
+    """Repeats a parameter once a sample, ``p.repeat(n, 1)``."""
     counts = tuple(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes
     rows = expand(run, source, *counts[:1], *[-1] * (len(counts) - 1))
     return rows if rows is NotImplemented else rows.repeat(1, *counts[1:])
@@ -240,7 +240,7 @@ def repeat(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
 def _norm(
     func: Any, run: GroupedRun, input: Tensor, normalized_shape: Any, weight: Any = None, bias: Any = None, **more: Any
 ) -> Any:
-    """A norm over the last dimensions: without its parameters, then those."""
+    """Normalises over the last dimensions without parameters, then applies weight and bias."""
     if not run.is_rows(input):
         return NotImplemented
     x = func(input, normalized_shape, **more)
@@ -260,7 +260,7 @@ for _function in (F.layer_norm, F.rms_norm):
 
 
 def _look_up(run: GroupedRun, table: PerCell, index: Tensor, lowest: int) -> Tensor:
-    """Entries [n * m, ..., *shape] of tables [e, *shape], for rows of indices [n * m, ...]."""
+    """Looks up entries [n * m, ..., *shape] of tables [e, *shape], for rows of indices [n * m, ...]."""
     entries, m = table.shape[0], run.entries(index)
     low, high = (int(bound) for bound in torch.aminmax(index)) if index.numel() else (0, 0)
     if low < lowest or high >= entries:
@@ -269,14 +269,14 @@ def _look_up(run: GroupedRun, table: PerCell, index: Tensor, lowest: int) -> Ten
     if low < 0:
         index = torch.where(index < 0, index + entries, index)
     index = index + (run.grouping.cells_of_rows(m) * entries).reshape(-1, *[1] * (index.dim() - 1))
-    return _found(run, table, math.prod(table.shape[1:]), index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
+    return _gather(run, table, math.prod(table.shape[1:]), index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
 
 
-def _found(run: GroupedRun, table: PerCell, c: int, index: Tensor) -> Tensor:
-    """Entries [m, c] of tables that hold e * c numbers for each cell, for indices [m] that count through all cells.
+def _gather(run: GroupedRun, table: PerCell, c: int, index: Tensor) -> Tensor:
+    """Gathers entries [m, c] of tables of e * c numbers a cell, for indices [m] that count through all cells.
 
-    A field reads a table many times in one forward: the eight corners of a voxel, for several levels. The gradient of
-    each look-up has the size of the whole table, so all look-ups of one table add theirs to one buffer.
+    A field reads a table many times in one forward pass: the eight corners of a voxel, for several levels. The gradient
+    of each look-up has the size of the whole table, so all look-ups of one table accumulate in one buffer.
     """
     stacked, start = table.origin
     if transformed():  # torch.func would copy the buffer
@@ -286,14 +286,14 @@ def _found(run: GroupedRun, table: PerCell, c: int, index: Tensor) -> Tensor:
         buffer: list[Tensor] = []
         flat = stacked.reshape(-1, c)
         source = _Source.apply(flat, buffer) if flat.requires_grad and torch.is_grad_enabled() else flat
-        run.tables[key] = stacked, source, buffer  # ``stacked`` as well: nothing else may get its id
+        run.tables[key] = stacked, source, buffer  # keeps ``stacked`` alive, and so its id
     _, source, buffer = run.tables[key]
     rows: Tensor = _LookUp.apply(source, start * (table.numel() // c), index, buffer)
     return rows
 
 
 class _Source(torch.autograd.Function):
-    """A table [k * e, c] whose gradient is what its look-ups have put into a buffer in this backward pass."""
+    """A table [k * e, c] whose gradient is the buffer in which its look-ups accumulate in a backward pass."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, buffer: list[Tensor]) -> Tensor:
@@ -310,7 +310,7 @@ class _Source(torch.autograd.Function):
 
 
 class _LookUp(torch.autograd.Function):
-    """Rows of a :class:`_Source`, for indices that count from one of its rows."""
+    """A look-up of rows of a :class:`_Source`, for indices relative to one of its rows."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, first: int, index: Tensor, buffer: list[Tensor]) -> Tensor:
@@ -321,7 +321,7 @@ class _LookUp(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, None, None]:
         table, index = ctx.saved_tensors
-        if torch.is_grad_enabled():  # the gradient has a gradient itself, which a buffer would lose
+        if torch.is_grad_enabled():  # a buffer would lose the gradient's gradient
             return torch.zeros_like(table).index_add(0, index + ctx.first, gradient), None, None, None
         if not ctx.buffer:
             ctx.buffer.append(on_huge_pages(torch.empty_like(table)).zero_())
@@ -334,14 +334,14 @@ class _LookUp(torch.autograd.Function):
 
 
 def _as_moved(rows: Tensor) -> Tensor:
-    """Rows of one number as numbers, and of two as one complex number on a CPU, where torch moves these faster."""
+    """Views rows [m, 1] as [m] and, on a CPU, float32 rows [m, 2] as complex numbers, which torch moves faster."""
     paired = rows.device.type == "cpu" and rows.shape[-1] == 2 and rows.dtype == torch.float32
     return torch.view_as_complex(rows) if paired else rows[:, 0] if rows.shape[-1] == 1 else rows
 
 
 @rule(F.embedding)
 def embedding(run: GroupedRun, input: Tensor, weight: Tensor, *, norm_type: float = 2.0, **options: Any) -> Any:
-    """Rows of indices into a table [e, c], without any of the options."""
+    """Looks up rows of indices in a table [e, c], without options."""
     if not isinstance(weight, PerCell) or weight.dim() != 2 or not run.is_rows(input):
         return NotImplemented
     if any(value is not None and value is not False for value in options.values()):
@@ -351,7 +351,7 @@ def embedding(run: GroupedRun, input: Tensor, weight: Tensor, *, norm_type: floa
 
 @rule(torch.Tensor.__getitem__)
 def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
-    """``table[index]`` for a table [e, c] and rows of integers."""
+    """Looks up ``table[index]`` for a table [e, c] and rows of integers."""
     if not isinstance(source, PerCell) or not source.dim() or not run.is_rows(index):
         return NotImplemented
     return _look_up(run, source, index, -source.shape[0]) if index.dtype in _INTEGERS else NotImplemented
@@ -359,44 +359,44 @@ def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
 
 @rule(F.grid_sample)
 def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) -> Any:
-    """Planes [p, c, h, w] or volumes [p, c, d, h, w] at rows [p, ..., 2] or [p, ..., 3], p of them for each cell.
+    """Samples p planes [p, c, h, w] or volumes [p, c, d, h, w] a cell at rows [p, ..., 2] or [p, ..., 3].
 
-    Cells of many samples come one after the other. Those of few have one look-up together, which reads and writes the
-    corners alone.
+    Large batches are sampled cell by cell. For small batches, one look-up of all cells reads and writes only the
+    corners.
     """
-    places = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
-    if not isinstance(input, PerCell) or not run.is_rows(grid) or len(places) != 1 or len(grid) != len(input):
+    sample_dims = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
+    if not isinstance(input, PerCell) or not run.is_rows(grid) or len(sample_dims) != 1 or len(grid) != len(input):
         return NotImplemented
-    plain = options["mode"] == "bilinear" and options["padding_mode"] in ("zeros", "border") and input.dim() == 4
-    few = grid[..., 0].numel() * input.shape[1] <= _FEW * run.grouping.k
-    if plain and few and input.origin[0].numel() < 1 << 31:
-        cells = run.grouping.sorted_cells.reshape(-1, *[1] * (2 - places[0])).expand(grid.shape[1:3])
+    is_bilinear = options["mode"] == "bilinear" and options["padding_mode"] in ("zeros", "border") and input.dim() == 4
+    is_small = grid[..., 0].numel() * input.shape[1] <= _FEW * run.grouping.k
+    if is_bilinear and is_small and input.origin[0].numel() < 1 << 31:
+        cells = run.grouping.sorted_cells.reshape(-1, *[1] * (2 - sample_dims[0])).expand(grid.shape[1:3])
         zeros, corners = options["padding_mode"] == "zeros", bool(options["align_corners"])
         return torch.cat([_bilinear(run, input, i, grid[i], cells, zeros, corners) for i in range(len(input))])
     occupied, planes = run.grouping.occupied, cells_of(input.stacked)
-    points = grid.split([last - first for _, first, last in occupied], places[0])
+    points = grid.split([last - first for _, first, last in occupied], sample_dims[0])
     sampled = [F.grid_sample(planes[cell], at, **options) for (cell, _, _), at in zip(occupied, points, strict=True)]
-    return torch.cat(sampled, places[0] + 1) if len(sampled) > 1 else sampled[0]
+    return torch.cat(sampled, sample_dims[0] + 1) if len(sampled) > 1 else sampled[0]
 
 
 def _bilinear(
     run: GroupedRun, planes: PerCell, i: int, grid: Tensor, cells: Tensor, zeros: bool, align_corners: bool
 ) -> Tensor:
-    """Planes i of [p, c, h, w] of ``cells``, [a, b], at points [a, b, 2] -> [1, c, a, b], as ``F.grid_sample``."""
+    """Samples plane i of [p, c, h, w] of ``cells`` [a, b] at points [a, b, 2], like ``F.grid_sample``: [1, c, a, b]."""
     p, c, h, w = planes.shape
     size = grid.new_tensor([w, h]).view(2, 1, 1)
     x = grid.movedim(-1, 0).contiguous() + 1  # [2, a, b]
     x = x * (0.5 * (size - 1)) if align_corners else (x * size - 1) * 0.5
-    if not zeros:  # beyond the border and on it nothing depends on x
+    if not zeros:  # no gradient on the border and beyond
         x = torch.where((x > 0) & (x < size - 1), x, x.detach().clamp(min=0).minimum(size - 1))
     low = x.detach().floor()
     high, corner = x - low, torch.stack([low, low + 1])
     inside = (corner >= 0) & (corner < size)
     corner, share = corner.where(inside, 0).int(), torch.stack([1 - high, high]) * inside  # [2, 2, a, b]
-    along = 1 if w == 1 and align_corners else 2  # corners of a line, which lies at 0 across
+    along = 1 if w == 1 and align_corners else 2  # a line has two corners, at 0 across
     index = (corner[:, None, 1] * w + corner[:along, 0]).flatten(0, 1)[:, None]
     channel = torch.arange(c, dtype=torch.int32, device=cells.device).view(-1, 1, 1)
     first = ((cells.int() * p + i) * c + channel) * (h * w)
-    index = index + first  # [2 or 4, c, a, b], of values of all planes
-    corners = _found(run, planes, 1, index.reshape(-1)).reshape(index.shape)
+    index = index + first  # [2 or 4, c, a, b], into the values of all planes
+    corners = _gather(run, planes, 1, index.reshape(-1)).reshape(index.shape)
     return (corners * (share[:, None, 1] * share[:along, 0]).flatten(0, 1)[:, None]).sum(0)[None]

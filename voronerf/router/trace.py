@@ -1,8 +1,7 @@
-"""One call of a module as a graph of functions.
+"""Traces one call of a module as a graph of functions.
 
-The number of samples is one that no other size is a multiple of. Every function that PyTorch's function modes see is
-recorded with the line that called it, and so is every custom function of autograd, which a profile function of this
-thread sees.
+The number of samples is chosen such that no other size is a multiple of it. A function mode records every PyTorch
+function with the line that called it. A profile function of the thread records custom autograd functions.
 """
 
 from __future__ import annotations
@@ -26,23 +25,23 @@ from voronerf.router.grouping import cell_parameters, owned_parameters, parts_of
 from voronerf.router.layout import Call, rebuild, tensors_of
 from voronerf.router.watch import Inputs, lookup
 
-CONSTANTS, CELLS, SAMPLES = range(3)  # what a value depends on: the latter of these
+CONSTANTS, CELLS, SAMPLES = range(3)  # dependence of a value: the largest of its operands'
 _PRIMES = (37, 31, 29, 23)  # numbers of samples of a trace, see `rows_for`
 _LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
-_TOTALS = find("any all sum", torch, torch.Tensor)  # a number that may not be used, but for a gradient
+_TOTALS = find("any all sum", torch, torch.Tensor)  # their scalar results may be used for a gradient only
 
 
 def differentiable(value: Tensor) -> Tensor:
-    """A tensor of which gradients are asked for, which what comes after it is computed from."""
+    """Returns a differentiable view or detached copy of a tensor; later values are computed from it."""
     return value.view_as(value) if value.requires_grad else value.detach().requires_grad_()
 
 
 class Unfusable(Exception):
-    """A module cannot be fused; the message says where, and what to write instead."""
+    """An error for a module that cannot be fused; the message names the line and a remedy."""
 
 
 class _Begun(NamedTuple):
-    """A function that is being recorded."""
+    """A function between its start and the record of its results."""
 
     node: fx.Node
     function: Any
@@ -52,7 +51,7 @@ class _Begun(NamedTuple):
 
 
 def rows_for(module: nn.Module, tensors: list[Tensor], primes: tuple[int, ...] = _PRIMES) -> int:
-    """A number of samples: one of the primes, of which no size of the module and its arguments is a multiple."""
+    """Returns a prime number of samples of which no size of the module or its arguments is a multiple."""
     sizes = {size for tensor in (*module.parameters(), *module.buffers()) for size in tensor.shape}
     sizes.update(size for tensor in tensors for size in tensor.shape[1:])
     return next((rows for rows in primes if all(size % rows or not size for size in sizes)), primes[0])
@@ -61,26 +60,31 @@ def rows_for(module: nn.Module, tensors: list[Tensor], primes: tuple[int, ...] =
 class Trace(TorchFunctionMode):
     """Records the functions that the routed module calls with its first cell's parameters.
 
-    The ``meta`` of a node has its ``value``, what it depends on (``on``), its ``line`` in the module, whether gradients
-    were on (``grad``), whether it is its first argument, written to (``inplace``), and whether it has no rows but
-    numbers that follow from the number of samples (``counts``), such as ``torch.tensor(x.shape)``.
+    The ``meta`` of a node has:
 
-    The rows of the arguments are given for ``self.rows`` samples, ``inputs`` are taken as values of each call, and
-    ``reads`` are the attributes that were read. Raises :class:`Unfusable` for a step that cannot be done again for
-    other samples.
+    - ``value``: its value;
+    - ``on``: its dependence, one of CONSTANTS, CELLS and SAMPLES;
+    - ``line``: its line in the module;
+    - ``grad``: whether gradients were on;
+    - ``inplace``: whether the function writes to its first argument, which is then the value;
+    - ``counts``: whether it has no rows but numbers derived from the number of samples, such as
+      ``torch.tensor(x.shape)``.
+
+    ``tensors`` are rows of the arguments, ``inputs`` the values that each call looks up, and ``reads`` the attributes
+    that were read. Raises :class:`Unfusable` for a step that cannot be repeated for other samples.
     """
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
         super().__init__()
         self._module = module = call.module
         single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for p in cell_parameters(module)}
-        self._of_cells = set(map(id, single.values()))
+        self._cell_ids = set(map(id, single.values()))
         self._places = {id(single.get(id(p), p)): i for i, (_, _, p) in enumerate(owned_parameters(module))}
         self.graph = fx.Graph()
-        self.parameters: dict[fx.Node, int] = {}  # with their place among ``owned_parameters``
+        self.parameters: dict[fx.Node, int] = {}  # the index in ``owned_parameters`` of each
         self._running, self._line = False, ""
-        self._code: tuple[tuple[str, ...], dict[str, Any]] = (), {}  # names that the line's code uses, and globals
-        self._nodes: dict[int, fx.Node] = {}  # by the id of their tensor, which ``meta`` keeps
+        self._code: tuple[tuple[str, ...], dict[str, Any]] = (), {}  # the names and the globals of the line's code
+        self._nodes: dict[int, fx.Node] = {}  # by the id of their tensor, which ``meta`` keeps alive
         self.rows = rows_for(module, tensors)
         self.n = self._new(self.rows)
         self.inputs = [self._new(tensor) for tensor in tensors]
@@ -95,7 +99,7 @@ class Trace(TorchFunctionMode):
         self.reads.clear()
         with self._custom_functions(), self:
             result = double.run(call, tensors, single)
-        self._part_from_gradients()
+        self._separate_gradients()
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
         self.outputs = [self._argument(tensor) for tensor in tensors_of(result)]
         for node in self.outputs:
@@ -103,7 +107,7 @@ class Trace(TorchFunctionMode):
                 raise Unfusable(node.meta["mixes"])
 
     def _new(self, value: Any, node: fx.Node | None = None, on: int = SAMPLES) -> fx.Node:
-        """The node of a value; without one it is an input of the graph."""
+        """Gives a value a node; without ``node``, a new input of the graph."""
         node = self.graph.placeholder("given") if node is None else node
         node.meta.update(value=value, on=on)
         if isinstance(value, Tensor):
@@ -122,13 +126,13 @@ class Trace(TorchFunctionMode):
         return any(size and size % self.rows == 0 for size in value.shape)
 
     def _argument(self, value: Any) -> Any:
-        """What stands for an argument in the graph."""
+        """Returns the node of an argument, or the argument itself if it is a constant."""
         if type(value) is int and value and value % self.rows == 0:
             return self._new(value, self.graph.call_function(operator.mul, (self.n, value // self.rows)))
         if not isinstance(value, Tensor) or id(value) in self._nodes:
             return self._nodes.get(id(value), value)
         if id(value) in self._places:
-            node = self._new(value, on=CELLS if id(value) in self._of_cells else CONSTANTS)
+            node = self._new(value, on=CELLS if id(value) in self._cell_ids else CONSTANTS)
             self.parameters[node] = self._places[id(value)]
             return node
         if value.requires_grad or value.shape[:1] == (self.rows,):
@@ -142,18 +146,18 @@ class Trace(TorchFunctionMode):
         return value
 
     def _compiled(self) -> str:
-        """The names of parts of the module, and of functions that its code calls, which ``torch.jit`` has compiled."""
-        names, known = self._code
+        """Returns the names of submodules and called functions that ``torch.jit`` has compiled."""
+        names, namespace = self._code
         compiled = torch.jit.ScriptModule
         parts = [f"part {name!r}" for name, part in self._module.named_modules() if isinstance(part, compiled)]
-        return ", ".join(parts + [name for name in names if isinstance(known.get(name), torch.jit.ScriptFunction)])
+        return ", ".join(parts + [name for name in names if isinstance(namespace.get(name), torch.jit.ScriptFunction)])
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Calls a function and records it."""
         if self._running or func in METADATA:
             return func(*args, **(kwargs or {}))
         begun = self._begin(func, args, kwargs or {})
-        self._running = True  # what it calls itself is part of it
+        self._running = True  # inner functions are not recorded
         try:
             result = begun.function(*begun.args, **begun.kwargs)
         finally:
@@ -165,13 +169,13 @@ class Trace(TorchFunctionMode):
     def _custom_functions(self) -> Iterator[None]:
         """Records the custom functions of autograd that this thread calls."""
         code, calls = torch.autograd.Function.apply.__func__.__code__, dict[FrameType, _Begun]()  # type: ignore[attr-defined]
-        before: Any = sys.getprofile()
-        in_c = before is not None and not callable(before)  # such as cProfile's, which has its own way to go on
-        if in_c and not hasattr(before, "enable"):
+        old_profile: Any = sys.getprofile()
+        in_c = old_profile is not None and not callable(old_profile)  # cProfile's, which has methods to stop and resume
+        if in_c and not hasattr(old_profile, "enable"):
             yield
             return
 
-        def see(frame: FrameType, event: str, value: Any) -> None:
+        def record(frame: FrameType, event: str, value: Any) -> None:
             if frame.f_code is not code:
                 return
             if event == "call" and not self._running:
@@ -182,24 +186,24 @@ class Trace(TorchFunctionMode):
                 self._running = False
 
         if in_c:
-            before.disable()
-        sys.setprofile(see)
+            old_profile.disable()
+        sys.setprofile(record)
         try:
             yield
         finally:
-            sys.setprofile(None if in_c else before)
+            sys.setprofile(None if in_c else old_profile)
             if in_c:
-                before.enable()
+                old_profile.enable()
 
     def _begin(self, func: Any, args: Any, kwargs: Any) -> _Begun:
-        """Records a function that is about to be called, and how to call it."""
+        """Records a function before its call; returns the node with the function and arguments to call."""
         frame = user_frame()
         self._line = line = line_of(frame)
         self._code = (frame.f_code.co_names, frame.f_globals) if frame else ((), {})
         operands = tensors_of((args, kwargs))
         if func is torch.Tensor.type_as:
             func, args = torch.Tensor.to, (args[0], args[1].device, args[1].dtype)
-        if func is torch.autograd.grad:  # again of one run, where a loop over cells has a graph for each call
+        if func is torch.autograd.grad:  # one graph, where a loop over cells has one for each call
             kwargs = {**kwargs, "retain_graph": True}
         node = self.graph.call_function(func, *map_aggregate((args, kwargs), self._argument))
         node.meta["inplace"] = writes_in_place(func) or bool(kwargs.get("inplace"))
@@ -207,17 +211,17 @@ class Trace(TorchFunctionMode):
         return _Begun(node, func, args, kwargs, operands)
 
     def _end(self, begun: _Begun, result: Any) -> None:
-        """Records what a function has returned."""
+        """Records the results of a function."""
         node, func, _, kwargs, operands = begun
         inplace, line = node.meta["inplace"], node.meta["line"]
         outputs = operands[:1] if inplace else tensors_of(result)
         used = node.all_input_nodes
-        idle = func is F.dropout and not (kwargs["training"] and kwargs["p"])
-        if used and func in RANDOM and not idle:
+        is_identity = func is F.dropout and not (kwargs["training"] and kwargs["p"])
+        if used and func in RANDOM and not is_identity:
             raise Unfusable(f"{name_of(func)} draws random numbers{line}; pass them as an argument")
         counts = all(s.meta.get("counts") or type(s.meta["value"]) is int for s in used)
-        of_rows = counts and type(result) is int and result and result % self.rows == 0  # recognised where it is used
-        if used and not outputs and result is not None and not of_rows:
+        from_n = counts and type(result) is int and result and result % self.rows == 0  # a node where it is used
+        if used and not outputs and result is not None and not from_n:
             name = "the truth of a tensor" if isinstance(result, bool) else name_of(node.target)
             raise Unfusable(
                 f"{name} is read{line}, so the path of the module depends on values; write it with torch.where"
@@ -225,8 +229,8 @@ class Trace(TorchFunctionMode):
         for source in used:
             if "mixes" in source.meta and func is not torch.autograd.grad:
                 raise Unfusable(source.meta["mixes"])
-        alone = func in _LIKE and not self._has_rows(outputs[0])
-        if not used or alone or not outputs or (not inplace and any(result is tensor for tensor in operands)):
+        is_constant = func in _LIKE and not self._has_rows(outputs[0])
+        if not used or is_constant or not outputs or (not inplace and any(result is tensor for tensor in operands)):
             self.graph.erase_node(node)
             return
         nodes, on = [node], max(value.meta["on"] for value in used)
@@ -238,14 +242,14 @@ class Trace(TorchFunctionMode):
             self._new(tensor, value, on)
         node.meta["on"] = on
 
-    def _part_from_gradients(self) -> None:
-        """Makes what a gradient is taken by a tensor between runs, from which what follows is computed."""
+    def _separate_gradients(self) -> None:
+        """Inserts a tensor between runs for each value that gradients are taken of; its users read the tensor."""
         for node in list(self.graph.nodes):
             if node.target is not torch.autograd.grad:
                 continue
-            by: list[fx.Node] = []
-            map_arg(node.args[1] if len(node.args) > 1 else node.kwargs["inputs"], by.append)
-            for source in by:
+            sources: list[fx.Node] = []
+            map_arg(node.args[1] if len(node.args) > 1 else node.kwargs["inputs"], sources.append)
+            for source in sources:
                 if source.target is not differentiable and source.meta["on"] == SAMPLES:
                     with self.graph.inserting_after(source):
                         new = self.graph.call_function(differentiable, (source,))

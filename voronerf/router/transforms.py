@@ -1,4 +1,4 @@
-"""What PyTorch does around a routed call: transforms of functions, tracers, and hooks on the tensors that it saves."""
+"""PyTorch's transforms, tracers and saved-tensor hooks that are active around a routed call."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ _ALONE = "router.cell(i) is a plain module of one cell"
 
 
 def transformed() -> bool:
-    """Whether the call is within a function that ``torch.func`` transforms."""
+    """Returns whether the call is within a function that ``torch.func`` transforms."""
     return _transforms()
 
 
 def refuse_transforms() -> None:
-    """Raises NotImplementedError within transforms that a routed call would give wrong results for, or none."""
+    """Raises NotImplementedError within transforms that a routed call does not support."""
     if torch.jit.is_tracing():
         raise NotImplementedError(
             f"{_OP}: torch.jit.trace and torch.onnx.export(dynamo=False) would keep the cells of one batch; "
             f"{_ALONE}, which they take"
         )
-    within = set[str]()
+    active = set[str]()
     if transformed():
-        within = {interpreter.key().name for interpreter in torch._C._functorch.get_interpreter_stack() or ()}
-    if "Vmap" in within:
+        active = {interpreter.key().name for interpreter in torch._C._functorch.get_interpreter_stack() or ()}
+    if "Vmap" in active:
         raise NotImplementedError(
             f"{_OP}: torch.func.vmap, jacrev and hessian take samples apart, which the cells are sorted by; call the "
             "router on the whole batch, where torch.autograd.grad(y[:, i].sum(), x, create_graph=True) gives the "
             "derivative of each sample, and once more the second"
         )
-    if "Jvp" in within or forward_ad._current_level >= 0:
+    if "Jvp" in active or forward_ad._current_level >= 0:
         raise NotImplementedError(
             f"{_OP}: forward-mode derivatives (jvp, jacfwd, dual numbers) are not supported; take torch.func.vjp or "
             "torch.autograd.grad, twice for a product with the Jacobian"
@@ -50,7 +50,7 @@ def refuse_transforms() -> None:
 
 @contextlib.contextmanager
 def outside() -> Iterator[None]:
-    """Ends the transforms of ``torch.func`` for a while."""
+    """Suspends the transforms of ``torch.func`` in the context."""
     if not transformed():
         yield
         return
@@ -62,7 +62,7 @@ def outside() -> Iterator[None]:
 
 
 def unwrapped(tensor: Tensor) -> Tensor:
-    """A tensor that ``torch.func`` may have wrapped as it is :func:`outside`; a leaf where the wrapper learns."""
+    """Returns the tensor inside a ``torch.func`` wrapper, as a leaf tensor with the wrapper's ``requires_grad``."""
     inner = tensor
     while torch._C._functorch.is_functorch_wrapped_tensor(inner):
         inner = torch._C._functorch.get_unwrapped(inner)
@@ -71,12 +71,12 @@ def unwrapped(tensor: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def aside(call: Call) -> Iterator[Call]:
-    """A call for what runs beside it, unseen by transforms and by hooks on saved tensors.
+    """Yields a copy of a call for a probe or a timing, hidden from transforms and saved-tensor hooks.
 
-    ``torch.utils.checkpoint`` counts what a call saves, and compares it with what the call saves when it runs again.
+    ``torch.utils.checkpoint`` counts the tensors that a call saves, and compares this with the recomputation.
     """
     if not transformed():
-        with torch.autograd.graph.saved_tensors_hooks(_same, _same) if recorded() else contextlib.nullcontext():
+        with torch.autograd.graph.saved_tensors_hooks(_identity, _identity) if recorded() else contextlib.nullcontext():
             yield call
         return
     with outside():
@@ -87,14 +87,14 @@ def aside(call: Call) -> Iterator[Call]:
 
 
 def recorded() -> bool:
-    """Whether hooks see what is saved for a backward pass. The call may then run again, and must go the same way."""
+    """Returns whether saved-tensor hooks are active. The call may then run again, and must take the same way."""
     return _hooks(False) is not None
 
 
 def is_watched() -> bool:
-    """Whether transforms, tracers or hooks on saved tensors see what a call does."""
+    """Returns whether transforms, tracers or saved-tensor hooks see a call."""
     return _transforms() or _hooks(False) is not None or forward_ad._current_level >= 0 or torch._C._is_tracing()
 
 
-def _same(tensor: Tensor) -> Tensor:
+def _identity(tensor: Tensor) -> Tensor:
     return tensor

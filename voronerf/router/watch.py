@@ -1,7 +1,7 @@
-"""The constants of a traced ``forward``: attributes and buffers of its module, and arguments that are no tensors.
+"""The constants of a traced ``forward``: attributes and buffers of its module, and arguments that are not tensors.
 
-A trace holds their values. Each call compares them with what they are then, so that a schedule that sets
-``module.progress`` is followed and not ignored.
+A trace stores their values. Each call compares the stored values with the current ones, so that a schedule that sets
+``module.progress`` takes effect.
 """
 
 from __future__ import annotations
@@ -18,56 +18,57 @@ from torch import Tensor, nn
 from voronerf.router.grouping import parts_of
 
 Source = str | tuple[int, str]
-"""An argument by its name, or an attribute by the place of its part in ``modules()`` and its name."""
+"""An argument by its name, or an attribute by (index of its submodule in ``modules()``, name)."""
 
 NUMBERS = (torch.float64, torch.float32, torch.int64)
-"""Dtypes of inputs: a number rounds nothing, decides no dtype beside integers, and may be an index."""
+"""The dtypes of inputs, tried in turn: float64 rounds nothing, float32 promotes like a number, int64 may index.
+"""
 
-_OWN = frozenset(vars(nn.Module())) - {"training"}
+_MODULE_ATTRIBUTES = frozenset(vars(nn.Module())) - {"training"}
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 _MISSING: Any = object()
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Attributes that a trace reads anew at each call."""
+    """Attributes and arguments that a fused call reads in each call."""
 
     sources: frozenset[Source] = frozenset()
-    dtype: torch.dtype = torch.float64  # of numbers, one of NUMBERS
+    dtype: torch.dtype = torch.float64  # dtype of numbers as tensors, one of NUMBERS
 
     def tensor(self, value: Any, device: torch.device) -> Tensor:
-        """A number as a tensor, and a tensor as it is."""
+        """Returns a number as a tensor, and a tensor unchanged."""
         return value if isinstance(value, Tensor) else torch.tensor(value, dtype=self.dtype, device=device)
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value can be an input of a trace."""
+    """Returns whether a value can be an input of a trace."""
     return isinstance(value, (Tensor, Number)) and not isinstance(value, (bool, complex))
 
 
 def lookup(part: nn.Module, name: str) -> Any:
-    """An attribute or a buffer of a part of a module, without properties and the class."""
+    """Returns an attribute or a buffer of a submodule itself, not of its class."""
     members = vars(part)
     return members[name] if name in members else part._buffers.get(name, _MISSING)
 
 
 @dataclass
 class Watch:
-    """Values that a trace took as fixed, and where they are now."""
+    """Values that a trace took as constants, and the places of their current values."""
 
     sources: list[Source] = field(default_factory=list)
     _values: list[Any] = field(default_factory=list)
     _dicts: list[tuple[dict[str, Any], str]] = field(default_factory=list)
     _tensors: list[Tensor] = field(default_factory=list)
     _versions: list[int] = field(default_factory=list)
-    _of_tensors: list[Source] = field(default_factory=list)
+    _tensor_sources: list[Source] = field(default_factory=list)
     _holders: list[tuple[Source, Any, tuple[Any, ...]]] = field(default_factory=list)
     _hooks: list[dict[int, Any]] = field(default_factory=list)
     _counts: list[int] = field(default_factory=list)
 
     @classmethod
     def of(cls, module: nn.Module, reads: set[tuple[int, str]], inputs: Inputs) -> Watch:
-        """Of what was read of the parts of a module, but for what is an input."""
+        """Makes a watch of the values read from submodules, excluding inputs."""
         watch, parts = cls(), list(parts_of(module).values())
         for place, name in sorted(reads):
             part, source = parts[place], (place, name)
@@ -78,7 +79,7 @@ class Watch:
                 watch._counts.append(len(vars(part)[name]))
             elif name == "_modules":
                 watch._holders.append((source, part._modules, (*part._modules, *part._modules.values())))
-            elif name not in _OWN:
+            elif name not in _MODULE_ATTRIBUTES:
                 watch._add(source, part)
         return watch
 
@@ -88,21 +89,21 @@ class Watch:
         if registry is None:
             if not isinstance(getattr(type(part), name, None), (bool, int, float, str, FunctionType)):
                 return  # a property or none
-            registry = vars(part)  # of which a value would come before that of the class
+            registry = vars(part)  # a value here would precede the class's
         value = registry.get(name, _MISSING)
         self.sources.append(source)
         self._values.append(value)
         self._dicts.append((registry, name))
         if isinstance(value, Tensor):
-            if not value.is_inference():  # whose changes nobody counts
+            if not value.is_inference():  # without a version counter
                 self._tensors.append(value)
                 self._versions.append(value._version)
-                self._of_tensors.append(source)
-        elif value is not _MISSING and (held := _held(value)) is not None:
-            self._holders.append((source, value, held))
+                self._tensor_sources.append(source)
+        elif value is not _MISSING and (items := _items(value)) is not None:
+            self._holders.append((source, value, items))
 
     def note(self, guard: Any) -> None:
-        """Has a guard of `unchanged` look at the same."""
+        """Adds the watched values to a guard of `unchanged`."""
         for registry, name in self._dicts:
             guard.entries(registry, [name])
         for tensor in self._tensors:
@@ -113,27 +114,27 @@ class Watch:
             guard.contents(hooks)
 
     def changed(self) -> list[Source]:
-        """The sources whose values have changed."""
+        """Lists the sources whose values have changed."""
         changed = list[Source]()
-        now = [registry.get(name, _MISSING) for registry, name in self._dicts]
-        if not all(map(operator.is_, now, self._values)):
-            changed += [s for s, a, b in zip(self.sources, now, self._values, strict=True) if not same(a, b)]
+        values = [registry.get(name, _MISSING) for registry, name in self._dicts]
+        if not all(map(operator.is_, values, self._values)):
+            changed += [s for s, a, b in zip(self.sources, values, self._values, strict=True) if not same(a, b)]
         if self._tensors and [tensor._version for tensor in self._tensors] != self._versions:
-            pairs = zip(self._of_tensors, self._tensors, self._versions, strict=True)
+            pairs = zip(self._tensor_sources, self._tensors, self._versions, strict=True)
             changed += [source for source, tensor, version in pairs if tensor._version != version]
-        for source, value, held in self._holders:
-            items = _held(value) or ()
-            if len(items) == len(held) and all(map(operator.is_, items, held)):
+        for source, value, old_items in self._holders:
+            items = _items(value) or ()
+            if len(items) == len(old_items) and all(map(operator.is_, items, old_items)):
                 continue
-            if len(items) != len(held) or not all(map(same, items, held)):
+            if len(items) != len(old_items) or not all(map(same, items, old_items)):
                 changed.append(source)
         if [*map(len, self._hooks)] != self._counts:
             changed.append((0, "hooks"))
         return changed
 
 
-def _held(value: Any) -> tuple[Any, ...] | None:
-    """What a container or a plain object holds, one level deep."""
+def _items(value: Any) -> tuple[Any, ...] | None:
+    """Returns the items of a container or a plain object, one level deep; None for other values."""
     if isinstance(value, dict):
         return (*value, *value.values())
     if isinstance(value, (list, tuple, set, frozenset)):
@@ -144,5 +145,5 @@ def _held(value: Any) -> tuple[Any, ...] | None:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two values are the same object, or equal numbers or texts."""
+    """Returns whether two values are the same object, or equal numbers or texts."""
     return a is b or (type(a) is type(b) and isinstance(a, (Number, str, torch.dtype, torch.device)) and bool(a == b))

@@ -1,7 +1,7 @@
-"""Sines and cosines of octaves, as codebases write them out, as one step of a program: the frequency encoding.
+"""Replaces sines and cosines of octaves in a program by one step, the frequency encoding.
 
-It takes less time than single waves, and what is put next to each other again in its order is not copied. Its second
-derivatives run in PyTorch, so this is for what is differentiated once.
+One step takes less time than separate waves, and concatenations in its order need no copy. Its second derivatives run
+in PyTorch, so this is for programs that are differentiated once.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ from typing import NamedTuple
 
 from voronerf.ops._core.program import PARAMETER, VALUE, Columns, Program, Step, pruned
 
-_Column = tuple[int, int]  # a value and a column of it
-_Waves = dict[_Column, dict[float, dict[int, list[_Column]]]]  # of a column, by factor and 0 or 1 for sine or cosine
+_Column = tuple[int, int]  # (value, column in it)
+_Waves = dict[_Column, dict[float, dict[int, list[_Column]]]]  # column: {factor: {0 for sine or 1 for cosine: copies}}
 _PHASES = {0.0: 0, round(math.pi / 2, 6): 1}
-_FEW = 3  # parts of what a layer reads
-_CLOSE = 3e-7  # the rounding of a power of two
+_FEW = 3  # most parts of a layer's input that are read separately
+_CLOSE = 3e-7  # largest relative error of an octave
 
 
 class _Group(NamedTuple):
-    """Columns of a value whose waves are octaves."""
+    """Adjacent columns of a value whose waves are octaves."""
 
     columns: list[_Column]
     factors: list[float]
 
 
 def with_encodings(program: Program, constants: Mapping[int, Sequence[float]]) -> Program:
-    """The same with ``encode`` steps in the place of waves.
+    """Returns the program with ``encode`` steps in the place of waves.
 
     Args:
-        program: Without sums.
-        constants: The entries of parameters that are numbers, by their index.
+        program: The program, without sums over rows.
+        constants: The entries of constant parameters, by their index.
     """
-    made = {step.out: step for step in program.steps}
-    waves, new, steps = _waves(program, made, constants), 1 + max(made, default=0), list[Step]()
-    joined = dict[int, Step]()  # moves by their values
-    first = {min(_outputs(waves, group)): group for group in _groups(waves)}
-    places: dict[_Column, _Column] = {}  # of waves, and of what a move only puts elsewhere
+    steps_by_value = {step.out: step for step in program.steps}
+    waves, new, steps = _waves(program, steps_by_value, constants), 1 + max(steps_by_value, default=0), list[Step]()
+    moves = dict[int, Step]()  # move steps by their value
+    group_at = {min(_outputs(waves, group)): group for group in _groups(waves)}
+    places: dict[_Column, _Column] = {}  # new places of waves and of moved columns
     for step in program.steps:
-        if step.out in first:
-            group = first[step.out]
+        if step.out in group_at:
+            group = group_at[step.out]
             width, octaves, factor = len(group.columns), len(group.factors), group.factors[0]
             x = Columns(VALUE, *group.columns[0], width)
             if factor != 1:
@@ -50,8 +50,8 @@ def with_encodings(program: Program, constants: Mapping[int, Sequence[float]]) -
                 x, new = Columns(VALUE, new, 0, width), new + 1
             steps.append(Step("encode", new, width * (1 + 2 * octaves), (x,), (octaves, 0, 0, 0), "frequency"))
             for at, column in enumerate(group.columns):
-                for octave, each in enumerate(group.factors):
-                    for phase, copies in waves[column][each].items():
+                for octave, multiple in enumerate(group.factors):
+                    for phase, copies in waves[column][multiple].items():
                         places.update(dict.fromkeys(copies, (new, width * (1 + 2 * octave + phase) + at)))
                 if factor == 1:
                     places[column] = new, at
@@ -63,17 +63,17 @@ def with_encodings(program: Program, constants: Mapping[int, Sequence[float]]) -
         if step.op != "encode":
             step = step._replace(operands=tuple(_elsewhere(c, places) for c in step.operands))
         if step.op == "move":
-            joined[step.out] = step
-        *parts, step = _by_parts(step, joined, new)
+            moves[step.out] = step
+        *parts, step = _by_parts(step, moves, new)
         new += len(parts)
         steps += [*parts, step]
     outputs = tuple(_elsewhere(c, places) for c in program.outputs)
     return pruned(replace(program, steps=tuple(steps), outputs=outputs))
 
 
-def _by_parts(step: Step, joined: Mapping[int, Step], new: int) -> list[Step]:
-    """A layer that reads what is joined of a few parts as one layer for each part, added up; their values are new."""
-    move = joined.get(step.operands[0].index) if step.op == "linear" and step.operands[0].of == VALUE else None
+def _by_parts(step: Step, moves: Mapping[int, Step], new: int) -> list[Step]:
+    """Splits a layer whose input is joined from a few parts into one layer for each part, whose results are added."""
+    move = moves.get(step.operands[0].index) if step.op == "linear" and step.operands[0].of == VALUE else None
     if move is None or step.numbers[2] or step.operands[0].width != move.width or len(move.operands) > _FEW:
         return [step]
     if any(c.of != VALUE or c.spread for c in move.operands) or sum(c.width for c in move.operands) != move.width:
@@ -87,17 +87,17 @@ def _by_parts(step: Step, joined: Mapping[int, Step], new: int) -> list[Step]:
     return steps
 
 
-def _waves(program: Program, made: Mapping[int, Step], constants: Mapping[int, Sequence[float]]) -> _Waves:
-    """The waves of each column that is not itself a x + b of another one."""
+def _waves(program: Program, steps_by_value: Mapping[int, Step], constants: Mapping[int, Sequence[float]]) -> _Waves:
+    """Finds the waves of each column that is not itself a x + b of another column."""
     waves: _Waves = {}
     for step in program.steps:
         if step.name != "sine" or step.numbers[0] or len(step.operands) > 1:
             continue
         for column in range(step.width):
-            of = _column(step.operands[0], column)
-            if of is None:
+            source_column = _column(step.operands[0], column)
+            if source_column is None:
                 continue
-            source, factor, phase = _source(of, made, constants, *step.numbers[1:])
+            source, factor, phase = _source(source_column, steps_by_value, constants, *step.numbers[1:])
             if (phase := _PHASES.get(round(phase, 6), -1)) >= 0:
                 waves.setdefault(source, {}).setdefault(factor, {}).setdefault(phase, []).append((step.out, column))
     return waves
@@ -108,11 +108,15 @@ def _column(c: Columns, column: int) -> _Column | None:
 
 
 def _source(
-    of: _Column, made: Mapping[int, Step], constants: Mapping[int, Sequence[float]], factor: float, offset: float
+    source: _Column,
+    steps_by_value: Mapping[int, Step],
+    constants: Mapping[int, Sequence[float]],
+    factor: float,
+    offset: float,
 ) -> tuple[_Column, float, float]:
-    """The column x of which another one, times a factor and plus an offset, is a x + b; and a and b."""
-    (value, column), by, plus = of, 1.0, 0.0
-    step, columns = made[value], list[_Column | None]()
+    """Returns a column x and the numbers a and b such that factor * source + offset = a x + b."""
+    (value, column), by, plus = source, 1.0, 0.0
+    step, columns = steps_by_value[value], list[_Column | None]()
     if step.op == "move":
         parts = [(c, int(at)) for c, at in zip(step.operands, step.numbers) if at <= column < at + c.width]
         columns = [_column(c, column - at) for c, at in parts]
@@ -124,12 +128,12 @@ def _source(
             columns, by = [_column(x, column)], constants[y.index][y.start + (0 if y.spread else column)]
     read = columns[0] if len(columns) == 1 else None
     if read is None:
-        return of, factor, offset
-    return _source(read, made, constants, factor * by, factor * plus + offset)
+        return source, factor, offset
+    return _source(read, steps_by_value, constants, factor * by, factor * plus + offset)
 
 
 def _groups(waves: _Waves) -> Iterator[_Group]:
-    """Columns next to each other with the same octaves of sines and cosines."""
+    """Yields groups of adjacent columns with the same octaves of sines and cosines."""
     group = _Group([], [])
     for column in sorted(waves):
         factors = sorted(factor for factor, phases in waves[column].items() if factor > 0 and len(phases) == 2)
@@ -146,7 +150,7 @@ def _groups(waves: _Waves) -> Iterator[_Group]:
 
 
 def _outputs(waves: _Waves, group: _Group) -> Iterator[int]:
-    """The steps that make the waves of a group."""
+    """Yields the values that hold the waves of a group."""
     for column in group.columns:
         for factor in group.factors:
             for copies in waves[column][factor].values():
@@ -154,7 +158,7 @@ def _outputs(waves: _Waves, group: _Group) -> Iterator[int]:
 
 
 def _elsewhere(c: Columns, places: Mapping[_Column, _Column]) -> Columns:
-    """The same columns where they are next to each other in one other value; else as they are."""
+    """Returns the new place of columns if they are adjacent there too, else the same columns."""
     if c.of != VALUE or (c.index, c.start) not in places:
         return c
     value, start = places[c.index, c.start]
@@ -164,15 +168,15 @@ def _elsewhere(c: Columns, places: Mapping[_Column, _Column]) -> Columns:
 
 
 def _moved(step: Step, places: dict[_Column, _Column]) -> Step:
-    """A move in as few pieces as may be; what it only puts elsewhere is noted in ``places``."""
-    taken: dict[int, _Column] = {}
+    """Returns a move with as few pieces as possible, and records the sources of its columns in ``places``."""
+    sources: dict[int, _Column] = {}
     for c, at in zip(step.operands, map(int, step.numbers), strict=True):
         columns = ((c.index, c.start + i) for i in range(c.width))
-        taken.update({at + i: places.get(column, column) for i, column in enumerate(columns)})
-    if len(taken) != sum(c.width for c in step.operands):
-        return step  # columns that are added up
+        sources.update({at + i: places.get(column, column) for i, column in enumerate(columns)})
+    if len(sources) != sum(c.width for c in step.operands):
+        return step  # columns are summed
     pieces: list[tuple[Columns, int]] = []
-    for at, (value, column) in sorted(taken.items()):
+    for at, (value, column) in sorted(sources.items()):
         places[step.out, at] = value, column
         last, first = pieces[-1] if pieces else (Columns(VALUE, -1, 0, 0), 0)
         if (last.index, last.start + last.width, first + last.width) == (value, column, at):

@@ -1,4 +1,4 @@
-"""Scenes made of several runs, and training in territories over processes."""
+"""Scenes made of several runs, and distributed training in territories."""
 
 from voronerf.town.editing import cut, join, place
 from voronerf.town.geometry import Similarity, Solid

@@ -1,6 +1,6 @@
-"""Runs made of runs: joined, cut, and placed in each other. What is made is a run of several parts, in new files.
+"""Joins runs, cuts them, and places them in each other. The result is a new run of several parts.
 
-Positions are in units of the scene that is made. A source is never written to.
+Positions are in units of the new scene. The source runs are never changed.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from voronerf.town.network import StoredRouter, config_of
 from voronerf.town.parts import Part, Parts
 from voronerf.town.run import TOWN, is_town, open_parts, write_parts
 
-#: The most voxels of the grid of a run that was made of others; it has larger ones where it would have more.
+#: Greatest number of voxels of a joined grid; its voxels become larger if it would have more.
 MOST_VOXELS = 1 << 22
-#: The least size of a run beside all together: strata, of which a ray has so many at most, would jump over a smaller.
+#: The least size of a run as a share of the joined scene: the strata of a ray would step over a smaller one.
 SMALLEST = 1e-4
 
 
 @dataclass(frozen=True)
 class Source:
-    """What is taken of a run."""
+    """The contents of a run that are joined, cut or placed: settings, scene, parts and grid."""
 
     name: str
     config: TrainConfig
@@ -50,7 +50,7 @@ class Source:
 
     @classmethod
     def of(cls, run: Path | str) -> Source:
-        """The source in a run directory. Of its networks the field alone is taken."""
+        """Reads the source from a run directory; of the networks, only the field."""
         run = Path(run)
         name, record = run.name, run / "scene.json"
         checkpoint = last_checkpoint(run, keep=is_shown)
@@ -80,19 +80,19 @@ class Source:
 
 
 def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Similarity] | None = None) -> Source:
-    """Writes one run of several: where they overlap the nearest centre decides.
+    """Joins several runs into a new one; where they overlap, the nearest centre decides.
 
     Args:
-        runs: At least two run directories; the first gives data, background and settings.
-        out: A new directory; the runs stay as they are.
-        frames: From the scene of each run into that of the new one; None for where they are.
+        runs: At least two run directories, which are not changed; the first gives data, background and settings.
+        out: A new directory.
+        frames: The similarity from the scene of each run to the new scene; None to leave all runs in place.
 
     Returns:
-        What was written.
+        The contents of the new run.
 
     Raises:
-        ConfigError: For runs that cannot be joined; see the guide.
-        OSError: When it cannot be written; nothing is left then.
+        ConfigError: The runs cannot be joined; see the guide.
+        OSError: The new run cannot be written; no files are left.
 
     Examples:
         >>> from voronerf.town import Similarity, join
@@ -103,25 +103,25 @@ def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Simila
         count = "none" if frames is None else f"{len(frames)}"
         raise ConfigError(f"join needs two runs or more, and a frame for each: got {len(runs)} runs, {count} frames")
     sources = {str(run): Source.of(run) for run in runs}
-    every = [sources[str(run)] for run in runs]
-    return _write(join_sources(every, frames or [Similarity()] * len(runs)), Path(out))
+    sources_of_runs = [sources[str(run)] for run in runs]
+    return _write(join_sources(sources_of_runs, frames or [Similarity()] * len(runs)), Path(out))
 
 
 def cut(run: Path | str, kept: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Source:
-    """Writes a run of what lies in a solid or in some cells; networks that show nothing of it are dropped.
+    """Writes a new run with only a solid or some cells of a run; networks that it does not need are left out.
 
     Args:
-        run: The run directory; it stays as it is.
+        run: The run directory, which is not changed.
         kept: A solid of the scene, such as ``Solid.box(low, high)``, or numbers of cells.
         out: A new directory.
-        outside: What does not lie there, in its place.
+        outside: Whether to keep everything outside of the solid or cells instead.
 
     Returns:
-        What was written.
+        The contents of the new run.
 
     Raises:
-        ConfigError: When nothing is left, or there is no such cell.
-        OSError: When it cannot be written; nothing is left then.
+        ConfigError: The result would be empty, or a cell does not exist.
+        OSError: The new run cannot be written; no files are left.
 
     Examples:
         >>> from voronerf.town import Solid, cut
@@ -148,22 +148,22 @@ def place(
     degrees: Sequence[float] = (0, 0, 0),
     scale: float = 1.0,
 ) -> Source:
-    """Writes a run with an object in it, whose density comes on top of the scene's.
+    """Places an object into a scene, as a new run; the object's density is added to the scene's.
 
     Args:
-        run: The run directory of the scene; it stays as it is.
-        thing: That of the object, cut out or trained on white.
-        at: Where the middle of the bottom of its box shall be.
+        run: The run directory of the scene, which is not changed.
+        thing: The run directory of the object, cut out or trained on white.
+        at: The position of the object: the centre of the bottom of its box goes there.
         out: A new directory.
-        degrees: Turned about the axes x, y, z, in this order.
-        scale: Of its size.
+        degrees: The rotations about the axes x, y, z, in this order.
+        scale: The factor on the object's size.
 
     Returns:
-        What was written.
+        The contents of the new run.
 
     Raises:
-        ConfigError: For an object without bounds.
-        OSError: When it cannot be written; nothing is left then.
+        ConfigError: The object has no bounds.
+        OSError: The new run cannot be written; no files are left.
 
     Examples:
         >>> from voronerf.town import place
@@ -176,7 +176,7 @@ def place(
         raise ConfigError(f"{source.name}: an object must have bounds, which voronerf cut --box or --sphere gives it")
     foot = torch.cat(((box[0] + box[1])[:2] / 2, box[0, 2:]))
     standing = Similarity.of(at, degrees, scale) @ Similarity(translation=-foot.double())
-    scene = source if Path(run) == Path(thing) else Source.of(run)  # networks of one run are stored once
+    scene = source if Path(run) == Path(thing) else Source.of(run)  # a run placed in itself stores its networks once
     return _write(join_sources([scene, source], [Similarity(), standing], on_top=True), Path(out))
 
 
@@ -184,12 +184,12 @@ def place(
 
 
 def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_top: bool = False) -> Source:
-    """One source of several: where they overlap the nearest centre decides.
+    """Joins sources into one; where they overlap, the nearest centre decides.
 
     Args:
-        sources: At least one. The first gives the settings, the background, and the data.
-        frames: From each into the new scene.
-        on_top: All but the first are in layers above it; their density comes on top of its.
+        sources: At least one source. The first gives the settings, the background, and the data.
+        frames: The similarity from each source to the new scene.
+        on_top: Whether to put all sources but the first into layers above it, so that their densities are added.
     """
     first = sources[0]
     for index, source in enumerate(sources):
@@ -205,13 +205,13 @@ def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_
     for index, (source, frame) in enumerate(zip(sources, frames, strict=True)):
         above = max((part.layer for part in parts), default=-1) + 1 if on_top and index else 0
         parts += [part.changed(frame=frame @ part.frame, layer=part.layer + above) for part in source.parts]
-    every = Parts(parts, backend=first.parts.backend)
+    joined = Parts(parts, backend=first.parts.backend)
     scene = _join_scenes(sources, frames)
-    return Source(first.name, _settings(sources, frames, scene), scene, every, _join_grids(sources, frames))
+    return Source(first.name, _settings(sources, frames, scene), scene, joined, _join_grids(sources, frames))
 
 
 def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
-    """The settings of a run of parts: those of the first, with strata as short as in any source."""
+    """Returns the settings of a joined run: the first source's, with strata as short as the shortest of any source."""
     first = sources[0].config
     samples = (first.samples or (64,))[0]
     if scene.box is not None:
@@ -229,7 +229,7 @@ def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Sc
 
 
 def _join_scenes(sources: Sequence[Source], frames: Sequence[Similarity]) -> Scene:
-    """The views of all sources, those of one scene in one place once, and the box around all of them."""
+    """Joins the views of all sources and their boxes; the same scene in the same place counts once."""
     first, box, views = sources[0].scene, sources[0].scene.box, []
     seen: set[tuple[str, str]] = set()
     if box is not None:
@@ -248,8 +248,8 @@ def _join_scenes(sources: Sequence[Source], frames: Sequence[Similarity]) -> Sce
         _join_views([(name, getattr(scene, part), f) for name, scene, f in views]) for part in ("train", "test")
     )
     if box is not None:
-        away = (torch.cat((train.cameras.origins, test.cameras.origins))[:, None] - _corners(box)).norm(dim=-1)
-        far = max(far, 1.01 * float(away.max()))
+        distances = (torch.cat((train.cameras.origins, test.cameras.origins))[:, None] - _corners(box)).norm(dim=-1)
+        far = max(far, 1.01 * float(distances.max()))
     moved = None if len(views) > 1 or not frames[0].is_identity else first.transform
     return replace(first, train=train, test=test, near=near, far=far, box=box, transform=moved)
 
@@ -260,7 +260,7 @@ def _corners(box: Tensor | None) -> Tensor:
 
 
 def _join_views(views: Sequence[tuple[str, Split, Similarity]]) -> Split:
-    """The cameras of several splits, without images; names that come twice get those of their runs before them."""
+    """Joins the cameras of several splits, without images; if names repeat, they get their split's number."""
     cameras = [moved_cameras(split.cameras, frame) for _, split, frame in views]
     names = [name for _, split, _ in views for name in split.names]
     if len(set(names)) < len(names):
@@ -272,7 +272,7 @@ def _join_views(views: Sequence[tuple[str, Split, Similarity]]) -> Split:
 
 
 def moved_cameras(cameras: Cameras, frame: Similarity) -> Cameras:
-    """Cameras after a similarity."""
+    """Moves cameras by a similarity."""
     if frame.is_identity:
         return cameras
     poses = cameras.poses.clone()
@@ -282,19 +282,19 @@ def moved_cameras(cameras: Cameras, frame: Similarity) -> Cameras:
 
 
 def _join_grids(sources: Sequence[Source], frames: Sequence[Similarity]) -> OccupancyGrid | None:
-    """What is empty in all sources; voxels as small as the smallest of theirs, as far as `MOST_VOXELS` allows."""
+    """Joins the occupancy grids; voxels are as small as the smallest source's, as far as `MOST_VOXELS` allows."""
     grids = [source.grid for source in sources]
     if any(source.scene.box is None for source in sources) or any(grid is None for grid in grids):
         return None
     pairs = [(grid, frame) for grid, frame in zip(grids, frames, strict=True) if grid is not None]
     first = pairs[0][0]
-    alike = all(
+    same_voxels = all(
         frame.is_identity and torch.equal(g.box, first.box) and g.density.shape == first.density.shape
         for g, frame in pairs
     )
     threshold = min(grid.threshold / frame.scale for grid, frame in pairs)
-    if alike:
-        grid = _grid_like(first.box, first.density.shape, threshold)
+    if same_voxels:
+        grid = _empty_grid(first.box, first.density.shape, threshold)
         for other, _ in pairs:
             grid.density = torch.maximum(grid.density, other.density)
             grid.occupied |= other.occupied
@@ -308,21 +308,21 @@ def _join_grids(sources: Sequence[Source], frames: Sequence[Similarity]) -> Occu
     extent = (high - low).double()
     side = max(side, float((extent.prod() / MOST_VOXELS) ** (1 / 3)))
     shape = (extent / side).round().clamp(min=1).long().tolist()
-    grid = _grid_like(torch.stack((low, high)), shape, threshold)
+    grid = _empty_grid(torch.stack((low, high)), shape, threshold)
     for source, frame in pairs:
         density, marked = torch.zeros(grid.density.numel()), torch.zeros(grid.density.numel(), dtype=torch.bool)
-        full = source.occupied.view(-1).nonzero()[:, 0]
+        occupied = source.occupied.view(-1).nonzero()[:, 0]
         size = float(((source.box[1] - source.box[0]) / torch.tensor(source.density.shape)).max()) * frame.scale
-        steps = math.ceil(size / side) + 1  # places along each axis of a voxel, so that none between is jumped over
+        steps = math.ceil(size / side) + 1  # sample points along an axis of a voxel; no voxel is skipped
         places = torch.linspace(1e-3, 1 - 1e-3, steps)
         for offset in itertools.product(places.tolist(), repeat=3):
-            inside = torch.tensor([offset]).expand(len(full), 3)
-            voxels = grid.voxels(frame.points(source.points(full, inside))).long()
+            inside = torch.tensor([offset]).expand(len(occupied), 3)
+            voxels = grid.voxels(frame.points(source.points(occupied, inside))).long()
             marked[voxels] = True
-            density.scatter_reduce_(0, voxels, source.density.view(-1)[full] / frame.scale, "amax")
+            density.scatter_reduce_(0, voxels, source.density.view(-1)[occupied] / frame.scale, "amax")
         filled, values = marked.view(grid.density.shape), density.view(grid.density.shape)
         turned = frame.rotation.abs()
-        if bool(((turned > 1e-6) & (turned < 1 - 1e-6)).any()):  # corners of turned voxels lie between the places
+        if bool(((turned > 1e-6) & (turned < 1 - 1e-6)).any()):  # turned voxels reach beyond the sampled voxels
             around = torch.nn.functional.max_pool3d(filled.float()[None, None], 3, 1, 1)[0, 0] > 0
             values = torch.where(around & ~filled, threshold, values)
             filled = around
@@ -331,8 +331,8 @@ def _join_grids(sources: Sequence[Source], frames: Sequence[Similarity]) -> Occu
     return grid
 
 
-def _grid_like(box: Tensor, shape: Sequence[int], threshold: float) -> OccupancyGrid:
-    """A grid that is empty."""
+def _empty_grid(box: Tensor, shape: Sequence[int], threshold: float) -> OccupancyGrid:
+    """Returns an empty grid."""
     grid = OccupancyGrid(box, list(shape), threshold=threshold)
     grid.density.zero_()
     grid.occupied.zero_()
@@ -343,13 +343,13 @@ def _grid_like(box: Tensor, shape: Sequence[int], threshold: float) -> Occupancy
 
 
 def cut_source(source: Source, kept: Solid | Tensor) -> Source:
-    """What lies in a solid, or in some cells; networks of cells that show nothing of it are dropped.
+    """Returns a source with only a solid or some cells; networks that it does not need are left out.
 
-    Space inside of the sphere of a contraction is as it was, so that what is cut out of it needs none.
+    A contraction is the identity inside of its sphere, so that a cut inside of it needs no contraction.
 
     Args:
-        source: Of any kind.
-        kept: A solid in the scene, or bool [k], the cells.
+        source: The source, of any kind.
+        kept: A solid in the scene, or bool [k], a mask of cells.
     """
     parts, box = source.parts, source.scene.box
     if isinstance(kept, Tensor):
@@ -358,16 +358,16 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
         changed = []
         for part in parts:
             solid = kept.moved(part.frame.inverse)
-            seen = part.contraction
-            if seen is not None and not kept.outside:
-                if not _inside_ball(solid, seen):
-                    where = [round(x, 3) for x in part.frame.points(seen.centre).tolist()]
+            warp = part.contraction
+            if warp is not None and not kept.outside:
+                if not _inside_ball(solid, warp):
+                    where = [round(x, 3) for x in part.frame.points(warp.centre).tolist()]
                     rule = (
-                        f"must lie within {seen.radius * part.frame.scale:g} of {where}, where space is not contracted"
+                        f"must lie within {warp.radius * part.frame.scale:g} of {where}, where space is not contracted"
                     )
                     raise ConfigError(f"{source.name}: --box or --sphere {rule}")
-                seen = None
-            changed.append(part.changed(region=(*part.region, solid), contraction=seen))
+                warp = None
+            changed.append(part.changed(region=(*part.region, solid), contraction=warp))
         parts = Parts(changed, backend=parts.backend)
         if not kept.outside:
             around = kept.bounds()
@@ -378,37 +378,37 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
         return replace(source, parts=parts)
     grid = source.grid
     if grid is None:
-        grid = _found_grid(source, parts, box)
-    full = grid.occupied.view(-1).nonzero()[:, 0]
+        grid = _evaluated_grid(source, parts, box)
+    occupied = grid.occupied.view(-1).nonzero()[:, 0]
     size = (grid.box[1] - grid.box[0]) / torch.tensor(grid.occupied.shape)
-    places = grid.points(full)
+    places = grid.points(occupied)
     near = ((places > box[0] - size) & (places < box[1] + size)).all(-1)
-    grid = _trimmed(grid, parts, full[near])
+    grid = _trimmed(grid, parts, occupied[near])
     if grid is None:
         raise ConfigError(f"{source.name}: nothing is left of it")
     if not isinstance(kept, Tensor):
-        full, shown = grid.occupied.view(-1).nonzero()[:, 0], torch.zeros(parts.num_cells, dtype=torch.bool)
+        occupied, shown = grid.occupied.view(-1).nonzero()[:, 0], torch.zeros(parts.num_cells, dtype=torch.bool)
         for offset in _LATTICE:
             if not bool(shown.all()):
-                places = grid.points(full, offset.expand(len(full), 3))
+                places = grid.points(occupied, offset.expand(len(occupied), 3))
                 for claim in (claim for layer in range(len(parts.layers)) for claim in parts.claims(layer, places)):
                     shown[parts.cells_of(claim).long()] = True
         if not bool(shown.all()):
             parts = keep_cells(parts, shown)
     config, scene = source.config, replace(source.scene, box=grid.box)
-    before = source.scene.box
-    if before is not None:  # strata stay as long as they were
-        share = float((grid.box[1] - grid.box[0]).norm() / (before[1] - before[0]).norm())
+    old_box = source.scene.box
+    if old_box is not None:  # keeps the length of the strata
+        share = float((grid.box[1] - grid.box[0]).norm() / (old_box[1] - old_box[0]).norm())
         config = replace(config, samples=(max(16, math.ceil((config.samples or (64,))[0] * share - 1e-6)),))
     config = _settings([replace(source, config=config, scene=scene)], [Similarity()], scene)
     return Source(source.name, config, scene, parts, grid)
 
 
 def keep_cells(parts: Parts, kept: Tensor) -> Parts:
-    """Parts with some of the cells alone, bool [k]."""
+    """Returns the parts with only the cells of a mask, bool [k]."""
     pieces = kept.split([part.num_cells for part in parts])
-    left = [part.keep(piece.nonzero()[:, 0]) for part, piece in zip(parts, pieces, strict=True)]
-    shown = [part for part in left if part is not None]
+    remaining = [part.keep(piece.nonzero()[:, 0]) for part, piece in zip(parts, pieces, strict=True)]
+    shown = [part for part in remaining if part is not None]
     if not shown:
         raise ConfigError("nothing is left: all cells are cut away")
     lowest = min(part.layer for part in shown)
@@ -418,41 +418,44 @@ def keep_cells(parts: Parts, kept: Tensor) -> Parts:
 
 
 def _inside_ball(solid: Solid, contraction: Contraction) -> bool:
-    """Whether a solid lies where a contraction leaves space as it is."""
+    """Returns whether a solid lies inside of a contraction's sphere, where the contraction is the identity."""
     if solid.ball is not None:
-        away = float((torch.tensor(solid.ball[:3]) - contraction.centre).norm()) + solid.ball[3]
+        farthest = float((torch.tensor(solid.ball[:3]) - contraction.centre).norm()) + solid.ball[3]
     else:
-        away = float((_corners(solid.bounds()) - contraction.centre).norm(dim=-1).max())
-    return away <= contraction.radius * (1 + 1e-4)
+        farthest = float((_corners(solid.bounds()) - contraction.centre).norm(dim=-1).max())
+    return farthest <= contraction.radius * (1 + 1e-4)
 
 
-#: Places in a voxel that say whether a part speaks for some of it.
+#: Sample points in a voxel, by which it is found whether a part covers some of it.
 _LATTICE = torch.tensor([*itertools.product((0.5, 1e-3, 1 - 1e-3), repeat=3)])
 
 
-def _trimmed(grid: OccupancyGrid, parts: Parts, full: Tensor) -> OccupancyGrid | None:
-    """A grid of those of some voxels, int64 [q], in which a part speaks; of the block around them. None for none."""
-    speaks = torch.zeros(len(full), dtype=torch.bool)
+def _trimmed(grid: OccupancyGrid, parts: Parts, voxels: Tensor) -> OccupancyGrid | None:
+    """Returns a grid of the given voxels, int64 [q], that a part covers, trimmed to their bounding box.
+
+    Returns None if no part covers any of the voxels.
+    """
+    covered = torch.zeros(len(voxels), dtype=torch.bool)
     for offset in _LATTICE:
-        left = (~speaks).nonzero()[:, 0]
-        speaks[left] = parts.assign(grid.points(full[left], offset.expand(len(left), 3))) >= 0
-    if not bool(speaks.any()):
+        uncovered = (~covered).nonzero()[:, 0]
+        covered[uncovered] = parts.assign(grid.points(voxels[uncovered], offset.expand(len(uncovered), 3))) >= 0
+    if not bool(covered.any()):
         return None
     occupied = torch.zeros_like(grid.occupied)
-    occupied.view(-1)[full[speaks]] = True
-    there = occupied.nonzero()
-    first, last = there.amin(0), there.amax(0) + 1
+    occupied.view(-1)[voxels[covered]] = True
+    indices = occupied.nonzero()
+    first, last = indices.amin(0), indices.amax(0) + 1
     shape = torch.tensor(occupied.shape)
     box = torch.stack([torch.lerp(grid.box[0], grid.box[1], edge / shape) for edge in (first, last)])
     block = tuple(slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True))
-    trimmed = _grid_like(box, (last - first).tolist(), grid.threshold)
+    trimmed = _empty_grid(box, (last - first).tolist(), grid.threshold)
     trimmed.occupied = occupied[block].contiguous()
     trimmed.density = torch.where(trimmed.occupied, grid.density[block], 0).contiguous()
     return trimmed
 
 
-def _found_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
-    """What is empty in a box of a run that has no grid, by asking the field in every voxel."""
+def _evaluated_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
+    """Makes an occupancy grid of a box, for a run without a grid, by evaluating the field in every voxel."""
     threshold = -math.log1p(-OPACITY) * (source.config.samples or (64,))[0] / float((box[1] - box[0]).norm())
     return ask_everywhere(OccupancyGrid(box, PICTURE_RESOLUTION, threshold=threshold), parts.eval())
 
@@ -461,48 +464,53 @@ def _found_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
 
 
 def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, int]:
-    """The similarity that moves cameras of a scene to where another has the images of the same names.
+    """Finds the similarity that maps cameras of a scene to another scene's cameras of the same image names.
 
     Source: Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns".
 
+    Args:
+        fixed: The scene that stays.
+        moving: The scene that is moved.
+        name: The name of the moving run in error messages.
+
     Returns:
-        The similarity, the root of the mean squared distance of camera centres after it, and how many these are.
+        The similarity, the root mean square distance of the camera centres after it, and the number of cameras.
     """
-    ours, theirs = (
+    fixed_places, moving_places = (
         {n: place for split in (s.train, s.test) for n, place in zip(split.names, split.cameras.origins, strict=True)}
         for s in (fixed, moving)
     )
-    shared = sorted(ours.keys() & theirs.keys())
+    shared = sorted(fixed_places.keys() & moving_places.keys())
     if len(shared) < 3:
         raise ConfigError(f"{name}: --align needs at least 3 images of the same names in both runs, got {len(shared)}")
-    to, at = (torch.stack([of[n] for n in shared]).double() for of in (ours, theirs))
-    to_mean, at_mean = to.mean(0), at.mean(0)
-    u, spread, v = torch.linalg.svd((to - to_mean).T @ (at - at_mean) / len(shared))
+    targets, sources = (torch.stack([of[n] for n in shared]).double() for of in (fixed_places, moving_places))
+    target_mean, source_mean = targets.mean(0), sources.mean(0)
+    u, spread, v = torch.linalg.svd((targets - target_mean).T @ (sources - source_mean) / len(shared))
     if float(spread[1]) < 1e-9 * max(float(spread[0]), 1e-30):
         raise ConfigError(f"{name}: --align needs cameras that are not on one line, those of {len(shared)} images are")
     sign = torch.ones(3, dtype=torch.float64)
     sign[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(v))
     rotation = u @ torch.diag(sign) @ v
-    scale = float((spread * sign).sum() / (at - at_mean).square().sum(1).mean())
-    similarity = Similarity(scale, rotation, to_mean - scale * rotation @ at_mean)
-    return similarity, float((similarity.points(at) - to).square().sum(1).mean().sqrt()), len(shared)
+    scale = float((spread * sign).sum() / (sources - source_mean).square().sum(1).mean())
+    similarity = Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+    return similarity, float((similarity.points(sources) - targets).square().sum(1).mean().sqrt()), len(shared)
 
 
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
 def check_out(out: Path) -> None:
-    """Refuses to write into a folder with something in it."""
+    """Raises ConfigError if a folder for a new run is not empty."""
     if checkpoint_paths(out):
         raise ConfigError(f"--out must not hold a run already, got {out}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"--out must be a new or an empty folder, got {out}")
 
 
-def _runs(number: int) -> bool:
-    """Whether there is a process of this number, or it cannot be known."""
+def _process_exists(number: int) -> bool:
+    """Returns whether a process with this number exists; True if that cannot be found out."""
     try:
-        os.kill(number, 0) if os.name == "posix" else None  # elsewhere it would end the process
+        os.kill(number, 0) if os.name == "posix" else None  # on Windows, os.kill would end the process
     except ProcessLookupError:
         return False
     except OSError:
@@ -511,12 +519,12 @@ def _runs(number: int) -> bool:
 
 
 def _write(source: Source, out: Path) -> Source:
-    """Writes a run of parts into a new folder, whole or not at all."""
+    """Writes a run of parts into a new folder, atomically."""
     check_out(out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    for left in out.parent.glob(".*.[0-9]*.partial"):
-        if not _runs(int(left.suffixes[-2][1:])):  # it was killed
-            shutil.rmtree(left, ignore_errors=True)
+    for leftover in out.parent.glob(".*.[0-9]*.partial"):
+        if not _process_exists(int(leftover.suffixes[-2][1:])):  # its process was killed
+            shutil.rmtree(leftover, ignore_errors=True)
     partial = out.parent / f".{out.name[:100]}.{os.getpid()}.partial"
     try:
         partial.mkdir()

@@ -1,4 +1,4 @@
-"""Where things stand in a scene: similarities and convex solids."""
+"""Geometry of parts in a scene: similarities and convex solids."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-#: How far a rotation may be from orthonormal, which rounding in a file makes it.
+#: Tolerance for the orthonormality of a rotation, since files round its numbers.
 _ORTHONORMAL = 1e-4
 
 
@@ -26,15 +26,15 @@ def _zeros() -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """``x -> scale * rotation @ x + translation``, from the frame of a part to that of the scene.
+    """A similarity ``x -> scale * rotation @ x + translation``, from the frame of a part to the scene.
 
     Args:
         scale: 1e-9 to 1e9.
-        rotation: [3, 3], orthonormal, no mirror image.
+        rotation: [3, 3], orthonormal with determinant 1.
         translation: [3].
 
     Raises:
-        ValueError: For anything else.
+        ValueError: An argument is invalid.
 
     Examples:
         >>> import torch
@@ -70,7 +70,7 @@ class Similarity:
         degrees: Sequence[float] = (0, 0, 0),
         scale: float = 1.0,
     ) -> Similarity:
-        """From angles about the axes x, y and z of the scene, turned in this order."""
+        """Makes a similarity from rotations about the axes x, y and z of the scene, in this order."""
         rotation = _eye()
         for axis, angle in enumerate(degrees):
             c, s, turn = math.cos(math.radians(angle)), math.sin(math.radians(angle)), _eye()
@@ -81,45 +81,45 @@ class Similarity:
 
     @functools.cached_property
     def is_identity(self) -> bool:
-        """Whether it moves nothing, but for rounding."""
+        """True if the similarity is the identity, up to rounding."""
         still = (self.rotation - _eye()).abs().max() < 1e-12 and self.translation.abs().max() < 1e-12
         return bool(still) and abs(self.scale - 1) < 1e-12
 
     @functools.cached_property
     def inverse(self) -> Similarity:
-        """From the scene to the part."""
+        """The inverse similarity, from the scene to the part."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.translation @ self.rotation) / self.scale)
 
     def __matmul__(self, first: Similarity) -> Similarity:
-        """This one after another."""
+        """Composes two similarities: ``first`` is applied first, then this one."""
         return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation))
 
     def points(self, points: Tensor) -> Tensor:
-        """Points [..., 3] of the part in the scene."""
+        """Maps points [..., 3] from the part to the scene."""
         if self.is_identity:
             return points
         return points @ (self.scale * self.rotation.T).to(points) + self.translation.to(points)
 
     def directions(self, directions: Tensor) -> Tensor:
-        """Unit vectors [..., 3] of the part in the scene."""
+        """Rotates unit vectors [..., 3] from the part to the scene."""
         return directions if self.is_identity else directions @ self.rotation.T.to(directions)
 
     def to_values(self) -> dict[str, Any]:
-        """As values of JSON, the arguments."""
+        """Returns the arguments as JSON values."""
         return {"scale": self.scale, "rotation": self.rotation.tolist(), "translation": self.translation.tolist()}
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A convex solid: what lies behind all its planes, or in a ball; or with ``outside`` all the rest of space.
+    """A convex solid, an intersection of half-spaces or a ball; with ``outside``, its complement.
 
     Args:
-        planes: (a, b, c, d) each, for ``a x + b y + c z <= d``.
-        ball: Centre and radius (x, y, z, r), in place of planes.
-        outside: The space around it.
+        planes: Half-spaces (a, b, c, d), for ``a x + b y + c z <= d``.
+        ball: Centre and radius (x, y, z, r), instead of planes.
+        outside: Whether to take the space outside of the planes or the ball instead.
 
     Raises:
-        ValueError: A solid that is empty or has no bounds at all.
+        ValueError: There are neither planes nor a ball, or both, or their numbers are invalid.
 
     Examples:
         >>> import torch
@@ -144,7 +144,7 @@ class Solid:
 
     @classmethod
     def box(cls, low: Sequence[float], high: Sequence[float]) -> Solid:
-        """The box between two corners.
+        """Returns the box between two corners.
 
         Raises:
             ValueError: The second corner is not above the first.
@@ -157,7 +157,7 @@ class Solid:
         return cls(tuple(above + below))
 
     def holds(self, points: Tensor) -> Tensor:
-        """Which of the points [n, 3] it has: bool [n]."""
+        """Returns a mask, bool [n], of the points [n, 3] in the solid."""
         if self.ball is not None:
             ball = points.new_tensor(self.ball)
             inside = (points - ball[:3]).square().sum(-1) <= ball[3] ** 2
@@ -167,10 +167,10 @@ class Solid:
         return ~inside if self.outside else inside
 
     def bounds(self) -> Tensor:
-        """float32 [2, 3], the box around the solid; for ``outside`` around what it leaves out.
+        """Returns float32 [2, 3], the box around the planes' or the ball's inside, also for ``outside``.
 
         Raises:
-            ValueError: For planes that leave a direction open.
+            ValueError: The planes have no corner.
         """
         if self.ball is not None:
             centre, radius = torch.tensor(self.ball[:3]), self.ball[3]
@@ -189,7 +189,7 @@ class Solid:
         return torch.stack((points.amin(0), points.amax(0)))
 
     def moved(self, move: Similarity) -> Solid:
-        """The same solid after a similarity."""
+        """Returns the solid after a similarity."""
         if self.ball is not None:
             centre = move.points(torch.tensor(self.ball[:3], dtype=torch.float64)).tolist()
             return Solid(ball=(*centre, self.ball[3] * move.scale), outside=self.outside)
@@ -200,11 +200,11 @@ class Solid:
         return Solid(tuple(map(tuple, rows)), outside=self.outside)
 
     def to_values(self) -> dict[str, Any]:
-        """As values of JSON, the arguments."""
+        """Returns the arguments as JSON values."""
         return {"planes": [*map(list, self.planes)], "ball": self.ball and list(self.ball), "outside": self.outside}
 
     @classmethod
     def from_values(cls, values: dict[str, Any]) -> Solid:
-        """What :meth:`to_values` gave."""
+        """Makes a solid from the values of :meth:`to_values`."""
         ball = None if values["ball"] is None else tuple(map(float, values["ball"]))
         return cls(tuple(tuple(map(float, row)) for row in values["planes"]), ball, bool(values["outside"]))

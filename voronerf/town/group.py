@@ -1,7 +1,7 @@
-"""The processes that train one run together: how they meet, what they send each other, and who says what is wrong.
+"""The processes that train one run together: rendezvous, communication, and reports of errors.
 
-torchrun starts the ranks and says in the environment who they are. They meet over ``torch.distributed``: gloo on CPUs,
-nccl on GPUs.
+torchrun starts the ranks and sets their environment variables. The ranks communicate by ``torch.distributed``: gloo on
+CPUs, nccl on GPUs.
 """
 
 from __future__ import annotations
@@ -24,41 +24,41 @@ from torch import Tensor
 
 from voronerf.app.scenes import Scene
 
-#: Seconds after which a rank that does not answer is given up.
+#: Timeout in seconds, after which a rank that does not answer counts as lost.
 PATIENCE = 50
-#: Settings that machines may name in their own ways.
-OWN = ("data", "device", "lpips")
-#: Of a part of a message: the territory that it is from, and the one that it is for.
+#: Settings that may differ between ranks.
+MAY_DIFFER = ("data", "device", "lpips")
+#: The (first, second) territory of a part of a message: the sender and the receiver, except for answers.
 Key = tuple[int, int]
 
 
 class RankLost(ConnectionError):
-    """Another rank has ended, or does not answer."""
+    """An error because another rank has ended, or does not answer."""
 
 
 def world_size() -> int:
-    """The ranks that torchrun has started; 1 without it."""
+    """Returns the number of ranks that torchrun has started; 1 without torchrun."""
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def local_rank() -> int:
-    """The number of this process among those of its machine, from 0, which is that of its GPU."""
+    """Returns the number of this process on its machine, from 0; it is also the number of its GPU."""
     return int(os.environ.get("LOCAL_RANK", "0"))
 
 
 def restarts() -> int:
-    """How often torchrun has started the ranks again after one of them failed."""
+    """Returns how often torchrun has restarted the ranks after a failure."""
     return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
 
 class Group:
-    """All ranks of a training. A group of one is a process by itself, which sends nothing.
+    """All ranks of a training. A group of one is a single process without communication.
 
     Attributes:
-        rank: The number of this one.
-        size: How many there are.
-        device: Where the tensors are that are sent.
-        store: What torchrun keeps for all ranks; None in a group of one.
+        rank: The number of this rank.
+        size: The number of ranks.
+        device: The device of the tensors that are sent.
+        store: torchrun's key-value store, which all ranks share; None in a group of one.
     """
 
     def __init__(self, device: torch.device, rank: int = 0, size: int = 1, store: dist.Store | None = None) -> None:
@@ -66,36 +66,36 @@ class Group:
 
     @classmethod
     def join(cls, device: torch.device) -> Group:
-        """Finds the store of the ranks that torchrun has started, which `meet` each other."""
+        """Joins the rendezvous of torchrun; `meet` then connects the ranks."""
         if world_size() == 1:
             return cls(device)
         with waiting():
             store, rank, size = next(iter(dist.rendezvous("env://", timeout=timedelta(seconds=PATIENCE))))
-        # torchrun keeps one store for all starts: a rank would find the addresses of those that were killed.
+        # torchrun's store survives restarts. The prefix hides the addresses of ranks that were killed.
         return cls(device, rank, size, dist.PrefixStore(f"voronerf/{restarts()}", store))
 
     def meet(self) -> None:
-        """Meets the other ranks."""
+        """Connects to the other ranks; all ranks call it together."""
         if self.size == 1:
             return
         if self.device.type == "cuda":
-            torch.cuda.set_device(self.device)  # where torch puts what it sends of Python objects
+            torch.cuda.set_device(self.device)  # `dist.all_gather_object` uses the current device
         backend, timeout = "nccl" if self.device.type == "cuda" else "gloo", timedelta(seconds=PATIENCE)
         with waiting():
             dist.init_process_group(backend, None, timeout, store=self.store, rank=self.rank, world_size=self.size)
 
     def leave(self) -> None:
-        """Leaves together with the others."""
+        """Disconnects from the other ranks; all ranks call it together."""
         if self.size > 1:
-            self.total(torch.zeros(1))  # all have come as far
+            self.total(torch.zeros(1))  # a barrier
             dist.destroy_process_group()
 
     def total(self, values: Tensor) -> Tensor:
-        """The sum of the tensors of all ranks, on the CPU."""
+        """Returns the sum of the tensors of all ranks, on the CPU."""
         return self._reduce(values, dist.ReduceOp.SUM)
 
     def any(self, value: bool) -> bool:
-        """Whether a value is true on any rank."""
+        """Returns whether a value is true on any rank."""
         return bool(self._reduce(torch.tensor(float(value)), dist.ReduceOp.MAX))
 
     def _reduce(self, values: Tensor, kind: Any) -> Tensor:
@@ -107,49 +107,53 @@ class Group:
         return values.cpu()
 
     def gather(self, value: Any) -> list[Any]:
-        """The values of all ranks, by rank."""
-        found: list[Any] = [value] * self.size
+        """Returns the values of all ranks, by rank."""
+        values: list[Any] = [value] * self.size
         if self.size > 1:
             with waiting():
-                dist.all_gather_object(found, value)
-        return found
+                dist.all_gather_object(values, value)
+        return values
 
     def send(
         self, parts: Mapping[Key, Tensor], counts: Tensor, owner: Sequence[int], width: int, *, back: bool = False
     ) -> dict[Key, Tensor]:
-        """Sends parts from territories to others.
+        """Sends parts of messages between territories; all ranks call it together.
 
         Args:
-            parts: float32 [counts[key], width] of the territories of this rank.
-            counts: int64 [T, T], the rows of all parts, the same on all ranks; there is no part without rows.
+            parts: float32 [counts[key], width], the parts that territories of this rank send.
+            counts: int64 [T, T], the numbers of rows of all parts, the same on all ranks; a part has at least one row.
             owner: The rank of each territory.
-            width: Columns of a part.
-            back: Answers: the parts go from the second territory of a key to the first.
+            width: Number of columns of a part.
+            back: Whether the parts are answers, from the second territory of a key to the first.
 
         Returns:
-            The parts for territories of this rank, by key in ascending order.
+            The parts that territories of this rank receive, by key in ascending order.
         """
         ends = {(n, m): (owner[m], owner[n]) if back else (owner[n], owner[m]) for n, m in counts.nonzero().tolist()}
-        sent, came = (
+        sent, received = (
             [[key for key in ends if ends[key] == pair] for pair in pairs]
             for pairs in (
                 [(self.rank, other) for other in range(self.size)],
                 [(other, self.rank) for other in range(self.size)],
             )
         )
-        out = torch.cat([torch.empty(0, width, device=self.device), *(parts[key] for each in sent for key in each)])
-        found = out
+        outgoing = torch.cat(
+            [torch.empty(0, width, device=self.device), *(parts[key] for keys_of_rank in sent for key in keys_of_rank)]
+        )
+        incoming = outgoing
         if self.size > 1:
-            coming, going = ([sum(int(counts[key]) for key in each) for each in keys] for keys in (came, sent))
-            found = out.new_empty(sum(coming), width)
+            incoming_rows, outgoing_rows = (
+                [sum(int(counts[key]) for key in keys_of_rank) for keys_of_rank in keys] for keys in (received, sent)
+            )
+            incoming = outgoing.new_empty(sum(incoming_rows), width)
             with waiting():
-                dist.all_to_all_single(found, out, coming, going)
-        keys = [key for each in came for key in each]
-        return dict(sorted(zip(keys, found.split([int(counts[key]) for key in keys]), strict=True)))
+                dist.all_to_all_single(incoming, outgoing, incoming_rows, outgoing_rows)
+        keys = [key for keys_of_rank in received for key in keys_of_rank]
+        return dict(sorted(zip(keys, incoming.split([int(counts[key]) for key in keys]), strict=True)))
 
-    def check_equal(self, what: dict[str, str]) -> None:
-        """Compares texts of all ranks, each rank naming them alike."""
-        first, *others = self.gather(what)
+    def check_equal(self, texts: dict[str, str]) -> None:
+        """Raises ValueError unless the texts of all ranks, by name, are equal."""
+        first, *others = self.gather(texts)
         for name, value in first.items():
             for rank, other in enumerate(others, 1):
                 if other[name] != value:
@@ -158,42 +162,45 @@ class Group:
                     )
 
     def check_same(self, config: Any, territories: int) -> None:
-        """Compares the settings, a dataclass, and the code of all ranks."""
+        """Raises ValueError unless the settings, a dataclass, and the code are the same on all ranks."""
         root, code = Path(__file__).resolve().parents[1], 0
         for path in sorted(root.rglob("*.py")):
             code = zlib.crc32(path.read_bytes(), code)
-        names = [field.name for field in dataclasses.fields(config) if field.name not in OWN]
+        names = [field.name for field in dataclasses.fields(config) if field.name not in MAY_DIFFER]
         settings = {f"--{name.replace('_', '-')}": repr(getattr(config, name)) for name in names}
-        made = {"the code of voronerf": f"{code:08x}", "the version of torch": torch.__version__}
-        self.check_equal({**made, "--territories": str(territories), **settings})
+        versions = {"the code of voronerf": f"{code:08x}", "the version of torch": torch.__version__}
+        self.check_equal({**versions, "--territories": str(territories), **settings})
 
     def check_same_scene(self, scene: Scene) -> None:
-        """Compares cameras and the middle row of every image on all ranks; images may not fit into memory."""
+        """Raises ValueError unless cameras and the middle row of every image are the same on all ranks.
+
+        Whole images are not compared, since they may not fit into memory.
+        """
         views = scene.train
         rows = views.images[:, views.images.shape[1] // 2]
         tensors = (rows, views.cameras.poses, views.cameras.intrinsics, scene.test.cameras.poses)
-        found = [zlib.crc32(tensor.contiguous().cpu().numpy().data) for tensor in tensors]
-        self.check_equal({"the scene": f"{scene.name} {'-'.join(f'{number:08x}' for number in found)}"})
+        checksums = [zlib.crc32(tensor.contiguous().cpu().numpy().data) for tensor in tensors]
+        self.check_equal({"the scene": f"{scene.name} {'-'.join(f'{number:08x}' for number in checksums)}"})
 
     def may_tell(self, error: Exception) -> bool:
-        """Whether this process is to say what is wrong: of many ranks that meet an error, the first.
+        """Returns whether this process reports an error: True for the first failing rank only.
 
-        One that only knows that another has ended leaves that one a second to say why.
+        A rank with a `RankLost` waits a second, so that the lost rank can report the reason.
         """
         if isinstance(error, RankLost):
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # of torchrun, which ends the ranks that are left
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # torchrun sends it to the remaining ranks
             time.sleep(1)
         try:
             return self.store is None or bool(self.store.add("voronerf/told", 1) == 1)
-        except RuntimeError:  # the process that kept the store is gone
+        except RuntimeError:  # the process with the store has ended
             return True
 
 
 @contextlib.contextmanager
 def waiting() -> Iterator[None]:
-    """A context in which what torch.distributed raises is a `RankLost`."""
+    """A context that converts errors of torch.distributed into `RankLost`."""
     try:
         yield
-    except RuntimeError as error:  # DistError and what gloo throws
+    except RuntimeError as error:  # DistError, and errors of gloo
         reason = re.sub(r"^\[\S+\] *", "", str(error)).splitlines()[0].split(". ")[0]
         raise RankLost(f"another rank has ended, or has not answered for {PATIENCE} s ({reason})") from None

@@ -1,4 +1,4 @@
-"""The networks of cells, as a file has them; the router is made of them when it is asked for."""
+"""The stored networks of cells, from which a router is made on first use."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from voronerf.router import VoronoiRouter
 
 
 class StoredRouter:
-    """The networks of cells: settings and tensors."""
+    """A router as a checkpoint with its settings and tensors."""
 
     def __init__(self, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> None:
         self.checkpoint, self.device, self.backend = checkpoint, device, backend
@@ -25,7 +25,7 @@ class StoredRouter:
 
     @classmethod
     def of(cls, router: VoronoiRouter, config: TrainConfig) -> StoredRouter:
-        """Those of a router, and the settings that its network is made of."""
+        """Returns the stored form of a router and its settings."""
         tensors = {f"router.{name}": tensor for name, tensor in router.state_dict().items()}
         network = cls(Checkpoint(tensors, {"config": replace(config, sampling="stratified").to_values()}))
         network.router = router
@@ -33,20 +33,20 @@ class StoredRouter:
 
     @functools.cached_property
     def router(self) -> VoronoiRouter:
-        """With averaged weights, in evaluation mode."""
+        """The router with averaged weights, in evaluation mode."""
         return open_routers(config_of(self.checkpoint), self.checkpoint, self.device, self.backend)["field"]
 
     def part(self, cells: Sequence[int] | Tensor) -> StoredRouter:
-        """Those of some of the cells."""
+        """Returns a StoredRouter with only the given cells."""
         return StoredRouter.of(self.router.part(cells), config_of(self.checkpoint))
 
     def stored(self) -> Checkpoint:
-        """The checkpoint without what only a training needs."""
-        shown = {k: v for k, v in self.checkpoint.tensors.items() if k.startswith("router") or k.endswith(".average")}
-        tensors = {name: tensor.cpu() for name, tensor in shown.items()}
+        """Returns the checkpoint on the CPU, without tensors that only a training needs."""
+        kept = {k: v for k, v in self.checkpoint.tensors.items() if k.startswith("router") or k.endswith(".average")}
+        tensors = {name: tensor.cpu() for name, tensor in kept.items()}
         return Checkpoint(tensors, {"config": self.checkpoint.values["config"]})
 
 
 def config_of(checkpoint: Checkpoint) -> TrainConfig:
-    """The settings in a checkpoint."""
+    """Returns the settings in a checkpoint."""
     return TrainConfig.from_values(checkpoint.values["config"], checkpoint.source)

@@ -1,9 +1,10 @@
-"""The loss of rays that pass through several territories, each with networks of its own: only partial sums travel.
+"""The loss of rays that pass through several territories with networks of their own: only partial sums are sent.
 
-Every territory draws rays from its own views, and evaluates its own part of them first. A ray that has not ended by
-then goes to the other territories that it meets. Each answers with a partial sum, 24 bytes; the territory that drew the
-ray puts it together, and answers with what the gradients of the sum follow from, 24 bytes (Li et al. 2024, NeRF-XL).
-What a territory computes does not depend on which rank has it. r rays, m samples, q runs, T territories.
+Every territory draws rays from its own views, and evaluates its own part of them first. A ray that is not opaque by
+then is sent to the other territories that it meets. Each of them returns a partial sum of 24 bytes. The home territory,
+which drew the ray, merges the sums and sends an answer of 24 bytes to each, from which the gradients of the sum follow
+(Li et al. 2024, NeRF-XL). The results of a territory do not depend on its rank. r rays, m samples, q runs, T
+territories.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from voronerf.nerf.occupancy import HIDDEN
 from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import Renderer
-from voronerf.nerf.segment import Made
+from voronerf.nerf.segment import SegmentResult
 from voronerf.nerf.step import StepOutput, TrainingStep
-from voronerf.nerf.volume import Batch, RenderOutput, Samples, shares_of
+from voronerf.nerf.volume import Batch, RenderOutput, Samples, gradient_factors
 from voronerf.ops.formulas import along_rays, compose
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.ray_runs import OwnSamples, compose_runs, own_samples, run_gradients, run_sums
 from voronerf.town.group import Group, Key
 from voronerf.town.territories import Place
 
-#: Light that is worth a message, one level of an 8-bit image.
+#: Least transmittance for which a ray is sent on: one level of an 8-bit image.
 FAINT = 1 / 255
-#: Columns of the rays that go to another territory, and of sums and answers.
+#: Number of columns of rays that are sent, and of sums and answers.
 RAY, SUM = 8, 6
 
 
@@ -45,12 +46,12 @@ class Territory:
 
     @property
     def renderer(self) -> Renderer:
-        """Networks and sampler."""
+        """The renderer, with networks and sampler."""
         return self.step.loss.renderer
 
 
-class Looked(NamedTuple):
-    """What the networks of a territory put out for its samples of rays."""
+class Evaluated(NamedTuple):
+    """The outputs of a territory's networks for its samples, with the autograd tape and the sums of the runs."""
 
     samples: OwnSamples
     tape: Tape
@@ -58,61 +59,61 @@ class Looked(NamedTuple):
     density: Tensor
 
 
-class Learnt(NamedTuple):
-    """What a territory has learnt of the answers to its sums."""
+class Gradients(NamedTuple):
+    """The weights of a territory's samples, and the gradients of its parameters."""
 
     weights: Tensor
     gradients: list[tuple[torch.nn.Parameter, Tensor]]
 
 
 class Pass:
-    """Rays [r] in one territory: its sums of them, and from the answers to these its gradients.
+    """One territory's part of a step: partial sums of its rays [r], then gradients from the merged result.
 
     Attributes:
-        sums: [q, 6] of its runs.
-        learnt: The segment that has left gradients at the parameters, if it had samples.
+        sums: [q, 6], the sums of its runs.
+        learnt: The segment that has set the gradients of the parameters, in a list; empty without samples.
 
     Args:
-        name: Of its segments of the step.
-        territory: Whose networks are asked.
+        name: The name of its segments of the step.
+        territory: The territory whose networks are evaluated.
         rays: r rays.
-        near: [r].
-        far: [r].
+        near: [r], the distance at which each ray begins.
+        far: [r], the distance at which it ends.
     """
 
     def __init__(self, name: str, territory: Territory, rays: Rays, near: Tensor, far: Tensor) -> None:
         self.name, self.territory, self.rays = name, territory, len(near)
-        self.found: Made | None = None
-        self.learnt: list[Made] = []
+        self.found: SegmentResult | None = None
+        self.learnt: list[SegmentResult] = []
         step, place, renderer = territory.step, territory.place, territory.renderer
         if renderer.contraction is None:
             first, last, _ = intersect_box(rays.origins, rays.directions, place.box.to(near.device), 0.0, math.inf)
-            near, far = torch.maximum(near, first), torch.minimum(far, last)  # without samples where the box is missed
+            near, far = torch.maximum(near, first), torch.minimum(far, last)  # no interval for rays that miss the box
         self.sums = near.new_empty(0, SUM)
         if not len(near):
             return
-        given = rays.origins, rays.directions, near, far
-        drawn = step.do(f"{name}: samples", self._draw, *given)
+        inputs = rays.origins, rays.directions, near, far
+        drawn = step.do(f"{name}: samples", self._draw, *inputs)
         positions, ray_index, depths, deltas, cells = drawn.now(drawn.value)
-        along = ray_index, depths, deltas, cells, place.own.to(near.device)
+        details = ray_index, depths, deltas, cells, place.own.to(near.device)
         bent = renderer.contraction is not None
-        own: OwnSamples = own_samples(positions, *along, bent=bent, backend=renderer.backend)
-        if not len(own.depths):
+        own_samples_of_rays: OwnSamples = own_samples(positions, *details, bent=bent, backend=renderer.backend)
+        if not len(own_samples_of_rays.depths):
             return
-        self.found = step.do(f"{name}: networks", self._look, rays.directions, *own)
-        self.sums, self.own = self.found.now(self.found.value.sums), own
+        self.found = step.do(f"{name}: networks", self._look, rays.directions, *own_samples_of_rays)
+        self.sums, self.own = self.found.now(self.found.value.sums), own_samples_of_rays
 
     def _draw(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, ...]:
         step, renderer = self.territory.step, self.territory.renderer
         rays = Rays(origins, directions)
-        known = renderer.sampler.sample(rays, near, far, jitter=True, generator=step.generator).counted()
-        cells = self.territory.place.cells(known.positions, renderer.backend)
-        return known.positions, known.ray_index, known.depths, known.deltas, cells
+        samples = renderer.sampler.sample(rays, near, far, jitter=True, generator=step.generator).counted()
+        cells = self.territory.place.cells(samples.positions, renderer.backend)
+        return samples.positions, samples.ray_index, samples.depths, samples.deltas, cells
 
-    def _look(self, directions: Tensor, *given: Tensor) -> Looked:
-        samples, backend, field = OwnSamples(*given), self.territory.renderer.backend, self._field()
+    def _look(self, directions: Tensor, *tensors: Tensor) -> Evaluated:
+        samples, backend, field = OwnSamples(*tensors), self.territory.renderer.backend, self._field()
         tape = forward_with_tape(field.arguments(samples.positions, directions, samples.ray_index), backend=backend)
-        return Looked(samples, tape, *run_sums(tape.raw, samples, **field.rule, backend=backend))
+        return Evaluated(samples, tape, *run_sums(tape.raw, samples, **field.rule, backend=backend))
 
     def _field(self) -> Radiance:
         renderer = self.territory.renderer
@@ -122,7 +123,7 @@ class Pass:
         return field
 
     def end(self) -> Tensor:
-        """[r], the depth at which a ray has ended here, or infinity."""
+        """Returns [r], the depth at which a ray becomes opaque in this territory, or infinity."""
         sums = self.sums
         if not len(sums):
             return sums.new_full((self.rays,), math.inf)
@@ -131,64 +132,68 @@ class Pass:
         deepest = sums.new_zeros(self.rays).scatter_reduce_(0, ray, last, "amax")
         return torch.where(optical > -math.log(FAINT), deepest, math.inf)
 
-    def learn(self, answers: Tensor, loss: Tensor, *before: Made) -> RenderOutput | None:
-        """Adds gradients to those of the parameters; returns what was found, None without samples.
+    def learn(self, answers: Tensor, loss: Tensor, *before: SegmentResult) -> RenderOutput | None:
+        """Accumulates gradients of the parameters; returns the output of the step, or None without samples.
 
         Args:
-            answers: [q, 6], to the sums.
-            loss: [], of the rays.
-            before: The segments that have left gradients before.
+            answers: [q, 6], the answers to the sums.
+            loss: [], the loss of the rays.
+            before: The segments whose gradients are already in the parameters.
         """
         if self.found is None:
             return None
         name = f"{self.name}: gradients beside {len(before)}"
-        made = self.territory.step.do(name, self._learn, self.found, answers, loss, *before)
-        for parameter, gradient in made.value.gradients:
+        segment = self.territory.step.do(name, self._learn, self.found, answers, loss, *before)
+        for parameter, gradient in segment.value.gradients:
             parameter.grad = gradient
-        self.learnt = [made]
-        own, weights = self.own, made.now(made.value.weights)
+        self.learnt = [segment]
+        own, weights = self.own, segment.now(segment.value.weights)
         error = weights.new_zeros(self.rays)
         error[self.sums[:, -1].long()] = answers[:, -1]
         samples = Samples(own.positions, own.ray_index, own.run_offsets, own.depths, own.deltas)
         density = self.found.now(self.found.value.density)
         return RenderOutput(loss, error, weights, density, samples, weights.new_empty(0, 3))
 
-    def _learn(self, found: Looked, answers: Tensor, loss: Tensor, *before: Learnt) -> Learnt:
+    def _learn(self, evaluated: Evaluated, answers: Tensor, loss: Tensor, *before: Gradients) -> Gradients:
         renderer, optimizer = self.territory.renderer, self.territory.step.optimizer
         rule: dict[str, Any] = {**self._field().rule, "hidden": HIDDEN, "backend": renderer.backend}
-        gradient, weights = run_gradients(found.tape.raw, found.samples, answers, **rule)
+        gradient, weights = run_gradients(evaluated.tape.raw, evaluated.samples, answers, **rule)
         if (full := renderer.sampler.space.full_gradient) is not None:
-            gradient.mul_(shares_of(found.samples.depths, full)[:, None])
-        found.tape.backward(loss, gradient)
+            gradient.mul_(gradient_factors(evaluated.samples.depths, full)[:, None])
+        evaluated.tape.backward(loss, gradient)
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        return Learnt(weights, [(each, each.grad) for each in parameters if each.grad is not None])
+        return Gradients(weights, [(tensor, tensor.grad) for tensor in parameters if tensor.grad is not None])
 
 
 class Crossing(StepOutput):
-    """What a step of a territory has found, whose rays pass through others, too."""
+    """The result of a territory's step whose rays also pass through other territories."""
 
     def __init__(self, batch: Batch, output: RenderOutput, sums: Tensor) -> None:
         super().__init__(batch, output)
         self._sums = sums
 
     def whole(self) -> StepOutput:
-        """The same rays through all territories, as if each had one sample."""
+        """Returns the output of the same rays through all territories, with one sample per ray."""
         batch, sums = self.batch, self._sums[along_rays(self._sums[:, 5].long(), self._sums[:, 4])]
-        found = compose(sums[:, :3], sums[:, 3], sums[:, 5].long(), len(batch.rays))
+        composed = compose(sums[:, :3], sums[:, 3], sums[:, 5].long(), len(batch.rays))
         behind = torch.zeros_like(batch.target) if batch.background is None else batch.background
         index = torch.arange(len(batch.rays), device=sums.device)
         samples = self.output.samples._replace(ray_index=index)
-        colour = found.colour + found.through[:, None] * behind
-        return StepOutput(batch, self.output._replace(weights=1 - found.through, samples=samples, colour=colour))
+        colour = composed.colour + composed.through[:, None] * behind
+        return StepOutput(batch, self.output._replace(weights=1 - composed.through, samples=samples, colour=colour))
 
 
 def meet(bounds: Tensor, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
-    """Which rays [r] meet which boxes [T, 2, 3] between near and far: bool [T, r]; swapped corners are an empty box."""
+    """Intersects rays [r] with boxes [T, 2, 3] between near and far; a box with swapped corners is empty.
+
+    Returns:
+        bool [T, r], whether each ray meets each box.
+    """
     inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
     low, high = ((bounds[:, None, end] - rays.origins) * inverse for end in (0, 1))
     first, last = torch.minimum(low, high).amax(-1), torch.maximum(low, high).amin(-1)
-    there = (bounds[:, 0] <= bounds[:, 1]).all(1)
-    return (torch.maximum(first, near) < torch.minimum(last, far)) & there[:, None]
+    not_empty = (bounds[:, 0] <= bounds[:, 1]).all(1)
+    return (torch.maximum(first, near) < torch.minimum(last, far)) & not_empty[:, None]
 
 
 def step_together(
@@ -199,59 +204,60 @@ def step_together(
     rays: Mapping[int, int],
     at: Mapping[int, int],
 ) -> dict[int, Crossing]:
-    """A step of all territories; all ranks call it together.
+    """Runs a step of all territories; all ranks call it together.
 
     Args:
         group: The ranks.
-        territories: Of this rank, by their numbers.
+        territories: The territories of this rank, by number.
         owner: The rank of each territory, [T].
-        bounds: [T, 2, 3], around what of each is not empty.
-        rays: How many each own territory draws.
-        at: Steps that it has done since it began.
+        bounds: [T, 2, 3], a box around the occupied space of each territory.
+        rays: The number of rays that each of ``territories`` draws.
+        at: The number of steps that each of ``territories`` has done since its coarse stage began.
 
     Returns:
-        What each own territory has found: on its own rays, and on those of others. A loss is that of its own rays.
+        The result of each of ``territories``, on its own rays and on other territories' rays; the loss is of its own
+        rays only.
     """
     count, bounds = len(owner), bounds.to(group.device)
     batches, homes = dict[int, Batch](), dict[int, Pass]()
-    gone: dict[Key, Tensor] = {}  # the rays that go from one territory to another
+    sent_rays: dict[Key, Tensor] = {}  # numbers of the rays that are sent from one territory to another
     sizes = torch.zeros(count, count, dtype=torch.int64)
     for number, territory in territories.items():
         territory.step.begin(at[number])
         batch = batches[number] = territory.step.draw(rays[number])
         home = homes[number] = Pass("own rays", territory, batch.rays, batch.near, batch.far)
-        met = meet(bounds, batch.rays, batch.near, torch.minimum(batch.far, home.end()))
+        hits = meet(bounds, batch.rays, batch.near, torch.minimum(batch.far, home.end()))
         for other in range(count):
             if other != number:
-                gone[number, other] = met[other].nonzero()[:, 0]
-                sizes[number, other] = len(gone[number, other])
+                sent_rays[number, other] = hits[other].nonzero()[:, 0]
+                sizes[number, other] = len(sent_rays[number, other])
     sizes = group.total(sizes)
-    parts = {key: _table(batches[key[0]], rows) for key, rows in gone.items()}
-    came = group.send(parts, sizes, owner, RAY)
+    parts = {key: _table(batches[key[0]], rows) for key, rows in sent_rays.items()}
+    received = group.send(parts, sizes, owner, RAY)
     guests: dict[int, Pass] = {}
     sums: dict[Key, Tensor] = {}
-    found = torch.zeros_like(sizes)
+    sum_counts = torch.zeros_like(sizes)
     for number in territories:
-        keys = [key for key in came if key[1] == number]
+        keys = [key for key in received if key[1] == number]
         if keys:
-            table = torch.cat([came[key] for key in keys])
-            given = Rays(table[:, :3].contiguous(), table[:, 3:6].contiguous()), *table[:, 6:].T.contiguous()
-            guest = guests[number] = Pass("others' rays", territories[number], *given)
-            for key, part in zip(keys, _parted(guest, [int(sizes[key]) for key in keys]), strict=True):
-                sums[key], found[key] = part, len(part)
-    found = group.total(found)
-    came = group.send(sums, found, owner, SUM, back=True)
+            table = torch.cat([received[key] for key in keys])
+            inputs = Rays(table[:, :3].contiguous(), table[:, 3:6].contiguous()), *table[:, 6:].T.contiguous()
+            guest = guests[number] = Pass("others' rays", territories[number], *inputs)
+            for key, part in zip(keys, _split_sums(guest, [int(sizes[key]) for key in keys]), strict=True):
+                sums[key], sum_counts[key] = part, len(part)
+    sum_counts = group.total(sum_counts)
+    received = group.send(sums, sum_counts, owner, SUM, back=True)
     answers: dict[Key, Tensor] = {}
     outputs: dict[int, RenderOutput] = {}
-    whole: dict[int, Tensor] = {}
+    merged_sums: dict[int, Tensor] = {}
     for number, home in homes.items():
-        keys, batch = [key for key in came if key[0] == number], batches[number]
-        rows = [home.sums[:, -1].long(), *(gone[key][came[key][:, -1].long()] for key in keys)]
-        every = torch.cat([home.sums, *(came[key] for key in keys)])
-        every[:, -1] = torch.cat(rows).to(every.dtype)
-        whole[number] = every
-        told, loss = compose_runs(
-            every,
+        keys, batch = [key for key in received if key[0] == number], batches[number]
+        rows = [home.sums[:, -1].long(), *(sent_rays[key][received[key][:, -1].long()] for key in keys)]
+        all_sums = torch.cat([home.sums, *(received[key] for key in keys)])
+        all_sums[:, -1] = torch.cat(rows).to(all_sums.dtype)
+        merged_sums[number] = all_sums
+        merged, loss = compose_runs(
+            all_sums,
             batch.target,
             background=batch.background,
             first=0,
@@ -259,47 +265,50 @@ def step_together(
             robust=territories[number].step.loss.robust,
             backend=territories[number].renderer.backend,
         )
-        own, *rest = told.split([len(each) for each in rows])
-        answers |= zip(keys, rest, strict=True)
-        outputs[number] = home.learn(own, loss) or _nothing(loss)
-    came = group.send(answers, found, owner, SUM)
-    made = dict[int, Crossing]()
+        own_answers, *guest_answers = merged.split([len(each) for each in rows])
+        answers |= zip(keys, guest_answers, strict=True)
+        outputs[number] = home.learn(own_answers, loss) or _empty_output(loss)
+    received = group.send(answers, sum_counts, owner, SUM)
+    results = dict[int, Crossing]()
     for number, output in outputs.items():
         learnt = homes[number].learnt
         if number in guests and len(guests[number].sums):
-            own = torch.cat([came[key] for key in came if key[1] == number])
-            also = guests[number].learn(own, own.new_zeros(()), *learnt)
-            output, learnt = output if also is None else _both(output, also), learnt + guests[number].learnt
+            own_answers = torch.cat([received[key] for key in received if key[1] == number])
+            guest_output = guests[number].learn(own_answers, own_answers.new_zeros(()), *learnt)
+            output, learnt = (
+                output if guest_output is None else _joined(output, guest_output),
+                learnt + guests[number].learnt,
+            )
         territories[number].step.end(at[number] + 1, output, *learnt)
-        made[number] = Crossing(batches[number], output, whole[number])
-    return made
+        results[number] = Crossing(batches[number], output, merged_sums[number])
+    return results
 
 
 def _table(batch: Batch, rows: Tensor) -> Tensor:
-    """Some rays as rows of numbers, [n, 8]."""
+    """Packs some rays of a batch into rows, [n, 8]: origin, direction, near, far."""
     rays = batch.rays[rows]
     return torch.cat((rays.origins, rays.directions, batch.near[rows, None], batch.far[rows, None]), 1)
 
 
-def _parted(guest: Pass, sizes: Sequence[int]) -> list[Tensor]:
-    """The sums of rays that came in parts of these sizes, rays numbered in each."""
+def _split_sums(guest: Pass, sizes: Sequence[int]) -> list[Tensor]:
+    """Splits the sums by the senders of the rays; rays are numbered anew within each sender's part."""
     number = guest.sums[:, -1].long()
     ends = torch.tensor([0, *sizes], device=number.device).cumsum(0)
-    each = torch.searchsorted(number, ends).diff()
+    counts = torch.searchsorted(number, ends).diff()
     sums = guest.sums.clone()
-    sums[:, -1] = (number - torch.repeat_interleave(ends[:-1], each)).to(sums.dtype)
-    return list(sums.split(each.tolist()))
+    sums[:, -1] = (number - torch.repeat_interleave(ends[:-1], counts)).to(sums.dtype)
+    return list(sums.split(counts.tolist()))
 
 
-def _nothing(loss: Tensor) -> RenderOutput:
-    """What is found where no ray has samples."""
+def _empty_output(loss: Tensor) -> RenderOutput:
+    """Returns the output of rays without samples."""
     none, index = loss.new_empty(0), torch.empty(0, dtype=torch.int32, device=loss.device)
     samples = Samples(loss.new_empty(0, 3), index, index.new_zeros(1), none, none)
     return RenderOutput(loss, none, none, none, samples, loss.new_empty(0, 3))
 
 
-def _both(one: RenderOutput, two: RenderOutput) -> RenderOutput:
-    """What a territory has found on its own rays and on those of others."""
+def _joined(one: RenderOutput, two: RenderOutput) -> RenderOutput:
+    """Concatenates the outputs of a territory on its own rays and on other territories' rays."""
     a, b = one.samples, two.samples
     samples = Samples(
         torch.cat((a.inputs, b.inputs)),

@@ -1,8 +1,8 @@
-"""Runs of several parts: their files, and how they are opened.
+"""Reads and writes runs of several parts.
 
-A run directory with the file ``town.json`` is one. Its checkpoint has the tensors ``part-N.diagram.*`` and
-``part-N.owner`` of each part, and what is empty; ``values["parts"]`` says where the parts stand, and names the files of
-their networks, which are checkpoints beside it.
+A run directory with the file ``town.json`` has several parts. Its checkpoint has the tensors ``part-N.diagram.*`` and
+``part-N.owner`` of each part, and the occupancy grid. ``values["parts"]`` has the placement of each part, and names the
+files of its networks, which are checkpoints in the same folder.
 """
 
 from __future__ import annotations
@@ -41,43 +41,43 @@ from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.network import StoredRouter, config_of
 from voronerf.town.parts import Part, Parts
 
-#: The file by which the directory of a run of several parts is told.
+#: The file that marks the directory of a run of several parts.
 TOWN = "town.json"
 
 
 def is_town(run: Path) -> bool:
-    """Whether a run directory holds a run of several parts."""
+    """Returns whether a run directory holds a run of several parts."""
     return (run / TOWN).is_file()
 
 
 def stored_territories(run: Path) -> int | None:
-    """The number of territories that a run was trained in; None where it does not say one."""
+    """Returns the number of territories in which a run was trained, or None if the run does not store it."""
     values = read_json(run / TOWN) if is_town(run) else None
     count = values.get("territories") if isinstance(values, dict) else None
     return count if isinstance(count, int) and count > 0 else None
 
 
 def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGrid | None) -> None:
-    """Writes the checkpoint of a run of parts, after the files of their networks, one for those in two places."""
+    """Writes the files of the networks, one per network even if several parts share it, then the run's checkpoint."""
     folder, names = checkpoint_path(run).parent, dict[int, str]()
     for network in (network for part in parts for network in part.networks):
         if id(network) not in names:
             names[id(network)] = name = f"networks-{len(names)}.safetensors"
             save_checkpoint(folder / name, network.stored())
-    placed = [place_of(part, [names[id(network)] for network in part.networks]) for part in parts]
+    placements = [place_of(part, [names[id(network)] for network in part.networks]) for part in parts]
     cells = [(part.diagram, part.owner) for part in parts]
-    save_checkpoint(checkpoint_path(run), index_of(config, cells, placed, grid))
+    save_checkpoint(checkpoint_path(run), index_of(config, cells, placements, grid))
 
 
 def place_of(part: Part, files: Sequence[str]) -> dict[str, Any]:
-    """What the values of a checkpoint say of a part."""
-    seen = part.contraction
+    """Returns the placement of a part, as stored in a checkpoint's values."""
+    sphere = part.contraction
     return {
         "networks": list(files),
         "frame": part.frame.to_values(),
         "region": [solid.to_values() for solid in part.region],
         "layer": part.layer,
-        "contraction": None if seen is None else {"centre": seen.centre.tolist(), "radius": seen.radius},
+        "contraction": None if sphere is None else {"centre": sphere.centre.tolist(), "radius": sphere.radius},
     }
 
 
@@ -87,7 +87,14 @@ def index_of(
     placed: list[dict[str, Any]],
     grid: OccupancyGrid | None,
 ) -> Checkpoint:
-    """The checkpoint of parts, each with its diagram and the network of each leaf, whose networks are in files."""
+    """Makes the checkpoint of a run of parts, without the networks, which are files of their own.
+
+    Args:
+        config: The settings of the run.
+        cells: (diagram, owner) of each part; owner is the network of each leaf.
+        placed: The placement of each part, see :func:`place_of`.
+        grid: The occupancy grid, or None.
+    """
     tensors: dict[str, Tensor] = {} if grid is None else {f"occupancy.{k}": v for k, v in grid.state_dict().items()}
     for number, (diagram, owner) in enumerate(cells):
         tensors |= {f"part-{number}.diagram.{name}": value for name, value in diagram.state_dict().items()}
@@ -97,32 +104,34 @@ def index_of(
 
 
 def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> Parts:
-    """The parts that a checkpoint of a run names; a network that stands in several places is one object."""
-    made: dict[str, StoredRouter] = {}
-    found = []
+    """Opens the parts of a checkpoint; a network that several parts share is one object."""
+    networks: dict[str, StoredRouter] = {}
+    parts = []
     for index, values in enumerate(checkpoint.values["parts"]):
         try:
             for name in values["networks"]:
                 if Path(name).name != name:
                     raise ValueError(f"networks must be files beside the checkpoint, got {name!r:.100}")
-                if name not in made:
+                if name not in networks:
                     stored = load_checkpoint(checkpoint_path(run).with_name(name), keep=is_shown)
-                    made[name] = StoredRouter(stored, device, backend)
-            seen = values["contraction"]
+                    networks[name] = StoredRouter(stored, device, backend)
+            sphere = values["contraction"]
             part = Part(
-                [made[name] for name in values["networks"]],
+                [networks[name] for name in values["networks"]],
                 VoronoiDiagram.from_state(checkpoint.group(f"part-{index}"), "diagram.").to(device),
                 checkpoint.tensors[f"part-{index}.owner"],
                 frame=Similarity(**values["frame"]),
-                contraction=None if seen is None else Contraction(torch.tensor(seen["centre"]), float(seen["radius"])),
+                contraction=None
+                if sphere is None
+                else Contraction(torch.tensor(sphere["centre"]), float(sphere["radius"])),
                 region=[Solid.from_values(solid) for solid in values["region"]],
                 layer=int(values["layer"]),
             )
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
             line = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise CheckpointError(f"{checkpoint.source}: part {index}: {line}") from None
-        found.append(part)
-    return Parts(found, backend=backend)
+        parts.append(part)
+    return Parts(parts, backend=backend)
 
 
 def open_run(
@@ -140,18 +149,18 @@ def open_run(
 
     Args:
         path: The run directory.
-        scene: The scene, if it is loaded already; where it has images, those of the first run.
-        data: Scene folder of the first run; None for that of its training.
-        downscale: Factor on the images; None for that of the training.
+        scene: The scene if it is already loaded, with the first run's images or none.
+        data: The scene folder of the first run; None for the folder of its training.
+        downscale: The factor by which images are reduced; None for the factor of the training.
         allow_outside: Also read images that lie outside of the scene folder.
-        samples: Samples per ray, one number; None for those of the run.
-        device: As for `--device`, such as "cpu", "cuda:0" or "auto".
-        backend: Backend of the operations.
+        samples: Samples per ray, one number; None for the number of the run.
+        device: "cpu", "cuda:0", "auto" or another value of `--device`.
+        backend: The backend of the operations.
 
     Raises:
-        CheckpointError: If there is no usable checkpoint.
-        ConfigError: For an argument that cannot be used, or a folder of the run that is a link to elsewhere.
-        SceneError: If the scene cannot be read.
+        CheckpointError: There is no usable checkpoint.
+        ConfigError: An argument is invalid, or a folder of the run is a link to elsewhere.
+        SceneError: The scene cannot be read.
 
     Examples:
         >>> from voronerf.town import open_run
@@ -179,14 +188,18 @@ def open_run(
     return Run(path, config, scene, parts, Renderer({"field": parts}, sampler, backend=backend))
 
 
-def _in_place(read: Scene, known: Scene) -> Scene:
-    """The pictures of a scene where the record of a run has their cameras first; others where they were read."""
+def _in_place(read: Scene, record: Scene) -> Scene:
+    """Gives the views of a scene the poses that the run's record has for them.
+
+    The views must be the first views of the record, by name. Otherwise they keep their poses, moved into the record's
+    space.
+    """
     splits = {}
     for name in ("train", "test"):
-        own, recorded = getattr(read, name), getattr(known, name)
-        names = recorded.names[: len(own)]
-        if names not in (own.names, tuple(f"0-{each}" for each in own.names)):
-            return placed(read, known)
-        cameras = replace(own.cameras, poses=recorded.cameras.poses[: len(own)].to(own.cameras.poses))
-        splits[name] = replace(own, cameras=cameras, names=names, sparse_depth=None)
-    return replace(known, **splits)
+        views, recorded = getattr(read, name), getattr(record, name)
+        names = recorded.names[: len(views)]
+        if names not in (views.names, tuple(f"0-{view}" for view in views.names)):
+            return placed(read, record)
+        cameras = replace(views.cameras, poses=recorded.cameras.poses[: len(views)].to(views.cameras.poses))
+        splits[name] = replace(views, cameras=cameras, names=names, sparse_depth=None)
+    return replace(record, **splits)

@@ -1,7 +1,6 @@
-"""Territories: the parts of space that a joint training is made of, each with its own views, and who has which.
+"""Territories: the regions of space of a joint training, each with its own views.
 
-T territories, c views, l centres, v voxels. Positions are in the space that the fields see: that of the world, or of
-its contraction.
+T territories, c views, l centres, v voxels. Positions are in the space of the fields: the world, or its contraction.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
 from voronerf.ops.nearest_centre import nearest_centre
 
-#: Rays of a view that say where it looks, on each side of a lattice.
+#: Rays along each side of the lattice by which the place of a view is found.
 LATTICE = 7
-#: Nearest centres among which the corners of a territory are looked for.
+#: Number of nearest centres whose bisectors are intersected for the corners of a territory.
 NEIGHBOURS = 16
 
 
@@ -42,24 +41,24 @@ class Territories:
         return len(self.centres)
 
     def place(self, number: int) -> Place:
-        """One of them among its neighbours."""
-        others = torch.arange(len(self)) != number
+        """Returns the place of a territory: its box, its centre and the centres near it."""
+        other_territories = torch.arange(len(self)) != number
         low, high = self.boxes[number]
         corners = torch.cartesian_prod(*torch.stack((low, high)).T)
         squares = (corners[:, None] - self.centres).square().sum(-1)
-        reach = (squares < squares[:, number, None] * (1 + 1e-5) + 1e-12).any(0)
-        numbers = (reach & others).nonzero()[:, 0].tolist()
-        kept = sorted([number, *numbers])
-        own = torch.full((len(kept),), -1, dtype=torch.int32)
-        own[kept.index(number)] = 0
-        return Place(self.boxes[number], self.centres[kept], own)
+        reaches_box = (squares < squares[:, number, None] * (1 + 1e-5) + 1e-12).any(0)
+        numbers = (reaches_box & other_territories).nonzero()[:, 0].tolist()
+        members = sorted([number, *numbers])
+        is_own = torch.full((len(members),), -1, dtype=torch.int32)
+        is_own[members.index(number)] = 0
+        return Place(self.boxes[number], self.centres[members], is_own)
 
     def views(self, number: int) -> Tensor:
-        """The training views of a territory, int64, ascending."""
+        """Returns the numbers of a territory's training views, int64, ascending."""
         return (self.train == number).nonzero()[:, 0]
 
     def scene(self, whole: Scene, number: int) -> Scene:
-        """What the settings of a territory follow from: its box, and the cameras of its views without their images."""
+        """Returns the scene of a territory, for its settings: its box, and the cameras of its views without images."""
         rows = self.views(number)
         names = tuple(whole.train.names[row] for row in rows.tolist())
         train = replace(whole.train, cameras=whole.train.cameras[rows], names=names, images=whole.train.images[:0])
@@ -68,12 +67,13 @@ class Territories:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a territory is.
+    """The place of a territory among its neighbours.
 
     Attributes:
-        box: [2, 3], around it.
-        centres: [l, 3], its own and those whose territories may reach into its box, by their numbers.
-        own: int32 [l], 0 for its own centre and -1 for the others.
+        box: [2, 3], the box around the territory.
+        centres: [l, 3], its own centre and the centres of territories that may reach into its box, in ascending order
+            of territories.
+        own: int32 [l], 0 for its own centre and -1 for the other centres.
     """
 
     box: Tensor
@@ -81,41 +81,41 @@ class Place:
     own: Tensor
 
     def cells(self, positions: Tensor, backend: str) -> Tensor:
-        """The nearest of the centres, int32 [n], of positions [n, 3]; where it is the own one, see ``own``."""
+        """Returns the number of the nearest of ``centres``, int32 [n], for positions [n, 3]."""
         return nearest_centre(positions, self.centres.to(positions.device), backend=backend)
 
     def outside(self, grid: OccupancyGrid) -> Tensor:
-        """Voxels of a grid that the territory does not reach, bool [v]."""
+        """Returns a mask, bool [v], of the voxels of a grid that lie wholly outside of the territory."""
         half = (grid.box[1] - grid.box[0]) / torch.tensor(grid.occupied.shape, device=grid.box.device) / 2
         number, centres = int((self.own == 0).nonzero()), self.centres.to(grid.box.device)
         slack = 2.002 * ((centres - centres[number]).abs() * half).sum(-1)
-        found = []
+        masks = []
         for voxels in torch.arange(grid.occupied.numel(), device=grid.box.device).split(1 << 16):
             squares = (grid.points(voxels)[:, None] - centres).square().sum(-1)
-            found.append((squares + slack < squares[:, number, None]).any(1))
-        return torch.cat(found)
+            masks.append((squares + slack < squares[:, number, None]).any(1))
+        return torch.cat(masks)
 
     def bounds(self, grid: OccupancyGrid) -> Tensor:
-        """[2, 3], a box around all that is not empty; all of space where rays are bent by a contraction.
+        """Returns [2, 3], a box around the occupied voxels; with a contraction, which bends rays, all of space.
 
-        Nothing at all is a box whose first corner is above the second.
+        For an empty grid the first corner is above the second.
         """
         if grid.contraction is not None:
             return torch.tensor([[-torch.inf] * 3, [torch.inf] * 3])
         if not bool(grid.occupied.any()):
             return torch.tensor([[torch.inf] * 3, [-torch.inf] * 3])
         rows = [grid.occupied.amax(tuple({0, 1, 2} - {axis})).nonzero() for axis in range(3)]
-        first, last = (torch.tensor([float(found[end]) for found in rows]) for end in (0, -1))
+        first, last = (torch.tensor([float(occupied[end]) for occupied in rows]) for end in (0, -1))
         size = (grid.box[1] - grid.box[0]).cpu() / torch.tensor(grid.occupied.shape)
         return grid.box[0].cpu() + torch.stack((first, last + 1)) * size
 
 
 def cut_space(scene: Scene, count: int, contraction: Contraction | Perspective | None) -> Territories:
-    """Cuts the space of a scene into territories that have as many training views each, within one.
+    """Cuts the space of a scene into territories with equal numbers of training views, within one.
 
-    A view lies where its rays are when they have gone half of their way through the scene, but for no longer than a
-    territory is wide. Views are halved by their places along the longest side of these, again and again; the centre of
-    a territory is the mean of its views' places.
+    The place of a view is the mean of its rays' middles in the scene, at most half a territory's width after the near
+    end. The views are halved recursively by their places, along the longest side of the places' box. The centre of a
+    territory is the mean of its views' places.
     """
     views = len(scene.train)
     if count > views:
@@ -134,10 +134,10 @@ def cut_space(scene: Scene, count: int, contraction: Contraction | Perspective |
 
 
 def halve(places: Tensor, count: int) -> Tensor:
-    """Divides places into parts that lie together and have as many each, within one.
+    """Divides places [n, 3] into compact parts of equal size, within one, by recursive halving.
 
     Returns:
-        int64 [n], the part of each place; parts with neighbouring numbers lie together.
+        int64 [n], the part of each place; parts with neighbouring numbers are neighbours in space.
     """
     part = torch.zeros(len(places), dtype=torch.int64)
     pending = [(torch.arange(len(places)), 0, count)]
@@ -146,16 +146,16 @@ def halve(places: Tensor, count: int) -> Tensor:
         if parts == 1:
             part[rows] = first
             continue
-        own = places[rows]
-        rows = rows[own[:, int((own.amax(0) - own.amin(0)).argmax())].argsort(stable=True)]
-        left = parts // 2
-        end = max(len(rows) * left // parts, left)
-        pending += [(rows[:end], first, left), (rows[end:], first + left, parts - left)]
+        part_places = places[rows]
+        rows = rows[part_places[:, int((part_places.amax(0) - part_places.amin(0)).argmax())].argsort(stable=True)]
+        lower = parts // 2
+        end = max(len(rows) * lower // parts, lower)
+        pending += [(rows[:end], first, lower), (rows[end:], first + lower, parts - lower)]
     return part
 
 
 def _places(scene: Scene, width: float, contraction: Contraction | Perspective | None) -> Tensor:
-    """Where each training view lies, [c, 3]."""
+    """Returns the place of each training view, [c, 3]; see `cut_space`."""
     cameras, views = scene.train.cameras, len(scene.train)
     share = (torch.arange(LATTICE) + 0.5) / LATTICE
     y, x = (values.reshape(-1) for values in torch.meshgrid(share, share, indexing="ij"))
@@ -170,32 +170,32 @@ def _places(scene: Scene, width: float, contraction: Contraction | Perspective |
     points = torch.addcmul(rays.origins, depth[:, None], rays.directions)
     points = points if contraction is None else contraction.points(points)
     weight = hit.float()[:, None]
-    blind = ~hit.view(views, -1).any(1)  # looks past the scene
+    blind = ~hit.view(views, -1).any(1)  # no ray hits the scene
     weight[blind.repeat_interleave(len(x))] = 1
     return (points * weight).view(views, -1, 3).sum(1) / weight.view(views, -1, 1).sum(1)
 
 
 def _boxes(centres: Tensor, box: Tensor) -> Tensor:
-    """A box around each territory [T, 2, 3], within the box of the scene.
+    """Returns a box around each territory, [T, 2, 3], within the box of the scene.
 
-    Corners of a territory are where three of its sides meet. They are looked for among the sides of the scene and those
-    towards the nearest centres: without the others a territory can only be larger.
+    Three sides of a territory meet in each corner. The candidates are the sides of the scene and the bisectors to the
+    nearest centres; leaving out the other bisectors can only make a box larger.
     """
     sides = torch.cat((torch.eye(3), -torch.eye(3))).double()
     limits = torch.cat((box[1], -box[0])).double()
-    found = []
+    boxes = []
     for centre in centres.double():
-        away = (centres.double() - centre).square().sum(1)
-        near = centres.double()[away.argsort()[1 : NEIGHBOURS + 1]]
+        squares = (centres.double() - centre).square().sum(1)
+        near = centres.double()[squares.argsort()[1 : NEIGHBOURS + 1]]
         normals = torch.cat((sides, near - centre))
         ends = torch.cat((limits, (near.square().sum(1) - centre.square().sum()) / 2))
         size = normals.norm(dim=1)
         normals, ends = normals / size[:, None], ends / size
-        three = torch.tensor(list(itertools.combinations(range(len(ends)), 3)))
-        solved, failed = torch.linalg.solve_ex(normals[three], ends[three][..., None])
+        triples = torch.tensor(list(itertools.combinations(range(len(ends)), 3)))
+        solved, failed = torch.linalg.solve_ex(normals[triples], ends[triples][..., None])
         corners = solved[..., 0]
         slack = 1e-6 * float((box[1] - box[0]).max())
         inside = (corners @ normals.T <= ends + slack).all(1) & (failed == 0) & corners.isfinite().all(1)
         corners = corners[inside]
-        found.append(torch.stack((corners.amin(0), corners.amax(0))) if len(corners) else box.double())
-    return torch.stack(found).float().clamp(box[0], box[1])
+        boxes.append(torch.stack((corners.amin(0), corners.amax(0))) if len(corners) else box.double())
+    return torch.stack(boxes).float().clamp(box[0], box[1])

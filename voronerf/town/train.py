@@ -1,7 +1,7 @@
-"""Training in territories: parts of space with networks, grid, optimiser and views of their own; rays cross borders.
+"""Training in territories: regions of space with networks, grid, optimiser and views of their own; rays cross borders.
 
-Ranks share out the territories. What a territory computes does not depend on which rank has it, so that one process
-trains the same run as many, bit for bit. T territories.
+The territories are distributed over the ranks. The results of a territory do not depend on its rank, so that one
+process trains the same run as several, bit for bit. T territories.
 """
 
 from __future__ import annotations
@@ -47,29 +47,29 @@ from voronerf.town.rays import Territory, step_together
 from voronerf.town.run import TOWN, index_of
 from voronerf.town.territories import Territories, cut_space
 
-#: Steps after which territories tell all others what of them is not empty; sooner at first.
+#: Number of steps after which ranks exchange the bounds of occupied space; more often in the first steps.
 EXCHANGE_EVERY = 64
-#: Steps after which ranks agree on the time and on stops.
+#: Number of steps after which ranks agree on the elapsed time and on stops.
 AGREE_EVERY = 8
-#: The most voxels of the grid that a finished run is drawn with.
+#: Greatest number of voxels of the occupancy grid of a finished run.
 VOXELS = 1 << 21
 
 
 @dataclass
 class Town:
-    """A training in territories, of which this rank has some; :func:`build_town` makes it.
+    """A training in territories, as one rank sees it; :func:`build_town` makes it.
 
     Attributes:
         config: The settings of a territory.
-        render_config: The settings with which the whole run is rendered: strata are as long as in its territories.
+        render_config: The settings for rendering the whole run, with strata as long as in its territories.
         scene: The whole scene.
         group: The ranks.
-        territories: All of them.
-        owner: The rank of each, [T].
-        states: Of the territories of this rank, by their numbers.
-        members: The same territories, with renderer and generator, for the exchange of rays.
-        bounds: [T, 2, 3], around what of each is not empty.
-        stopping: Whether somebody asked this rank to end the training.
+        territories: All territories.
+        owner: The rank of each territory, [T].
+        states: The training states of this rank's territories, by number.
+        members: The same territories, for the exchange of rays.
+        bounds: [T, 2, 3], a box around the occupied space of each territory.
+        stopping: Whether this rank was asked to end the training.
     """
 
     config: TrainConfig
@@ -91,11 +91,11 @@ class Town:
 
     @property
     def first(self) -> State:
-        """The first territory of this rank, which has the time and the steps of all."""
+        """The state of this rank's first territory; time and steps are the same in all states."""
         return next(iter(self.states.values()))
 
     def stop(self) -> None:
-        """Ends the training on all ranks some steps later, with a checkpoint."""
+        """Ends the training on all ranks within `AGREE_EVERY` steps, with a checkpoint."""
         self.stopping = True
         if len(self.owner) == 1:
             self.first.stop()
@@ -109,7 +109,7 @@ class Town:
 
 
 def grid_of(state: State) -> OccupancyGrid:
-    """Which space of a territory is empty; `check_territories` rejects settings without a grid."""
+    """Returns the occupancy grid of a territory; `check_territories` rejects settings without one."""
     assert state.sampler.grid is not None
     return state.sampler.grid
 
@@ -135,20 +135,20 @@ def check_territories(config: TrainConfig, count: int, ranks: int) -> None:
 def build_town(
     config: TrainConfig, scene: Scene, count: int, group: Group, *, on_event: Callable[[str], None] | None = None
 ) -> Town:
-    """All that a training in territories needs on this rank, before its first step.
+    """Builds a training in territories on this rank, before its first step.
 
     Args:
         config: The settings of a territory.
         scene: The scene that ``config.data`` names.
-        count: T.
+        count: The number of territories, T.
         group: The ranks.
-        on_event: Called with a line of text for what happens.
+        on_event: Called with a line of text for each event.
     """
     config = config if count == 1 else replace(config, sparse_depth=0.0)
     check_territories(config, count, group.size)
-    whole = resolve(config, scene)
-    check_territories(whole, count, group.size)
-    space = scene.space(whole.contraction)
+    resolved = resolve(config, scene)
+    check_territories(resolved, count, group.size)
+    space = scene.space(resolved.contraction)
     contraction, unseen = space.contraction, unseen_move(scene, space) if count == 1 else 0.0
     try:
         territories = cut_space(scene, count, contraction)
@@ -159,12 +159,14 @@ def build_town(
     members: dict[int, Territory] = {}
     for number in (n for n in range(count) if owner[n] == group.rank):
         seed = (config.seed + 1_000_003 * number) % 2**63
-        own = replace(config, seed=seed, sparse_depth=whole.sparse_depth)
-        batches = make_batches(own, scene, territories.views(number), unseen=unseen)
+        territory_config = replace(config, seed=seed, sparse_depth=resolved.sparse_depth)
+        batches = make_batches(territory_config, scene, territories.views(number), unseen=unseen)
         place = territories.place(number)
-        state = states[number] = build(own, territories.scene(scene, number), batches=batches, on_event=on_event)
-        obstacle, known = state.ray_loss.why_not_fused(), radiance_of(state.renderer.field)
-        if isinstance(known, Radiance) and known.networks.density_scale is None:
+        state = states[number] = build(
+            territory_config, territories.scene(scene, number), batches=batches, on_event=on_event
+        )
+        obstacle, radiance = state.ray_loss.why_not_fused(), radiance_of(state.renderer.field)
+        if isinstance(radiance, Radiance) and radiance.networks.density_scale is None:
             obstacle = obstacle or "its activations are not a sigmoid and a scaled softplus"
         if obstacle is not None:
             raise ConfigError(f"--field {config.field} cannot be trained in territories: {obstacle}")
@@ -178,16 +180,16 @@ def build_town(
                 backend=sampler.backend,
             )
         members[number] = Territory(place, state.training_step)
-    render_config = whole
+    render_config = resolved
     if contraction is None and scene.box is not None:
         lengths = [float((box[1] - box[0]).norm()) for box in (scene.box, territories.boxes[0])]
         samples = resolve(config, territories.scene(scene, 0)).samples or (64,)
-        render_config = replace(whole, samples=(math.ceil(samples[0] * lengths[0] / lengths[1]),))
+        render_config = replace(resolved, samples=(math.ceil(samples[0] * lengths[0] / lengths[1]),))
     return Town(config, render_config, scene, group, territories, owner, states, members, territories.boxes.clone())
 
 
-class _Keep(Callback):
-    """Writes checkpoints of a training in one territory."""
+class _Saver(Callback):
+    """A callback that writes the checkpoints of a training in one territory."""
 
     group = GROUP
 
@@ -210,35 +212,35 @@ def train(
     """Trains to the end, or until :meth:`Town.stop`; all ranks call it together.
 
     Args:
-        town: What :func:`build_town` made.
-        callbacks: Called with the state of the first territory of this rank.
-        checkpoint_every: Seconds of training between checkpoints; one is written at the end.
-        clock: Counts seconds; that of rank 0 counts.
+        town: The training from :func:`build_town`.
+        callbacks: Called with the state of this rank's first territory.
+        checkpoint_every: Seconds of training between checkpoints; another one is written at the end.
+        clock: Returns the time in seconds; the clock of rank 0 is the training's clock.
 
     Raises:
-        TrainingError: When gradients or parameters stop being finite; the last checkpoint is left as it was.
-        OSError: When a checkpoint cannot be written.
-        RankLost: When another rank has ended.
+        TrainingError: Gradients or parameters are no longer finite; the last checkpoint stays.
+        OSError: A checkpoint cannot be written.
+        RankLost: Another rank has ended.
     """
     group, first, passed, saved_at = town.group, town.first, 0.0, town.first.seconds
-    if len(town.owner) == 1:  # nothing crosses a border
-        train_alone(first, [*callbacks, Divergence(town.out), _Keep(town, checkpoint_every)], clock=clock)
+    if len(town.owner) == 1:  # no ray crosses a border
+        train_alone(first, [*callbacks, Divergence(town.out), _Saver(town, checkpoint_every)], clock=clock)
         return save(town)
-    alone = all(state.thread_deterministic for state in town.states.values())
+    one_thread = all(state.thread_deterministic for state in town.states.values())
     while first.fraction < 1 and not first.stopped:
         started = clock()
-        with backends.torch_on_one_thread() if alone else nullcontext():
+        with backends.torch_on_one_thread() if one_thread else nullcontext():
             if first.step % EXCHANGE_EVERY == 0 or (first.step < EXCHANGE_EVERY and first.step & (first.step - 1) == 0):
                 town.exchange_bounds()
             for state in town.states.values():
                 prepare(state, patient=True)
             rays = {number: state.rays for number, state in town.states.items()}
-            at = {number: state.step - state.began for number, state in town.states.items()}
-            made = step_together(group, town.members, town.owner, town.bounds, rays, at)
+            steps_done = {number: state.step - state.began for number, state in town.states.items()}
+            results = step_together(group, town.members, town.owner, town.bounds, rays, steps_done)
             for number, state in town.states.items():
-                count(state, 1, made[number])
+                count(state, 1, results[number])
                 if state.step == judged_at(state):
-                    judge_start(state, made[number].whole())
+                    judge_start(state, results[number].whole())
         passed += clock() - started
         if group.size == 1 or first.step % AGREE_EVERY == 0 or first.step == town.config.steps:
             agreed = torch.tensor([passed * (group.rank == 0), float(town.stopping)], dtype=torch.float64)
@@ -268,7 +270,7 @@ def train(
 
 
 def save(town: Town) -> None:
-    """Writes the checkpoints of all territories, and then the one that names them; until then the last one counts."""
+    """Writes the checkpoints of all territories, then the index that names them; until then the last index is valid."""
     group, count, folder = town.group, len(town.owner), checkpoint_path(town.out).parent
     token = f"{town.first.step}-{group.gather(secrets.token_hex(4))[0]}"
     names = [f"networks-{token}-{number}.safetensors" for number in range(count)]
@@ -282,17 +284,17 @@ def save(town: Town) -> None:
         failure = error
     if group.any(failure is not None):
         raise failure or RankLost("another rank could not write the checkpoint")
-    own = {
+    own_grids = {
         number: [{k: v.cpu() for k, v in each.state_dict().items()} for each in (state.router.diagram, grid_of(state))]
         for number, state in town.states.items()
     }
-    found = {number: told for each in group.gather(own) for number, told in each.items()}
+    grids = {number: tensors for each in group.gather(own_grids) for number, tensors in each.items()}
     if group.rank == 0:
         if not (town.out / TOWN).is_file():
             write_text(town.out / TOWN, json_text({"territories": count}) + "\n")
             write_text(town.out / "config.json", town.config.to_json())
             write_scene(town.out / "scene.json", town.scene)
-        keep_checkpoint(town.out, _index(town, names, [found[number] for number in range(count)]), KEPT)
+        keep_checkpoint(town.out, _index(town, names, [grids[number] for number in range(count)]), KEPT)
         named = {name for path in checkpoint_paths(town.out) for name in _names(path)}
         for path in folder.glob("networks-*.safetensors"):
             if path.name not in named:
@@ -300,22 +302,28 @@ def save(town: Town) -> None:
 
 
 def _names(path: Path) -> list[str]:
-    """The files that a checkpoint names; all that there are for one that cannot be read."""
+    """Returns the names of the files that a checkpoint uses; for an unreadable checkpoint, of all files."""
     try:
         return list(load_checkpoint(path).values["parts"][0]["networks"])
     except CheckpointError:
-        return [each.name for each in path.parent.glob("networks-*.safetensors")]
+        return [file.name for file in path.parent.glob("networks-*.safetensors")]
 
 
-def _index(town: Town, names: list[str], found: Sequence[Sequence[dict[str, Tensor]]]) -> Checkpoint:
-    """The checkpoint that names the files of all territories; with it the run is opened as a run of one part."""
-    diagrams = [VoronoiDiagram.from_state(diagram) for diagram, _ in found]
-    grids = [OccupancyGrid.from_state(grid) for _, grid in found]
+def _index(town: Town, names: list[str], stored: Sequence[Sequence[dict[str, Tensor]]]) -> Checkpoint:
+    """Makes the index, a checkpoint that names the files of all territories and describes a run of one part.
+
+    Args:
+        town: The training.
+        names: The files of the territories.
+        stored: The state of the diagram and of the grid of each territory.
+    """
+    diagrams = [VoronoiDiagram.from_state(diagram) for diagram, _ in stored]
+    grids = [OccupancyGrid.from_state(grid) for _, grid in stored]
     sizes = torch.tensor([diagram.num_cells for diagram in diagrams])
     diagram = diagrams[0]
-    if len(found) > 1:
+    if len(stored) > 1:
         diagram, _ = VoronoiDiagram(town.territories.centres).refine(dict(enumerate(diagrams)))
-    owner = torch.repeat_interleave(torch.arange(len(found)), sizes)
+    owner = torch.repeat_interleave(torch.arange(len(stored)), sizes)
     sphere, grid = town.scene.space(town.render_config.contraction).contraction, None
     assert not isinstance(sphere, Perspective)
     if sphere is None:
@@ -332,7 +340,7 @@ def _index(town: Town, names: list[str], found: Sequence[Sequence[dict[str, Tens
 
 
 def resume(town: Town) -> None:
-    """Puts all territories where they were at the last checkpoint that all ranks can read."""
+    """Restores all territories from the last checkpoint that all ranks can read."""
     errors: list[CheckpointError] = []
     for path in checkpoint_paths(town.out):
         index, parts, failure = Checkpoint({}, {}), dict[int, Checkpoint](), None
@@ -358,31 +366,34 @@ def resume(town: Town) -> None:
 
 
 def _whole_grid(like: OccupancyGrid, grids: Sequence[OccupancyGrid]) -> OccupancyGrid:
-    """One grid over the box of another; occupied where that of any territory is, too much rather than too little."""
+    """Merges the grids of territories into one over the box of ``like``.
+
+    A voxel is occupied if an occupied voxel of any territory reaches into it.
+    """
     box = like.box
     sizes = torch.stack([(g.box[1] - g.box[0]) / torch.tensor(g.occupied.shape) for g in grids]).amax(0)
     shape = ((box[1] - box[0]) / sizes).floor().clamp(1, 512)
     shape = (shape * min(1.0, (VOXELS / float(shape.prod())) ** (1 / 3))).floor().clamp(min=1).long()
-    whole = OccupancyGrid(box, shape.tolist(), threshold=like.threshold)
-    whole.occupied.zero_()
+    merged = OccupancyGrid(box, shape.tolist(), threshold=like.threshold)
+    merged.occupied.zero_()
     corners = torch.cartesian_prod(*(torch.tensor((0.001, 0.999)),) * 3)
     for grid in grids:
-        full = grid.occupied.view(-1).nonzero()[:, 0]
+        occupied = grid.occupied.view(-1).nonzero()[:, 0]
         for corner in corners:
-            points = grid.points(full, corner.expand(len(full), 3))
-            whole.occupied.view(-1)[whole.voxels(points).long()] = True
-    whole.density = torch.where(whole.occupied, 2 * whole.threshold, 0.0)
-    return whole
+            points = grid.points(occupied, corner.expand(len(occupied), 3))
+            merged.occupied.view(-1)[merged.voxels(points).long()] = True
+    merged.density = torch.where(merged.occupied, 2 * merged.threshold, 0.0)
+    return merged
 
 
 def summary_of(town: Town) -> dict[str, Any]:
-    """What ``summary.json`` says of a training, on all ranks alike; scores are added to it."""
-    own = torch.zeros(5, dtype=torch.float64)
+    """Returns the contents of ``summary.json`` without scores, the same on all ranks; all ranks call it together."""
+    sums = torch.zeros(5, dtype=torch.float64)
     for state in town.states.values():
         counts = state.parameter_count, state.strategy.left, state.skipped, state.rays_done, state.router.num_cells
-        own += torch.tensor(counts, dtype=torch.float64)
-    told = town.group.total(own)
-    parameters, left, skipped, rays, cells = map(int, told.tolist())
+        sums += torch.tensor(counts, dtype=torch.float64)
+    totals = town.group.total(sums)
+    parameters, splits_left, skipped, rays, cells = map(int, totals.tolist())
     return {
         "complete": town.first.fraction >= 1,
         "seconds": town.first.seconds,
@@ -390,7 +401,7 @@ def summary_of(town: Town) -> dict[str, Any]:
         "rays_per_second": rays / max(town.first.seconds, 1e-9),
         "parameters": parameters,
         "cells": cells,
-        "splits_left": left,
+        "splits_left": splits_left,
         "skipped_steps": skipped,
         "width": town.render_config.width,
         "territories": len(town.owner),

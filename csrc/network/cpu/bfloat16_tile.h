@@ -1,7 +1,6 @@
-// Operands of bfloat16 products, made from float32 rows. Two values share 32 bits, so a pair is handled as one float by
-// what only moves data: blocks broadcast it, panels are laid out by it (gemm_tile.h). Along k, what a pair joins is
-// neighbouring columns of a row (`narrow_row`), or neighbouring rows of a column (`interleave`) where the samples are
-// k.
+// Operands of bfloat16 products, made from float32 rows. A pair of two values has 32 bits, so code that only moves data
+// treats it as one float: blocks broadcast it, and panels are laid out in pairs (gemm_tile.h). A pair joins two
+// neighbours along k: columns of a row (`narrow_row`), or rows of a column if the samples are k (`interleave`).
 #pragma once
 
 #include "common/memory_tile.h"
@@ -14,7 +13,7 @@ namespace {
 
 #if VN_ISA == 2
 
-// The first `count` <= 16 floats, then zeros; negative counts are 0.
+// Loads the first `count` floats (0 to 16) and fills up with zeros. A negative count is 0.
 VN_INLINE F32 load_some(const float* from, int64_t count) {
   const unsigned mask = count >= kLanes ? 0xffffu : count <= 0 ? 0u : (1u << count) - 1u;
   return _mm512_maskz_loadu_ps(static_cast<__mmask16>(mask), from);
@@ -22,21 +21,22 @@ VN_INLINE F32 load_some(const float* from, int64_t count) {
 
 VN_INLINE F32 joined(F32 low, F32 high) { return (F32)_mm512_cvtne2ps_pbh(high, low); }
 
-// Pairs (even[i], odd[i]).
+// Returns the pairs (even[i], odd[i]).
 VN_INLINE F32 interleave(F32 even, F32 odd) {
   const __m512i order = _mm512_set_epi16(31, 15, 30, 14, 29, 13, 28, 12, 27, 11, 26, 10, 25, 9, 24, 8, 23, 7, 22, 6, 21,
                                          5, 20, 4, 19, 3, 18, 2, 17, 1, 16, 0);
   return (F32)_mm512_maskz_permutexvar_epi16(0xffffffffu, order, (__m512i)joined(even, odd));
 }
 
-// One half of what was joined: the first values, or those behind them.
+// Returns one half of the joined values as floats: the first (0) or the second (1) vector.
 VN_INLINE F32 widened(F32 pairs, int half) {
   const __m256i values =
       half == 0 ? _mm512_castsi512_si256((__m512i)pairs) : _mm512_maskz_extracti64x4_epi64(0xf, (__m512i)pairs, 1);
   return (F32)_mm512_maskz_slli_epi32(0xffff, _mm512_maskz_cvtepu16_epi32(0xffff, values), 16);
 }
 
-// Pairs of the values of two that were joined: of the first ones, and of those behind them.
+// Zips the values of two joined vectors to pairs: `low` has the pairs of their first halves, `high` of their second
+// halves.
 VN_INLINE void zip_halves(F32 even, F32 odd, F32& low, F32& high) {
   const __m512i first = _mm512_set_epi16(47, 15, 46, 14, 45, 13, 44, 12, 43, 11, 42, 10, 41, 9, 40, 8, 39, 7, 38, 6, 37,
                                          5, 36, 4, 35, 3, 34, 2, 33, 1, 32, 0);
@@ -47,7 +47,7 @@ VN_INLINE void zip_halves(F32 even, F32 odd, F32& low, F32& high) {
 
 #else
 
-// To the nearest, ties to even; NaN stays NaN.
+// Rounds to the nearest bfloat16, ties to even; NaN stays NaN.
 VN_INLINE uint32_t rounded(float value) {
   uint32_t bits;
   __builtin_memcpy(&bits, &value, sizeof bits);
@@ -67,17 +67,17 @@ VN_INLINE F32 joined(F32 low, F32 high) {
     const F32 half = 2 * i < kLanes ? low : high;
     pairs[i] = rounded(half[2 * i % kLanes]) | rounded(half[2 * i % kLanes + 1]) << 16;
   }
-  F32 made;
-  __builtin_memcpy(&made, pairs, sizeof made);
-  return made;
+  F32 result;
+  __builtin_memcpy(&result, pairs, sizeof result);
+  return result;
 }
 
 VN_INLINE F32 interleave(F32 even, F32 odd) {
   uint32_t pairs[kLanes];
   for (int i = 0; i < kLanes; ++i) pairs[i] = rounded(even[i]) | rounded(odd[i]) << 16;
-  F32 made;
-  __builtin_memcpy(&made, pairs, sizeof made);
-  return made;
+  F32 result;
+  __builtin_memcpy(&result, pairs, sizeof result);
+  return result;
 }
 
 VN_INLINE F32 widened(F32 pairs, int half) {
@@ -85,14 +85,14 @@ VN_INLINE F32 widened(F32 pairs, int half) {
   __builtin_memcpy(values, &pairs, sizeof pairs);
   uint32_t bits[kLanes];
   for (int i = 0; i < kLanes; ++i) bits[i] = static_cast<uint32_t>(values[half * kLanes + i]) << 16;
-  F32 made;
-  __builtin_memcpy(&made, bits, sizeof made);
-  return made;
+  F32 result;
+  __builtin_memcpy(&result, bits, sizeof result);
+  return result;
 }
 
 #endif
 
-// The first and the second value of each pair.
+// lower_of and upper_of return the first and the second value of each pair as floats.
 VN_INLINE F32 lower_of(F32 pairs) {
   I32 bits;
   __builtin_memcpy(&bits, &pairs, sizeof bits);
@@ -116,13 +116,13 @@ VN_INLINE F32 upper_of(F32 pairs) {
 #endif
 }
 
-// What rounding to pairs has left of two vectors, as pairs.
+// Returns the rounding remainders of two vectors that were joined to `pairs`, as pairs.
 VN_INLINE F32 left_of(F32 low, F32 high, F32 pairs) {
   return joined(low - widened(pairs, 0), high - widened(pairs, 1));
 }
 
-// `width` floats -> pairs, the last filled up with 0. Whole vectors are written: 16 pairs at a time.
-// `left`: in this place, if not null, what rounding has left.
+// Rounds `width` floats to pairs and pads with 0 to a multiple of 16 pairs. If `left` is not null, the rounding
+// remainders are stored there as pairs.
 VN_INLINE void narrow_row(const float* from, int64_t width, float* to, float* left = nullptr) {
   for (int64_t i = 0; i < width; i += 32) {
     for (int64_t v = i; v < i + 32; v += 2 * kLanes) {

@@ -1,6 +1,6 @@
-// Layers of up to four outputs, as heads have: in the product of gemm_tile.h a vector of outputs would be empty but for
-// those. Here vectors run along the inputs: each output of a row is a dot product, as many of which as a vector has
-// lanes are summed at once, [rows][1] or [rows][4], and their lanes are added up together at the end.
+// Layers of up to four outputs, such as heads. The product of gemm_tile.h would leave most lanes of an output vector
+// empty. Here vectors run along the inputs, and each output of a row is a dot product. A block has one dot product per
+// lane, [rows][1] or [rows][4], and adds up the lanes of all of them at the end.
 #pragma once
 
 #include "network/cpu/gemm_tile.h"
@@ -10,13 +10,14 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// Sources in whole vectors of k; weights [O][all k]; C [rows][kGranule], filled up with 0. All sums are of the same
-// shape, so a row's result does not depend on its place. The last rows are done again where `rows` is no multiple.
+// Sources have whole vectors of k, weights are [O][all k], and C is [rows][kGranule], padded with 0. All sums use the
+// same order, so a row's result does not depend on its position. If `rows` is not a multiple of a block's rows, the
+// last row is computed repeatedly.
 template <int O>
 void few_outputs(const Source* sources, int64_t count, const float* weights, int64_t depth, const float* bias,
                  bool relu, int64_t rows, float* c) {
   constexpr int kRows = kLanes / O;
-  const F32 lowest = splat(relu ? 0.0f : -__builtin_huge_valf());  // NaN is not less
+  const F32 lowest = splat(relu ? 0.0f : -__builtin_huge_valf());  // NaN passes: it is not less
   float start[kLanes];
   for (int i = 0; i < kLanes; ++i) start[i] = bias[i % O];
   for (int64_t first = 0; first < rows; first += kRows) {

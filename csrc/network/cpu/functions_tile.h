@@ -1,4 +1,4 @@
-// What the functions of programs (network/functions.h) are made of, in vectors.
+// The vector functions of which network/functions.h builds the functions of programs.
 #pragma once
 
 #include "common/elementwise_math.h"
@@ -21,7 +21,7 @@ VN_INLINE F32 square_root(F32 x) {
 #endif
 }
 
-// With x = 2^e m, m from sqrt(1/2) to sqrt 2: e log 2 + 2 atanh((m - 1) / (m + 1)).
+// Returns log x. With x = 2^e m and m from sqrt(1/2) to sqrt 2, it is e log 2 + 2 atanh((m - 1) / (m + 1)).
 VN_INLINE F32 logarithm(F32 x) {
   const F32 zero = splat(0.0f), one = splat(1.0f), least = splat(1.17549435e-38f);
   const F32 normal = x < least ? x * splat(8388608.0f) : x;
@@ -35,9 +35,9 @@ VN_INLINE F32 logarithm(F32 x) {
   p = fma(u, p, splat(1.0f / 5));
   p = fma(u, p, splat(1.0f / 3));
   p = fma(u * (s + s), p, s + s);
-  const F32 found = fma(e, splat(0.693359375f), fma(e, splat(-2.12194440e-4f), p));
+  const F32 result = fma(e, splat(0.693359375f), fma(e, splat(-2.12194440e-4f), p));
   const F32 infinite = splat(__builtin_inff());
-  return x > zero ? (x < infinite ? found : x) : x == zero ? zero - infinite : splat(__builtin_nanf(""));
+  return x > zero ? (x < infinite ? result : x) : x == zero ? zero - infinite : splat(__builtin_nanf(""));
 }
 
 VN_INLINE F32 rounded_down(F32 x) {
@@ -47,8 +47,8 @@ VN_INLINE F32 rounded_down(F32 x) {
   return load(lanes);
 }
 
-// sin(angle + half * pi) of angles some of which are too large for `sine`, by the scalar function. Lane by lane: what
-// else is in a vector, such as old floats behind the columns of a value, changes no bit.
+// Returns the sine or cosine if some angles are too large for `sine`; the scalar function computes them. The choice is
+// made per lane, so other lanes, such as stale floats in padding lanes, do not change a result.
 __attribute__((noinline)) F32 careful_sine(F32 angle, bool cosine) {
   float lanes[kLanes], angles[kLanes];
   store(lanes, sine(angle, splat(cosine ? 0.5f : 0.0f)));
@@ -65,8 +65,8 @@ VN_INLINE F32 any_sine(F32 angle, bool cosine) {
   return sine(angle, splat(cosine ? 0.5f : 0.0f));
 }
 
-// e^x to 0 and infinity: `exponential` ends at e^-87 and e^88, which times a large x is not 0. What float32 holds with
-// fewer digits is 0, since such numbers take the processor ten times as long.
+// Returns e^x down to 0 and up to infinity. `exponential` is clamped to e^-87 and e^88, but e^-87 times a large x is
+// not 0. Denormal results are 0, since denormals take the processor ten times as long.
 VN_INLINE F32 any_exponential(F32 x) {
   const F32 root = x < splat(-87.0f) ? splat(0.0f) : exponential(splat(0.5f) * x);
   return root * root;

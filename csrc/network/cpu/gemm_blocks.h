@@ -7,13 +7,14 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// Rows of a block that fill the registers.
+// Returns the rows of a block that fill the registers.
 template <int V>
 constexpr int block_rows() {
   return kLanes < 16 ? 6 : V == 4 ? 6 : V == 3 ? 8 : 12;
 }
 
-// Not inlined: among the caller's variables its pointers go to the stack, and the inner loop reloads them.
+// Computes a block of R rows by V vectors. It is not inlined, or its pointers would be spilled to the stack and
+// reloaded in the inner loop.
 template <int R, int V, bool Transposed>
 __attribute__((noinline)) void block(const Product& p, int64_t row, int64_t column) {
   F32 sum[R][V];
@@ -24,7 +25,7 @@ __attribute__((noinline)) void block(const Product& p, int64_t row, int64_t colu
   const int64_t b_stride = p.b_stride;
   const Source* source = p.sources;
   const Source* const end = source + p.count;
-  // There is at least one source, and none is empty: loops that test at their end keep the sums in registers.
+  // There is at least one source and none is empty, so do-while loops are possible: they keep the sums in registers.
   do {
     const int64_t stride = source->stride;
     int64_t depth = source->depth;
@@ -55,8 +56,9 @@ __attribute__((noinline)) void block(const Product& p, int64_t row, int64_t colu
       } while (--depth > 0);
     }
   } while (++source != end);
-  // Every way to finish stores by itself: merging them would send the sums through the stack. The order of operands
-  // lets NaN pass, as in torch; a slope selects, since 0 times an infinite gradient would be NaN.
+  // Each finish has its own stores: shared stores would spill the sums to the stack. The order of the operands of max
+  // lets NaN pass, as in torch. A slope selects instead of multiplying, since 0 times an infinite gradient would be
+  // NaN.
   const F32 zero = splat(0.0f);
   const int64_t c_stride = p.c_stride;
   float* const c = p.c == nullptr ? nullptr : p.c + row * c_stride + column;

@@ -1,10 +1,10 @@
-// The products of gemm_tile.h in tile registers (tile_registers.h), 16 rows by 16 columns by 16 pairs at a time: all
-// operands are pairs, and depths are filled up with 0 to 16 of them.
+// The products of gemm_tile.h in tile registers (tile_registers.h), 16 rows by 16 columns by 16 pairs at a time. All
+// operands are pairs, and depths are padded with 0 to a multiple of 16 pairs.
 //
-// A block of 32 rows by 32 columns has four registers of sums, two of A and two of B: as many loads as products, which
-// take twice as long. The sums of a block go to memory, in the first-level cache, and are finished (a ReLU, rounding)
-// while the products of the next one run: what waits for them would fill the processor's queue before those products
-// come into it.
+// A block of 32 rows by 32 columns has four registers of sums, two of A and two of B: as many loads as products, and a
+// product takes twice as long as a load. The sums of a block are stored to memory in the first-level cache and finished
+// (ReLU, rounding) while the products of the next block run. Otherwise instructions that wait for the sums would fill
+// the processor's queue, and the next products could not enter it.
 #pragma once
 
 #include "network/cpu/gemm_tile.h"
@@ -15,7 +15,7 @@ namespace VN_ISA_NAMESPACE {
 inline namespace tiles_of_pairs {
 namespace {
 
-constexpr int64_t kBlock = 2 * kTileRows, kStep = 16;  // rows and columns of a block, pairs of a register
+constexpr int64_t kBlock = 2 * kTileRows, kStep = 16;  // rows and columns of a block, pairs per row of a register
 constexpr int64_t kFloat = sizeof(float);
 
 template <int N>
@@ -23,22 +23,22 @@ struct Register {
   static constexpr int kNumber = N;
 };
 
-// For blocks of up to so many rows: registers 0 to 3 are sums, 4 and 5 A, 6 and 7 B.
+// Shapes the registers for blocks of up to `rows` rows: 0 to 3 are sums, 4 and 5 are A, 6 and 7 are B.
 VN_INLINE void shape_for(int64_t rows) {
   TileShapes shapes;
   for (int i = 0; i < 8; ++i) {
-    const int64_t own = i > 5 ? kTileRows : rows - i % 2 * kTileRows;
+    const int64_t count = i > 5 ? kTileRows : rows - i % 2 * kTileRows;
     shapes.bytes[i] = kTileBytes;
-    shapes.rows[i] = static_cast<uint8_t>(own > kTileRows ? kTileRows : own < 1 ? 1 : own);
+    shapes.rows[i] = static_cast<uint8_t>(count > kTileRows ? kTileRows : count < 1 ? 1 : count);
   }
   shape_tiles(shapes);
 }
 
-// Blocks of the same size: rows and columns [from, end), `row_step` and `column_step` of each.
+// Blocks of row_step rows and column_step columns, in rows [row, row_end) and columns [column, column_end).
 struct Blocks {
   int64_t row, row_end, row_step, column, column_end, column_step;
 };
-// A block whose sums lie at `sums`, in rows of kBlock.
+// A block whose sums are stored at `sums`, in rows of kBlock floats.
 struct Block {
   int64_t row, column, rows;
   const float* sums;
@@ -46,12 +46,13 @@ struct Block {
 enum class Slope { none, relu, floats, pairs };
 enum class Pairs { none, rounded, parts };
 
-// Where a slope is 0 or less, the result is 0.
+// Returns the sum, or 0 in lanes whose slope is 0 or less.
 VN_INLINE F32 by_slope(F32 slope, F32 sum) { return slope <= splat(0.0f) ? splat(0.0f) : sum; }
 
 VN_INLINE F32 joined_by_slope(F32 slopes, F32 low, F32 high) {
 #if VN_ISA == 2
-  // Of the slopes' bits, as integers, those of what is above 0 are above 0, and those of NaN with a sign the largest.
+  // As signed integers, the bits of slopes above 0 are above 0. As unsigned integers, the bits of negative NaN are the
+  // largest.
   const __m512i slope = (__m512i)slopes;
   const __mmask32 above = _mm512_cmpgt_epi16_mask(slope, _mm512_setzero_si512());
   const __mmask32 none = _mm512_cmpgt_epu16_mask(slope, _mm512_set1_epi16(static_cast<int16_t>(0xff80)));
@@ -61,8 +62,7 @@ VN_INLINE F32 joined_by_slope(F32 slopes, F32 low, F32 high) {
 #endif
 }
 
-// Makes rows [begin, end) of a block what they are to be, two neighbouring vectors at a time. Behind the last column
-// there are zeros.
+// Finishes rows [begin, end) of a block, two neighbouring vectors at a time. Pairs after the last column become zeros.
 template <Slope S, bool kFloats, Pairs P, bool kWhole>
 VN_INLINE void finish(const Product& p, const Block& block, int64_t begin, int64_t end) {
   constexpr bool kPairs = P != Pairs::none, kLeft = P == Pairs::parts;
@@ -113,8 +113,9 @@ VN_INLINE void finish(const Product& p, const Block& block, int64_t begin, int64
   }
 }
 
-// Blocks of R by C registers. While the products of a block's first step run, the sums of the block before are stored:
-// where they belong, if they are only floats; else in memory, to be finished while the products of the last step run.
+// Computes blocks of R by C registers. The sums of the previous block are stored while the products of a block's first
+// step run: to C if there is nothing to finish, else to a buffer, which is finished while the products of the last step
+// run.
 template <int R, int C, Slope S, bool kFloats, Pairs P>
 __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& blocks) {
   constexpr bool kFinish = S != Slope::none || P != Pairs::none;
@@ -126,14 +127,15 @@ __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& b
   const int64_t to_row = kFinish ? kBlock : p.c_stride, to_next = kTileRows * to_row, to_stride = to_row * kFloat;
   const int64_t steps = (p.a_left > 0 ? 3 : 1) * source.depth / kStep;
   float* to = memory;
-  bool others = false;
-  Block before{0, 0, blocks.row_step, memory};
+  bool has_previous = false;
+  Block previous{0, 0, blocks.row_step, memory};
   const auto store = [&](auto q) {
     constexpr int kQ = decltype(q)::kNumber, kRow = kQ % 2, kColumn = kQ / 2;
     tile_store<kQ>(to + kRow * to_next + kColumn * kTileRows, to_stride);
   };
   const auto finish_quarter = [&](int64_t q) {
-    if (kFinish && others) finish<S, kFloats, P, C == 2>(p, before, before.rows * q / 4, before.rows * (q + 1) / 4);
+    if (kFinish && has_previous)
+      finish<S, kFloats, P, C == 2>(p, previous, previous.rows * q / 4, previous.rows * (q + 1) / 4);
   };
   for (int64_t row = blocks.row; row < blocks.row_end; row += blocks.row_step) {
     for (int64_t column = blocks.column; column < blocks.column_end; column += blocks.column_step) {
@@ -141,7 +143,7 @@ __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& b
       const float* const start = p.start + row * p.start_stride + column;
       const auto begin = [&](auto q) {
         constexpr int kQ = decltype(q)::kNumber, kRow = kQ % 2, kColumn = kQ / 2;
-        if (others) store(q);
+        if (has_previous) store(q);
         tile_load<kQ>(start + kRow * start_next + kColumn * kTileRows, start_stride);
       };
       const auto products = [&](const auto& begins, const auto& then) {
@@ -173,7 +175,7 @@ __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& b
       for (int64_t step = 1, k = kStep; step < steps; ++step, k += kStep) {
         a += kStep;
         b += b_step;
-        if (k == source.depth) {  // of products in parts: high x low, then low x high
+        if (k == source.depth) {  // products in parts: high x low, then low x high
           const bool last = step + source.depth / kStep == steps;
           a = source.data + row * source.stride + (last ? p.a_left : 0);
           b = p.b + column + (last ? 0 : p.b_left);
@@ -182,9 +184,9 @@ __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& b
         step + 1 < steps ? products(nothing, nothing) : products(nothing, finish_quarter);
       }
       for (int q = 0; steps == 1 && q < 4; ++q) finish_quarter(q);
-      others = true;
-      before.row = row;
-      before.column = column;
+      has_previous = true;
+      previous.row = row;
+      previous.column = column;
       if (!kFinish) to = p.c + row * p.c_stride + column;
     }
   }
@@ -192,7 +194,7 @@ __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& b
   if constexpr (R > 1) store(Register<1>{});
   if constexpr (C > 1) store(Register<2>{});
   if constexpr (R > 1 && C > 1) store(Register<3>{});
-  if (kFinish) finish<S, kFloats, P, C == 2>(p, before, 0, before.rows);
+  if (kFinish) finish<S, kFloats, P, C == 2>(p, previous, 0, previous.rows);
 }
 
 template <Slope S, bool kFloats, Pairs P>
@@ -230,7 +232,8 @@ VN_INLINE void multiply_to(const Product& p, int64_t rows, int64_t columns) {
 
 }  // namespace
 
-// C [rows][columns], columns a multiple of 16; the shapes of the registers are those of whole blocks, before and after.
+// Computes C [rows][columns], with columns a multiple of 16. The registers have the shapes of whole blocks on entry and
+// on return.
 static void multiply_tiles(const Product& p, int64_t rows, int64_t columns) {
   if (p.finish == Finish::none) {
     multiply_to<Slope::none>(p, rows, columns);

@@ -1,4 +1,4 @@
-// Programs over threads, task by task (row_tasks.h).
+// Runs programs on threads, task by task (row_tasks.h).
 #include "network/program.h"
 
 #include <algorithm>
@@ -17,8 +17,8 @@ namespace voronerf {
 namespace {
 
 constexpr RowLimits kRows{96, 1024}, kSumRows{384, 4096};
-constexpr int64_t kTaskUnit = 48, kTileUnit = 96;  // tasks are whole tiles or halves of one
-constexpr int64_t kSlack = 128;                    // floats behind the slots that vectors may read and write
+constexpr int64_t kTaskUnit = 48, kTileUnit = 96;  // tasks are multiples of a tile or half a tile
+constexpr int64_t kSlack = 128;                    // floats after the slots that vectors may read and write
 
 int64_t aligned(int64_t floats) { return ceil_div<int64_t>(floats, kGranule) * kGranule; }
 
@@ -34,9 +34,9 @@ bool in_tiles(const ProgramTable& table) {
   return table.layout == ProgramLayout::tiles || table.layout == ProgramLayout::parts;
 }
 
-// Whether values leave 0 to end - 1: they, or what is left to the end, are negative then. A sum of signs is made in
-// vectors on any processor, unlike one of comparisons without signs.
-bool leaves(const int32_t* values, int64_t n, int64_t end) {
+// Returns whether a value is outside [0, end): then the value or its distance to end - 1 is negative. The loop collects
+// sign bits, which compilers vectorise on any processor, unlike unsigned comparisons.
+bool out_of_range(const int32_t* values, int64_t n, int64_t end) {
   const auto last = static_cast<uint32_t>(end - 1);
   uint32_t signs = 0;
   for (int64_t i = 0; i < n; ++i) signs |= static_cast<uint32_t>(values[i]) | (last - static_cast<uint32_t>(values[i]));
@@ -46,26 +46,26 @@ bool leaves(const int32_t* values, int64_t n, int64_t end) {
 void check(const ProgramInputs& in) {
   const std::string op = in.caller;
   check_offsets(op, in.offsets, in.k, in.n);
-  const bool foreign = op == "grouped_program";  // other operations have made the order themselves
-  if (foreign && in.order != nullptr && leaves(in.order, in.n, in.n)) {
+  const bool unchecked = op == "grouped_program";  // other operations compute the order themselves
+  if (unchecked && in.order != nullptr && out_of_range(in.order, in.n, in.n)) {
     const auto [low, high] = std::minmax_element(in.order, in.order + in.n);
     throw std::invalid_argument(op + ": order must lie in 0 to " + std::to_string(in.n - 1) + ", got values from " +
                                 std::to_string(*low) + " to " + std::to_string(*high));
   }
-  if (in.ray_index != nullptr && leaves(in.ray_index, in.n, in.r)) {
+  if (in.ray_index != nullptr && out_of_range(in.ray_index, in.n, in.r)) {
     const auto [low, high] = std::minmax_element(in.ray_index, in.ray_index + in.n);
     throw std::invalid_argument(op + ": " + in.ray_name + " must be 0 to " + std::to_string(in.r - 1) + ", got " +
                                 std::to_string(*low < 0 ? *low : *high));
   }
 }
 
-constexpr int64_t kMostFetched = 1 << 15;  // floats of a cell
+constexpr int64_t kMostFetched = 1 << 15;  // floats per cell
 
-// Memory of a cell on its way to the cache: of many small cells, each would be waited for. Large ones take so long to
-// run that it does not show, and would push out what is in use.
+// Prefetches memory of the next cell: with many small cells, each would wait for its memory. Large cells run so long
+// that the wait does not matter, and prefetching them would evict data in use.
 void fetch(const float* from, int64_t floats, bool writes) {
   constexpr int64_t kLine = 16;  // floats
-  asm volatile("");              // GCC drops the calls of a function that does nothing but prefetch
+  asm volatile("");              // otherwise GCC removes calls of a function that only prefetches
   for (int64_t i = 0; i < floats; i += kLine) {
     if (writes) {
       __builtin_prefetch(from + i, 1, 2);
@@ -75,10 +75,10 @@ void fetch(const float* from, int64_t floats, bool writes) {
   }
 }
 
-// The parameters of a cell, each once.
+// Prefetches each parameter of a cell once.
 void fetch_parameters(const ProgramCall& call, int64_t cell) {
   if (call.code.packed > kMostFetched) return;
-  uint64_t seen = 0;  // of the parameters, since most are packed twice
+  uint64_t seen = 0;  // prefetched parameters: most are packed twice
   for (int32_t p = 0; p < call.code.pack_count; ++p) {
     const ProgramPack& pack = call.code.packs[p];
     const uint64_t bit = uint64_t{1} << (pack.parameter & 63);
@@ -89,17 +89,17 @@ void fetch_parameters(const ProgramCall& call, int64_t cell) {
   }
 }
 
-// The gradients of a cell, which are about to be written.
+// Prefetches the sums of a cell, which will be written next.
 void fetch_sums(const ProgramCall& call, int64_t cell) {
   if (call.code.partial > kMostFetched) return;
   for (int32_t s = 0; s < call.code.sum_count; ++s) {
     const ProgramSum& sum = call.code.sums[s];
-    if (sum.size > kMostFetched) continue;  // of a table
+    if (sum.size > kMostFetched) continue;  // the sum of a table
     if (s == 0 || call.code.sums[s - 1].sum != sum.sum) fetch(call.sums[sum.sum] + cell * sum.size, sum.size, true);
   }
 }
 
-// Rows of no cell.
+// Sets outputs of rows in no cell to 0.
 void clear_strays(const ProgramInputs& in, const ProgramResults& results, const ProgramTable& table) {
   for (size_t o = 0; o < table.outputs.size(); ++o) {
     if (table.outputs[o].ray || in.n == 0) continue;
@@ -118,7 +118,7 @@ void clear_strays(const ProgramInputs& in, const ProgramResults& results, const 
   }
 }
 
-// What no look-up writes of what is kept: rows of no cell, and columns behind the features.
+// Sets the entries of kept look-ups to 0 that no look-up writes: rows in no cell, and columns after the features.
 void clear_kept(const ProgramInputs& in, int64_t features, int64_t stride, float* kept, int threads) {
   std::fill(kept, kept + in.offsets[0] * stride, 0.0f);
   std::fill(kept + in.offsets[in.k] * stride, kept + in.n * stride, 0.0f);
@@ -127,12 +127,12 @@ void clear_kept(const ProgramInputs& in, int64_t features, int64_t stride, float
                [&](int64_t row) { std::fill(kept + row * stride + features, kept + (row + 1) * stride, 0.0f); });
 }
 
-// Rows with a gradient, which alone add to sums; those without are samples that no light reaches, say.
+// The rows with a non-zero gradient: only they add to sums. For example, samples that no light reaches have gradient 0.
 struct Sifted {
-  std::vector<int32_t> rows, order, offsets;  // numbers as sorted, and of the caller; [k+1]. Empty: all rows
+  std::vector<int32_t> rows, order, offsets;  // sorted indices, the caller's indices; [k+1]. Empty: all rows
 };
 
-// Whether values, float32 or bfloat16, are all 0, of either sign.
+// Returns whether all values, float32 or bfloat16 (half), are 0 or -0.
 bool all_zero(const char* values, int64_t count, bool half) {
   const int64_t bytes = count * (half ? 2 : 4);
   const uint64_t sizes = half ? 0x7fff7fff7fff7fffu : 0x7fffffff7fffffffu;
@@ -149,16 +149,16 @@ bool all_zero(const char* values, int64_t count, bool half) {
   return any == 0;
 }
 
-// Empty too where the few without a gradient would not pay for copies. Blocks of rows list their own, which are then
-// put together.
+// Lists the rows with a non-zero gradient: blocks of rows make lists, which are then concatenated. The result is also
+// empty if so few rows have zero gradient that compacting does not pay.
 Sifted sift(const ProgramTable& table, const ProgramInputs& in, int threads) {
   constexpr int64_t kBlock = 1024;
-  const int64_t first = in.offsets[0], all = in.offsets[in.k] - first, blocks = ceil_div(all, kBlock);
-  std::vector<int32_t> lists(all), begins(blocks + 1, 0);
+  const int64_t first = in.offsets[0], row_count = in.offsets[in.k] - first, blocks = ceil_div(row_count, kBlock);
+  std::vector<int32_t> lists(row_count), begins(blocks + 1, 0);
   parallel_for(blocks, 1, threads, [&](int64_t block) {
     int32_t* to = lists.data() + block * kBlock;
     int32_t count = 0;
-    const int64_t begin = first + block * kBlock, end = std::min(first + all, begin + kBlock);
+    const int64_t begin = first + block * kBlock, end = std::min(first + row_count, begin + kBlock);
     bool zero[kBlock];
     std::fill_n(zero, kBlock, true);
     for (size_t input = static_cast<size_t>(in.gradients); input < table.inputs.size(); ++input) {
@@ -183,28 +183,28 @@ Sifted sift(const ProgramTable& table, const ProgramInputs& in, int threads) {
   });
   for (int64_t block = 0; block < blocks; ++block) begins[block + 1] += begins[block];
   const int64_t count = blocks > 0 ? begins[blocks] : 0;
-  Sifted found;
-  constexpr int64_t kPart = 16;  // of the rows at least are left out
-  if (count > all - all / kPart) return found;
-  found.rows.resize(count);
-  found.order.resize(count);
+  Sifted result;
+  constexpr int64_t kPart = 16;  // compact only if at least 1/kPart of the rows is left out
+  if (count > row_count - row_count / kPart) return result;
+  result.rows.resize(count);
+  result.order.resize(count);
   parallel_for(blocks, 1, threads, [&](int64_t block) {
     const int32_t* from = lists.data() + block * kBlock;
     for (int32_t i = begins[block]; i < begins[block + 1]; ++i) {
       const int32_t row = *from++;
-      found.rows[i] = row;
-      found.order[i] = in.order == nullptr ? row : in.order[row];
+      result.rows[i] = row;
+      result.order[i] = in.order == nullptr ? row : in.order[row];
     }
   });
-  found.offsets.resize(in.k + 1);
+  result.offsets.resize(in.k + 1);
   for (int64_t cell = 0; cell <= in.k; ++cell) {
-    found.offsets[cell] = static_cast<int32_t>(
-        std::lower_bound(found.rows.begin(), found.rows.end(), in.offsets[cell]) - found.rows.begin());
+    result.offsets[cell] = static_cast<int32_t>(
+        std::lower_bound(result.rows.begin(), result.rows.end(), in.offsets[cell]) - result.rows.begin());
   }
-  return found;
+  return result;
 }
 
-// Rows [n, width] in the order of the cells, summed over the samples of each ray in that order.
+// Sums rows [n, width] over the samples of each ray, in the order of the cells.
 void sum_by_ray(const ProgramInputs& in, int64_t width, const float* rows, float* out) {
   std::fill(out, out + in.r * width, 0.0f);
   for (int64_t i = in.offsets[0]; i < in.offsets[in.k]; ++i) {
@@ -213,7 +213,7 @@ void sum_by_ray(const ProgramInputs& in, int64_t width, const float* rows, float
   }
 }
 
-// A grid at rows [begin, end), one level after the other, whose entries then stay in cache.
+// Looks up rows [begin, end) in a grid, one level after the other, so that the entries of a level stay in cache.
 void lookup_by_level(const HashEncoding& grid, int64_t begin, int64_t end, float* out, int64_t stride, Isa isa,
                      int threads) {
   constexpr int64_t kLine = 64, kTask = 1 << 14;  // bytes, rows
@@ -331,31 +331,31 @@ void ProgramRows::reduce(const ProgramCall& call, int64_t cell, float* partials,
 }
 
 void ProgramRows::forward(const ProgramInputs& in, const ProgramResults& results, Own& own) const {
-  constexpr size_t kFew = 16;  // inputs and memories of a network; more would need memory for each call
+  constexpr size_t kFew = 16;  // inputs, or memories, of a network; more would need an allocation per call
   VN_CHECK(table_.inputs.size() <= kFew && table_.memories.size() <= kFew, "a program of rows has at most 16 inputs");
   bool in_place[kFew];
   float* memories[kFew] = {};
   bool filled[kFew] = {};
-  ProgramCall made = call(in, results, in_place);
-  made.memories = memories;
-  made.filled = filled;
+  ProgramCall program_call = call(in, results, in_place);
+  program_call.memories = memories;
+  program_call.filled = filled;
   for (int64_t cell = 0; cell < in.k; ++cell) {
     if (in.offsets[cell] == in.offsets[cell + 1]) continue;
-    if (cell != own.packed) pack(made, cell, own.packed < 0, own.memory);
+    if (cell != own.packed) pack(program_call, cell, own.packed < 0, own.memory);
     own.packed = cell;
-    run(made, cell, in.offsets[cell], in.offsets[cell + 1], own.memory, nullptr);
+    run(program_call, cell, in.offsets[cell], in.offsets[cell + 1], own.memory, nullptr);
   }
 }
 
-void grouped_program_cpu(const Program& program, const ProgramInputs& given, const ProgramResults& results, Isa isa,
+void grouped_program_cpu(const Program& program, const ProgramInputs& original, const ProgramResults& results, Isa isa,
                          int threads) {
   const ProgramTable& table = program.table;
-  check(given);
-  ProgramInputs in = given;
+  check(original);
+  ProgramInputs in = original;
   Sifted sifted;
-  if (given.gradients >= 0) sifted = sift(table, given, threads);
-  const bool fewer = !sifted.offsets.empty();
-  if (fewer) {
+  if (original.gradients >= 0) sifted = sift(table, original, threads);
+  const bool compacted = !sifted.offsets.empty();
+  if (compacted) {
     in.n = static_cast<int64_t>(sifted.rows.size());
     in.order = sifted.order.data();
     in.offsets = sifted.offsets.data();
@@ -366,10 +366,11 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
   ProgramCall call = rows.call(in, results, in_place.get());
   call.memories = memories.data();
   call.filled = filled.get();
-  call.n = given.n;
+  call.n = original.n;
   clear_strays(in, results, table);
 
-  // The memory of the call: threads, partials, memories of n rows, and points in the order of the cells.
+  // The workspace of the call: the memory of each thread, partials, memories of n rows, and points in the order of the
+  // cells.
   const bool summed = !table.sums.empty();
   const int64_t unit = in_tiles(table) ? kTileUnit : kTaskUnit;
   const RowTasks tasks = split_rows(in.offsets, in.k, in.n, summed ? kSumRows : kRows, unit, table.partial);
@@ -391,7 +392,7 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
     float* const kept = in.kept == nullptr ? nullptr : in.kept[l];
     const auto m = static_cast<size_t>(lookup.memory);
     if (kept == nullptr) continue;
-    if (fewer) {
+    if (compacted) {
       VN_CHECK(in.ready, "what is kept of rows with a gradient is ready");
       places[m] = take(in.n * table.memories[m]);
     } else {
@@ -403,8 +404,8 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
     filled[m] = in.ready || shared;
     if (!in.ready && shared) gather(lookup.input);
   }
-  const auto known = [&](const ProgramLookup& lookup) { return filled[static_cast<size_t>(lookup.memory)]; };
-  call.looked_up = std::all_of(table.lookups.begin(), table.lookups.end(), known);
+  const auto is_filled = [&](const ProgramLookup& lookup) { return filled[static_cast<size_t>(lookup.memory)]; };
+  call.looked_up = std::all_of(table.lookups.begin(), table.lookups.end(), is_filled);
   for (const ProgramScatter& scatter : table.scatters) {
     places[static_cast<size_t>(scatter.memory)] = take(in.n * table.memories[static_cast<size_t>(scatter.memory)]);
     gather(scatter.input);
@@ -414,8 +415,8 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
   }
   for (size_t o = 0; o < table.outputs.size(); ++o) {
     const ProgramOutput& output = table.outputs[o];
-    const bool here = !output.ray && in.order == nullptr && results.output_types[o] == TableType::float32;
-    if (here && output.memory >= 0) {
+    const bool in_place_output = !output.ray && in.order == nullptr && results.output_types[o] == TableType::float32;
+    if (in_place_output && output.memory >= 0) {
       memories[static_cast<size_t>(output.memory)] = static_cast<float*>(results.outputs[o]);
     }
   }
@@ -424,8 +425,8 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
   for (size_t m = 0; m < memories.size(); ++m) {
     if (places[m] >= 0) memories[m] = memory + places[m];
   }
-  constexpr int64_t kRun = 512;  // rows that are copied at a time
-  if (fewer) {
+  constexpr int64_t kRun = 512;  // rows per run of a copy
+  if (compacted) {
     for (size_t l = 0; l < table.lookups.size(); ++l) {
       const auto m = static_cast<size_t>(table.lookups[l].memory);
       const float* const kept = in.kept == nullptr ? nullptr : in.kept[l];
@@ -455,7 +456,7 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
     return grid;
   };
 
-  // Look-ups in a table of all cells, level by level: the entries of one level stay in cache.
+  // Look-ups in a table that all cells share, level by level, so that the entries of a level stay in cache.
   for (const ProgramLookup& lookup : table.lookups) {
     const auto m = static_cast<size_t>(lookup.memory);
     if (in.ready || memories[m] == nullptr || !filled[m]) continue;
@@ -487,7 +488,7 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
     });
   }
 
-  // The gradients of tables, level by level: the rows are added up in their order by any number of threads.
+  // The gradients of tables, one item per table and level. Each adds the rows in order, for any number of threads.
   for (const ProgramScatter& scatter : table.scatters) {
     const auto m = static_cast<size_t>(scatter.memory);
     const HashEncoding grid = grid_of(scatter.grid, scatter.parameter, scatter.input);
@@ -495,9 +496,9 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
     const int64_t tables = shared ? 1 : in.k, size = grid.in.entries * grid.features;
     float* const to = results.sums[scatter.sum];
     parallel_for(tables * grid.count, 1, threads, [&](int64_t item) {
-      const int64_t one = item / grid.count, level = item % grid.count;
-      hash_level_backward_cpu(grid, level, memories[m], table.memories[m], in.offsets[shared ? 0 : one],
-                              in.offsets[shared ? in.k : one + 1], to + one * size, isa);
+      const int64_t table_index = item / grid.count, level = item % grid.count;
+      hash_level_backward_cpu(grid, level, memories[m], table.memories[m], in.offsets[shared ? 0 : table_index],
+                              in.offsets[shared ? in.k : table_index + 1], to + table_index * size, isa);
     });
   }
   for (size_t o = 0; o < table.outputs.size(); ++o) {

@@ -1,6 +1,6 @@
-// The kernels of programs with bfloat16 products: AVX-512 with its bfloat16 dot product, which multiplies pairs and
-// adds to float32. Values, slopes, sums and gradients stay float32 in the tile; what enters a product is rounded to
-// bfloat16 on the way (bfloat16_tile.h).
+// The kernels of programs with bfloat16 products, by the bfloat16 dot product of AVX-512, which multiplies pairs and
+// adds to float32. Values, slopes, sums and gradients are float32 in the tile, and operands are rounded to bfloat16 for
+// each product (bfloat16_tile.h).
 #include "network/cpu/program_isa.h"
 
 #if VN_ISA == 2 && VN_HAS_HALF

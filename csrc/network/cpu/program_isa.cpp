@@ -1,9 +1,8 @@
-// The CPU kernels of programs, once for each instruction set.
+// The CPU kernels of programs, compiled once per instruction set.
 //
-// A tile of rows goes through all steps while its values stay in the first two cache levels; nothing of the size of n
-// times a layer is ever written. A cell's parameters are made ready once by each thread that works on it, matrices as
-// the products (gemm_tile.h) read them. Sums over rows are added up in one partial over all tiles of a task, which
-// stays in cache as well.
+// A tile of rows runs through all steps while its values stay in the first two cache levels, so no [n, layer width]
+// tensor is written. Each thread packs the parameters of its cells once, matrices in the layout of the products
+// (gemm_tile.h). All tiles of a task add to the same partial sums, which stay in cache too.
 #define VN_HALF 0
 #include "network/cpu/program_tile.h"
 

@@ -1,4 +1,4 @@
-// The kernels of programs, once for each instruction set (program_isa.cpp).
+// The kernels of programs, compiled once per instruction set (program_isa.cpp).
 #pragma once
 
 #include "common/isa.h"
@@ -7,13 +7,13 @@
 
 namespace voronerf {
 
-// What the tiles read of a call.
+// The data of a call that the tiles read.
 struct ProgramCall {
   ProgramCode code;
   const void* const* inputs;
   const TableType* input_types;
   const int32_t* input_widths;
-  const bool *turned, *rays, *in_place;  // of inputs
+  const bool *turned, *rays, *in_place;  // properties of the inputs
   const void* const* parameters;
   const TableType* parameter_types;
   const int64_t* strides;
@@ -21,24 +21,25 @@ struct ProgramCall {
   const TableType* output_types;
   const int32_t* output_widths;
   float* const* sums;
-  float* const* memories;     // of the call, in the order of the cells, or null
-  const bool* filled;         // of memories: nothing is to be looked up
+  float* const* memories;     // memories of the call, in the order of the cells; null: none
+  const bool* filled;         // memories with finished look-ups
   bool looked_up;             // all memories of hash grids are filled
-  const HashEncoding* grids;  // without their tables
+  const HashEncoding* grids;  // without the pointers of tables
   const int32_t *order, *ray_index;
   int64_t n;     // rows of inputs
-  int64_t tile;  // rows, at most
-  bool parts;    // in tile registers: pairs are followed by what rounding has left of the values
+  int64_t tile;  // maximal rows
+  bool parts;    // in tile registers: rounding remainders follow the pairs of a value
 };
 
-// Makes a cell's parameters ready; `first`: nothing was before. `free`: the thread's slots.
+// Packs a cell's parameters. `first`: it is the thread's first cell. `free`: the thread's slots, as scratch memory.
 VN_DECLARE_FOR_ISA(void program_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free))
 
-// Rows [begin, end) of the cell that is packed. `tiles` holds the slots; sums fill `partial`.
+// Runs rows [begin, end) of the packed cell. `tiles` holds the slots, and the sums of the rows are written to
+// `partial`.
 VN_DECLARE_FOR_ISA(void program_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end,
                                     const float* packed, float* tiles, float* partial))
 
-// The same with products of bfloat16 pairs.
+// The same functions with products of bfloat16 pairs.
 #if VN_HAS_HALF
 namespace avx512 {
 void program_half_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free);
@@ -47,7 +48,7 @@ void program_half_run(const ProgramCall& call, int64_t cell, int64_t begin, int6
 }  // namespace avx512
 #endif
 
-// The same in tile registers; on the portable path in their double.
+// The same functions with tile registers, which the portable path emulates.
 #define VN_DECLARE_TILES                                                                                         \
   void program_tiles_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free);        \
   void program_tiles_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed, \
@@ -58,7 +59,7 @@ VN_DECLARE_IN(avx512, VN_DECLARE_TILES)
 #endif
 #undef VN_DECLARE_TILES
 
-// The sums of a cell, from `count` partials in their order, the first of which is changed.
+// Computes the sums of a cell from `count` partials, added in order. It overwrites the first partial.
 VN_DECLARE_FOR_ISA(void program_reduce(const ProgramCall& call, int64_t cell, float* partials, int64_t count))
 
 }  // namespace voronerf

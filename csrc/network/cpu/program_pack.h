@@ -1,5 +1,4 @@
-// Parameters of a cell in the order in which the products read them: in panels (gemm_tile.h), so that a block walks
-// memory in a straight line.
+// Parameters of a cell in panels (gemm_tile.h), the layout that the products read contiguously.
 #pragma once
 
 #include "encoding/frequency_encode_tile.h"
@@ -10,7 +9,8 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// Four rows of `from` become the four columns of `to`; by fours, since weights of small networks are packed often.
+// Transposes four rows of `from` to four columns of `to`. It is vectorised, since the weights of small networks are
+// packed often.
 VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t count, float* to, int64_t to_stride) {
   int64_t i = 0;
 #if VN_ISA == 1 || VN_ISA == 2
@@ -41,10 +41,11 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
 
 VN_INLINE int64_t padded(int64_t width) { return (width + kGranule - 1) / kGranule * kGranule; }
 
-// A product's operand along `depth`, with bfloat16 in pairs, for tile registers as many as fill them: as many steps.
+// Returns the number of steps of a product along `depth`: floats, pairs of bfloat16, or pairs padded to whole tile
+// registers.
 VN_INLINE int64_t steps_of(int64_t depth) { return VN_HALF == 2 ? pairs_of(depth) : VN_HALF ? (depth + 1) / 2 : depth; }
 
-// The matrix as it lies in memory: outputs of the product next to each other (`turned`), or its depth.
+// A matrix in memory. The outputs of the product are contiguous if `turned`, else its depth is.
 struct Matrix {
   const float* from;
   int64_t stride;  // from one row in memory to the next
@@ -54,7 +55,7 @@ struct Matrix {
   float at(int64_t o, int64_t k) const { return turned ? from[k * stride + o] : from[o * stride + k]; }
 };
 
-// [outputs][depth] -> [1 or 4][depth], filled up with 0; the depth in whole vectors.
+// Packs [outputs][depth] as [1 or 4][depth], padded with 0. The depth is a multiple of a vector.
 [[maybe_unused]] void pack_few(const Matrix& m, float* to) {
   constexpr int64_t kStep = (VN_HALF ? 2 : 1) * kLanes;
   for (int64_t o = 0; o < (m.outputs == 1 ? 1 : 4); ++o) {
@@ -74,8 +75,9 @@ struct Matrix {
 
 #if VN_HALF
 
-// -> panels [pairs of depth][<= kPanel outputs, padded with 0]; in `parts` each is followed by one of what rounding has
-// left. Rows are narrowed four at a time into `free`, then transposed, a pair being as wide as a float.
+// Packs a matrix as panels [pairs of depth][<= kPanel outputs, padded with 0]. With `parts`, a panel of rounding
+// remainders follows each panel. Rows are narrowed into `free` four at a time and then transposed, with a pair treated
+// as a float.
 [[maybe_unused]] void pack_panels(const Matrix& m, float* to, float* free, bool parts) {
   const int64_t all = padded(m.outputs), depth = steps_of(m.depth);
   for (int64_t first = 0; first < all; first += kPanel) {
@@ -116,7 +118,7 @@ struct Matrix {
 
 #else
 
-// -> panels [depth][<= kPanel outputs, padded with 0].
+// Packs a matrix as panels [depth][<= kPanel outputs, padded with 0].
 [[maybe_unused]] void pack_panels(const Matrix& m, float* to, float*, bool) {
   const int64_t all = padded(m.outputs);
   for (int64_t first = 0; first < all; first += kPanel) {

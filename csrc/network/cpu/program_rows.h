@@ -1,5 +1,5 @@
-// A program for rows that come a few at a time, to a thread of the caller's: what depends on the program and its
-// parameters alone is made once.
+// A program for calls with few rows each, on the caller's threads. Data that depends only on the program and its
+// parameters is prepared once.
 #pragma once
 
 #include <memory>
@@ -12,24 +12,26 @@ namespace voronerf {
 
 class ProgramRows {
  public:
-  // What a thread keeps from one call to the next.
+  // The state of a thread between calls.
   struct Own {
-    float* memory;        // `workspace` floats, on a cache line
-    int64_t packed = -1;  // the cell whose parameters lie there
+    float* memory;        // workspace() floats, aligned to a cache line
+    int64_t packed = -1;  // the cell whose parameters are packed; -1: none
   };
 
-  // Of `in` the parameters, and which inputs are turned.
+  // Reads from `in` only which inputs are turned.
   ProgramRows(const Program& program, const ProgramInputs& in, Isa isa);
 
-  int64_t workspace() const;  // floats of a thread, a multiple of 16
+  int64_t workspace() const;  // floats per thread, a multiple of 16
 
-  // All rows of `in`, with the same parameters, on the calling thread. Nothing is kept, summed by ray or added to sums.
+  // Runs all rows of `in` on the calling thread, with the same parameters in every call. It supports no kept look-ups,
+  // outputs per ray or sums.
   void forward(const ProgramInputs& in, const ProgramResults& results, Own& own) const;
 
-  // Parts of both
+  // Steps shared with grouped_program_cpu
   // ------------------------------------------------------------------------------------------------------
 
-  // What tiles read of a call, but for its memories. The arrays of this object and of `in` are to live as long.
+  // Returns the data of a call except its memories. It points into this object, `in` and `results`, which must outlive
+  // it.
   ProgramCall call(const ProgramInputs& in, const ProgramResults& results, bool* in_place) const;
   void pack(const ProgramCall& call, int64_t cell, bool first, float* own) const;
   void run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, float* own, float* partial) const;

@@ -1,5 +1,5 @@
-// Rows of a tile: how operands lie, how stored ones are read and written, and with bfloat16 products how they become
-// pairs.
+// Rows of a tile: the layout of operands, loads and stores of rows in memory, and the conversion to pairs for bfloat16
+// products.
 #pragma once
 
 #include "common/memory_tile.h"
@@ -12,7 +12,8 @@ namespace {
 
 VN_INLINE int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
 
-// Columns of a value or of a vector: rows of `stride` floats, 0 where they are all the same.
+// Columns of a value or vector, in rows of `stride` floats; stride 0: all rows are the same. `spread`: one column is
+// broadcast.
 struct Rows {
   const float* data;
   int64_t stride;
@@ -23,7 +24,7 @@ struct Rows {
   }
 };
 
-// Few outputs, as heads have, and points are not worth a call of memcpy.
+// Copies a row. For points and the few outputs of heads, a call of memcpy would be too slow.
 VN_INLINE void copy_row(const float* from, int64_t width, float* to) {
   if (width == 3) {
     __builtin_memcpy(to, from, 3 * sizeof(float));
@@ -42,7 +43,7 @@ VN_INLINE void copy_row(const float* from, int64_t width, float* to) {
   for (; c < width; ++c) to[c] = from[c];
 }
 
-// bfloat16 is the upper half of a float32. Plain loops: the compiler makes vectors of them.
+// Converts bfloat16, the upper half of a float32, to float32. The compiler vectorises the loop.
 VN_INLINE void widen_row(const uint16_t* from, int64_t width, float* to) {
   for (int64_t c = 0; c < width; ++c) {
     const uint32_t bits = static_cast<uint32_t>(from[c]) << 16;
@@ -50,7 +51,7 @@ VN_INLINE void widen_row(const uint16_t* from, int64_t width, float* to) {
   }
 }
 
-// To the nearest, ties to even; NaN stays NaN.
+// Rounds to the nearest bfloat16, ties to even; NaN stays NaN.
 VN_INLINE void round_row(const float* from, int64_t width, uint16_t* to) {
 #if VN_HALF && VN_ISA == 2
   for (int64_t c = 0; c < width; c += kLanes) {
@@ -68,12 +69,12 @@ VN_INLINE void round_row(const float* from, int64_t width, uint16_t* to) {
 #endif
 }
 
-// The stride of rows of pairs: whole vectors, which may be written.
+// Returns the stride of rows of pairs, padded to whole vectors, which may be written.
 VN_INLINE int64_t pairs_of(int64_t width) { return (width + 31) / 32 * 16; }
 
 #if VN_HALF
 
-// Behind the last column of rows of pairs: there infinity times a weight of 0 has left NaN.
+// Clears the padding columns of rows of pairs, where infinity times a weight of 0 may have left NaN.
 VN_INLINE void clear_behind(float* pairs, int64_t width, int64_t rows, int64_t stride) {
   const int64_t bytes = 2 * (2 * pairs_of(width) - width);
   for (int64_t row = 0; row < rows && bytes > 0; ++row, pairs += stride) {
@@ -81,14 +82,15 @@ VN_INLINE void clear_behind(float* pairs, int64_t width, int64_t rows, int64_t s
   }
 }
 
-// Columns as pairs, the last one filled up with 0; so many floats behind them, if not 0, what rounding has left.
+// Rounds rows to pairs, padded with 0. If `left` is not 0, the rounding remainders follow `left` floats later.
 VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to, int64_t stride, int64_t left = 0) {
   for (int64_t row = 0; row < rows; ++row, to += stride) {
     narrow_row(x.data + row * x.stride, width, to, left == 0 ? nullptr : to + left);
   }
 }
 
-// `columns`, a multiple of 16, as pairs of neighbouring rows, [(rows + 1) / 2][columns], the last filled up with 0.
+// Joins neighbouring rows to pairs [(rows + 1) / 2][columns], with a last odd row padded with 0. `columns` must be a
+// multiple of 16.
 VN_INLINE void interleave_columns(const Rows& x, int64_t columns, int64_t rows, float* to) {
   for (int64_t row = 0; row < rows; row += 2, to += columns) {
     const float* from = x.data + row * x.stride;
@@ -102,9 +104,9 @@ VN_INLINE void interleave_columns(const Rows& x, int64_t columns, int64_t rows, 
 
 #if VN_HALF == 2
 
-constexpr int64_t kTurned = 32;  // rows that become 16 pairs
+constexpr int64_t kTurned = 32;  // rows that are joined to 16 pairs
 
-// bfloat16 as pairs, filled up with 0.
+// Copies a row of bfloat16 as pairs, padded with 0.
 VN_INLINE void copy_pairs(const uint16_t* from, int64_t width, float* to) {
   for (int64_t i = 0; i < pairs_of(width); i += kLanes, to += kLanes, from += 2 * kLanes) {
     const int64_t count = smaller(2 * kLanes, width - 2 * i);
@@ -118,7 +120,7 @@ VN_INLINE void copy_pairs(const uint16_t* from, int64_t width, float* to) {
   }
 }
 
-// Columns of the rows of pairs in a slot behind the last one, up to a multiple of 32: 0.
+// Clears the padding rows of pairs in a slot, from the last row up to a multiple of 32.
 VN_INLINE void clear_behind(const Rows& x, int64_t columns, int64_t rows) {
   float* const data = const_cast<float*>(x.data);
   for (int64_t row = rows; row % kTurned != 0; ++row) {
@@ -128,12 +130,13 @@ VN_INLINE void clear_behind(const Rows& x, int64_t columns, int64_t rows) {
 
 VN_INLINE Rows behind(const Rows& x, int64_t floats) { return {x.data + floats, x.stride, x.spread}; }
 
-// Rows of pairs -> pairs of neighbouring rows, [columns][stride], columns a multiple of 16.
+// Converts rows of pairs to pairs of neighbouring rows, transposed to [columns][stride]. `columns` must be a multiple
+// of 16.
 VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* to, int64_t stride) {
   clear_behind(x, columns, rows);
 #if VN_ISA == 2
-  // Eight columns at a time. Lane l of the i-th vector holds those of pair i + 4 l, so what is turned within lanes is
-  // in order: half as many shuffles as turning whole vectors takes.
+  // Eight columns are transposed at a time. 128-bit lane l of vector i holds the columns of pair i + 4 l, so shuffles
+  // within lanes give the right order. Transposing whole vectors would take twice as many shuffles.
   for (int64_t row = 0; row < rows; row += kTurned) {
     for (int64_t column = 0; column < columns; column += 8) {
       const float* const from = x.data + row * x.stride + column / 2;
@@ -145,7 +148,7 @@ VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* t
         const __m512i low = _mm512_inserti32x4(_mm512_castsi128_si512(lane(0)), lane(1), 1);
         return _mm512_inserti32x4(_mm512_inserti32x4(low, lane(2), 2), lane(3), 3);
       };
-      __m512i left[4], right[4];  // the first four columns, and the others
+      __m512i left[4], right[4];  // the first and the last four columns
       for (int64_t i = 0; i < 4; ++i) {
         const __m512i even = lanes(2 * i), odd = lanes(2 * i + 1);
         left[i] = _mm512_unpacklo_epi16(even, odd);
@@ -175,7 +178,7 @@ VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* t
 #endif
 }
 
-// Rows of pairs -> pairs of neighbouring rows, [all pairs][columns], columns a multiple of 16.
+// Converts rows of pairs to pairs of neighbouring rows, [row pairs][columns]. `columns` must be a multiple of 16.
 VN_INLINE void zip_pairs(const Rows& x, int64_t columns, int64_t rows, float* to) {
   clear_behind(x, columns, rows);
   for (int64_t row = 0; row < 2 * pairs_of(rows); row += 2, to += columns) {
@@ -197,11 +200,11 @@ VN_INLINE void zip_pairs(const Rows& x, int64_t columns, int64_t rows, float* to
   }
 }
 
-// to [columns] += the sums over rows of pairs, or = if `first`.
+// Adds the sums over rows of pairs to `to` [columns], or overwrites it if `first`.
 VN_INLINE void add_pairs(const Rows& x, int64_t columns, int64_t rows, bool first, float* to) {
   for (int64_t column = 0; column < columns; column += 2 * kLanes) {
     const bool both = column + kLanes < columns;
-    F32 even[] = {splat(0.0f), splat(0.0f)}, odd[] = {splat(0.0f), splat(0.0f)};  // columns, of every second row
+    F32 even[] = {splat(0.0f), splat(0.0f)}, odd[] = {splat(0.0f), splat(0.0f)};  // even and odd columns, by row parity
     for (int64_t row = 0; row < rows; ++row) {
       const F32 values = load(x.data + row * x.stride + column / 2);
       even[row % 2] = even[row % 2] + lower_of(values);

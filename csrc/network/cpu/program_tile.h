@@ -16,7 +16,7 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// to = body(x, y), for `width` columns rounded up to whole vectors.
+// Computes to = body(x, y) elementwise, for all `stride` columns including the padding.
 template <typename Body>
 VN_INLINE void each(float* to, int64_t stride, int64_t rows, const Rows& x, const Rows& y, const Body& body) {
   const bool flat = !x.spread && !y.spread && x.stride == stride && y.stride == stride;
@@ -58,7 +58,7 @@ void apply_function(const ProgramStep& step, float* to, int64_t rows, const Rows
   }
 }
 
-// Rows of one tile.
+// Runs a program on the rows of one tile.
 struct ProgramTile {
   const ProgramCall& call;
   const float* packed;
@@ -91,19 +91,20 @@ struct ProgramTile {
       run_step(step, call.code.operands + step.first, to);
 #if VN_HALF == 2
       if (step.pairs >= 0 && narrows(step)) {
-        narrow_rows(made(step, to), step.width, rows, slot(step.pairs), stride_of(step.width), left_of(step.width));
+        narrow_rows(result_of(step, to), step.width, rows, slot(step.pairs), stride_of(step.width),
+                    left_of(step.width));
       }
 #endif
     }
   }
 
-  // What a step has made, or left where it is.
-  Rows made(const ProgramStep& step, const float* to) const {
+  // Returns the result of a step, or its input if it is read in place.
+  Rows result_of(const ProgramStep& step, const float* to) const {
     if (step.op != ProgramOp::input || !step.in_place || !call.in_place[step.number]) return {to, step.stride, false};
     return {static_cast<const float*>(call.inputs[step.number]) + begin * step.width, step.width, false};
   }
 
-  // Whether a step leaves it to others to make pairs of its value.
+  // Returns whether a step's value must be narrowed to pairs after the step.
   bool narrows(const ProgramStep& step) const {
     if (step.op == ProgramOp::input) return !narrowed_as_read(step);
     return step.op != ProgramOp::linear && step.op != ProgramOp::encode;
@@ -208,8 +209,9 @@ struct ProgramTile {
       __builtin_memcpy(to, from + begin * width, sizeof(float) * rows * width);
       return;
     }
-    // Wide rows that are gathered follow no pattern that the processor foresees: they are asked for this many rows
-    // ahead (63 features: 1.24 times the time of sorted rows without, 1.04 with it and whole vectors).
+    // The processor cannot predict the addresses of gathered rows, so wide rows are prefetched this many rows ahead.
+    // With 63 features, gathered rows take 1.24 times as long as sorted rows without prefetching, and 1.04 times as
+    // long with prefetching and whole vectors.
     constexpr int64_t kAhead = 8;
     const bool scattered = call.order != nullptr && width >= kGranule;
     for (int64_t row = 0; row < rows; ++row) {
@@ -221,7 +223,7 @@ struct ProgramTile {
     }
   }
 
-  // Columns [width][n] as rows.
+  // Transposes an input [width][n] to rows.
   void turn(const float* from, const ProgramStep& step, float* to) const {
     int64_t c = 0;
     for (; call.order == nullptr && c + 4 <= step.width; c += 4) {
@@ -234,19 +236,20 @@ struct ProgramTile {
 
   void output(const ProgramStep& step, const ProgramOperand& from) const {
     const Rows x = operand(from);
-    if (x.data == static_cast<float*>(call.outputs[step.number]) + begin * step.width) return;  // made there
-    const int64_t width = step.width, all = call.output_widths[step.number];
-    float* const summed = step.memory < 0 ? nullptr : call.memories[step.memory];  // of rays
+    if (x.data == static_cast<float*>(call.outputs[step.number]) + begin * step.width) return;  // in place
+    const int64_t width = step.width, row_width = call.output_widths[step.number];
+    float* const summed = step.memory < 0 ? nullptr : call.memories[step.memory];  // rows of a ray output
     const bool half = call.output_types[step.number] == TableType::bfloat16;
     if (summed == nullptr && !half && !x.spread) {
       float* const out = static_cast<float*>(call.outputs[step.number]) + step.depth;
       const float* values = x.data;
-      for (int64_t row = 0; row < rows; ++row, values += x.stride) copy_row(values, width, out + place(row) * all);
+      for (int64_t row = 0; row < rows; ++row, values += x.stride)
+        copy_row(values, width, out + place(row) * row_width);
       return;
     }
     for (int64_t row = 0; row < rows; ++row) {
       const float* values = x.data + row * x.stride;
-      const int64_t to = (summed == nullptr ? place(row) : begin + row) * all + step.depth;
+      const int64_t to = (summed == nullptr ? place(row) : begin + row) * row_width + step.depth;
       if (half && summed == nullptr) {
         uint16_t* const into = static_cast<uint16_t*>(call.outputs[step.number]) + to;
         round_row(values, x.spread ? 1 : width, into);
@@ -282,7 +285,7 @@ struct ProgramTile {
     bool slope_in_pairs = false;
 #if VN_HALF
     const Rows x = in_pairs(operands[0], scratch(0));
-    sources[0].data = x.data;  // of pairs there is one source
+    sources[0].data = x.data;  // with pairs there is one source
     sources[0].stride = x.stride;
 #endif
 #if VN_HALF == 2
@@ -332,12 +335,13 @@ struct ProgramTile {
 #endif
   }
 
-  // Of rows of pairs, and in parts of what rounding has left, which lies behind them: the stride, and how far.
+  // stride_of returns the stride of rows of pairs, including the rounding remainders of products in parts. left_of
+  // returns the offset of these remainders (0: none).
   int64_t stride_of(int64_t width) const { return (call.parts ? 2 : 1) * pairs_of(width); }
   int64_t left_of(int64_t width) const { return call.parts ? pairs_of(width) : 0; }
 
 #if VN_HALF
-  // An operand of a product as pairs: those there are, or made in `free`.
+  // Returns an operand of a product as pairs: stored pairs, or pairs computed in `free`.
   Rows in_pairs(const ProgramOperand& of, float* free) const {
     const int64_t stride = stride_of(of.width);
     if (of.pairs >= 0) return {slot(of.pairs), stride, false};
@@ -369,7 +373,7 @@ struct ProgramTile {
   }
 
   void move(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
-    if (step.order == 0) {  // something is added up, or left out
+    if (step.order == 0) {  // columns may have several operands, or none
       for (int64_t i = 0; i < rows * step.stride; i += kLanes) store(to + i, splat(0.0f));
     }
     for (int32_t i = 0; i < step.taken; ++i) {
@@ -391,8 +395,8 @@ struct ProgramTile {
 
   // Encodings ---------------------------------------------------------------------------------------------------------
 
-  // Rows of `d` floats, one right behind the other.
-  const float* close(const Rows& x, int64_t d) const {
+  // Returns rows of `d` floats contiguously, copied if necessary.
+  const float* contiguous(const Rows& x, int64_t d) const {
     if (x.stride == d) return x.data;
     float* const to = scratch(0);
     for (int64_t row = 0; row < rows; ++row) copy_row(x.data + row * x.stride, d, to + row * d);
@@ -400,22 +404,23 @@ struct ProgramTile {
   }
 
   HashEncoding grid(const ProgramStep& step, const float* points) const {
-    HashEncoding own = call.grids[step.number];
+    HashEncoding encoding = call.grids[step.number];
     const int64_t bytes = call.parameter_types[step.parameter] == TableType::float32 ? 4 : 2;
-    own.in.table =
+    encoding.in.table =
         static_cast<const char*>(call.parameters[step.parameter]) + cell * call.strides[step.parameter] * bytes;
-    own.in.type = call.parameter_types[step.parameter];
-    own.in.tables = 1;
-    own.in.positions = points;
-    return own;
+    encoding.in.type = call.parameter_types[step.parameter];
+    encoding.in.tables = 1;
+    encoding.in.positions = points;
+    return encoding;
   }
 
-  // The encoding of x or, of the order 1, its gradient. Operands x, the gradient of its encoding, and the encoding.
+  // Looks up the encoding of x or, if the order is 1, computes the gradient of x. Operands: x, the gradient of its
+  // encoding, and the encoding.
   void look_up(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
     const Rows x = operand(operands[0]);
     if (step.order == 0) {
       if (step.memory >= 0 && call.filled[step.memory]) return;
-      return hash_encode_rows(grid(step, close(x, 3)), to, step.stride, 0, rows);
+      return hash_encode_rows(grid(step, contiguous(x, 3)), to, step.stride, 0, rows);
     }
     const Rows g = operand(operands[1]);
     float* const points = scratch(1);
@@ -449,9 +454,9 @@ struct ProgramTile {
     const Rows g = operand(operands[1]), value = operand(operands[2]);
     const int64_t of_table = pack(step.number).width;
     for (int64_t row = 0; row < rows; ++row, to += stride) {
-      const float *encoded = value.data + row * value.stride, *given = g.data + row * g.stride;
-      encode_row_backward(encoded, given, table, of_table, columns, to);
-      if (kBlurred) blur_row_backward(encoded, given, table, of_table, columns, to + columns.d);
+      const float *encoded = value.data + row * value.stride, *gradient = g.data + row * g.stride;
+      encode_row_backward(encoded, gradient, table, of_table, columns, to);
+      if (kBlurred) blur_row_backward(encoded, gradient, table, of_table, columns, to + columns.d);
     }
   }
 
@@ -464,7 +469,7 @@ struct ProgramTile {
 #endif
     const Rows g = operand(of);
     for (int64_t c = 0; c < step.stride; c += kLanes) {
-      // Four sums, or every addition waits for the one before.
+      // Four independent sums hide the latency of additions.
       F32 sums[4] = {fill ? splat(0.0f) : load(to + c), splat(0.0f), splat(0.0f), splat(0.0f)};
       const float* from = g.data + c;
       int64_t row = 0;
@@ -476,37 +481,37 @@ struct ProgramTile {
     }
   }
 
-  // partial [a][b] += a^T b, of the values of two operands with the rows as k.
+  // Computes partial [a][b] += a^T b for the values of two operands, with the rows as k.
   void outer(const ProgramStep& step, const ProgramOperand* operands) const {
     float* const to = partial + step.number;
     const ProgramOperand &of_a = operands[step.order ? 0 : 1], &of_b = operands[step.order ? 1 : 0];
 #if VN_HALF == 2
     const int64_t depth = pairs_of(rows);
-    const Source source{scratch(0), depth, depth}, other{scratch(1), padded(of_b.width), depth};
-    const int64_t width = padded(of_a.width), a_left = call.parts ? width * depth : 0, b_left = depth * other.stride;
+    const Source left{scratch(0), depth, depth}, right{scratch(1), padded(of_b.width), depth};
+    const int64_t width = padded(of_a.width), a_left = call.parts ? width * depth : 0, b_left = depth * right.stride;
     const Rows a = in_pairs(of_a, scratch(2));
     turn_pairs(a, width, rows, scratch(0), depth);
     if (call.parts) turn_pairs(behind(a, left_of(of_a.width)), width, rows, scratch(0) + a_left, depth);
     const Rows b = in_pairs(of_b, scratch(2));
-    zip_pairs(b, other.stride, rows, scratch(1));
-    if (call.parts) zip_pairs(behind(b, left_of(of_b.width)), other.stride, rows, scratch(1) + b_left);
+    zip_pairs(b, right.stride, rows, scratch(1));
+    if (call.parts) zip_pairs(behind(b, left_of(of_b.width)), right.stride, rows, scratch(1) + b_left);
 #else
     constexpr int64_t a_left = 0, b_left = 0;
     const Rows a = operand(of_a), b = operand(of_b);
-    Source source{a.data, a.stride, rows}, other{b.data, b.stride, rows};
+    Source left{a.data, a.stride, rows}, right{b.data, b.stride, rows};
 #if VN_HALF
-    source = {scratch(0), padded(of_a.width), (rows + 1) / 2};
-    other = {scratch(1), padded(of_b.width), (rows + 1) / 2};
-    interleave_columns(a, source.stride, rows, scratch(0));
-    interleave_columns(b, other.stride, rows, scratch(1));
+    left = {scratch(0), padded(of_a.width), (rows + 1) / 2};
+    right = {scratch(1), padded(of_b.width), (rows + 1) / 2};
+    interleave_columns(a, left.stride, rows, scratch(0));
+    interleave_columns(b, right.stride, rows, scratch(1));
 #endif
 #endif
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       float* c = to + first;
-      const Product product{&source,
+      const Product product{&left,
                             1,
-                            other.data + first,
-                            other.stride,
+                            right.data + first,
+                            right.stride,
                             fill ? kZeros : c,
                             fill ? 0 : step.stride,
                             c,

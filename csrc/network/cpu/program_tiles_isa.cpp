@@ -1,6 +1,6 @@
-// The kernels of programs with bfloat16 products in tile registers: those of AMX, and on the portable path their
-// double, for tests. Values, slopes, sums and gradients are float32 in the tile but for those that products alone read;
-// what enters a product is rounded to bfloat16.
+// The kernels of programs with bfloat16 products in tile registers, by AMX or, for tests, by its emulation on the
+// portable path. Values, slopes, sums and gradients are float32 in the tile, except the ones that only products read.
+// Operands of products are rounded to bfloat16.
 #include "network/cpu/program_isa.h"
 
 #if VN_ISA == 0 || (VN_ISA == 2 && VN_HAS_TILES)

@@ -10,11 +10,11 @@ namespace voronerf {
 
 namespace {
 
-// Tasks to aim at.
+// The desired number of tasks.
 constexpr int64_t kTasks = 64;
-// What a thread keeps from one call to the next, in floats.
+// The most floats that a thread keeps between calls.
 constexpr int64_t kKeptFloats = 2 * kPartialFloats;
-constexpr std::align_val_t kAlign{64};  // std::aligned_alloc is not on Windows
+constexpr std::align_val_t kAlign{64};  // Windows has no std::aligned_alloc
 
 struct Free {
   void operator()(float* memory) const { ::operator delete(memory, kAlign); }
@@ -43,14 +43,14 @@ Workspace::~Workspace() {
 float* Workspace::data() const { return kept.memory.get(); }
 
 void check_offsets(const std::string& op, const int32_t* offsets, int64_t k, int64_t n) {
-  int64_t before = 0;
+  int64_t previous = 0;
   for (int64_t c = 0; c <= k; ++c) {
-    if (offsets[c] < before || offsets[c] > n) {
+    if (offsets[c] < previous || offsets[c] > n) {
       throw std::invalid_argument(op + ": offsets must rise from 0 or more to at most the number of rows, " +
                                   std::to_string(n) + ", got " + std::to_string(offsets[c]) + " for cell " +
                                   std::to_string(c));
     }
-    before = offsets[c];
+    previous = offsets[c];
   }
 }
 

@@ -1,16 +1,16 @@
-// The five instructions of AMX that products of bfloat16 take, on eight registers of up to 16 rows of 64 bytes; and on
-// the portable path a double of each, with which every machine tests what is made of them.
+// The AMX instructions for bfloat16 products, on eight registers of up to 16 rows of 64 bytes. The portable path
+// emulates them, so that every machine can test the kernels that use them.
 //
-//   shape_tiles    rows and bytes a row of each register; all become 0
-//   tile_load      rows `stride` bytes apart
-//   tile_store     likewise
-//   tile_zero
-//   tile_products  C[m][n] += sum over k of A[m][2k] B[k][2n] + A[m][2k+1] B[k][2n+1]: rows of C and A, columns of C
-//   and
-//                  B in pairs. Sums are float32, rounded to the nearest; what is below its smallest normal number is 0.
+//   shape_tiles    sets the rows, and the bytes per row, of each register, and all registers to 0
+//   tile_load      loads rows `stride` bytes apart
+//   tile_store     stores rows `stride` bytes apart
+//   tile_zero      sets a register to 0
+//   tile_products  C[m][n] += sum over k of A[m][2k] B[k][2n] + A[m][2k+1] B[k][2n+1], with B in pairs of
+//                  rows. Sums are float32, rounded to the nearest; denormals are 0.
+//   release_tiles  releases the registers
 //
-// The shape belongs to the thread, which releases it before it does something else: only then has the kernel nothing
-// to save where threads change.
+// The shapes belong to the thread, which releases them after the products: otherwise the operating system would save
+// the registers at every context switch.
 #pragma once
 
 #include "common/memory_tile.h"
@@ -54,7 +54,7 @@ struct Tile {
   int64_t rows, bytes;
   unsigned char data[kTileRows][kTileBytes];
 };
-// Of the calling thread.
+// Returns the registers of the calling thread.
 inline Tile* tiles() {
   static thread_local Tile registers[8];
   return registers;

@@ -1,20 +1,19 @@
-// Programs on CUDA: an interpreter. A block takes tasks, rows of one cell, a tile of them after the other. Of a tile
-// each of its warps has 16 or 32 rows of its own, and does one step after another for them without waiting for the
-// others; but for sums over rows, which all warps make together for all rows. Where the values of few rows fit, four
-// warps are a team that has 16 rows and shares the columns.
+// The interpreter of programs on CUDA. A task is a range of rows of one cell, and a block runs the tiles of its tasks
+// one after the other. Each warp has 16 or 32 rows of a tile and runs the steps on them independently of the other
+// warps. Only sums over rows are computed by all warps together, for all rows. If the values of only few rows fit, four
+// warps form a team, which has 16 rows and shares the columns.
 //
-// Values lie in shared memory, for each team [rows][stride] at their slot: as float32, and with products of 16 bits as
-// words of two such numbers wherever only products read them. What one product makes and the next one reads stays in
-// registers. Where less than two teams fit, values lie in the workspace instead, a part for each block that is
-// resident.
+// Values are in shared memory, for each team [rows][stride] at their slot. They are float32 or, with 16-bit products,
+// words of two 16-bit numbers if only products read them. A value that one product passes to the next stays in
+// registers. If fewer than two teams fit, values are in the workspace instead, with a part for each resident block.
 //
-// Layers: weights are packed once for a call, in the order and the type that products take them in
-// (program_cuda_product.h). Sums over rows: a thread has the same entries in every tile and adds to them in the task's
-// partial in global memory; a second kernel adds up the partials of a cell in their order, so results are the same
-// every time. Gradients of tables alone are added up by atomic operations, in any order.
+// Layers: weights are packed once per call, in the layout and type of the products (program_cuda_product.h). Sums over
+// rows: a thread has the same entries in every tile and adds to the task's partial in global memory. A second kernel
+// adds up the partials of a cell in order, so results are deterministic. Only gradients of tables are added by atomic
+// operations, in any order.
 //
-// Budget: registers for two blocks of 8 warps with 16 rows each, or three of 4 warps with 32 rows. What is not a
-// product is not inlined.
+// Registers suffice for two resident blocks of 8 warps with 16 rows each, or three of 4 warps with 32 rows. Only
+// products are inlined.
 #include <algorithm>
 #include <cstring>
 #include <stdexcept>
@@ -31,10 +30,11 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int64_t kPartialBytes = int64_t{1} << 28;
-constexpr int64_t kBlocksPerMultiprocessor = 8;  // of kernels other than the interpreter
-constexpr int kPackPart = 1024;                  // words of what is packed that a block takes at a time
-constexpr int64_t kReservedBytes = 1024;         // of shared memory, for each block
-// The memory of a step, in the device's records: the number of a look-up, none, or below that the number of a scatter.
+constexpr int64_t kBlocksPerMultiprocessor = 8;  // for kernels other than the interpreter
+constexpr int kPackPart = 1024;                  // packed words that a block writes at a time
+constexpr int64_t kReservedBytes = 1024;         // shared memory reserved by CUDA for each block
+// The memory of a step in the device's records is the index of a look-up, kNoMemory, or kNoMemory - 1 - index of a
+// scatter.
 constexpr int kNoMemory = -1;
 
 // Steps ----------------------------------------------------------------------------------------------------------
@@ -90,7 +90,7 @@ __device__ __forceinline__ float binary(ProgramBinary name, float a, float b) {
 template <typename Tile>
 __device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
   const auto to = tile.target(step);
-  if (step.order == 1) {  // every column has one part
+  if (step.order == 1) {  // one operand writes each column
     for (int i = 0; i < step.taken; ++i) {
       const Rows x = tile.operand(operands[i]);
       const int place = operands[i].place;
@@ -109,12 +109,12 @@ __device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& s
   });
 }
 
-// What neither multiplies nor is in memory of the caller's.
+// Runs a step other than products, inputs and outputs.
 template <typename Tile>
 __device__ __noinline__ void plain_step(Tile tile, const ProgramStep& step) {
   const ProgramOperand* operands = tile.call.code.operands + step.first;
-  const bool there = step.op == ProgramOp::encode && tile.call.ready && step.memory >= 0;
-  if (step.op == ProgramOp::encode && !(there && tile.call.kept[step.memory] != nullptr)) {
+  const bool ready = step.op == ProgramOp::encode && tile.call.ready && step.memory >= 0;
+  if (step.op == ProgramOp::encode && !(ready && tile.call.kept[step.memory] != nullptr)) {
     return encode_step(tile, step, operands);
   }
   if (step.op == ProgramOp::function) return function_step(tile, step, operands);
@@ -136,7 +136,7 @@ __device__ __noinline__ void plain_step(Tile tile, const ProgramStep& step) {
     }
     case ProgramOp::move:
       return move_step(tile, step, operands);
-    default: {  // what is looked up already
+    default: {  // a kept look-up is read
       const int64_t stride = tile.call.kept_strides[step.memory];
       const float* from = tile.call.kept[step.memory] + tile.begin() * stride;
       return for_each_entry<Tile>(tile.rows(), step.width,
@@ -145,8 +145,7 @@ __device__ __noinline__ void plain_step(Tile tile, const ProgramStep& step) {
   }
 }
 
-// What becomes of a value beside its slot: what was looked up is kept, and the gradient of that is added to that of the
-// table.
+// Stores a look-up in the caller's memory, or adds the gradient of a look-up to the gradient of its table.
 template <typename Tile>
 __device__ __noinline__ void keep(Tile tile, const ProgramStep& step) {
   const CudaProgram& call = tile.call;
@@ -162,7 +161,7 @@ __device__ __noinline__ void keep(Tile tile, const ProgramStep& step) {
 
 // Kernels --------------------------------------------------------------------------------------------------------
 
-// The last of the cells whose first task is not above one, by all lanes of a warp.
+// Returns the cell of a task, the last cell whose first task is not above it. All lanes of a warp search together.
 __device__ __forceinline__ int cell_of_task(const CudaRows& rows, int task) {
   const int lane = static_cast<int>(threadIdx.x % 32);
   MapSpan cells{0, rows.k};
@@ -174,7 +173,7 @@ __device__ __forceinline__ int cell_of_task(const CudaRows& rows, int task) {
   return static_cast<int>(cells.first);
 }
 
-// Steps from `i` on that a team does by itself; returns the number of the next one that it does not.
+// Runs the steps from `i` on that a team computes independently. Returns the index of the next sum over rows.
 template <typename Steps, typename Tile>
 __device__ __forceinline__ int own_steps(const CudaProgram& call, const Tile& tile, int i) {
   for (; i < call.code.step_count; ++i) {
@@ -210,7 +209,7 @@ __device__ __forceinline__ int own_steps(const CudaProgram& call, const Tile& ti
   }
   return i;
 }
-// The same for a warp that has no rows.
+// Returns the index of the next sum over rows, for a warp without rows.
 __device__ __forceinline__ int next_sum(const CudaProgram& call, int i) {
   while (i < call.code.step_count && !load_step(call.steps + i).sums()) ++i;
   return i;
@@ -230,18 +229,18 @@ __device__ __forceinline__ int sums(const CudaProgram& call, const Tile& tile, i
   return i;
 }
 
-// Rows of a block's tile.
+// Returns the rows of a block's tile.
 template <typename Tile>
 __device__ __forceinline__ int tile_height() {
   return static_cast<int>(threads_again() / Tile::kWorkers) * Tile::kRows;
 }
-// The rows of a tile, from `left` of the task on.
+// Sets the row counts of a tile, if `left` rows of the task remain.
 template <typename Tile>
 __device__ __forceinline__ void cut_rows(TileState& state, int left) {
-  const int height = tile_height<Tile>(), all = left < height ? left : height;
-  const int own = all - static_cast<int>(threadIdx.x / Tile::kWorkers) * Tile::kRows;
-  state.left = left, state.all = all;
-  state.rows = own < 0 ? 0 : own < Tile::kRows ? own : Tile::kRows;
+  const int height = tile_height<Tile>(), block_rows = left < height ? left : height;
+  const int team_rows = block_rows - static_cast<int>(threadIdx.x / Tile::kWorkers) * Tile::kRows;
+  state.left = left, state.all = block_rows;
+  state.rows = team_rows < 0 ? 0 : team_rows < Tile::kRows ? team_rows : Tile::kRows;
 }
 template <typename Tile>
 __device__ __forceinline__ void begin_task(const CudaProgram& call, int task, int64_t partial) {
@@ -295,13 +294,13 @@ __global__ void __launch_bounds__(32 * program_warps(Steps::Tile::kRows), progra
   }
 }
 
-// first_task [k+1] by one block: the running sum of the tasks of the cells. Cells that overlap, which offsets that
-// fall make, could have more tasks than `most`, what the workspace has partials for: no number exceeds it, and what
-// such cells get is undefined.
+// Computes first_task [k+1], the running sum of the cells' tasks, with one block. Decreasing offsets make cells
+// overlap, which could give more tasks than the workspace has partials (`most`). So the indices are clamped to `most`,
+// and the results of overlapping cells are undefined.
 __device__ void number_tasks(const CudaRows& rows, int64_t task_rows, int64_t most) {
   VN_SHARED(sums, int64_t[kThreads / 32]);
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-  const auto inside = [most](int64_t tasks) { return static_cast<int32_t>(tasks < most ? tasks : most); };
+  const auto clamped = [most](int64_t tasks) { return static_cast<int32_t>(tasks < most ? tasks : most); };
   int64_t carry = 0;
   for (int64_t start = 0; start < rows.k; start += kThreads) {
     const int64_t cell = start + threadIdx.x;
@@ -313,18 +312,18 @@ __device__ void number_tasks(const CudaRows& rows, int64_t task_rows, int64_t mo
     }
     if (lane == 31) sums[warp] = running;
     __syncthreads();
-    int64_t before = carry;
+    int64_t offset = carry;
     for (int i = 0; i < kThreads / 32; ++i) {
-      if (i < warp) before += sums[i];
+      if (i < warp) offset += sums[i];
       carry += sums[i];
     }
-    if (cell < rows.k) rows.first_task[cell] = inside(before + running - tasks);
-    __syncthreads();  // the sums are read by all
+    if (cell < rows.k) rows.first_task[cell] = clamped(offset + running - tasks);
+    __syncthreads();  // all threads have read the sums
   }
-  if (threadIdx.x == 0) rows.first_task[rows.k] = inside(carry);
+  if (threadIdx.x == 0) rows.first_task[rows.k] = clamped(carry);
 }
 
-// Word `word` of a matrix as products take it: in the order of fragments, or [depth][outputs].
+// Returns word `word` of a packed matrix, in the order of fragments or as [depth][outputs].
 __device__ __forceinline__ uint32_t any_packed_word(const PackedMatrix& matrix, ProgramPrecision precision, int outputs,
                                                     int word) {
   switch (precision) {
@@ -343,7 +342,7 @@ __device__ __forceinline__ uint32_t any_packed_word(const PackedMatrix& matrix, 
   }
 }
 
-// Of each cell's matrices and biases, as products take them. A block takes a part of one at a time.
+// Packs the matrices and biases of each cell. A block packs one part of a matrix or bias at a time.
 __device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision) {
   const bool halves = precision == ProgramPrecision::bfloat16 || precision == ProgramPrecision::float16;
   const bool tensors = precision != ProgramPrecision::float32;
@@ -360,7 +359,7 @@ __device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision
                         turned ? pack.width : pack.o};
     if (vector) matrix = {from, 0, 1, 1, pack.width};
     const int outputs = padded(matrix.outputs, kProgramOutputs);
-    // Of a bias for tensor cores the two columns of a lane come twice, as it has them in two rows.
+    // For tensor cores, the two bias columns of a lane are stored twice, because a lane has them in two rows.
     const int words = vector ? (tensors ? 2 : 1) * outputs : padded(matrix.depth, deep) * outputs / (halves ? 2 : 1);
     auto* const to = reinterpret_cast<uint32_t*>(call.packed) + cell * call.packed_stride + pack.at;
     const int last = words < (part + 1) * kPackPart ? words : (part + 1) * kPackPart;
@@ -371,7 +370,7 @@ __device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision
   }
 }
 
-// What rows of no cell have: 0 in outputs, and in what is kept.
+// Sets outputs and kept look-ups of rows in no cell to 0.
 __device__ void clear_strays(const CudaProgram& call) {
   const CudaRows& rows = call.rows;
   const int64_t low = cell_begin(rows, 0), last = cell_begin(rows, rows.k), high = last < low ? low : last;
@@ -393,7 +392,7 @@ __device__ void clear_strays(const CudaProgram& call) {
   }
 }
 
-// The first block numbers the tasks.
+// Prepares a call. The first block also numbers the tasks.
 __global__ void __launch_bounds__(kThreads)
     program_prepare_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t most, ProgramPrecision precision) {
   if (blockIdx.x == 0) number_tasks(call.rows, call.task_rows, most);
@@ -401,7 +400,7 @@ __global__ void __launch_bounds__(kThreads)
   clear_strays(call);
 }
 
-// Grid (k, blocks of a cell).
+// Adds up the partials of each cell. The grid is (k, blocks of a cell).
 __global__ void __launch_bounds__(kThreads)
     program_reduce_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t partial) {
   const ProgramCode& code = call.code;
@@ -420,7 +419,7 @@ __global__ void __launch_bounds__(kThreads)
         const int at = sum.partial + (turned ? column * sum.stride + o : o * sum.stride + column);
         const float* from = call.partials + at;
         int64_t task = first;
-        for (; task + 8 <= last; task += 8) {  // several loads on their way at a time
+        for (; task + 8 <= last; task += 8) {  // eight loads in flight
           float parts[8];
 #pragma unroll
           for (int p = 0; p < 8; ++p) parts[p] = from[(task + p) * partial];
@@ -439,33 +438,33 @@ __global__ void __launch_bounds__(kThreads)
 struct Device {
   int multiprocessors, shared_bytes;
   int64_t multiprocessor_bytes;
-  int capability;  // 86 for 8.6; of the architecture that the kernels are compiled for, where that is lower
+  int capability;  // 86 for 8.6; at most that of the compiled code
 };
 
-// Of the current device, which each thread asks for once.
+// Returns the properties of the current device, cached per thread.
 const Device& current_device() {
-  thread_local int asked = -1;
-  thread_local Device found{};
+  thread_local int cached_device = -1;
+  thread_local Device properties{};
   int device = 0;
   VN_CUDA_CHECK(cudaGetDevice(&device));
-  if (asked == device) return found;
+  if (cached_device == device) return properties;
   int major = 0, minor = 0;
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&minor, cudaDevAttrComputeCapabilityMinor, device));
-  VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
-  found.multiprocessor_bytes = found.shared_bytes + kReservedBytes;
-  VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.multiprocessors, cudaDevAttrMultiProcessorCount, device));
-  // Code for a lower architecture than the device's chooses its instructions by that.
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&properties.shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
+  properties.multiprocessor_bytes = properties.shared_bytes + kReservedBytes;
+  VN_CUDA_CHECK(cudaDeviceGetAttribute(&properties.multiprocessors, cudaDevAttrMultiProcessorCount, device));
+  // Code compiled for a lower architecture than the device's uses only the instructions of that architecture.
   cudaFuncAttributes compiled{};
   VN_CUDA_CHECK(cudaFuncGetAttributes(&compiled, program_prepare_kernel));
-  found.capability = std::min(10 * major + minor, compiled.ptxVersion);
-  asked = device;
-  return found;
+  properties.capability = std::min(10 * major + minor, compiled.ptxVersion);
+  cached_device = device;
+  return properties;
 }
 
-// Where the slots of a program are in shared memory, whose rows are longer than the program says: a slot moves by what
-// those before it have grown. A value that a program has in memory alone, the gradient of what was looked up, has a
-// slot here instead, behind the others.
+// The positions of a program's slots in shared memory. Their rows are kProgramSkew longer than in the program, which
+// moves all later slots. A value without a slot in the program, the gradient of a look-up, gets a slot after the
+// others.
 class Slots {
  public:
   explicit Slots(const ProgramTable& table) : own_(table.memories.size(), -1) {
@@ -497,27 +496,27 @@ class Slots {
   int32_t columns_;
 };
 
-// Bytes of the parts of a code, one after another.
+// The offsets of a code's parts in bytes, and its size.
 struct CodePlaces {
   int64_t packs, steps, operands, sums, scatters, grids, own_steps, bytes;
 };
 int64_t aligned(int64_t bytes) { return ceil_div<int64_t>(bytes, 256) * 256; }
 CodePlaces code_places(const ProgramTable& table) {
   CodePlaces at{};
-  const auto behind = [](int64_t place, const auto& records) {
+  const auto after = [](int64_t place, const auto& records) {
     return place + aligned(static_cast<int64_t>(records.size() * sizeof(records[0])));
   };
-  at.steps = behind(at.packs, table.packs);
-  at.operands = behind(at.steps, table.steps);
-  at.sums = behind(at.operands, table.operands);
-  at.scatters = behind(at.sums, table.sums);
-  at.grids = behind(at.scatters, table.scatters);
+  at.steps = after(at.packs, table.packs);
+  at.operands = after(at.steps, table.steps);
+  at.sums = after(at.operands, table.operands);
+  at.scatters = after(at.sums, table.sums);
+  at.grids = after(at.scatters, table.scatters);
   at.own_steps = at.grids + aligned(static_cast<int64_t>(table.grids.size() * sizeof(HashEncoding)));
   at.bytes = at.own_steps + aligned(static_cast<int64_t>(table.steps.size() * sizeof(CudaStep)));
   return at;
 }
 
-// Words that the largest of what is packed takes, at most: up to where the next one begins.
+// Returns an upper bound of the largest pack's words, from the distances of the packs.
 int32_t largest_pack(const ProgramTable& table) {
   int32_t largest = 1;
   for (size_t i = 0; i < table.packs.size(); ++i) {
@@ -527,58 +526,59 @@ int32_t largest_pack(const ProgramTable& table) {
   return largest;
 }
 
-// A step for the interpreter, of records whose slots are those of the device. goes_on: with the sums of the one before.
+// Returns a step for the interpreter, from records with the slots of the device. goes_on: the step adds to the sums of
+// the previous step.
 CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, const std::vector<ProgramPack>& packs,
                    bool goes_on) {
-  CudaStep made{};
+  CudaStep result{};
   const auto value = [](const ProgramOperand& o) -> CudaValue {
     if (o.pairs >= 0) return {o.pairs, 0, pair_stride(o.width), o.width};
     return {o.slot, o.start, o.stride, o.width};
   };
-  made.keeps = step.memory != kNoMemory;
-  made.slot = step.floats ? step.slot : -1, made.stride = step.stride, made.pairs = step.pairs;
-  made.width = step.width, made.depth = step.depth;
-  made.bias = made.added = -1;
-  made.number = step.number;
+  result.keeps = step.memory != kNoMemory;
+  result.slot = step.floats ? step.slot : -1, result.stride = step.stride, result.pairs = step.pairs;
+  result.width = step.width, result.depth = step.depth;
+  result.bias = result.added = -1;
+  result.number = step.number;
   const ProgramOperand *x = operands, *y = operands;
   if (step.op == ProgramOp::linear) {
     const ProgramPack& pack = packs[static_cast<size_t>(step.number)];
-    made.weights = pack.at;
-    made.turned = pack.kind == ProgramPackKind::turned;
-    made.relu = step.finish == ProgramFinish::relu;
-    made.sloped = step.finish == ProgramFinish::relu_slope;
-    made.x_held = step.from_registers;
-    made.holds = step.hands == ProgramHands::words;
-    made.carries = step.hands == ProgramHands::sums;
-    if (made.sloped) y = operands + step.taken - 1;
-    if (step.taken > 1 + static_cast<int>(made.sloped) && !goes_on) {
+    result.weights = pack.at;
+    result.turned = pack.kind == ProgramPackKind::turned;
+    result.relu = step.finish == ProgramFinish::relu;
+    result.sloped = step.finish == ProgramFinish::relu_slope;
+    result.x_held = step.from_registers;
+    result.holds = step.hands == ProgramHands::words;
+    result.carries = step.hands == ProgramHands::sums;
+    if (result.sloped) y = operands + step.taken - 1;
+    if (step.taken > 1 + static_cast<int>(result.sloped) && !goes_on) {
       const ProgramOperand& added = operands[1];
       const bool bias = added.parameter && !added.spread;
-      if (bias) made.bias = packs[static_cast<size_t>(added.slot)].at;
-      if (!bias) made.added = step.first + 1;
+      if (bias) result.bias = packs[static_cast<size_t>(added.slot)].at;
+      if (!bias) result.added = step.first + 1;
     }
-    const bool words = (made.x_held || x->pairs >= 0) && (!made.sloped || y->pairs >= 0) && !step.floats;
-    made.op = words && made.added < 0 && !made.carries ? CudaOp::chain : CudaOp::linear;
+    const bool words = (result.x_held || x->pairs >= 0) && (!result.sloped || y->pairs >= 0) && !step.floats;
+    result.op = words && result.added < 0 && !result.carries ? CudaOp::chain : CudaOp::linear;
   } else if (step.op == ProgramOp::outer) {
-    made.op = CudaOp::outer;
-    made.swapped = step.order != 1;
-    (made.swapped ? x : y) = operands + 1;
+    result.op = CudaOp::outer;
+    result.swapped = step.order != 1;
+    (result.swapped ? x : y) = operands + 1;
   } else if (step.op == ProgramOp::columns) {
-    made.op = CudaOp::columns;
+    result.op = CudaOp::columns;
   } else {
-    made.op = step.op == ProgramOp::input    ? CudaOp::input
-              : step.op == ProgramOp::output ? CudaOp::output
-                                             : CudaOp::plain;
-    made.added = step.first;
-    return made;
+    result.op = step.op == ProgramOp::input    ? CudaOp::input
+                : step.op == ProgramOp::output ? CudaOp::output
+                                               : CudaOp::plain;
+    result.added = step.first;
+    return result;
   }
-  made.x = value(*x), made.x_words = x->pairs >= 0;
-  made.y = value(*y), made.y_words = y->pairs >= 0;
-  return made;
+  result.x = value(*x), result.x_words = x->pairs >= 0;
+  result.y = value(*y), result.y_words = y->pairs >= 0;
+  return result;
 }
 
-// A step that adds up the columns of a gradient becomes a part of the outer product beside it, if that reads the same
-// words on its right side.
+// Merges a sum over the columns of a gradient into a neighbouring outer product, if its right operand is the same
+// words.
 void join_columns(std::vector<CudaStep>& steps) {
   for (size_t i = 0; i < steps.size(); ++i) {
     CudaStep& sum = steps[i];
@@ -594,9 +594,9 @@ void join_columns(std::vector<CudaStep>& steps) {
   }
 }
 
-// How a call is cut: rows and warps of a tile, rows of a task, blocks, at most so many tasks, and where what is in the
-// workspace.
-struct Cut {
+// The launch plan of a call: rows of a team, warps of a team and of a block, rows of a task, the most tasks, blocks,
+// and the offsets in the workspace.
+struct LaunchPlan {
   int own_rows, team, warps;
   bool spilled;
   int shared;
@@ -604,7 +604,7 @@ struct Cut {
   int64_t packed, partials, slots, bytes;
 };
 
-Cut cut(const Program& program, int64_t n, int64_t k) {
+LaunchPlan plan_launch(const Program& program, int64_t n, int64_t k) {
   const ProgramTable& table = program.table;
   const Device& device = current_device();
   const size_t most = std::max({table.inputs.size(), static_cast<size_t>(table.parameters), table.outputs.size(),
@@ -619,77 +619,78 @@ Cut cut(const Program& program, int64_t n, int64_t k) {
                                 " look-ups of hash grids on CUDA, got " + std::to_string(table.lookups.size()) +
                                 "; use backend='reference'");
   }
-  Cut found{};
-  const int64_t columns = std::max(1, Slots(table).columns());  // of sums that nothing is added to there are none
-  // Teams of so many rows each that fit into a multiprocessor beside what as many blocks as are resident need.
+  LaunchPlan result{};
+  const int64_t columns = std::max(1, Slots(table).columns());  // a program whose sums stay 0 has no columns
+  // Returns the teams of `rows` rows that fit into a multiprocessor, besides the fixed memory of its resident blocks.
   const auto fitting = [&](int rows) {
     return (device.multiprocessor_bytes - program_blocks(rows) * (kReservedBytes + kProgramStates)) /
            (4 * rows * columns);
   };
-  // Warps of 32 rows read each weight once for all of them, if cells have so many and as many warps fit as there are
-  // registers for; of 16 rows, if half as many do.
+  // A warp with 32 rows reads each weight once for all of them. This is used if cells have enough rows and the values
+  // of all resident warps fit. Else a warp has 16 rows, if the values of half the resident warps fit.
   const int64_t resident_tall = program_blocks(32) * program_warps(32);
   const bool tall = table.layout == ProgramLayout::tiles && fitting(32) >= resident_tall && n >= 32 * k;
-  found.own_rows = tall ? 32 : 16;
-  found.team = fitting(16) >= program_warps(16) ? 1 : kProgramTeam;
-  found.spilled = fitting(16) < 2;
-  // No more teams than there are rows for, in each cell and on every multiprocessor.
-  const int resident = program_blocks(found.own_rows);
-  const int64_t useful = n / (found.own_rows * std::max<int64_t>(1, std::max<int64_t>(k, device.multiprocessors)));
-  int64_t teams = program_warps(found.own_rows) / found.team;
-  // A tile reads and writes the partial sums once. So one block takes a multiprocessor where two would be smaller.
-  const int64_t room = found.spilled ? teams : fitting(found.own_rows) / (table.partial > 0 ? 1 : resident);
+  result.own_rows = tall ? 32 : 16;
+  result.team = fitting(16) >= program_warps(16) ? 1 : kProgramTeam;
+  result.spilled = fitting(16) < 2;
+  // There must be enough rows for all teams, in each cell and on every multiprocessor.
+  const int resident = program_blocks(result.own_rows);
+  const int64_t useful = n / (result.own_rows * std::max<int64_t>(1, std::max<int64_t>(k, device.multiprocessors)));
+  int64_t teams = program_warps(result.own_rows) / result.team;
+  // Each tile reads and writes the partial sums once, so with partials one large block per multiprocessor is better
+  // than two small ones.
+  const int64_t room = result.spilled ? teams : fitting(result.own_rows) / (table.partial > 0 ? 1 : resident);
   while (teams > 1 && teams > std::min(room, useful)) teams /= 2;
-  const int64_t height = found.own_rows * teams;
-  found.warps = static_cast<int>(found.team * teams);
-  found.shared = static_cast<int>(kProgramStates + (found.spilled ? 0 : 4 * height * columns));
-  // More than one tile where a multiprocessor has many.
-  found.task_rows = height * std::clamp<int64_t>(n / (32 * height * device.multiprocessors), 1, 8);
+  const int64_t height = result.own_rows * teams;
+  result.warps = static_cast<int>(result.team * teams);
+  result.shared = static_cast<int>(kProgramStates + (result.spilled ? 0 : 4 * height * columns));
+  // A task has several tiles if each multiprocessor has many tiles.
+  result.task_rows = height * std::clamp<int64_t>(n / (32 * height * device.multiprocessors), 1, 8);
   if (table.partial > 0) {
-    // As many tasks as there are blocks at a time, of which each cell's last one is smaller, and few enough partials.
-    const int64_t most_blocks = resident * program_warps(found.own_rows) / found.warps;
-    const int64_t blocks = device.multiprocessor_bytes / (found.shared + kReservedBytes);
+    // One task per resident block, counting a smaller last task of each cell, and partials of at most kPartialBytes.
+    const int64_t most_blocks = resident * program_warps(result.own_rows) / result.warps;
+    const int64_t blocks = device.multiprocessor_bytes / (result.shared + kReservedBytes);
     const int64_t wave = std::clamp<int64_t>(blocks, 1, most_blocks) * device.multiprocessors;
-    found.task_rows = std::max(height, ceil_div<int64_t>(n, wave > 2 * k ? wave - k : wave));
-    found.task_rows = std::max(found.task_rows, ceil_div<int64_t>(n * table.partial, kPartialBytes / 4));
+    result.task_rows = std::max(height, ceil_div<int64_t>(n, wave > 2 * k ? wave - k : wave));
+    result.task_rows = std::max(result.task_rows, ceil_div<int64_t>(n * table.partial, kPartialBytes / 4));
   }
-  found.task_rows = ceil_div<int64_t>(found.task_rows, height) * height;
-  found.tasks = n / found.task_rows + k;
-  found.blocks =
-      found.spilled ? std::min<int64_t>(found.tasks, int64_t{resident} * device.multiprocessors) : found.tasks;
-  found.packed = aligned(4 * (k + 1));
-  found.partials = found.packed + aligned(4 * k * table.packed);
-  found.slots = found.partials + aligned(4 * found.tasks * table.partial);
-  found.bytes = found.slots + (found.spilled ? aligned(4 * found.blocks * height * columns) : 0);
-  return found;
+  result.task_rows = ceil_div<int64_t>(result.task_rows, height) * height;
+  result.tasks = n / result.task_rows + k;
+  result.blocks =
+      result.spilled ? std::min<int64_t>(result.tasks, int64_t{resident} * device.multiprocessors) : result.tasks;
+  result.packed = aligned(4 * (k + 1));
+  result.partials = result.packed + aligned(4 * k * table.packed);
+  result.slots = result.partials + aligned(4 * result.tasks * table.partial);
+  result.bytes = result.slots + (result.spilled ? aligned(4 * result.blocks * height * columns) : 0);
+  return result;
 }
 
 template <typename Steps>
-void launch(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
+void launch(const CudaProgram& call, const LaunchPlan& plan, int64_t partial, void* stream) {
   const auto kernel = program_kernel<Steps>;
-  // Always the same, since what one host thread sets must do for the launch of another.
+  // The limit is always the same, because a launch may use the limit that another host thread has set.
   VN_CUDA_CHECK(
       cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, current_device().shared_bytes));
-  VN_LAUNCH(kernel, static_cast<unsigned>(found.blocks), static_cast<unsigned>(32 * found.warps), found.shared, stream,
+  VN_LAUNCH(kernel, static_cast<unsigned>(plan.blocks), static_cast<unsigned>(32 * plan.warps), plan.shared, stream,
             call, partial);
 }
 
-void launch_floats(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
-  if (found.spilled) return launch<FloatSteps<kProgramTeam, false>>(call, found, partial, stream);
-  if (found.team > 1) return launch<FloatSteps<kProgramTeam, true>>(call, found, partial, stream);
-  launch<FloatSteps<1, true>>(call, found, partial, stream);
+void launch_floats(const CudaProgram& call, const LaunchPlan& plan, int64_t partial, void* stream) {
+  if (plan.spilled) return launch<FloatSteps<kProgramTeam, false>>(call, plan, partial, stream);
+  if (plan.team > 1) return launch<FloatSteps<kProgramTeam, true>>(call, plan, partial, stream);
+  launch<FloatSteps<1, true>>(call, plan, partial, stream);
 }
 template <typename Numbers>
-void launch_tensors(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
-  if (found.spilled) return launch<TensorSteps<Numbers, 1, kProgramTeam, false>>(call, found, partial, stream);
-  if (found.team > 1) return launch<TensorSteps<Numbers, 1, kProgramTeam, true>>(call, found, partial, stream);
+void launch_tensors(const CudaProgram& call, const LaunchPlan& plan, int64_t partial, void* stream) {
+  if (plan.spilled) return launch<TensorSteps<Numbers, 1, kProgramTeam, false>>(call, plan, partial, stream);
+  if (plan.team > 1) return launch<TensorSteps<Numbers, 1, kProgramTeam, true>>(call, plan, partial, stream);
   if constexpr (Numbers::kHalves) {
-    if (found.own_rows == 32) return launch<TensorSteps<Numbers, 2, 1, true>>(call, found, partial, stream);
+    if (plan.own_rows == 32) return launch<TensorSteps<Numbers, 2, 1, true>>(call, plan, partial, stream);
   }
-  launch<TensorSteps<Numbers, 1, 1, true>>(call, found, partial, stream);
+  launch<TensorSteps<Numbers, 1, 1, true>>(call, plan, partial, stream);
 }
 
-// Blocks that fill the device, if there is as much to do.
+// Returns the blocks that fill the device, or fewer if there are few entries.
 unsigned blocks_for(int64_t entries) {
   const int64_t most = kBlocksPerMultiprocessor * current_device().multiprocessors;
   return static_cast<unsigned>(std::max<int64_t>(1, std::min(most, ceil_div<int64_t>(entries, kThreads))));
@@ -712,7 +713,8 @@ void program_code_cuda(const Program& program, unsigned char* code) {
   const Slots slots(table);
   std::vector<ProgramStep> steps = table.steps;
   std::vector<ProgramOperand> operands = table.operands;
-  // Of each memory of the program what kNoMemory says; outputs are written by their steps alone.
+  // The device's memory index of each memory of the program (see kNoMemory). Outputs have none: only their output steps
+  // write them.
   std::vector<int32_t> memories(table.memories.size(), kNoMemory);
   for (size_t i = 0; i < table.lookups.size(); ++i) {
     memories[static_cast<size_t>(table.lookups[i].memory)] = static_cast<int32_t>(i);
@@ -721,13 +723,13 @@ void program_code_cuda(const Program& program, unsigned char* code) {
     memories[static_cast<size_t>(table.scatters[i].memory)] = kNoMemory - 1 - static_cast<int32_t>(i);
   }
   for (ProgramStep& step : steps) {
-    const bool made = Slots::makes_value(step);
-    if (made) {
+    const bool makes_value = Slots::makes_value(step);
+    if (makes_value) {
       step.slot = slots.at(step.slot, step.memory);
       step.pairs = step.pairs < 0 ? step.pairs : slots.at(step.pairs, kNoMemory);
       step.stride += kProgramSkew;
     }
-    step.memory = made && step.memory >= 0 ? memories[static_cast<size_t>(step.memory)] : kNoMemory;
+    step.memory = makes_value && step.memory >= 0 ? memories[static_cast<size_t>(step.memory)] : kNoMemory;
   }
   for (ProgramOperand& operand : operands) {
     if (operand.parameter) continue;
@@ -756,7 +758,7 @@ void program_code_cuda(const Program& program, unsigned char* code) {
 }
 
 int64_t grouped_program_workspace_cuda(const Program& program, int64_t n, int64_t, int64_t k) {
-  return cut(program, n, k).bytes;
+  return plan_launch(program, n, k).bytes;
 }
 
 void grouped_program_cuda(const Program& program, const unsigned char* code, const ProgramInputs& in,
@@ -764,9 +766,9 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
                           void* stream) {
   const ProgramTable& table = program.table;
   if (current_device().capability < 80 && precision == ProgramPrecision::tf32) {
-    precision = ProgramPrecision::float32;  // there are no such products
+    precision = ProgramPrecision::float32;  // no tf32 before sm_80
   }
-  const Cut found = cut(program, in.n, in.k);
+  const LaunchPlan plan = plan_launch(program, in.n, in.k);
   const CodePlaces at = code_places(table);
   CudaProgram call{};
   call.code.packs = reinterpret_cast<const ProgramPack*>(code + at.packs);
@@ -781,12 +783,12 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
   call.scatters = reinterpret_cast<const ProgramScatter*>(code + at.scatters);
   call.grids = reinterpret_cast<const HashEncoding*>(code + at.grids);
   call.rows = {in.offsets, in.order, in.ray_index, reinterpret_cast<int32_t*>(workspace), in.n, in.r, in.k};
-  call.packed = reinterpret_cast<float*>(workspace + found.packed);
+  call.packed = reinterpret_cast<float*>(workspace + plan.packed);
   call.packed_stride = table.packed;
   call.pack_parts = ceil_div(largest_pack(table), kPackPart);
-  call.partials = reinterpret_cast<float*>(workspace + found.partials);
-  call.spilled = reinterpret_cast<float*>(workspace + found.slots);
-  call.task_rows = found.task_rows;
+  call.partials = reinterpret_cast<float*>(workspace + plan.partials);
+  call.spilled = reinterpret_cast<float*>(workspace + plan.slots);
+  call.task_rows = plan.task_rows;
   for (size_t i = 0; i < table.inputs.size(); ++i) {
     call.inputs[i] = in.inputs[i];
     call.input_types[i] = static_cast<uint8_t>(in.input_types[i]);
@@ -821,21 +823,21 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
                                   static_cast<cudaStream_t>(stream)));
   }
   const int64_t packed = in.k * table.packed;
-  VN_LAUNCH(program_prepare_kernel, blocks_for(std::max<int64_t>(in.n, packed)), kThreads, 0, stream, call, found.tasks,
+  VN_LAUNCH(program_prepare_kernel, blocks_for(std::max<int64_t>(in.n, packed)), kThreads, 0, stream, call, plan.tasks,
             precision);
   if (in.n > 0 && in.k > 0) {
     switch (precision) {
       case ProgramPrecision::float32:
-        launch_floats(call, found, table.partial, stream);
+        launch_floats(call, plan, table.partial, stream);
         break;
       case ProgramPrecision::tf32:
-        launch_tensors<Tf32Numbers>(call, found, table.partial, stream);
+        launch_tensors<Tf32Numbers>(call, plan, table.partial, stream);
         break;
       case ProgramPrecision::bfloat16:
-        launch_tensors<HalfNumbers<true>>(call, found, table.partial, stream);
+        launch_tensors<HalfNumbers<true>>(call, plan, table.partial, stream);
         break;
       case ProgramPrecision::float16:
-        launch_tensors<HalfNumbers<false>>(call, found, table.partial, stream);
+        launch_tensors<HalfNumbers<false>>(call, plan, table.partial, stream);
         break;
     }
   }

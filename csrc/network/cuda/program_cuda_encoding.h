@@ -1,5 +1,6 @@
-// Encodings of a warp's rows on CUDA, and the gradients to what was encoded. A lane has an entry, of a hash grid a
-// level of a row, neighbouring lanes neighbouring rows of one level, whose entries often share sectors.
+// Encodings of a team's rows on CUDA, and the gradients with respect to their inputs. A lane computes one entry or, for
+// a hash grid, one level of a row. Neighbouring lanes have neighbouring rows of the same level, whose table entries
+// often share sectors.
 #pragma once
 
 #include <type_traits>
@@ -8,12 +9,12 @@
 #include "encoding/hash_encode_device.h"
 #include "network/cuda/program_cuda_tile.h"
 #include "network/cuda/words_device.h"
-// behind the words
+// requires words_device.h
 #include "encoding/encodings.h"
 
 namespace voronerf {
 
-// run(features of a level), as a constant.
+// Calls run(features of a level) with a compile-time constant.
 template <typename Run>
 __device__ __forceinline__ void hash_with_features(int features, const Run& run) {
   switch (features) {
@@ -28,7 +29,7 @@ __device__ __forceinline__ void hash_with_features(int features, const Run& run)
   }
 }
 
-// run(features of a level, a table of its type), as constants.
+// Calls run(features of a level, type of the table) with compile-time constants.
 template <typename Run>
 __device__ __forceinline__ void hash_with_table(int features, int type, const Run& run) {
   hash_with_features(features, [&](auto count) {
@@ -46,18 +47,19 @@ __device__ __forceinline__ void hash_with_table(int features, int type, const Ru
 struct HashAxes {
   HashAxis axes[3];
 };
-// point(axis) -> coordinate.
+// Returns the corners and weights of a point on each axis of a level. point(axis) returns a coordinate.
 template <typename Point>
 __device__ __forceinline__ HashAxes hash_axes(const HashEncoding& grid, const GridLevel& level, const Point& point) {
-  HashAxes found;
+  HashAxes result;
 #pragma unroll
   for (int axis = 0; axis < 3; ++axis) {
-    found.axes[axis] = hash_axis(hash_place(point(axis), grid.low[axis], grid.inverse[axis]).place, level, grid.smooth);
+    result.axes[axis] =
+        hash_axis(hash_place(point(axis), grid.low[axis], grid.inverse[axis]).place, level, grid.smooth);
   }
-  return found;
+  return result;
 }
 
-// The table of a cell.
+// Returns the table of the tile's cell.
 template <TableType kType, typename Tile>
 __device__ __forceinline__ const typename HashElement<kType>::Type* hash_table(const Tile& tile, int parameter) {
   return static_cast<const typename HashElement<kType>::Type*>(tile.call.parameters[parameter]) +
@@ -83,10 +85,10 @@ __device__ __noinline__ void look_up(Tile tile, const ProgramStep& step, const P
       float sums[kFeatures] = {};
       hash_corners<kFeatures>(at.axes, level, level.offset * kFeatures, [&](int64_t entry, int a, int b, int c) {
         const float weight = hash_weight(at.axes, false, nullptr, a, b, c);
-        float found[kFeatures];
-        hash_load<kType>(table + entry, found);
+        float values[kFeatures];
+        hash_load<kType>(table + entry, values);
 #pragma unroll
-        for (int f = 0; f < kFeatures; ++f) sums[f] += weight * found[f];
+        for (int f = 0; f < kFeatures; ++f) sums[f] += weight * values[f];
       });
 #pragma unroll
       for (int f = 0; f < kFeatures; ++f) to.put(row, number * kFeatures + f, sums[f]);
@@ -94,7 +96,7 @@ __device__ __noinline__ void look_up(Tile tile, const ProgramStep& step, const P
   });
 }
 
-// Adds to the gradient of a table that of what was looked up, a value of a step, by atomic operations.
+// Adds the gradient of a look-up, which is the value of a step, to the gradient of the table by atomic operations.
 template <typename Tile>
 __device__ __noinline__ void scatter_rows(Tile tile, const ProgramStep& step, const ProgramScatter& scatter) {
   const CudaProgram& call = tile.call;
@@ -111,19 +113,19 @@ __device__ __noinline__ void scatter_rows(Tile tile, const ProgramStep& step, co
       const GridLevel& level = grid.levels[number];
       const InputRow from = input_row(call, scatter.input, 3, source);
       const HashAxes at = hash_axes(grid, level, [&](int axis) { return from.column(axis); });
-      const float* given = tile.slot(step.slot) + row * step.stride + number * kFeatures;
+      const float* gradient = tile.slot(step.slot) + row * step.stride + number * kFeatures;
       hash_corners<kFeatures>(at.axes, level, level.offset * kFeatures, [&](int64_t entry, int x, int y, int z) {
         const float weight = hash_weight(at.axes, false, nullptr, x, y, z);
         float added[kFeatures];
 #pragma unroll
-        for (int f = 0; f < kFeatures; ++f) added[f] = weight * given[f];
+        for (int f = 0; f < kFeatures; ++f) added[f] = weight * gradient[f];
         hash_add(to + entry, added);
       });
     }
   });
 }
 
-// Eight lanes share a row and its levels.
+// Computes the gradient of the points of a look-up. Eight lanes share the levels of a row.
 template <typename Tile>
 __device__ __noinline__ void look_up_gradient(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
   const Rows x = tile.value(operands[0]), g = tile.value(operands[1]);
@@ -143,10 +145,10 @@ __device__ __noinline__ void look_up_gradient(Tile tile, const ProgramStep& step
         const GridLevel& level = grid.levels[number];
         const HashAxes at = hash_axes(grid, level, [&](int axis) { return x.at(row, axis); });
         hash_corners<kFeatures>(at.axes, level, level.offset * kFeatures, [&](int64_t entry, int a, int b, int c) {
-          float product = 0.0f, found[kFeatures];
-          hash_load<kType>(table + entry, found);
+          float product = 0.0f, values[kFeatures];
+          hash_load<kType>(table + entry, values);
 #pragma unroll
-          for (int f = 0; f < kFeatures; ++f) product += g.at(row, number * kFeatures + f) * found[f];
+          for (int f = 0; f < kFeatures; ++f) product += g.at(row, number * kFeatures + f) * values[f];
           const int corner[3] = {a, b, c};
 #pragma unroll
           for (int axis = 0; axis < 3; ++axis) {
@@ -166,7 +168,7 @@ __device__ __noinline__ void look_up_gradient(Tile tile, const ProgramStep& step
   });
 }
 
-// The formula of a row, by a thread for each: what its columns share is computed once.
+// Evaluates a formula with one thread per row, so that common terms of a row's columns are computed once.
 template <typename Formula>
 struct ByRow {
   template <typename Tile>
@@ -183,7 +185,7 @@ struct ByRow {
   }
 };
 
-// By the hardware's own functions, whose error is 2^-21 near 0; of angles that are not large.
+// Returns sine and cosine by the hardware functions, with an error of 2^-21 near 0. The angle must not be large.
 __device__ __forceinline__ float2 fast_sine_and_cosine(float angle) {
 #ifdef VN_EMULATE
   return make_float2(sine_of_octave(angle, 0.0f), sine_of_octave(angle, 0.5f));
@@ -193,21 +195,22 @@ __device__ __forceinline__ float2 fast_sine_and_cosine(float angle) {
   return make_float2(__sinf(r), __cosf(r));
 #endif
 }
-// Of a whole octave. Called where angles are large alone, which others need not have registers for.
+// Returns the sine and cosine of an octave for large angles. It is not inlined, so that other code needs no registers
+// for it.
 __device__ __noinline__ float2 exact_sine_and_cosine(float value, int octave) {
   const float angle = value * octave_scale(octave);
   return make_float2(sine_of_octave(angle, 0.0f), sine_of_octave(angle, 0.5f));
 }
 
-// Sines and cosines of `features` columns of x in octaves; after x itself, or blurred by the variances beside it. A
-// thread has a sine and its cosine.
+// Computes sines and cosines of `features` columns of x in octaves. They follow x itself, or they are blurred by the
+// variances in the next columns of x (kBlurred). A thread computes a sine and its cosine.
 template <bool kBlurred, typename Tile>
 __device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int features, const Rows& x,
                                               const Target<Tile::kBfloat16>& to) {
   if (!kBlurred) {
     for_each_entry<Tile>(tile.rows(), features, [&](int row, int column) { to.put(row, column, x.at(row, column)); });
   }
-  // A product in place of a division, which is right for what is below 2^32 / features.
+  // Division by multiplication, exact for dividends below 2^32 / features.
   const uint32_t inverse = 0xffffffffu / static_cast<uint32_t>(features) + 1u;
   for_each_entry<Tile>(tile.rows(), features * octaves, [&](int row, int i) {
     const int octave = features == 1 ? i : static_cast<int>(uint64_t{static_cast<uint32_t>(i)} * inverse >> 32);
@@ -218,8 +221,9 @@ __device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int
     to.put(row, column + features, sine_of_octave(angle, 0.5f) * blur);
   });
 }
-// The same as 16-bit numbers, and as floats if kFloats. A thread has a column of a row in all octaves: every fourth by
-// the hardware, those behind it by the double angle, which doubles the error.
+// Computes the octaves as 16-bit numbers, and also as floats if kFloats. A thread computes all octaves of a column of a
+// row: every fourth by the hardware functions, and the next three by double-angle formulas, each of which doubles the
+// error.
 template <bool kBlurred, bool kFloats, typename Tile>
 __device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int features, const Rows& x,
                                              const Target<Tile::kBfloat16>& to) {
@@ -243,7 +247,7 @@ __device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int 
         wide += 2 * features;
       }
     };
-    if (!(fabsf(value) <= largest)) {  // or NaN
+    if (!(fabsf(value) <= largest)) {  // too large, or NaN
 #pragma unroll 1
       for (int octave = 0; octave < octaves; ++octave) put(octave, exact_sine_and_cosine(value, octave));
       continue;
@@ -271,7 +275,8 @@ __device__ __noinline__ void octaves(Tile tile, const ProgramStep& step, const P
   exact_octaves<kBlurred>(tile, step.depth, features, x, to);
 }
 
-// The gradient to them from g, with what was encoded: the derivative of a sine is the cosine beside it.
+// Computes the gradient of the encoded columns from g and the encoding: the derivative of a sine is the cosine next to
+// it.
 template <typename Tile>
 __device__ __noinline__ void octaves_gradient(Tile tile, const ProgramStep& step, const ProgramOperand* operands,
                                               int features, bool blurred) {
@@ -304,10 +309,10 @@ struct Octaves {
   }
 };
 
-// A step that encodes. Operands are x or, for the gradient, x, g and what was encoded.
+// Runs an encoding step. The operands are x or, for the gradient, x, g and the encoding.
 template <typename Tile>
 __device__ __forceinline__ void encode_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
-  using namespace device;  // the formulas
+  using namespace device;  // the formulas of encodings
   switch (step.encoding) {
 #define VN_CASE(NAME, ...)    \
   case ProgramEncoding::NAME: \

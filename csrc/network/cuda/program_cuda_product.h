@@ -1,13 +1,13 @@
-// Products on CUDA. TensorSteps and FloatSteps make the steps of a program that multiply, with values as they lie in
-// slots and weights as program_prepare_kernel has packed them. Linear steps are a warp's, of its own rows by all
-// columns, 64 at a time; sums over rows are the block's.
+// Products on CUDA. TensorSteps and FloatSteps run the product steps of a program, with values in slots and weights
+// packed by program_prepare_kernel. In a linear step a warp computes all columns of its rows, 64 at a time. Sums over
+// rows are computed by the whole block.
 //
-// Tensor cores: weights lie in the order of fragments: for each chunk of the depth and each tile of 8 columns the 16
-// bytes of a lane, so that a warp reads 512 bytes in a row. 16-bit values lie in words of two columns, whose rows are 4
-// words longer than a multiple of 16: the 8 rows of a matrix that ldmatrix reads are in different banks. What the next
-// step multiplies stays in registers, since sums of one product lie as a left operand of another does.
+// Tensor cores: weights are in the order of fragments. Each chunk of the depth and each tile of 8 columns has 16 bytes
+// per lane, so a warp reads 512 contiguous bytes. 16-bit values are words of two columns. Their rows are 4 words longer
+// than a multiple of 16, so the 8 rows of a matrix that ldmatrix reads are in different banks. The operand of the next
+// step can stay in registers, since the accumulators of a product have the layout of a left operand.
 //
-// float32: a thread has up to 8 rows by four columns; weights lie as [depth][columns].
+// float32: a thread computes up to 8 rows by four columns, and weights are [depth][columns].
 #pragma once
 
 #include "common/cuda_wrappers.h"
@@ -16,9 +16,9 @@
 
 namespace voronerf {
 
-// Weights, packed -------------------------------------------------------------------------------------------------
+// Packed weights --------------------------------------------------------------------------------------------------
 
-// Of a matrix as a product reads it: what there is at a depth and an output.
+// A matrix of weights: at(depth, output) returns an element, or 0 outside.
 struct PackedMatrix {
   const float* data;
   int by_depth, by_output, depth, outputs;
@@ -27,7 +27,7 @@ struct PackedMatrix {
   }
 };
 
-// Word `word` of the fragments: lane 4 g + m of a tile has steps m of column g.
+// Returns word `word` of the fragments: lane 4 g + m of a tile has the depth indices of member m, of column g.
 template <typename Numbers>
 __device__ __forceinline__ uint32_t packed_word(const PackedMatrix& matrix, int word) {
   const int tiles = padded(matrix.outputs, kProgramOutputs) / 8;
@@ -35,30 +35,31 @@ __device__ __forceinline__ uint32_t packed_word(const PackedMatrix& matrix, int 
   return Numbers::right(matrix, Numbers::kChunk * chunk, part, lane % 4, 8 * tile + lane / 4);
 }
 
-// Of a step without one: as those that are packed, each column twice.
+// The bias of steps without a bias. As in packed biases, each column is stored twice.
 alignas(16) static __device__ const float kNoBias[2 * kProgramWide] = {};
 
 // Operands --------------------------------------------------------------------------------------------------------
 
-// A value in its slot: words of two 16-bit numbers where there are such, else floats.
+// A value in its slot, as words of two 16-bit numbers or as floats.
 struct ProductValue {
   const float* floats;
   const uint32_t* words;
   bool has_words;
-  int stride;   // of either
-  int columns;  // behind which floats are anything, and words are 0 up to the next multiple of 32
+  int stride;   // of the floats or the words
+  int columns;  // floats after them are undefined, words are 0 up to a multiple of 32 columns
   __device__ __forceinline__ float at(int row, int column) const {
     return column < columns ? floats[row * stride + column] : 0.0f;
   }
 };
-// kFirst: of the block's first warp, else of the warp.
+// Returns a value in its slot of the block's first team (kFirst) or of the thread's team.
 template <bool kFirst, typename Tile>
 __device__ __forceinline__ ProductValue product_value(const Tile& tile, const CudaValue& value, bool words) {
   const float* at = (kFirst ? tile.first_slot(value.slot) : tile.slot(value.slot)) + value.start;
   return {at, reinterpret_cast<const uint32_t*>(at), words, value.stride, value.columns};
 }
 
-// What a lane has of a left operand [16][32] of 16 bits: two fragments of mma.m16n8k16; of tf32 [16][16].
+// A lane's part of a left operand: two fragments of mma.m16n8k16 for 16-bit [16][32], or the fragments of tf32
+// [16][16].
 struct LeftFragments {
   uint32_t words[2][4];
 };
@@ -66,7 +67,7 @@ struct LeftFragments {
 template <bool kBfloat16>
 struct HalfNumbers {
   static constexpr int kChunk = 32;
-  static constexpr bool kHalves = true, kCuts = !kBfloat16;  // numbers beyond the largest
+  static constexpr bool kHalves = true, kCuts = !kBfloat16;  // kCuts: clamp to the largest number
   static constexpr auto kKind = kBfloat16 ? ProgramNumbers::bfloat16 : ProgramNumbers::float16;
 
   static __device__ __forceinline__ uint32_t pair(float x, float y) { return pack_halves<kBfloat16>(x, y); }
@@ -74,33 +75,33 @@ struct HalfNumbers {
   static __device__ __forceinline__ uint32_t above_zero(uint32_t word) { return above_zero_halves<kBfloat16>(word); }
   static __device__ __forceinline__ uint32_t right(const PackedMatrix& matrix, int k, int part, int member, int n) {
     const int at = k + 8 * part + 2 * member;
-    // Weights beyond the largest float16 are cut off.
+    // Weights beyond the largest float16 are clamped.
     const uint32_t word = pair(matrix.at(at, n), matrix.at(at + 1, n));
     return kCuts ? clamp_halves(word) : word;
   }
 
-  // Rows from `row` on, steps from k on. Infinities that enter a product of float16 are cut off where `cut` says so.
+  // Loads a left operand: rows from `row` on, depth from k on. If `cut`, infinite float16 operands are clamped.
   template <bool kShared, bool kWords>
   static __device__ __forceinline__ LeftFragments left(const ProductValue& x, int row, int k, bool cut, int lane) {
-    LeftFragments found;
+    LeftFragments result;
     if constexpr (kWords) {
 #pragma unroll
       for (int s = 0; s < 2; ++s)
-        load_matrices<kShared>(found.words[s], x.words + row * x.stride + k / 2 + 8 * s, x.stride, lane);
+        load_matrices<kShared>(result.words[s], x.words + row * x.stride + k / 2 + 8 * s, x.stride, lane);
     } else {
       const int group = lane / 4, member = lane % 4;
 #pragma unroll
       for (int i = 0; i < 8; ++i) {
         const int at = k + 16 * (i / 4) + 8 * (i % 4 / 2) + 2 * member, of = row + group + 8 * (i % 2);
-        found.words[i / 4][i % 4] = pair(x.at(of, at), x.at(of, at + 1));
+        result.words[i / 4][i % 4] = pair(x.at(of, at), x.at(of, at + 1));
       }
     }
-    if (kCuts && cut) clamp(found);
-    return found;
+    if (kCuts && cut) clamp(result);
+    return result;
   }
-  static __device__ __forceinline__ void clamp(LeftFragments& found) {
+  static __device__ __forceinline__ void clamp(LeftFragments& result) {
 #pragma unroll
-    for (int i = 0; i < 8; ++i) found.words[i / 4][i % 4] = clamp_halves(found.words[i / 4][i % 4]);
+    for (int i = 0; i < 8; ++i) result.words[i / 4][i % 4] = clamp_halves(result.words[i / 4][i % 4]);
   }
   static __device__ __forceinline__ void multiply(float (&sums)[4], const LeftFragments& left, const uint4& right) {
     const uint32_t first[2] = {right.x, right.y}, second[2] = {right.z, right.w};
@@ -108,8 +109,8 @@ struct HalfNumbers {
     multiply_halves<kBfloat16>(sums, left.words[1], second);
   }
 
-  // For sums over rows: columns from i on as the rows of a left operand, over the 16 rows from `row` on. kWhole: in
-  // words.
+  // Loads a transposed left operand for sums over rows: columns from i on become its rows, and the 16 rows from `row`
+  // on its depth. kWhole: the value is in words.
   static constexpr int kRows = 16;
   template <bool kShared, bool kWhole>
   static __device__ __forceinline__ void turned_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
@@ -121,7 +122,7 @@ struct HalfNumbers {
       for (int j = 0; j < 4; ++j) words[j] = turned_pair(a, row + 8 * (j / 2), i + 8 * (j % 2), rows, lane);
     }
   }
-  // Columns from j on, two tiles of 8, as right operands.
+  // Loads columns from j on, two tiles of 8, as right operands.
   template <bool kShared, bool kWhole>
   static __device__ __forceinline__ void turned_right(uint32_t (&words)[2][2], const ProductValue& b, int j, int row,
                                                       int rows, bool cut, int lane) {
@@ -145,7 +146,7 @@ struct HalfNumbers {
   }
 
  private:
-  // Two rows of a lane's column.
+  // Returns two rows of a lane's column as a pair.
   static __device__ __forceinline__ uint32_t turned_pair(const ProductValue& a, int row, int column, int rows,
                                                          int lane) {
     const int at = row + 2 * (lane % 4), of = column + lane / 4;
@@ -164,7 +165,7 @@ struct Tf32Numbers {
     memcpy(&bits, &rounded, sizeof bits);
     return bits;
   }
-  static __device__ __forceinline__ uint32_t pair(float, float) { return 0; }  // values are floats
+  static __device__ __forceinline__ uint32_t pair(float, float) { return 0; }  // unused: values are floats
   static __device__ __forceinline__ uint32_t relu_pair(float, float) { return 0; }
   static __device__ __forceinline__ uint32_t above_zero(uint32_t) { return 0; }
   static __device__ __forceinline__ uint32_t right(const PackedMatrix& matrix, int k, int part, int member, int n) {
@@ -173,12 +174,12 @@ struct Tf32Numbers {
   template <bool kShared, bool kWords>
   static __device__ __forceinline__ LeftFragments left(const ProductValue& x, int row, int k, bool, int lane) {
     const int group = lane / 4, member = lane % 4;
-    LeftFragments found;
+    LeftFragments result;
 #pragma unroll
     for (int i = 0; i < 8; ++i) {
-      found.words[i / 4][i % 4] = word(x.at(row + group + 8 * (i % 2), k + 8 * (i / 4) + 4 * (i % 4 / 2) + member));
+      result.words[i / 4][i % 4] = word(x.at(row + group + 8 * (i % 2), k + 8 * (i / 4) + 4 * (i % 4 / 2) + member));
     }
-    return found;
+    return result;
   }
   static __device__ __forceinline__ void clamp(LeftFragments&) {}
   static __device__ __forceinline__ void multiply(float (&sums)[4], const LeftFragments& left, const uint4& right) {
@@ -187,7 +188,7 @@ struct Tf32Numbers {
     multiply_tf32(sums, left.words[1], second);
   }
 
-  // A lane takes rows 2 m and 2 m + 1, not m and m + 4: its 32 lanes are then in different banks.
+  // Member m takes rows 2 m and 2 m + 1, not m and m + 4, so that the 32 lanes of a warp read different banks.
   static constexpr int kRows = 8;
   template <bool kShared, bool kWhole>
   static __device__ __forceinline__ void turned_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
@@ -217,32 +218,32 @@ struct Tf32Numbers {
 
 // Steps -----------------------------------------------------------------------------------------------------------
 
-// What a warp holds from one step to the next, a value of up to 64 columns: words as they leave a product, which are
-// fragments of the next one. Of each tile of 8 columns those of a lane in rows g and g + 8.
+// A value of up to 64 columns that a warp holds in registers between steps. The words of a product's result are
+// fragments of the next product. For each tile of 8 columns, a lane has its words of rows g and g + 8.
 template <int kTall>
 struct HeldWords {
   uint32_t words[kTall][kProgramWide / 8][2];
-  // Columns from 32 c on.
+  // Returns the columns from 32 c on as a left operand.
   __device__ __forceinline__ LeftFragments left(int r, int c) const {
-    LeftFragments found;
+    LeftFragments result;
 #pragma unroll
-    for (int i = 0; i < 8; ++i) found.words[i / 4][i % 4] = words[r][4 * c + i / 2][i % 2];
-    return found;
+    for (int i = 0; i < 8; ++i) result.words[i / 4][i % 4] = words[r][4 * c + i / 2][i % 2];
+    return result;
   }
 };
 
-// kTall: times 16 rows of a team. kTeam: its warps. kShared: slots are in shared memory.
+// The product steps on tensor cores. A team has 16 kTall rows and kTeam warps. kShared: slots are in shared memory.
 //
-// What enters a product of float16 is cut off at its largest number, since infinities in a network soon become NaN,
-// except for gradients: whoever scales a loss looks for the infinite ones. What a turned matrix multiplies is taken for
-// one.
+// Operands of float16 products are clamped to the largest number, since infinities in a network soon become NaN.
+// Gradients are not clamped, because loss scaling checks them for infinities. An operand of a turned (transposed)
+// matrix is assumed to be a gradient.
 template <typename Numbers, int kTall, int kTeam, bool kShared>
 struct TensorSteps {
   using Tile = ProgramTile<16 * kTall, kTeam, kShared, Numbers::kKind>;
   using Held = HeldWords<kTall>;
 
-  // Of any kind. Goes on to the last of those steps whose sums go on in the next one. In teams a warp has 16 of 64
-  // columns, but for what stays in registers, which the first one has.
+  // Runs any linear step. If the next steps add to its sums, it runs them too and advances `number` to the last of
+  // them. In a team each warp has 16 of 64 columns, except for values in registers, which only the first warp computes.
   static __device__ __forceinline__ void linear(const Tile& tile, CudaStep& step, int& number, Held& held) {
     const bool words = Numbers::kHalves && (step.pairs >= 0 || step.holds || step.carries);
     const int wide = words ? 2 * pair_words(step.width) : step.width;
@@ -266,8 +267,8 @@ struct TensorSteps {
     }
   }
 
-  // What chains of layers consist of, words to words, has its own code for each way to read them: where such ways meet,
-  // the compiler moves sums from register to register.
+  // Runs a step of a chain of layers, from words to words. Each way to read the operand has separate code: where the
+  // ways shared code, the compiler would move sums between registers.
   static __device__ __forceinline__ void chained(const Tile& tile, const CudaStep& step, Held& held) {
     if constexpr (Numbers::kHalves) {
       const int width = step.width, half = kProgramWide / 2;
@@ -298,8 +299,8 @@ struct TensorSteps {
     }
   }
 
-  // partial[i][j] += sum over rows of a[row][i] b[row][j]. A warp has 16 by 32 of them at a time. Those of a's first
-  // 16 columns add up the columns of b as well, where step.bias says so.
+  // Computes partial[i][j] += sum over rows of a[row][i] b[row][j]. A warp computes 16 by 32 entries at a time. If
+  // step.bias >= 0, warps with a's first 16 columns also add up the columns of b.
   static __device__ __forceinline__ void outer(const Tile& tile, const CudaStep& step) {
     const bool swapped = step.swapped != 0;
     const ProductValue a = product_value<true>(tile, step.x, step.x_words);
@@ -308,7 +309,7 @@ struct TensorSteps {
     const bool words = Numbers::kHalves && a.has_words && b.has_words, full = tile.all() % Tile::kRows == 0,
                fill = tile.fill();
     float* const partial = tile.partial() + step.number;
-    // Without a division.
+    // Blocks of entries are counted without a division.
     const int down = 16 * ceil_div(a.columns, 16);
     int i0 = 16 * warp, j0 = 0;
 #pragma unroll 1
@@ -316,15 +317,15 @@ struct TensorSteps {
       for (; i0 >= down; j0 += 32) i0 -= down;
       if (j0 >= b.columns) break;
       float sums[4][4] = {};
-      float2 before[8];  // on their way meanwhile
+      float2 previous[8];  // loaded while the products run
       const bool pairs = j0 + 32 <= b.columns && i0 + 16 <= a.columns && !fill;
       float* const corner = partial + (i0 + lane / 4) * step.stride + j0 + 2 * (lane % 4);
 #pragma unroll
       for (int t = 0; t < 8; ++t) {
-        before[t] = pairs ? *reinterpret_cast<const float2*>(corner + t % 2 * 8 * step.stride + t / 2 * 8)
-                          : make_float2(0.0f, 0.0f);
+        previous[t] = pairs ? *reinterpret_cast<const float2*>(corner + t % 2 * 8 * step.stride + t / 2 * 8)
+                            : make_float2(0.0f, 0.0f);
       }
-      // Floats behind the columns of a row, up to where the next row begins, come to sums that are not stored.
+      // The padding after the columns of a row only affects sums that are not stored.
       const bool floats = !Numbers::kHalves && full && step.x.start + i0 + 16 <= step.x.stride &&
                           step.y.start + j0 + 32 <= step.y.stride;
       if (words && step.bias >= 0 && i0 == 0) {
@@ -339,7 +340,7 @@ struct TensorSteps {
       if (j0 + 32 <= b.columns && i0 + 16 <= a.columns) {
 #pragma unroll
         for (int t = 0; t < 8; ++t) {
-          const float x = sums[t / 2][t % 2 * 2] + before[t].x, y = sums[t / 2][t % 2 * 2 + 1] + before[t].y;
+          const float x = sums[t / 2][t % 2 * 2] + previous[t].x, y = sums[t / 2][t % 2 * 2 + 1] + previous[t].y;
           *reinterpret_cast<float2*>(corner + t % 2 * 8 * step.stride + t / 2 * 8) = make_float2(x, y);
         }
         continue;
@@ -355,7 +356,7 @@ struct TensorSteps {
     }
   }
 
-  // partial[j] += sum over rows of b[row][j]; of words by a product with ones.
+  // Computes partial[j] += sum over rows of b[row][j]; for words by a product with ones.
   static __device__ __forceinline__ void columns(const Tile& tile, const CudaStep& step) {
     if constexpr (Numbers::kHalves) {
       if (step.x_words) return sum_words(tile, step);
@@ -371,7 +372,7 @@ struct TensorSteps {
     return step.x_held || step.holds || step.carries;
   }
 
-  // 8 kTiles columns from `first` on. kHeld: chunks of what is held.
+  // Computes 8 kTiles columns from `first` on. kHeld: chunks of the operand in registers; 0: it is in its slot.
   template <int kTiles, int kHeld>
   static __device__ __forceinline__ void chained_part(const Tile& tile, const CudaStep& step, int first, Held& held) {
     const int lane = lane_again();
@@ -388,7 +389,7 @@ struct TensorSteps {
     }
     put_words<kTiles>(held, sums, tile, step, first);
   }
-  // 8 kTiles columns from `first` on, by the kind of step that has them all.
+  // Computes 8 kTiles columns from `first` on for any linear step.
   template <int kTiles>
   static __device__ __forceinline__ void part(const Tile& tile, CudaStep& step, int& number, int first, Held& held) {
     const int lane = lane_again();
@@ -411,8 +412,8 @@ struct TensorSteps {
     } else if (floats) {
       store<kTiles, false>(sums, tile, step, first);
     }
-    // Even where nothing reads these words: what was held before would keep its registers beside the sums. No other
-    // part needs it, since a value in registers has at most 64 columns.
+    // Words are made even if no step reads them: otherwise the previously held value would occupy registers besides the
+    // sums. Overwriting it is safe, since a value in registers has at most 64 columns, so no other part needs it.
     if constexpr (kTiles > 1 && Numbers::kHalves) put_words<kTiles>(held, sums, tile, step, first);
   }
 
@@ -426,13 +427,13 @@ struct TensorSteps {
 #pragma unroll
     for (int i = 0; i < 2 * kTall * kTiles; ++i) visit(i / (2 * kTiles), i / 2 % kTiles, i % 2);
   }
-  // Row and column of a sum, within the rows of its warp and the columns of its part.
+  // Returns the row and column of a sum, relative to the rows of its warp and the columns of its part.
   static __device__ __forceinline__ MapPlace place(int r, int t, int i, int lane) {
-    const MapPlace own = accumulator_place(static_cast<unsigned>(lane), i);
-    return {16 * r + own.row, 8 * t + own.column};
+    const MapPlace offset = accumulator_place(static_cast<unsigned>(lane), i);
+    return {16 * r + offset.row, 8 * t + offset.column};
   }
 
-  // Columns from a first one on of x w^T + bias, for a lane.
+  // A lane's part of the product x w^T + bias, for columns from `first` on.
   struct Product {
     ProductValue x;
     const uint4* weights;
@@ -447,7 +448,7 @@ struct TensorSteps {
           across(4 * padded(step.width, kProgramOutputs)),
           lane(lane),
           cut(!step.turned) {}
-    // sums = bias.
+    // Sets the sums to the bias.
     template <int kTiles>
     __device__ __forceinline__ void start(float (&sums)[kTall][kTiles][4]) const {
 #pragma unroll
@@ -459,7 +460,7 @@ struct TensorSteps {
         }
       }
     }
-    // A left operand of 16 rows: what is held, or what is in its slot.
+    // held and left return a left operand of 16 rows, from registers or from its slot.
     __device__ __forceinline__ LeftFragments held(const Held& held, int r, int c) const {
       LeftFragments left = held.left(r, c);
       if (Numbers::kCuts && cut) Numbers::clamp(left);
@@ -469,22 +470,22 @@ struct TensorSteps {
     __device__ __forceinline__ LeftFragments left(int r, int c) const {
       return Numbers::template left<kShared, kWords>(x, 16 * r, Numbers::kChunk * c, cut, lane);
     }
-    // sums += the product at a chunk of the depth. left(r): of 16 rows.
+    // Adds the product of one chunk of the depth to the sums. left(r) returns the left operand of 16 rows.
     template <int kTiles, typename Left>
     __device__ __forceinline__ void chunk(float (&sums)[kTall][kTiles][4], int c, const Left& left) const {
       const uint4* const from = weights + c * across;
-      LeftFragments own[kTall];
+      LeftFragments fragments[kTall];
 #pragma unroll
-      for (int r = 0; r < kTall; ++r) own[r] = left(r);
+      for (int r = 0; r < kTall; ++r) fragments[r] = left(r);
 #pragma unroll
       for (int t = 0; t < kTiles; ++t) {
         const uint4 right = load_constant(from + 32 * t);
 #pragma unroll
-        for (int r = 0; r < kTall; ++r) Numbers::multiply(sums[r][t], own[r], right);
+        for (int r = 0; r < kTall; ++r) Numbers::multiply(sums[r][t], fragments[r], right);
       }
     }
   };
-  // sums += x w^T.
+  // Adds x w^T to the sums.
   template <int kTiles>
   static __device__ __forceinline__ void multiply(Sums<kTiles>& sums, const Tile& tile, const CudaStep& step, int first,
                                                   const Held& held, int lane) {
@@ -504,8 +505,8 @@ struct TensorSteps {
     }
   }
 
-  // visit(a, b, row, rows) for the depth of a sum over the block's rows: operands that lie from a warp's first row on,
-  // and which of its rows come next, of those that have a sample.
+  // Calls visit(a, b, row, rows) along the depth of a sum over the block's rows. The operands begin at a team's first
+  // row, `row` is the next row of the team, and `rows` is the number of remaining rows with a sample.
   template <bool kWhole, typename Visit>
   static __device__ __forceinline__ void for_each_depth(const Tile& tile, ProductValue a, ProductValue b,
                                                         const Visit& visit) {
@@ -518,9 +519,9 @@ struct TensorSteps {
     }
   }
 
-  // sums += over rows a's 16 columns from i0 on by b's 32 from j0 on. kWhole: both lie in words, which are 0 up to
-  // there and in rows without a sample; or in floats, whose rows go so far and all have a sample. kColumns: columns +=
-  // the sum of b over rows.
+  // Adds the product, over rows, of a's 16 columns from i0 on and b's 32 columns from j0 on to the sums. kWhole: no
+  // bounds checks are needed. Both operands are words, padded with 0 in rows and columns, or floats whose rows are long
+  // enough and all have a sample. kColumns: also adds the sum of b over rows to `columns`.
   template <bool kWhole, bool kColumns>
   static __device__ __forceinline__ void multiply_turned(float (&sums)[4][4], float (&columns)[4][4], const Tile& tile,
                                                          const ProductValue& a, const ProductValue& b, int i0, int j0,
@@ -563,12 +564,12 @@ struct TensorSteps {
       add_columns(sums, tile.partial() + step.number, j0, step.width, fill, lane);
     }
   }
-  // A sum over rows of columns, by a product with ones.
+  // Adds a sum over rows of columns by a product with ones.
   static __device__ __forceinline__ void add_ones(float (&sums)[4], const uint32_t (&right)[2]) {
     const uint32_t one = Numbers::pair(1.0f, 1.0f), ones[4] = {one, one, one, one};
     Numbers::multiply_turned(sums, ones, right);
   }
-  // partial[j] += such a sum, for columns from j0 on, eight of each of kTiles.
+  // Adds sums of columns to partial[j], for columns from j0 on: kTiles tiles of eight.
   template <int kTiles>
   static __device__ __forceinline__ void add_columns(const float (&sums)[kTiles][4], float* partial, int j0,
                                                      int columns, bool fill, int lane) {
@@ -579,19 +580,19 @@ struct TensorSteps {
     }
   }
 
-  // What is added to the product, where that is a value.
+  // Adds a value to the product.
   template <int kTiles>
   static __device__ __forceinline__ void add(Sums<kTiles>& sums, const CudaStep& step, const Tile& tile, int first) {
     const int lane = lane_again(), rows = tile.rows();
     const Rows added = tile.operand(tile.call.code.operands[step.added]);
     for_each_sum<kTiles>([&](int r, int t, int i) {
       const MapPlace at = place(r, t, i, lane);
-      const bool there = at.row < rows && first + at.column < step.width;
-      if (there) sums[r][t][i] += added.at(at.row, first + at.column);
+      const bool inside = at.row < rows && first + at.column < step.width;
+      if (inside) sums[r][t][i] += added.at(at.row, first + at.column);
     });
   }
 
-  // 0 where a value of ReLU is.
+  // Sets sums to 0 where the value of the ReLU is 0 or less.
   template <int kTiles>
   static __device__ __forceinline__ void cut_slopes(Sums<kTiles>& sums, const Tile& tile, const CudaStep& step,
                                                     int first) {
@@ -607,12 +608,12 @@ struct TensorSteps {
     }
     for_each_sum<kTiles>([&](int r, int t, int i) {
       const MapPlace at = place(r, t, i, lane);
-      const bool cut = slope.at(at.row, first + at.column) <= 0.0f;  // NaN is not
+      const bool cut = slope.at(at.row, first + at.column) <= 0.0f;  // false for NaN
       sums[r][t][i] = cut ? 0.0f : sums[r][t][i];
     });
   }
 
-  // The value as words: to its slot, and held.
+  // Rounds the value to words, keeps them in registers and stores them to their slot, if any.
   template <int kTiles>
   static __device__ __forceinline__ void put_words(Held& held, const Sums<kTiles>& sums, const Tile& tile,
                                                    const CudaStep& step, int first) {
@@ -640,7 +641,7 @@ struct TensorSteps {
     uint32_t* const to = reinterpret_cast<uint32_t*>(tile.slot(step.pairs)) + lane / 4 * stride + first / 2 + lane % 4;
     for_each_word<kTiles>([&](int r, int t, int h) { to[(16 * r + 8 * h) * stride + 4 * t] = held.words[r][t][h]; });
   }
-  // Words are 0 where there is no sample or no column, since products take whole sixteens of both.
+  // Clears words without a sample or a column, since products read multiples of 16 rows and columns.
   template <int kTiles>
   static __device__ __forceinline__ void clear_outside(Held& held, const Tile& tile, int columns, int lane) {
     const int rows = tile.rows();
@@ -651,7 +652,7 @@ struct TensorSteps {
     });
   }
 
-  // kWhole: there is a sample in every row, and each sum has a column.
+  // Stores the sums as floats. kWhole: every row has a sample and every sum a column.
   template <int kTiles, bool kWhole>
   static __device__ __forceinline__ void store(const Sums<kTiles>& sums, const Tile& tile, const CudaStep& step,
                                                int first) {
@@ -673,7 +674,7 @@ struct TensorSteps {
   }
 };
 
-// In float32. A team has 16 rows.
+// The product steps in float32. A team has 16 rows.
 template <int kTeam, bool kShared>
 struct FloatSteps {
   using Tile = ProgramTile<16, kTeam, kShared, ProgramNumbers::floats>;
@@ -695,7 +696,7 @@ struct FloatSteps {
     }
   }
 
-  // As of TensorSteps; a thread has 4 by 4 at a time.
+  // Computes the same sums as TensorSteps::outer. A thread computes 4 by 4 entries at a time.
   static __device__ __forceinline__ void outer(const Tile& tile, const CudaStep& step) {
     const ProductValue a = product_value<true>(tile, step.x, false), b = product_value<true>(tile, step.y, false);
     const bool whole = (step.x.start | step.x.stride | step.y.start | step.y.stride) % 4 == 0;
@@ -750,7 +751,7 @@ struct FloatSteps {
   static __device__ __forceinline__ void columns(const Tile& tile, const CudaStep& step) { sum_columns(tile, step); }
 
  private:
-  // Rows from `row` on, kRows of them, by four columns.
+  // Computes kRows rows from `row` on, kApart apart, by four columns.
   template <int kRows>
   static __device__ __forceinline__ void block(const Tile& tile, const CudaStep& step, int row, int first) {
     constexpr int kApart = Tile::kRows / kRows;

@@ -1,7 +1,7 @@
-// What the kernels of programs share: a call, the rows of its cells, and a tile.
+// Definitions shared by the kernels of programs: a call, the rows of its cells, and a tile.
 //
-// The map from blocks to rows of cells is made on the device, so that the host does not read the offsets. What a caller
-// has given and no host has read, offsets, an order and a ray_index, is kept inside the tensors wherever it is used.
+// The map from blocks to rows of cells is made on the device, so that the host does not read the offsets. The host has
+// not validated offsets, order and ray_index, so each use clamps them to valid indices.
 #pragma once
 
 #include "common/cuda_wrappers.h"
@@ -11,14 +11,15 @@
 
 namespace voronerf {
 
-// Warps of a block and blocks of a multiprocessor, by rows of a team: 16 warps with 128 registers, or 12 with 168.
+// The warps of a block and the resident blocks of a multiprocessor, by the rows of a team: 16 warps with 128 registers
+// per thread, or 12 with 168.
 VN_HD constexpr int program_warps(int rows) { return rows == 32 ? 4 : 8; }
 VN_HD constexpr int program_blocks(int rows) { return rows == 32 ? 3 : 2; }
-constexpr int kProgramTeam = 4;          // warps that share their rows, where the values of few rows fit
-constexpr int kProgramWide = kMostHeld;  // columns of a product that a warp has at a time
-constexpr int kProgramSkew = 4;          // floats that rows of slots are longer than a multiple of 16
-constexpr int kProgramOutputs = 32;      // packed weights and biases are 0 up to a multiple of this
-constexpr int kProgramMost = 64;         // tensors of a kind: kernel arguments hold 4 KiB
+constexpr int kProgramTeam = 4;          // warps of a team that share rows, if the values of few rows fit
+constexpr int kProgramWide = kMostHeld;  // columns of a product that a warp computes at a time
+constexpr int kProgramSkew = 4;          // padding of rows of slots, in floats beyond a multiple of 16
+constexpr int kProgramOutputs = 32;      // packed weights and biases are padded with 0 to a multiple of this
+constexpr int kProgramMost = 64;         // limit for tensors of a kind: kernel arguments have at most 4 KiB
 constexpr int kProgramLookups = 16;
 
 struct CudaRows {
@@ -27,35 +28,37 @@ struct CudaRows {
   int64_t n, r, k;
 };
 
-// A value that a product reads: columns from `start` on at a slot.
+// An operand of a product: columns from `start` on of the value at a slot.
 struct CudaValue {
   int32_t slot, start, stride, columns;
 };
-// chain: a linear step from words to words.
+// The kinds of steps. chain: a linear step that reads and writes only words (pairs of 16-bit numbers).
 enum class CudaOp : int32_t { plain, input, output, linear, chain, outer, columns };
-// A step as the interpreter reads it, in a few loads: what the step and its operands and packs say, put together. Plain
-// steps have `op` and `keeps` alone.
+// A step as the interpreter reads it, in five loads: the fields of the step, its operands and packs. Plain steps use
+// only `op` and `keeps`.
 struct alignas(16) CudaStep {
   CudaValue x;
-  int32_t weights, bias;  // places in what is packed; -1: none. outer: bias is where the sum of y's columns goes, or -1
-  int32_t depth, width;   // output: `depth` is the first column where it goes
-  CudaValue y;            // linear: where ReLU was. outer: x by y
-  int32_t slot, stride;   // of what it makes as floats, or -1; outer: `stride` floats are a row of the sum
-  int32_t pairs;          // where what it makes is as 16-bit words, or -1
-  int32_t added;          // an operand, or -1; output: what is written
-  int32_t number;         // input, output: which. outer, columns: the place in the partial
+  // Offsets in the packed parameters; -1: none. For outer, bias is the offset of the sums of y's columns in the
+  // partial, or -1.
+  int32_t weights, bias;
+  int32_t depth, width;  // output: `depth` is the first destination column
+  CudaValue y;           // linear: the value of the ReLU whose slope is applied. outer: right operand
+  int32_t slot, stride;  // of the result as floats (slot -1: none); outer: `stride` is the row of the sum
+  int32_t pairs;         // slot of the result as 16-bit words, or -1
+  int32_t added;         // index of an added operand, or -1; output: the written operand
+  int32_t number;        // input, output: its index. outer, columns: offset in the partial
   CudaOp op;
-  uint32_t keeps : 1;  // in memory of the call
+  uint32_t keeps : 1;  // the result also goes to memory of the call
   uint32_t relu : 1, sloped : 1, turned : 1;
   uint32_t x_words : 1, y_words : 1;
-  uint32_t swapped : 1;            // x is not the gradient
-  uint32_t x_held : 1, holds : 1;  // x is in registers; what it makes stays there for the next step
-  uint32_t carries : 1;            // the next step goes on with its sums
+  uint32_t swapped : 1;            // outer: y, not x, is the gradient
+  uint32_t x_held : 1, holds : 1;  // x is in registers; the result stays in registers
+  uint32_t carries : 1;            // the next step adds to the sums
   __device__ __forceinline__ bool sums() const { return op == CudaOp::outer || op == CudaOp::columns; }
 };
 static_assert(sizeof(CudaStep) == 80, "five loads");
 
-// All of it at once: a thread waits for none of its numbers by itself.
+// Loads a whole step at once, so that a thread does not wait for each field separately.
 __device__ __forceinline__ CudaStep load_step(const CudaStep* from) {
   CudaStep step;
   uint4 parts[5];
@@ -65,7 +68,7 @@ __device__ __forceinline__ CudaStep load_step(const CudaStep* from) {
   return step;
 }
 
-// Pointers of a call, on the device; `code` too.
+// The arguments of a call, with pointers to device memory, also in `code`.
 struct CudaProgram {
   ProgramCode code;
   const CudaStep* steps;
@@ -73,21 +76,21 @@ struct CudaProgram {
   const ProgramScatter* scatters;
   CudaRows rows;
   float *partials, *spilled, *packed;  // in the workspace
-  int64_t task_rows, packed_stride;    // of what is packed, from cell to cell
+  int64_t task_rows, packed_stride;    // packed_stride: floats from one cell's packs to the next
   const void *inputs[kProgramMost], *parameters[kProgramMost];
   void* outputs[kProgramMost];
   float* sums[kProgramMost];
-  int64_t strides[kProgramMost];  // of parameters, from cell to cell
+  int64_t strides[kProgramMost];  // from one cell's parameter to the next
   float* kept[kProgramLookups];   // [n][stride] of each look-up, or null
   int32_t kept_strides[kProgramLookups], output_widths[kProgramMost];
   uint8_t input_types[kProgramMost], parameter_types[kProgramMost], output_types[kProgramMost];
   bool turned[kProgramMost], rays[kProgramMost];  // inputs
   int32_t output_count, lookup_count, pack_parts;
-  bool ready;  // what is kept is there
+  bool ready;  // kept look-ups are filled
 };
 static_assert(sizeof(CudaProgram) <= 4000, "kernel arguments hold 4 KiB");
 
-// The nearest index in [0, n).
+// Returns the nearest index in [0, n).
 __device__ __forceinline__ int64_t index_within(int64_t index, int64_t n) {
   return index < 0 ? 0 : index < n ? index : n - 1;
 }
@@ -95,7 +98,7 @@ __device__ __forceinline__ int64_t source_row(const CudaRows& rows, int64_t row)
   return rows.order == nullptr ? row : index_within(rows.order[row], rows.n);
 }
 
-// Rows of a cell.
+// cell_begin returns the first row of a cell, cell_rows the number of its rows.
 __device__ __forceinline__ int64_t cell_begin(const CudaRows& rows, int64_t cell) {
   const int64_t first = rows.offsets[cell];
   return first < 0 ? 0 : first > rows.n ? rows.n : first;
@@ -105,7 +108,7 @@ __device__ __forceinline__ int64_t cell_rows(const CudaRows& rows, int64_t cell)
   return count < 0 ? 0 : count;
 }
 
-// Numbers by their type in memory.
+// Loads and stores of numbers by their type in memory.
 __device__ __forceinline__ float load_number(const void* from, int type, int64_t at) {
   switch (static_cast<TableType>(type)) {
     case TableType::float32:
@@ -129,10 +132,10 @@ __device__ __forceinline__ void store_number(void* to, int type, int64_t at, flo
   }
 }
 
-// Of an input, what a row of the caller's has.
+// One row of an input, in the caller's order.
 struct InputRow {
   const void* data;
-  int64_t at, apart;  // the first column, and from one to the next
+  int64_t at, apart;  // offset of the first column, and stride of columns
   int type;
   __device__ __forceinline__ float column(int i) const {
     return data == nullptr ? 0.0f : load_number(data, type, at + i * apart);
@@ -150,12 +153,13 @@ __device__ __forceinline__ InputRow input_row(const CudaProgram& call, int input
   return {data, turned ? row : row * width, turned ? rows : 1, call.input_types[input]};
 }
 
-// Of a value as 16-bit numbers: words of a row that are 0 behind its columns, and from row to row.
+// The layout of a value as 16-bit numbers: pair_words is the words of a row, padded with 0; pair_stride is the words
+// from one row to the next.
 VN_HD constexpr int padded(int width, int to) { return ceil_div(width, to) * to; }
 VN_HD constexpr int pair_words(int width) { return padded(width, 2 * kGranule) / 2; }
 VN_HD constexpr int pair_stride(int width) { return pair_words(width) + kProgramSkew; }
 
-// Columns of a value or of a cell's vector.
+// Columns of a value or of a cell's parameter vector.
 struct Rows {
   const float* data;
   int stride;
@@ -163,7 +167,7 @@ struct Rows {
   __device__ __forceinline__ float at(int row, int column) const { return data[row * stride + (spread ? 0 : column)]; }
 };
 
-// What a step makes: floats in a slot, 16-bit numbers in another one, or both.
+// The destination of a step's result: floats in a slot, 16-bit numbers in another slot, or both.
 template <bool kBfloat16>
 struct Target {
   float* floats;
@@ -179,23 +183,23 @@ struct Target {
   }
 };
 
-// What products of a kernel multiply.
+// The type of values that a kernel's products read.
 enum class ProgramNumbers { floats, bfloat16, float16 };
 
-// The rows of a cell that a block has in hand, and which of them are the own ones of a warp's team. Each warp has a
-// copy in shared memory: in registers these numbers would take the place of sums.
+// The current tile of a block, and the rows of a warp's team in it. Each warp has a copy in shared memory: registers
+// are needed for sums.
 struct TileState {
-  const float* weights;  // what is packed for the cell
-  int64_t partial;       // where the task's partial is
+  const float* weights;  // packed parameters of the cell
+  int64_t partial;       // offset of the task's partial
   int32_t cell, begin;   // begin: the team's first row
-  int32_t rows, all;     // that have a sample, of the team and of the block
-  int32_t left;          // rows of the task from this tile on
+  int32_t rows, all;     // rows with a sample, of the team and of the block
+  int32_t left;          // remaining rows of the task, including this tile
   int32_t fill;          // 1 in the first tile of a task
 };
-constexpr int kProgramStates = 512;  // bytes of them, before the slots
+constexpr int kProgramStates = 512;  // bytes of all states, before the slots
 
-// A value is [kRows][stride] at its slot for each team, rows without a sample included, which hold anything; as 16-bit
-// numbers they are 0. kShared: the slots are the block's shared memory.
+// Each team has a value as [kRows][stride] at its slot. Rows without a sample are undefined as floats, and 0 as 16-bit
+// numbers. kShared: the slots are in the block's shared memory.
 template <int kOwnRows, int kWarps, bool kShared, ProgramNumbers kNumbers>
 struct ProgramTile {
   static constexpr int kRows = kOwnRows, kTeam = kWarps, kWorkers = 32 * kTeam;
@@ -213,22 +217,22 @@ struct ProgramTile {
   __device__ __forceinline__ int begin() const { return state().begin; }
   __device__ __forceinline__ bool fill() const { return state().fill != 0; }
   __device__ __forceinline__ float* partial() const { return call.partials + state().partial; }
-  // Floats from the values of a team to those of the next one.
+  // Returns the floats from the slots of a team to the slots of the next team.
   __device__ __forceinline__ int pitch() const { return call.code.columns * kRows; }
 
-  // A thread's number in its team, and a warp's.
+  // worker returns the index of a thread in its team, warp the index of a warp.
   static __device__ __forceinline__ int worker() { return static_cast<int>(thread_again() % kWorkers); }
   static __device__ __forceinline__ int warp() { return worker() / 32; }
-  // What the team has written is there for all of it.
+  // Makes the writes of a team visible to all its threads.
   static __device__ __forceinline__ void sync() {
     if constexpr (kTeam == 1) {
       __syncwarp();
     } else {
-      __syncthreads();  // teams keep in step
+      __syncthreads();  // all teams run the same steps
     }
   }
 
-  // Of the team; of the block's first one.
+  // slot returns a slot of the thread's team, first_slot of the block's first team.
   __device__ __forceinline__ float* slot(int32_t columns) const {
     return first_slot(columns) + static_cast<int>(thread_again() / kWorkers) * pitch();
   }
@@ -241,7 +245,7 @@ struct ProgramTile {
       return call.spilled + int64_t{blockIdx.x} * call.code.columns * height + columns * kRows;
     }
   }
-  // Parameters but tables are float32.
+  // Returns a float32 parameter. Only tables may have other types.
   __device__ __forceinline__ const float* parameter(const ProgramPack& pack) const {
     return static_cast<const float*>(call.parameters[pack.parameter]) + cell() * call.strides[pack.parameter] +
            pack.start;
@@ -271,8 +275,8 @@ struct ProgramTile {
 
 __device__ __forceinline__ int lane_again() { return static_cast<int>(thread_again() % 32); }
 
-// visit(row, column) for all entries, by a team: neighbours go along a row as far as it is long, and a thread goes down
-// a column, so that what depends on the column alone is computed once.
+// Calls visit(row, column) for all entries, distributed over a team. Neighbouring threads have neighbouring columns,
+// and a thread iterates over the rows of a column, so that terms of the column are computed once.
 template <typename Tile, typename Visit>
 __device__ __forceinline__ void for_each_entry(int rows, int width, const Visit& visit) {
   const int shift = width > 16 ? 5 : width > 1 ? 32 - __clz(width - 1) : 0;
@@ -282,8 +286,8 @@ __device__ __forceinline__ void for_each_entry(int rows, int width, const Visit&
   }
 }
 
-// partial[j] += sum over the block's rows of a value's column. Four lanes share a column, two neighbouring rows at a
-// time.
+// Computes partial[j] += the sum of column j over the block's rows. Four lanes share a column and add two neighbouring
+// rows at a time.
 template <typename Tile>
 __device__ __forceinline__ void sum_columns(const Tile& tile, const CudaStep& step) {
   const float* const values = tile.first_slot(step.x.slot) + step.x.start;
@@ -307,24 +311,25 @@ __device__ __forceinline__ void sum_columns(const Tile& tile, const CudaStep& st
   }
 }
 
-// Of 16-bit numbers what no sample has: rows and columns behind the last.
+// Clears the padding rows and columns of a value as 16-bit numbers.
 template <typename Tile>
 __device__ __forceinline__ void clear_rest(const Tile& tile, const CudaStep& step) {
   const auto to = tile.target(step);
   auto* const words = reinterpret_cast<uint32_t*>(to.halves);
-  const int width = step.width, stride = to.halves_stride / 2, behind = (width + 1) / 2, last = pair_words(width);
+  const int width = step.width, stride = to.halves_stride / 2, first_padding = (width + 1) / 2,
+            last = pair_words(width);
   const int row = Tile::worker(), rows = tile.rows();
   if (width % 2 != 0 && row < rows) to.put_half(row, width, 0.0f);
-  if (behind < last) {
-    for_each_entry<Tile>(tile.rows(), last - behind,
-                         [&](int row, int word) { words[row * stride + behind + word] = 0; });
+  if (first_padding < last) {
+    for_each_entry<Tile>(tile.rows(), last - first_padding,
+                         [&](int row, int word) { words[row * stride + first_padding + word] = 0; });
   }
   if (rows < Tile::kRows) {
     for_each_entry<Tile>(Tile::kRows - rows, last, [&](int row, int word) { words[(rows + row) * stride + word] = 0; });
   }
 }
 
-// Inputs and outputs. The rows of a tile are looked for once, by a thread each, if there are few columns.
+// Inputs and outputs with at most this many columns have one thread per row, which resolves the row's index once.
 constexpr int kFewColumns = 8;
 
 template <typename Tile>

@@ -1,5 +1,5 @@
-// What the functions of programs (network/functions.h) and the formulas of encodings (encoding/encodings.h) are made
-// of, for one float of a thread.
+// The scalar functions of which network/functions.h builds the functions of programs, and encoding/encodings.h the
+// formulas of encodings. F32 is one float per thread.
 #pragma once
 
 #include <cmath>

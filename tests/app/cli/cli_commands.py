@@ -1,4 +1,4 @@
-"""Commands as lists of words, and options of a run of a few steps."""
+"""Splits commands into lists of words, and defines the options of a run of a few steps."""
 
 import sys
 from pathlib import Path
@@ -12,5 +12,5 @@ TINY = (
 
 
 def words(*parts):
-    """A command: text is split at its spaces, other things are one word each."""
+    """Returns a command as a list of words: strings are split at their spaces, other objects become one word each."""
     return [word for part in parts for word in (part.split() if isinstance(part, str) else [str(part)])]

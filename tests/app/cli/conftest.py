@@ -6,7 +6,7 @@ from voronerf.app.cli import main
 
 @pytest.fixture(autouse=True, scope="session")
 def own_cache(tmp_path_factory):
-    """No test leaves the paths that it names to others, or to the user."""
+    """Gives the tests a cache folder of their own, so that no path of a test enters the user's cache."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("VORONERF_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -14,7 +14,7 @@ def own_cache(tmp_path_factory):
 
 @pytest.fixture
 def fails(capsys):
-    """Fails unless the command prints a single line that contains the message, and has an exit status."""
+    """Returns a check that a command exits with an error status and one line that contains the message."""
 
     def check(message, *parts):
         capsys.readouterr()

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: commands, files, and one line for everything that can go wrong."""
+"""Tests of the command line from outside: commands, files, and one-line error messages."""
 
 import json
 import os
@@ -65,8 +65,8 @@ def test_eval_scores_every_view(run, capsys, fails):
 @pytest.mark.parametrize("options", ["--samples 4", "--occupancy"])
 def test_pictures_and_videos(run, tmp_path, options):
     scores = []
-    for given in ("", options):
-        succeeds("eval", run, "--views 1 --panels 1", given)
+    for extra in ("", options):
+        succeeds("eval", run, "--views 1 --panels 1", extra)
         scores.append(read_json(run / "eval.json")["psnr"])
     assert scores[0] != scores[1] or options == "--occupancy"
     path = tmp_path / "turn.mp4"
@@ -126,7 +126,7 @@ def test_exports_of_a_run(run, tmp_path, capsys, fails, monkeypatch):
     pytest.importorskip("skimage", reason="scikit-image is not installed")
     pytest.importorskip("fast_simplification", reason="fast-simplification is not installed")
     files = [tmp_path / name for name in ("mesh.glb", "cells.glb")]
-    monkeypatch.setattr(space, "SOLID", 0.01)  # of a run of a few steps
+    monkeypatch.setattr(space, "SOLID", 0.01)  # since a run of a few steps has low densities
     succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--resolution 8 --faces 50")
     assert all(file.stat().st_size for file in files)
     output = capsys.readouterr().out
@@ -145,7 +145,7 @@ def test_info_names_every_backend(capsys):
     output = capsys.readouterr().out
     for word in ("torch", "native", "warp", "extra export", "voronerf info --ops"):
         assert word in output
-    assert "nearest_centre" not in output and len(output.splitlines()) <= 40  # a screen
+    assert "nearest_centre" not in output and len(output.splitlines()) <= 40  # fits on a screen
     succeeds("info --ops")
     output = capsys.readouterr().out
     for word in ("reference", "native", "warp", "nearest_centre", "grouped_mlp", "resample"):
@@ -155,21 +155,21 @@ def test_info_names_every_backend(capsys):
 def test_resume_needs_no_setting_again(run, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
-    # Twice longer, then from a number of steps to a time, and back.
-    for given, steps, budget in (
+    # Longer twice, then from a number of steps to a time budget, and back.
+    for options, steps, budget in (
         (f"--out {copy} --steps 20", 20, None),
         (f"--out={copy} --steps 22", 22, None),
         (f"--out={copy} --budget=0.001", None, 0.001),
         (f"--out={copy} --steps 24", 24, None),
     ):
-        succeeds("train --resume", given)
+        succeeds("train --resume", options)
         config = read_json(copy / "config.json")
         assert (config["steps"], config["budget"], config["width"]) == (steps, budget, 8)
         assert steps is None or read_json(copy / "summary.json")["steps"] == steps
 
 
 def test_defaults_follow_the_speed_of_the_machine_that_began(tmp_path, monkeypatch):
-    """They stay when a machine of another speed goes on."""
+    """Defaults stay when a machine of another speed resumes the run."""
     out, tiny = tmp_path / "run", TINY.replace("--steps 16", "").replace("--samples 8", "").replace("--depth 2", "")
     monkeypatch.setattr("voronerf.app.cli.train.machine_speed", lambda: 1024.0)
     succeeds("train --data builtin --budget 0.2 --out", out, tiny)
@@ -183,7 +183,7 @@ def test_defaults_follow_the_speed_of_the_machine_that_began(tmp_path, monkeypat
 
 
 def test_a_stopped_run_goes_on_with_the_command_that_it_prints(tmp_path, monkeypatch, capsys, fails):
-    """Its scene lies neither in the run nor in the working directory, and the command does not name it."""
+    """The run resumes although its scene is in another folder, which the command does not name."""
     data, out, elsewhere = tmp_path / "a scene", tmp_path / "a run", tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
@@ -226,7 +226,7 @@ def test_demo_shows_a_run_and_writes_over_none(tmp_path, capsys, monkeypatch, fa
     for picture in ("turn.png", "placed.png"):
         with Image.open(run / picture) as image:
             assert image.width >= 16
-    # the command that it prints makes the same run of the same cells
+    # The printed command makes the same run of the same cells.
     (said,) = re.findall("voronerf (place .*), without", output)
     assert main([*shlex.split(said), "--out", "again"]) == 0
     files = [sorted((folder / "checkpoints").iterdir())[-1] for folder in (run / "placed", tmp_path / "again")]
@@ -247,7 +247,7 @@ def test_an_interrupted_demo_says_where_its_run_is(tmp_path, capsys, monkeypatch
     monkeypatch.setattr("voronerf.app.cli.demo.show", interrupt)
     assert main(words("demo --budget 0.1 --out", tmp_path / "run")) == status
     said = capsys.readouterr()
-    assert said.err == "" and "psnr" in said.out  # lines of the training, as nothing here is a terminal
+    assert said.err == "" and "psnr" in said.out  # training lines, since stdout is no terminal
     (command,) = re.findall("stopped; the trained run is in .*: voronerf (.*) makes a video of it\n$", said.out)
     assert main([*shlex.split(command), "--frames", "1"]) == 0 and (tmp_path / "run" / "video.mp4").is_file()
 
@@ -340,14 +340,14 @@ def no_memory_to_import() -> int:
 def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails):
     monkeypatch.chdir(tmp_path)
     train = f"train --data builtin --device cpu {TINY}"
-    for message, given in (
+    for message, options in (
         ("--width 65536 with 3 cells needs", "--width 65536 --depth 1000"),
         ("--parameters 1000000000000 needs", f"--field kilonerf --parameters {10**12}"),
         ("--rays 1000000000 with 8 samples needs", "--rays 1000000000"),
         ("--rays 64 with 1000000000 samples needs", "--samples 1000000000"),
         ("samples needs 1180591620717411303424.0 GiB of memory or more", f"--samples {10**400}"),
     ):
-        fails(message, train, given)
+        fails(message, train, options)
     monkeypatch.setattr(sys.modules["voronerf.app.train.build"], "SAMPLE_BYTES", 0)
     fails("count must be at most 134217728, got 8000000000000", train, "--rays 8000000000000")
     monkeypatch.setitem(COMMANDS, "info", no_memory_to_import)
@@ -371,7 +371,7 @@ def test_image_names_that_are_too_long_for_panels(tmp_path, monkeypatch, fails):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_signals_leave_a_usable_checkpoint(tmp_path, monkeypatch, capsys):
-    """SIGTERM in a process of its own, the others in this one."""
+    """A run stopped by a signal can be resumed. SIGTERM goes to a child process, the other signals to this one."""
     last, steps = tmp_path / "checkpoints" / "last.safetensors", [0]
 
     def leaves_a_checkpoint(status, output):
@@ -393,7 +393,7 @@ def test_signals_leave_a_usable_checkpoint(tmp_path, monkeypatch, capsys):
 
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
         monkeypatch.setattr(TrainingDisplay, "after_step", lambda *_, number=number: signal.raise_signal(number))
-        before = signal.signal(number, signal.SIG_DFL)  # nohup, and the background of a shell, ignore some
+        before = signal.signal(number, signal.SIG_DFL)  # nohup and background jobs ignore some signals
         try:
             leaves_a_checkpoint(main(words("train --resume --out", tmp_path)), "".join(capsys.readouterr()))
         finally:
@@ -409,7 +409,7 @@ def test_a_second_signal_ends_at_once(tmp_path, monkeypatch, capsys):
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(TrainingDisplay, "after_step", interrupt)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests without it
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have disabled it
     try:
         assert main(words("train --data builtin --out", tmp_path, TINY)) == 130
     finally:

@@ -10,7 +10,7 @@ from voronerf.app.train.callbacks import counted
 
 
 def test_the_loss_is_that_of_the_steps_whose_loss_was_read():
-    """On a GPU the first losses are not known, and a resumed run begins at a later step."""
+    """The average starts at the first known loss: on a GPU early losses are NaN, and a run may resume late."""
     display = TrainingDisplay("run")
     router = SimpleNamespace(num_cells=1)
     for step, loss in ((51, math.nan), (52, math.nan), (53, 0.4), (54, 0.2)):
@@ -28,7 +28,7 @@ def test_what_goes_on_beside_a_training_has_a_bar_with_its_name():
     assert shown == [(5, "scores", "0 of 2"), (6, "scores", "1 of 2")]
     parts = display.track([5, 6], "scores")
     next(iter(parts))
-    parts.close()  # as where a training is stopped
+    parts.close()  # as a stopped training does
     assert [task.description for task in display.progress.tasks] == ["run"]
 
 
@@ -54,7 +54,7 @@ def test_stages_of_a_process_fit_80_columns_and_say_the_time_left(monkeypatch):
     display, now = StageDisplay(), [0.0]
     display.progress.get_time = lambda: now[0]
     display.show("features", 0, 500)
-    now[0] = 40.0  # of two parts of four large images
+    now[0] = 40.0  # after two batches of four large images
     display.show("features", 8, 500)
 
     def shown():
@@ -84,7 +84,7 @@ def test_without_a_terminal_lines_tell_how_far_it_is(monkeypatch, capsys):
     ]
     with busy("reading x"):
         for thread in threading.enumerate():
-            if isinstance(thread, threading.Timer):  # which says it, and has gone where it is done
+            if isinstance(thread, threading.Timer):  # the timer that prints the message
                 thread.join()
     assert capsys.readouterr().out == "reading x\n"
     monkeypatch.setattr("voronerf.app.cli.display.EVERY", 1000.0)

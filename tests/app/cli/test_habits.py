@@ -1,4 +1,4 @@
-"""Comparisons of runs, TensorBoard, extras, and what is said to one who says nothing."""
+"""Tests of `voronerf compare`, TensorBoard output, optional packages, and a command without arguments."""
 
 import json
 import re
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def make_run(folder, psnr, cells, *, ended=True):
-    """A run as far as its files tell; a line of metrics for one that has not ended."""
+    """Writes the files of a run and returns its folder; an unfinished run has no summary.json."""
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps({"cells": cells, "width": 32, "out": str(folder)}))
     scores = {"psnr": psnr, "ssim": 0.9, "lpips": None, "steps": 1200, "seconds": 60.0}
@@ -68,7 +68,7 @@ def test_a_joined_run_shows_what_is_known(tmp_path, capsys):
 
     figures, shown = rows()
     count = json.loads((one / "summary.json").read_text())["parameters"]
-    assert figures["cells"] == ["3", "6"] and figures["parameters"] == [f"{count:,}"] * 2  # one network, twice in place
+    assert figures["cells"] == ["3", "6"] and figures["parameters"] == [f"{count:,}"] * 2  # one network, placed twice
     assert figures["PSNR [dB]"][1] == figures["scores of"][1] == figures["training [s]"][1] == "-"
     assert f"{joined} has no scores: voronerf eval '{joined}' makes them" in shown and f"{one} has" not in shown
     assert main(words("eval --views 3 --panels 0", joined)) == 0
@@ -87,7 +87,7 @@ def test_what_is_not_compared(tmp_path, fails):
 
 
 def scalars(folder):
-    """Names of the scalars of an event file: records of a length, a checksum, a message and a checksum."""
+    """Returns the names of the scalars in an event file, whose records are length, checksum, message, checksum."""
     (file,) = folder.iterdir()
     data, at, names = file.read_bytes(), 0, []
     while at < len(data):
@@ -101,11 +101,11 @@ def test_tensorboard(tmp_path, fails, monkeypatch):
     pytest.importorskip("tensorboard", reason="tensorboard is not installed")
     pytest.importorskip("torch.utils.tensorboard", reason="tensorboard is not complete")
     assert main(words("train --tensorboard --out", tmp_path / "run", TINY)) == 0
-    found = scalars(tmp_path / "run" / "tensorboard")
-    assert found.count("train/loss") == found.count("train/cells") == 1  # after 16 steps
-    assert found.count("test/psnr") == found.count("test/ssim") == 2 and "test/lpips" not in found
+    names = scalars(tmp_path / "run" / "tensorboard")
+    assert names.count("train/loss") == names.count("train/cells") == 1  # after 16 steps
+    assert names.count("test/psnr") == names.count("test/ssim") == 2 and "test/lpips" not in names
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    monkeypatch.setattr("voronerf.app.cli.train.load_scene", None)  # data is read after it
+    monkeypatch.setattr("voronerf.app.cli.train.load_scene", None)  # the package is checked before data is read
     fails("needs tensorboard: pip install 'voronerf[tensorboard]'", "train --tensorboard --out", tmp_path / "x", TINY)
     assert not (tmp_path / "x").exists()
 
@@ -145,6 +145,6 @@ def test_info_lists_the_extras(capsys, monkeypatch):
 def test_what_the_demo_installs_is_what_the_package_needs():
     project = (ROOT / "pyproject.toml").read_text()
     lists = (re.search(rf"\n{name} = \[(.*?)\]", project, re.DOTALL)[1] for name in ("requires", "dependencies"))
-    needed = {name for found in lists for name in re.findall(r'"([a-z0-9-]+)', found)}
+    needed = {name for text in lists for name in re.findall(r'"([a-z0-9-]+)', text)}
     pinned = set(re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.txt").read_text(), re.MULTILINE))
     assert pinned == needed | {"wheel"}

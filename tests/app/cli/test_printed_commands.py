@@ -1,7 +1,7 @@
-"""Every command that a page, a help or a message prints: each is parsed, and those of `voronerf` run on a small run.
+"""Parses every command that a page, a help or a message prints, and runs the `voronerf` commands on a small run.
 
 Commands are read from the pages' code blocks and inline code, and from the strings of the program. Words in capitals
-stand for what a reader puts there. Only what installs, builds or measures is not run, and is looked up instead.
+are placeholders. Commands that install, build or measure are not run: the tests check that their targets exist.
 """
 
 import ast
@@ -26,13 +26,13 @@ from voronerf.app.train.config import ConfigError
 from voronerf.nerf import orbit_cameras
 
 ROOT = Path(__file__).resolve().parents[3]
-#: But the changelog, which names commands that are no more.
+#: All pages except the changelog, which names removed commands.
 PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "SECURITY")), *(ROOT / "docs").rglob("*.md")]
-#: What a command of a page begins with.
+#: The first words of commands in pages.
 PROGRAMS = ("voronerf", "torchrun", "python", "make", "pip", "ns-train", "tensorboard")
-#: Programs that are not this project's.
+#: Programs of other projects.
 FOREIGN = ("tensorboard", "ns-train")
-#: Values that make a command short; an option that is not there is added for these commands.
+#: Option values that make a command short.
 SHORT = {"--budget": "0.1", "--frames": "2", "--resolution": "8", "--count": "20"}
 ADDED = {
     "train": ("--budget",),
@@ -40,7 +40,7 @@ ADDED = {
     "render": ("--frames",),
     "export": ("--resolution", "--count"),
 }
-#: What stands for what a page leaves to the reader, and for scenes that are large.
+#: Replacements of placeholders and of large scenes.
 STAND_INS = {
     "DIR": "scene",
     "DATA": "scene",
@@ -51,12 +51,12 @@ STAND_INS = {
     "FILE": "path.json",
     "FILE.json": "path.json",
 }
-#: Commands whose own tests run them.
+#: Commands that other tests run, with the files of these tests.
 ELSEWHERE = {"process": "tests/app/scenes/test_process.py", "demo": "tests/app/cli"}
 
 
 def of_page(path):
-    """Commands of a page, in order: lines of code, and what stands between backquotes."""
+    """Yields the commands of a page in order, from lines of code and from inline code."""
     prose, fence = "", None
     for line in [*re.sub(r"\\\n *", "", path.read_text()).splitlines(), ""]:
         if line.startswith("```"):
@@ -66,14 +66,14 @@ def of_page(path):
             continue
         inline, prose = re.findall("`([^`]+)`", prose), ""
         code = [line.strip()] if fence in (None, "bash") else []
-        for found in inline + code:
-            command = " ".join(re.split(" +# ", found)[0].split())
+        for text in inline + code:
+            command = " ".join(re.split(" +# ", text)[0].split())
             if command.split(" ")[0] in PROGRAMS:
                 yield command
 
 
 def of_strings(path):
-    """Commands in the strings of a module, with the name of what a message fills in in capitals."""
+    """Yields the commands in the strings of a module; fields of f-strings become their names in capitals."""
     tree = ast.parse(path.read_text())
     parts = {id(value) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for value in node.values}
     for node in ast.walk(tree):
@@ -100,7 +100,7 @@ EVERY = sorted({command for found in (*COLLECTED.values(), MESSAGES) for command
 
 
 def given(command):
-    """The words of a command of voronerf; None for another program."""
+    """Returns the arguments of a `voronerf` command as a list of words, or None for another program."""
     parts = shlex.split(command.replace("...", ""), comments=True)
     if parts[0] == "torchrun":
         parts = parts[parts.index("voronerf") :] if "voronerf" in parts else None
@@ -114,18 +114,18 @@ def test_there_are_commands_to_look_at():
 
 @pytest.mark.parametrize("command", EVERY)
 def test_a_printed_command_is_one(command, capsys):
-    found, (program, *rest) = given(command), shlex.split(command)
-    if found is not None:
-        (name, *others) = found or ["--help"]
+    arguments, (program, *rest) = given(command), shlex.split(command)
+    if arguments is not None:
+        (name, *others) = arguments or ["--help"]
         assert name in COMMANDS or name.startswith("--"), f"voronerf has no command {name}"
         if "--help" in others:
             others = []
         numbers = [re.sub("^(FLOAT|SECONDS|N|X)$", "1", word) for word in others]
         wants_run = name in COMMANDS and name not in ("train", "train-territories", "demo", "info")
-        if name in COMMANDS and (numbers or not wants_run):  # the name alone stands for the command
+        if name in COMMANDS and (numbers or not wants_run):  # a bare name only mentions the command
             try:
                 parse(name, COMMANDS[name], numbers)
-            except ConfigError as error:  # of a message that names an option
+            except ConfigError as error:  # a message may name an option without its value
                 assert command in MESSAGES and re.search(r" needs (a|\d+) value", str(error)), error
     elif program == "make":
         assert re.search(rf"^(?!.PHONY)([a-z-]+ )*{rest[0]}\b.*:", (ROOT / "Makefile").read_text(), re.MULTILINE)
@@ -144,7 +144,7 @@ def test_a_printed_command_is_one(command, capsys):
 
 @pytest.fixture(scope="module")
 def small_run(tmp_path_factory):
-    """A folder with a scene, a run of it and a camera path."""
+    """A folder with a scene, a trained run and a camera path."""
     folder = tmp_path_factory.mktemp("small")
     write_blender(folder / "scene", builtin_scene(32, train_views=6, test_views=2), 0.7)
     with pytest.MonkeyPatch.context() as patched:
@@ -156,7 +156,7 @@ def small_run(tmp_path_factory):
 
 
 def shortened(name, parts):
-    """A command with small values, and what its page leaves to the reader."""
+    """Returns a command with small option values and with its placeholders filled in."""
     parts = [STAND_INS.get(word, SHORT.get(before, word)) for before, word in zip(["", *parts], parts)]
     if "--help" in parts:
         return parts
@@ -170,10 +170,10 @@ def shortened(name, parts):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [*(page for page, found in COLLECTED.items() if any(map(given, found))), "messages"])
 def test_printed_commands_run(page, small_run, tmp_path, monkeypatch, capsys):
-    """Those of a page in their order, in one folder; what none of them has made is a copy of the small run."""
+    """The commands of a page run in order in one folder, which starts as a copy of the small run's folder."""
     pytest.importorskip("trimesh", reason="trimesh is not installed")
     viser = pytest.importorskip("voronerf.app.viewer", reason="viser is not installed")
-    monkeypatch.setattr(viser.Viewer, "serve", lambda viewer: None)  # until Ctrl-C
+    monkeypatch.setattr(viser.Viewer, "serve", lambda viewer: None)  # it would serve until Ctrl-C
     monkeypatch.chdir(tmp_path)
     shutil.copytree(small_run, tmp_path, dirs_exist_ok=True)
     for number, command in enumerate(MESSAGES if page == "messages" else COLLECTED[page]):
@@ -183,19 +183,19 @@ def test_printed_commands_run(page, small_run, tmp_path, monkeypatch, capsys):
         if "cuda" in parts and not torch.cuda.is_available():
             continue
         parts = shortened(name, parts)
-        made = next((after for word, after in itertools.pairwise(parts) if word == "--out"), None)
-        if made is not None and "--resume" not in parts:
-            shutil.rmtree(made, ignore_errors=True)
-        if made is None and name == "train":
+        out = next((after for word, after in itertools.pairwise(parts) if word == "--out"), None)
+        if out is not None and "--resume" not in parts:
+            shutil.rmtree(out, ignore_errors=True)
+        if out is None and name == "train":
             parts += ["--out", f"unnamed-{number}"]
         for word in parts:
-            is_input = re.fullmatch("(runs|scenes)/[a-z]+", word) and (word != made or "--resume" in parts)
+            is_input = re.fullmatch("(runs|scenes)/[a-z]+", word) and (word != out or "--resume" in parts)
             if is_input and not Path(word).exists():
                 shutil.copytree("scene" if word.startswith("scenes") else "run", word)
         capsys.readouterr()
         try:
             status = main([name, *parts])
-        except SystemExit as stop:  # of --help
+        except SystemExit as stop:  # --help exits
             status = stop.code
         said = capsys.readouterr().err
         assert status == 0 or (command in MESSAGES and re.search(r" needs (a|\d+) value", said)), f"{command}: {said}"

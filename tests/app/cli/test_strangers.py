@@ -1,4 +1,4 @@
-"""Runs that a stranger made: nothing in them takes memory or time, or leads outside, before it is refused."""
+"""Tests of untrusted runs: a run is refused before it costs memory or time, or leads to files outside its folder."""
 
 import json
 import os
@@ -24,7 +24,7 @@ def trained(tmp_path_factory):
 
 @pytest.fixture
 def copied(trained, tmp_path):
-    """A run that a test may change."""
+    """A copy of a run, which a test may change."""
     shutil.copytree(trained, tmp_path / "run")
     return tmp_path / "run"
 
@@ -77,8 +77,8 @@ def test_paths_in_the_settings_of_a_run(copied, tmp_path, fails, monkeypatch, op
         save_checkpoint(path, checkpoint)
         for command in ("eval --views 1", "train --resume --steps 18 --out"):
             fails(f"--{option} must be given", command, copied)
-    given = {"data": "--data builtin", "lpips": "--lpips off"}[option]
-    assert main(words("eval --views 1", copied, given)) == 0
+    arguments = {"data": "--data builtin", "lpips": "--lpips off"}[option]
+    assert main(words("eval --views 1", copied, arguments)) == 0
     settings(**{option: str(outside)})(copied, checkpoint)
     save_checkpoint(path, checkpoint)
     monkeypatch.chdir(tmp_path)
@@ -93,7 +93,7 @@ def test_settings_that_a_terminal_would_obey(copied, fails):
 
 
 def settings(**changes):
-    """Other settings, in the checkpoint as in config.json."""
+    """Returns a function that changes settings in the checkpoint and in config.json."""
 
     def change(run, checkpoint):
         checkpoint.values["config"].update(changes)
@@ -113,7 +113,7 @@ def flat_average(run, checkpoint):
     checkpoint.tensors["optimizer.0.average"] = checkpoint.tensors["optimizer.0.average"].flatten()
 
 
-#: Changes of a run, and what is said of it.
+#: Changes of a run, and the messages that refuse it.
 OVERSIZED = {
     "width": (
         settings(width=18_000),
@@ -151,4 +151,4 @@ def test_shapes_are_compared_before_memory_is_taken(trained, tmp_path):
     assert memory < 500_000 and seconds < 20
     for (name, (_, message)), said in zip(OVERSIZED.items(), zip(lines[::2], lines[1::2]), strict=True):
         assert message in said[0] and f"/{name}/" in said[0]
-        assert message in said[1] or "needs" in said[1]  # more than the machine has
+        assert message in said[1] or "needs" in said[1]  # more memory than the machine has

@@ -1,4 +1,4 @@
-"""What is typed wrong: one plain line, with what was meant; help by groups; and the few words that are no command."""
+"""Tests of mistyped commands (one line with a suggestion), grouped help, and the words that are no command."""
 
 import os
 import re
@@ -136,7 +136,7 @@ def test_wrong_words_are_one_line(fails, command, said):
 def test_a_command_that_was_meant_is_told_whole(fails, command, meant):
     fails(f"; did you mean voronerf {meant}?", *map(Path, shlex.split(command)))
     name, *rest = shlex.split(meant)
-    assert callable(parse(name, COMMANDS[name], rest))  # and it is one
+    assert callable(parse(name, COMMANDS[name], rest))  # the suggestion is a valid command
 
 
 @pytest.mark.parametrize(
@@ -189,15 +189,15 @@ def test_a_box_is_one_line_on_every_terminal(fails, monkeypatch, width):
 def test_the_version_and_the_list_of_commands(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"voronerf {__version__}\n"
-    for given in ([], ["--help"], ["-h"]):
-        assert main(given) == 0
+    for arguments in ([], ["--help"], ["-h"]):
+        assert main(arguments) == 0
         lines = capsys.readouterr().out.splitlines()
         assert [line.split()[0] for line in lines if re.match("  [a-z]", line)] == list(COMMANDS)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_is_whole(capsys, monkeypatch, command):
-    """Every option with its text, no default of None, and no line that breaks where the code does."""
+    """The help describes every option, shows no default of None, and has no line breaks of the source code."""
     monkeypatch.setenv("COLUMNS", "10000")
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
@@ -218,7 +218,7 @@ def test_none_stands_for_the_default(tmp_path):
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_ctrl_c_while_the_program_is_loaded_leaves_no_traceback():
     code = (
-        "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "  # it may be ignored here
+        "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "  # the parent may ignore it
         "sys.argv = ['voronerf', '--version']; from voronerf.app.cli import _prepare, main; {}"
     )
     stop = "_prepare(); os.kill(os.getpid(), signal.SIGINT)"
@@ -239,8 +239,8 @@ def test_ctrl_c_while_the_program_is_loaded_leaves_no_traceback():
 def test_a_closed_pipe_ends_a_command_quietly(command, status, buffered):
     reading, writing = os.pipe()
     os.close(reading)
-    given = {"stdout": writing, "stderr": subprocess.PIPE, "env": {**os.environ, "PYTHONUNBUFFERED": buffered}}
-    done = subprocess.run([sys.executable, "-m", "voronerf", *command.split()], text=True, **given)
+    options = {"stdout": writing, "stderr": subprocess.PIPE, "env": {**os.environ, "PYTHONUNBUFFERED": buffered}}
+    done = subprocess.run([sys.executable, "-m", "voronerf", *command.split()], text=True, **options)
     os.close(writing)
     said = "voronerf: error: there is no command xyzzy; see voronerf --help\n"
     assert (done.returncode, done.stderr) == (status, said if status == 1 else "")

@@ -1,9 +1,9 @@
-"""Pairs of pictures computed from formulas, and what other programs say of them.
+"""Pairs of images computed from formulas, and their scores by other programs.
 
-The figures were made once, by scikit-image 0.26.0 (PSNR; SSIM with a Gaussian window, sigma 1.5, population covariance,
-data range 1), the lpips package 0.1.4 (net "alex", version 0.1, in float64) and torchmetrics 1.9.0, on torch 2.13.0.
-torchmetrics agrees: PSNR to 2e-6 dB (it divides in float32), SSIM to 1e-15 where the border that it adds by reflection
-is left out of its map (its own mean takes the border in: 0.9032 for 100 x 100), LPIPS to the last bit of float32.
+PSNR and SSIM are by scikit-image 0.26.0 (Gaussian window, sigma 1.5, population covariance, data range 1). LPIPS is by
+the lpips package 0.1.4 (net "alex", version 0.1, in float64) on torch 2.13.0. torchmetrics 1.9.0 agrees: PSNR to
+2e-6 dB (it divides in float32), LPIPS to the last bit of float32. Its SSIM agrees to 1e-15 without the border, which it
+pads by reflection; its own mean includes the border and is 0.9032 for 100 x 100.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 
 
 class Figures(NamedTuple):
-    """Scores of one pair."""
+    """The scores of one pair of images."""
 
     height: int
     width: int
@@ -30,7 +30,7 @@ FIGURES = (
 
 
 def pictures_by_formula(height, width):
-    """(image, truth), float32 [h, w, 3] in 0..1: waves and squares in a disc, on white."""
+    """Returns (image, truth), float32 [h, w, 3] in 0..1: waves and squares in a disc, on white."""
     y, x, c = np.meshgrid(np.arange(height), np.arange(width), np.arange(3), indexing="ij")
     truth = 0.5 + 0.3 * np.sin(0.31 * x + 0.7 * c) * np.cos(0.23 * y) + 0.2 * (((x // 9 + y // 7) % 2) - 0.5)
     image = truth + 0.08 * np.sin(1.7 * x + 2.3 * y + c) + 0.05 * np.cos(0.05 * x * y)

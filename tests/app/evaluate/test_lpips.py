@@ -1,4 +1,4 @@
-"""LPIPS: against patches and sums in float64, against the lpips package's figures, and everything about its weights."""
+"""Tests of LPIPS against a slow float64 version and against the lpips package, and of finding its weights."""
 
 import importlib.machinery
 import math
@@ -21,7 +21,7 @@ Weights = dict[str, torch.Tensor]
 
 @pytest.fixture(autouse=True)
 def nothing_installed(monkeypatch):
-    """A user who has no weights anywhere."""
+    """Hides all LPIPS weights of the machine."""
     monkeypatch.delenv("VORONERF_LPIPS", raising=False)
     monkeypatch.delenv("VORONERF_DATA", raising=False)
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
@@ -39,7 +39,7 @@ def weights():
 
 
 def patches(x, size, stride, padding):
-    """[c, h, w] -> [rows, columns, c, size, size], each filter's view of it copied out."""
+    """Returns the patches of an image [c, h, w] that a convolution reads, [rows, columns, c, size, size]."""
     x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
     rows, columns = ((extent - size) // stride + 1 for extent in x.shape[1:])
     views = [
@@ -50,7 +50,7 @@ def patches(x, size, stride, padding):
 
 
 def slow_lpips(image, truth, weights):
-    """Equation 1 of the paper, pixel by pixel."""
+    """Computes LPIPS by equation 1 of the paper, pixel by pixel."""
     maps = [np.moveaxis(2 * p.astype(np.float64) - 1, -1, 0) for p in (image, truth)]
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
     maps = [(p - shift[:, None, None]) / scale[:, None, None] for p in maps]
@@ -77,8 +77,8 @@ def slow_lpips(image, truth, weights):
 @pytest.mark.parametrize(("height", "width"), [(31, 31), (31, 52), (44, 35)])
 def test_against_patches_and_sums(height, width, weights):
     image, truth = pictures_by_formula(height, width)
-    found = Lpips(weights)(torch.from_numpy(image), torch.from_numpy(truth))
-    assert float(found) == pytest.approx(slow_lpips(image, truth, weights), rel=1e-5)
+    score = Lpips(weights)(torch.from_numpy(image), torch.from_numpy(truth))
+    assert float(score) == pytest.approx(slow_lpips(image, truth, weights), rel=1e-5)
     assert float(Lpips(weights)(torch.from_numpy(truth), torch.from_numpy(truth))) == 0
 
 
@@ -87,10 +87,10 @@ def test_against_patches_and_sums(height, width, weights):
 def test_against_the_lpips_package(figures):
     if not (DATA / "lpips").is_dir():
         pytest.skip(f"{DATA / 'lpips'} is not there; set VORONERF_DATA to a folder that holds lpips")
-    found, source = find_lpips(DATA / "lpips")
+    lpips, source = find_lpips(DATA / "lpips")
     assert str(DATA / "lpips") in source
     image, truth = (torch.from_numpy(p) for p in pictures_by_formula(figures.height, figures.width))
-    assert float(found(image, truth)) == pytest.approx(figures.lpips, rel=2e-5)
+    assert float(lpips(image, truth)) == pytest.approx(figures.lpips, rel=2e-5)
 
 
 def test_shapes_and_small_images(weights):
@@ -104,14 +104,14 @@ def test_shapes_and_small_images(weights):
 def test_where_weights_are_looked_for(tmp_path, weights, monkeypatch):
     scenes = tmp_path / "scenes"
     (scenes / "lego").mkdir(parents=True)
-    found, line = find_lpips(None, str(scenes / "lego"))
-    assert found is None and "--lpips FILE or set VORONERF_LPIPS" in line and "\n" not in line
+    lpips, line = find_lpips(None, str(scenes / "lego"))
+    assert lpips is None and "--lpips FILE or set VORONERF_LPIPS" in line and "\n" not in line
     (scenes / "lpips").mkdir()
     (scenes / "lpips" / "README").write_text("none yet")
     assert find_lpips(None, str(scenes / "lego"))[0] is None
     save_file(weights, scenes / "lpips" / "lpips_alex.safetensors")
-    found, line = find_lpips(None, str(scenes / "lego"))
-    assert found is not None and str(scenes / "lpips") in line
+    lpips, line = find_lpips(None, str(scenes / "lego"))
+    assert lpips is not None and str(scenes / "lpips") in line
     (scenes / "lego" / "transforms.json").touch()
     assert find_lpips(None, str(scenes / "lego" / "transforms.json"))[0] is not None
     assert find_lpips(None, "builtin")[0] is None
@@ -127,8 +127,8 @@ def test_where_weights_are_looked_for(tmp_path, weights, monkeypatch):
     file = scenes / "lpips" / "lpips_alex.safetensors"
     assert find_lpips(file)[0] is not None
     monkeypatch.setenv("VORONERF_LPIPS", str(file))
-    found, line = find_lpips(None, size=(16, 40))
-    assert found is None and "images of 16 x 40 are below AlexNet's smallest, 31 x 31" in line
+    lpips, line = find_lpips(None, size=(16, 40))
+    assert lpips is None and "images of 16 x 40 are below AlexNet's smallest, 31 x 31" in line
     rule = "--lpips must be off or come with larger images: images of 16 x 40"
     refuses(rule, find_lpips, file, size=(16, 40), error=LpipsError)
 
@@ -143,13 +143,13 @@ def test_the_installed_package(tmp_path, weights, monkeypatch):
     (hub / "checkpoints").mkdir(parents=True)
     linear = {name: weights[name] for name in SHAPES if name.startswith("lin")}
     torch.save(linear, package / "weights" / "v0.1" / "alex.pth")
-    found, line = find_lpips(None)
-    assert found is None and "alexnet-owt-7be5be79.pth" in line and "lpips.LPIPS(net='alex') once" in line
+    lpips, line = find_lpips(None)
+    assert lpips is None and "alexnet-owt-7be5be79.pth" in line and "lpips.LPIPS(net='alex') once" in line
     rest = {name: weights[name] for name in SHAPES if name.startswith("features")}
     torch.save({**rest, "classifier.1.weight": torch.zeros(2)}, hub / "checkpoints" / "alexnet-owt-7be5be79.pth")
-    found, line = find_lpips(None)
-    assert found is not None and "lpips package" in line
-    assert all(torch.equal(found.weights[name], weights[name]) for name in SHAPES)
+    lpips, line = find_lpips(None)
+    assert lpips is not None and "lpips package" in line
+    assert all(torch.equal(lpips.weights[name], weights[name]) for name in SHAPES)
 
 
 def test_names_of_the_whole_network_and_several_files(tmp_path, weights):
@@ -164,9 +164,9 @@ def test_names_of_the_whole_network_and_several_files(tmp_path, weights):
     folder.mkdir()
     torch.save({n: t for n, t in weights.items() if n.startswith("lin")}, folder / "alex.pth")
     save_file({n: t for n, t in weights.items() if n.startswith("features")}, folder / "alexnet.safetensors")
-    torch.save({"lin0.model.1.weight": torch.ones(1, 64, 1, 1)}, folder / "vgg.pth")  # of another network
-    found, _ = find_lpips(folder)
-    assert found is not None and torch.equal(found.weights["lin0.model.1.weight"], weights["lin0.model.1.weight"])
+    torch.save({"lin0.model.1.weight": torch.ones(1, 64, 1, 1)}, folder / "vgg.pth")  # weights of another network
+    lpips, _ = find_lpips(folder)
+    assert lpips is not None and torch.equal(lpips.weights["lin0.model.1.weight"], weights["lin0.model.1.weight"])
 
 
 def test_bad_files(tmp_path, weights):

@@ -1,4 +1,4 @@
-"""PSNR and SSIM against slow loops written from their definitions, scipy, and figures of other programs."""
+"""Tests of PSNR and SSIM against slow loops by their definitions, against scipy, and against other programs' scores."""
 
 import itertools
 import math
@@ -21,7 +21,7 @@ def pictures(height, width):
 
 
 def slow_ssim(image, truth, size=11):
-    """Window by window and channel by channel."""
+    """Computes SSIM in a loop over windows and channels."""
     places, half = list(itertools.product(range(size), repeat=2)), size // 2
     weights = [math.exp(-((y - half) ** 2 + (x - half) ** 2) / (2 * 1.5**2)) for y, x in places]
     weights = [weight / sum(weights) for weight in weights]
@@ -74,7 +74,7 @@ def test_shapes(score):
 
 
 def scipy_ssim(image, truth):
-    """The same by scipy's filter, which cuts a Gaussian of 1.5 off at 5 pixels too."""
+    """Computes SSIM with scipy's Gaussian filter of sigma 1.5, which is also cut off at 5 pixels."""
     scores = []
     for a, b in zip(np.moveaxis(image.astype(np.float64), -1, 0), np.moveaxis(truth.astype(np.float64), -1, 0)):
         mean_a, mean_b, aa, bb, ab = (
@@ -89,10 +89,10 @@ def scipy_ssim(image, truth):
 @pytest.mark.parametrize("figures", FIGURES, ids=lambda figures: f"{figures.height}x{figures.width}")
 def test_against_other_programs(figures):
     image, truth = pictures_by_formula(figures.height, figures.width)
-    found = [float(score(torch.from_numpy(image), torch.from_numpy(truth))) for score in (psnr, ssim)]
-    assert found[0] == pytest.approx(figures.psnr, abs=1e-9)
-    assert found[1] == pytest.approx(figures.ssim, abs=1e-12)
-    assert found[1] == pytest.approx(scipy_ssim(image, truth), abs=1e-9)
+    scores = [float(score(torch.from_numpy(image), torch.from_numpy(truth))) for score in (psnr, ssim)]
+    assert scores[0] == pytest.approx(figures.psnr, abs=1e-9)
+    assert scores[1] == pytest.approx(figures.ssim, abs=1e-12)
+    assert scores[1] == pytest.approx(scipy_ssim(image, truth), abs=1e-9)
 
 
 def test_means_and_the_psnr_of_the_mean_error():
@@ -103,6 +103,6 @@ def test_means_and_the_psnr_of_the_mean_error():
     assert means["psnr_of_mean_error"] == pytest.approx(-10 * math.log10((0.01 + 0.001) / 2))
     assert mean_scores([*scores, ViewScore("c", 25.0, 0.5)])["lpips"] is None
     assert mean_scores([ViewScore("perfect", math.inf, 1.0)])["psnr_of_mean_error"] == math.inf
-    # Scores that are no numbers are not perfect.
+    # NaN scores do not count as perfect.
     scores = [ViewScore("a", 20.0, 0.5, None), ViewScore("b", math.nan, math.nan, None)]
     assert math.isnan(mean_scores(scores)["psnr_of_mean_error"])

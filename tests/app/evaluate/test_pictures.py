@@ -1,4 +1,4 @@
-"""Panels, sheets and videos."""
+"""Tests of comparison panels, contact sheets and videos."""
 
 import sys
 from pathlib import Path
@@ -44,7 +44,7 @@ def test_cells_and_opacity():
 def test_depth_and_error():
     depth = torch.linspace(2, 4, 50).reshape(5, 10)
     picture = panels.picture_of_depth(depth, torch.ones(5, 10))
-    assert float(picture[0, 0].float().sum()) > float(picture[-1, -1].float().sum())  # near is bright
+    assert float(picture[0, 0].float().sum()) > float(picture[-1, -1].float().sum())  # near pixels are bright
     empty = panels.picture_of_depth(depth, torch.zeros(5, 10))
     assert (empty == 255).all()
     flat = panels.picture_of_depth(torch.full((3, 3), 2.0), torch.ones(3, 3))
@@ -63,7 +63,7 @@ def test_panel_file(tmp_path):
     width, height = Image.open(path).size
     zoom = -(-panels.PICTURE_HEIGHT // 7)
     assert (width, height) == (5 * (9 * zoom + 6) + 6, 7 * zoom + 6 + panels.CAPTION + 6)
-    strip = torch.zeros(1, 5000, 3, dtype=torch.uint8)  # enlarged to 240 rows it would take 288 million pixels
+    strip = torch.zeros(1, 5000, 3, dtype=torch.uint8)  # 240 rows would need 288 million pixels
     assert panels.contact_sheet({"truth": strip}).shape == (6 + panels.CAPTION + 1 + 6, 5000 + 6 + 6, 3)
     pixels = np.asarray(Image.open(path))
     truth = panels.picture_of_colour(colour)

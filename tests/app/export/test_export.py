@@ -1,4 +1,4 @@
-"""Points, meshes and cells of runs whose field is a formula, loaded again."""
+"""Tests of exported points, meshes and cells, loaded again; the fields of the runs are formulas."""
 
 import itertools
 import json
@@ -35,26 +35,26 @@ RED, BLUE = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9])
 
 
 def shell(positions, directions, ray_index):
-    """A hollow ball, red above and blue below, and a speck beside it."""
+    """Computes colour and density of a hollow ball, red above and blue below, with a speck beside it."""
     apart = (positions.norm(dim=-1) - (RADIUS - 0.1)).abs() < 0.1
     speck = (positions - torch.tensor([0.9, 0.9, 0.6])).norm(dim=-1) < 0.04
     return torch.where(positions[:, 2:] > 0, RED, BLUE), 300.0 * (apart | speck)
 
 
 def test_pixels_without_a_ray_show_no_surface():
-    """In the corners of a wide lens a picture may have any colour."""
+    """The corners of a wide lens, which have no rays, give no surface points."""
     cameras = orbit_cameras(2, radius=2, elevation=5, width=20, height=16, focal=10)
     cameras = replace(cameras, distortion=torch.tensor([[-0.25] + 7 * [0.0], 8 * [0.0]]))
     image = SimpleNamespace(colour=torch.ones(16, 20, 3), opacity=torch.ones(16, 20), heaviest=torch.ones(16, 20, 3))
     run = SimpleNamespace(render=lambda *_: image, renderer=SimpleNamespace(contraction=None))
     wide, plain = views_of(run, cameras)
-    there = cameras.has_ray(0)
-    assert 0.5 < float(there.float().mean()) < 0.9 and cameras.has_ray(1) is None
-    assert torch.equal(wide.surface.isfinite().all(-1), there) and bool(plain.surface.isfinite().all())
+    has_ray = cameras.has_ray(0)
+    assert 0.5 < float(has_ray.float().mean()) < 0.9 and cameras.has_ray(1) is None
+    assert torch.equal(wide.surface.isfinite().all(-1), has_ray) and bool(plain.surface.isfinite().all())
 
 
 def read_glb(path):
-    """Every mesh of a file by its node's name: arrays by attribute and the material; nodes must have no transform."""
+    """Returns {node name: (arrays by attribute, material)} of a GLB file, whose nodes must have no transform."""
     data = path.read_bytes()
     magic, version, length, size = struct.unpack_from("<4s3I", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))
@@ -80,17 +80,17 @@ def read_glb(path):
 
 
 def linear(colour):
-    """The linear values of sRGB ones in 0..1."""
+    """Converts sRGB values in 0..1 to linear ones."""
     return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
 
 
 def loaded(path):
-    """A mesh as trimesh reads it, turned to z up, and the colours of its vertices in sRGB."""
+    """Returns (mesh, vertex colours): the mesh as trimesh reads it, with z up, and its vertex colours in sRGB."""
     mesh = trimesh.load(path, force="mesh", process=False)
     if path.suffix != ".glb":
         return mesh, mesh.visual.vertex_colors[:, :3]
     ((arrays, _),) = read_glb(path).values()
-    mesh.apply_transform([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # as Blender does
+    mesh.apply_transform([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # to z up, as Blender does
     bytes_of_linear = np.searchsorted(linear(np.arange(256) / 255) * 65535, arrays["COLOR_0"][:, :3] - 0.5)
     return mesh, bytes_of_linear
 
@@ -108,17 +108,17 @@ def test_a_mesh_is_the_outer_surface_alone(run, tmp_path, suffix):
     path = tmp_path / "deep" / f"ball{suffix}"
     export_mesh(run, path, resolution=48)
     mesh, colours = loaded(path)
-    assert mesh.is_watertight and mesh.body_count == 1  # neither the inside of the shell nor the speck
+    assert mesh.is_watertight and mesh.body_count == 1  # no inner surface, and no speck
     distance = np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS)
     assert distance.mean() < 0.02 and distance.max() < 0.06
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.08)
     assert (mesh.vertex_normals * mesh.vertices).sum(-1).min() > 0
     for colour, where in ((RED, mesh.vertices[:, 2] > 0.05), (BLUE, mesh.vertices[:, 2] < -0.05)):
-        assert np.abs(np.median(colours[where], axis=0) - colour.numpy() * 255).max() < 12  # pixels of the rim mix
+        assert np.abs(np.median(colours[where], axis=0) - colour.numpy() * 255).max() < 12  # rim pixels mix colours
 
 
 def test_steps_of_pixels_and_samples_are_smoothed(run, tmp_path, monkeypatch):
-    def slope(mesh):  # its triangles, in degrees, against the ball's surface
+    def slope(mesh):  # the angles of its triangles to the ball's surface, in degrees
         along = (mesh.face_normals * mesh.triangles_center).sum(-1) / np.linalg.norm(mesh.triangles_center, axis=-1)
         return np.degrees(np.arccos(along.clip(-1, 1))).mean()
 
@@ -139,7 +139,7 @@ def test_the_surface_of_an_object_on_a_plain_background_lies_before_its_distance
         mesh = export_mesh(seen, tmp_path / "mesh.ply", resolution=48, box=None if plain else BOX)
         radii.append(np.linalg.norm(mesh.triangles_center, axis=-1).mean())
     moved = (radii[1] - radii[0]) / (0.01 * float((BOX[1] - BOX[0]).max()))
-    assert 0.1 < moved < 1 if plain else moved == 0  # distances are along rays: most meet the surface at a slant
+    assert 0.1 < moved < 1 if plain else moved == 0  # distances are along rays, which are oblique
 
 
 @pytest.mark.parametrize("to_files", [False, True])
@@ -158,7 +158,7 @@ def test_a_glb_stands_upright_and_has_linear_colours(run, tmp_path, to_files):
     }
     x, y, z = np.asarray(ply.vertices, dtype=np.float32).T
     assert np.array_equal(arrays["POSITION"], np.stack((x, z, -y), 1))
-    assert np.abs(returned.vertices - ply.vertices).max() < 1e-6  # z up
+    assert np.abs(returned.vertices - ply.vertices).max() < 1e-6  # both have z up
     radius = RADIUS * (2 if to_files else 1)
     assert np.abs(np.linalg.norm(arrays["POSITION"], axis=-1) - radius).max() < 0.2
     assert (arrays["NORMAL"] * arrays["POSITION"]).sum(-1).min() > 0
@@ -166,7 +166,7 @@ def test_a_glb_stands_upright_and_has_linear_colours(run, tmp_path, to_files):
     colours = np.asarray(ply.visual.vertex_colors[:, :3]) / 255
     assert np.abs(arrays["COLOR_0"][:, :3] / 65535 - linear(colours)).max() < 1e-5
     red = colours[:, 0] > 0.8
-    assert red.any() and arrays["POSITION"][red, 1].min() > -0.1 * radius  # which is above
+    assert red.any() and arrays["POSITION"][red, 1].min() > -0.1 * radius  # the red half is above
 
 
 def test_dark_colours_of_a_glb_stay_apart(tmp_path):
@@ -183,14 +183,14 @@ def test_dark_colours_of_a_glb_stay_apart(tmp_path):
 def test_a_mesh_has_as_many_triangles_as_asked_for(run, tmp_path):
     whole, few = (export_mesh(run, tmp_path / "ball.ply", resolution=48, faces=faces) for faces in (10**6, 600))
     assert len(whole.faces) > 4000 and 500 < len(few.faces) <= 600
-    assert np.bincount(few.edges_unique_inverse).min() > 1 and few.body_count == 1  # closed
+    assert np.bincount(few.edges_unique_inverse).min() > 1 and few.body_count == 1  # the mesh is closed
     distance = np.abs(np.linalg.norm(few.vertices, axis=-1) - RADIUS)
     assert distance.mean() < 0.02 and distance.max() < 0.06
     assert few.volume == pytest.approx(whole.volume, rel=0.03)
 
 
 def test_colours_are_those_seen_from_the_front(run, tmp_path):
-    """A ball that is green for whoever looks straight at it, and darker from the side."""
+    """The mesh takes the colours of a frontal view: the ball is green from the front and darker from the side."""
 
     def glossy(positions, directions, ray_index):
         _, density = shell(positions, directions, ray_index)
@@ -201,7 +201,7 @@ def test_colours_are_those_seen_from_the_front(run, tmp_path):
 
     shiny = replace(run, renderer=renderer_of({"field": glossy}, samples=192))
     mesh = export_mesh(shiny, tmp_path / "ball.ply", resolution=48)
-    seen = mesh.vertices[:, 2] > 0  # where the cameras are
+    seen = mesh.vertices[:, 2] > 0  # the side of the cameras
     red, green, _ = np.median(mesh.visual.vertex_colors[seen, :3], axis=0)
     assert green > 0.8 * 255 and red < 2
 
@@ -211,7 +211,7 @@ def test_a_mesh_of_an_unbounded_scene_is_what_the_cameras_see(run, tmp_path):
     unbounded = replace(run, scene=replace(run.scene, box=None), renderer=renderer)
     mesh = export_mesh(unbounded, tmp_path / "ball.ply", resolution=48)
     distance = np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS)
-    assert distance.mean() < 0.03 and distance.max() < 0.12  # no walls where space is unknown
+    assert distance.mean() < 0.03 and distance.max() < 0.12  # no walls around unseen space
     half = torch.tensor([[-1.0, -1, 0], [1.0, 1, 1]])
     told, said = [], []
     track = lambda parts, name: told.append((name, len(parts))) or parts  # noqa: E731
@@ -222,7 +222,7 @@ def test_a_mesh_of_an_unbounded_scene_is_what_the_cameras_see(run, tmp_path):
 
 
 def test_a_mesh_is_what_the_cameras_look_at_and_not_what_lies_around(run, tmp_path):
-    def with_sky(positions, directions, ray_index):  # which is 7 away, and in every picture
+    def with_sky(positions, directions, ray_index):  # the sky is at distance 7 and in every picture
         colour, density = shell(positions, directions, ray_index)
         return colour, density + 300.0 * (positions.norm(dim=-1) > 2.2)
 
@@ -231,10 +231,10 @@ def test_a_mesh_is_what_the_cameras_look_at_and_not_what_lies_around(run, tmp_pa
     mesh = export_mesh(shown, tmp_path / "ball.ply", resolution=48, say=said.append)
     assert mesh.body_count == 1 and np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS).max() < 0.12
     share, *corners = (float(number) for number in re.findall(r"-?\d+\.?\d*", said[0])[:7])
-    assert 30 < share < 95 and np.abs(np.abs(corners) - 1.2 * RADIUS).max() < 0.3  # no camera sees it from below
+    assert 30 < share < 95 and np.abs(np.abs(corners) - 1.2 * RADIUS).max() < 0.3  # no camera sees the ball from below
     assert not said[0].startswith("0%") and len(said) == 1
     export_mesh(run, tmp_path / "boxed.ply", resolution=16, say=said.append)
-    assert len(said) == 1  # all of a scene with a box is in it
+    assert len(said) == 1  # a scene's box holds the whole scene: no note
 
 
 def test_points_have_colours_and_normals(run, tmp_path):
@@ -335,7 +335,7 @@ def test_meshes_in_the_coordinates_of_the_files(run, tmp_path):
     turn = torch.linalg.qr(torch.randn(3, 3, generator=seeded(), dtype=torch.float64))[0]
     turn *= torch.linalg.det(turn)
     transform = torch.eye(4, dtype=torch.float64)
-    transform[:3, :3], transform[:3, 3] = 0.25 * turn, torch.tensor([0.1, 0.2, 0.3])  # 1 of the scene is 4 metres
+    transform[:3, :3], transform[:3, 3] = 0.25 * turn, torch.tensor([0.1, 0.2, 0.3])  # a unit of the scene is 4 metres
     moved = replace(run, scene=replace(run.scene, transform=transform))
     assert export_mesh(run, tmp_path / "scene.ply", resolution=32).extents.max() < 1.3
     extents = export_mesh(moved, tmp_path / "metres.ply", resolution=32, to_files=True).extents
@@ -343,7 +343,7 @@ def test_meshes_in_the_coordinates_of_the_files(run, tmp_path):
 
 
 def test_a_floor_within_a_layer_of_blocks_has_no_hole():
-    """Its own layer is filled, too, and not only those a reach above and below."""
+    """The layer of blocks that contains the floor is filled too, not only the layers above and below."""
     pose = look_at(torch.tensor([[0.0, 0.0, 3.0]]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     camera = Cameras(pose, torch.tensor([[60.0, 60, 32, 32]]), 64, 64)
     y, x = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(64) + 0.5, indexing="ij")
@@ -354,7 +354,7 @@ def test_a_floor_within_a_layer_of_blocks_has_no_hole():
     side, low = 1 / 64, torch.full((3,), -0.5)
     value, seen = _fused(low, side, torch.full((3,), 8), [view], False, lambda items, name: items)
     heights = low[2] + side * torch.arange(64)
-    there = (heights - floor).abs() < REACH * side / 2
-    assert bool(seen[8:-8, 8:-8, there].all())
-    expected = ((heights - floor) / (REACH * side))[there].expand(48, 48, -1)
-    torch.testing.assert_close(value[8:-8, 8:-8, there], expected, atol=0.1, rtol=0)
+    near_floor = (heights - floor).abs() < REACH * side / 2
+    assert bool(seen[8:-8, 8:-8, near_floor].all())
+    expected = ((heights - floor) / (REACH * side))[near_floor].expand(48, 48, -1)
+    torch.testing.assert_close(value[8:-8, 8:-8, near_floor], expected, atol=0.1, rtol=0)

@@ -1,4 +1,4 @@
-"""voronerf as a method of nerfstudio, in its own trainer and pipeline, on a scene of a few pixels."""
+"""Tests of voronerf as a method of nerfstudio, in nerfstudio's trainer and pipeline, on a scene of a few pixels."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SMALL = ("log2_entries=10", "levels=2")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The built-in scene in 10 x 10 pixels, as a folder that nerfstudio's parser for Blender scenes reads."""
+    """A folder with the built-in scene in 10 x 10 pixels, in the format of nerfstudio's parser for Blender scenes."""
     path = tmp_path_factory.mktemp("scene")
     scene = load_scene("builtin", downscale=10)
     for split, views in (("train", scene.train), ("val", scene.test), ("test", scene.test)):
@@ -53,7 +53,7 @@ def _no_download(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def trainer_of(folder: Path, out: Path, *, load: Path | None = None, alpha: str | None = "white", **model: Any) -> Any:
-    """nerfstudio's trainer of the registered method."""
+    """Returns nerfstudio's trainer of the registered method."""
     config = copy.deepcopy(method.config)
     config.set_timestamp()
     config.output_dir, config.load_dir, config.vis = out, load, "tensorboard"
@@ -71,7 +71,7 @@ def trainer_of(folder: Path, out: Path, *, load: Path | None = None, alpha: str 
 
 
 def test_it_is_registered() -> None:
-    """By the entry point of the installed package; a checkout alone has none."""
+    """nerfstudio finds the method by the entry point of the installed package; a plain checkout has none."""
     if "voronerf" not in all_methods:
         pytest.skip("voronerf is not installed here, only on the path")
     assert all_methods["voronerf"].pipeline.model == VoronerfModelConfig()
@@ -84,10 +84,10 @@ def test_it_trains_splits_evaluates_and_resumes(folder: Path, tmp_path: Path) ->
     before = model.num_cells
     trainer.train()
     assert (before, model.num_cells) == (1, 4)
-    held = optimizer.param_groups[0]["params"]
-    assert all(a is b and len(a) == 4 for a, b in zip(parameters, held, strict=True))
-    assert all(optimizer.state[p]["exp_avg"].shape == p.shape for p in held)
-    assert optimizer.param_groups[0]["lr"] == pytest.approx(0.001)  # the length of the decay is that of the run
+    optimised = optimizer.param_groups[0]["params"]
+    assert all(a is b and len(a) == 4 for a, b in zip(parameters, optimised, strict=True))
+    assert all(optimizer.state[p]["exp_avg"].shape == p.shape for p in optimised)
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(0.001)  # the rate decays over the whole run
     scores = trainer.pipeline.get_average_eval_image_metrics()
     assert 5 < scores["psnr"] < 60 and 0 < scores["ssim"] <= 1
 
@@ -102,7 +102,7 @@ def test_it_trains_splits_evaluates_and_resumes(folder: Path, tmp_path: Path) ->
     shown = [each.eval().get_outputs_for_camera(rays) for each in (model, resumed)]
     assert all(torch.equal(shown[0][name], shown[1][name]) for name in ("rgb", "depth", "accumulation", "cells"))
     again.train()
-    assert resumed.num_cells == 4  # the split was made
+    assert resumed.num_cells == 4  # the cell was split
 
 
 def test_a_training_that_ends_before_the_split_makes_it_when_it_is_resumed(folder: Path, tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_other_fields_and_samplers_train(folder: Path, tmp_path: Path, model: di
 
 
 def test_transparent_images_lie_over_colours_that_are_drawn(folder: Path, tmp_path: Path) -> None:
-    """An empty field is right where the image is transparent, whatever the colour behind."""
+    """An empty field has no loss where the image is transparent, for any drawn background colour."""
     trainer = trainer_of(folder, tmp_path, alpha=None, field_options=SMALL)
     model = trainer.pipeline.model
     bundle, batch = trainer.pipeline.datamanager.next_train(0)
@@ -144,12 +144,12 @@ def test_transparent_images_lie_over_colours_that_are_drawn(folder: Path, tmp_pa
 
 def test_a_camera_inside_of_the_scene_box_sees_all_of_space(folder: Path, tmp_path: Path) -> None:
     cameras = trainer_of(folder, tmp_path, field_options=SMALL).pipeline.datamanager.train_dataset.cameras
-    found = []
+    settings = []
     for size in (1.0, 10.0):
         box = SceneBox(torch.tensor(((-size,) * 3, (size,) * 3)))
         model = VoronerfModel(VoronerfModelConfig(), box, 3, metadata={"cameras": cameras}, device="cpu")
-        found.append((model.settings.contraction, model.settings.occupancy))
-    assert found == [("none", True), ("sphere", True)]
+        settings.append((model.settings.contraction, model.settings.occupancy))
+    assert settings == [("none", True), ("sphere", True)]
 
 
 def test_wrong_settings_are_one_line(folder: Path, tmp_path: Path) -> None:
@@ -158,7 +158,7 @@ def test_wrong_settings_are_one_line(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_router_takes_the_place_of_nerfactos_field(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As docs/nerfstudio.md says: the field of another method in its own model."""
+    """A router replaces the field of nerfacto's model, as docs/nerfstudio.md shows."""
     monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", lambda **_: None)
     sizes = {"num_levels": 2, "log2_hashmap_size": 8, "hidden_dim": 8, "hidden_dim_color": 8}
     sizes |= {"num_proposal_samples_per_ray": (8, 8), "num_nerf_samples_per_ray": 8}

@@ -1,6 +1,6 @@
-"""The model of nerfstudio's method, with a stand-in for the few classes of nerfstudio that it takes.
+"""Tests of the nerfstudio model with stubs for the few nerfstudio classes that it uses.
 
-What is asked of them is in nerfstudio 1.1.5 as it is here; `test_method.py` runs the model in nerfstudio itself.
+The stubs have the interface of nerfstudio 1.1.5; `test_method.py` runs the model in nerfstudio itself.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STEPS = 40
 
 
 class Model(nn.Module):
-    """nerfstudio.models.base_model.Model, as far as training goes."""
+    """A stub of nerfstudio.models.base_model.Model for training."""
 
     def __init__(self, config: Any, scene_box: Any, num_train_data: int, **kwargs: Any) -> None:
         super().__init__()
@@ -69,7 +69,7 @@ class Bundle:
 
 @pytest.fixture
 def model_module(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """`voronerf.app.nerfstudio.model`, imported with the stand-ins."""
+    """The module `voronerf.app.nerfstudio.model`, imported with the stubs."""
     names: dict[str, dict[str, Any]] = {
         "": {},
         "cameras": {},
@@ -137,7 +137,7 @@ def test_a_step_is_one_operation_and_learns(model_module: Any, monkeypatch: pyte
         rays = views.image_rays(image)
         batch = {"image": scene.train.images[image].reshape(-1, 4)[pixels].float() / 255}
         outputs = model(Bundle(rays.origins[pixels], rays.directions[pixels]))
-        metrics = model.get_metrics_dict(outputs, batch)  # nerfstudio asks for these first
+        metrics = model.get_metrics_dict(outputs, batch)  # nerfstudio computes metrics first
         loss = model.get_loss_dict(outputs, batch, metrics)["rgb_loss"]
         for optimizer in optimizers.values():
             optimizer.zero_grad()
@@ -147,6 +147,6 @@ def test_a_step_is_one_operation_and_learns(model_module: Any, monkeypatch: pyte
             optimizer.step()
         after.func(step)
         losses.append(float(loss.detach()))
-        assert len(calls) == step + 1  # metrics and loss are of one evaluation
+        assert len(calls) == step + 1  # metrics and loss share one evaluation
     assert model.num_cells == 4 and int(metrics["cells"]) == 4
     assert sum(losses[-8:]) < 0.7 * sum(losses[:8])

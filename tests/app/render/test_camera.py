@@ -1,4 +1,4 @@
-"""Pictures of photographs: their holes have the colour of what lies beside them."""
+"""Tests of rendered photographs: holes are filled with the colours beside them."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ def test_a_picture_of_nothing_is_black():
 
 
 def test_photographs_alone_are_filled():
-    """A wall with a hole: of the background's colour where there is one, black in the viewer and in a box."""
+    """A hole is filled only without a background colour, outside the viewer (fill=False) and without a box."""
 
     def wall(positions, directions, ray_index):
-        there = (positions[:, 2] < 0) & (positions[:, :2].norm(dim=-1) > 0.3)
-        return torch.full_like(positions, 0.75), torch.where(there, 1e4, 0.0)
+        inside = (positions[:, 2] < 0) & (positions[:, :2].norm(dim=-1) > 0.3)
+        return torch.full_like(positions, 0.75), torch.where(inside, 1e4, 0.0)
 
     cameras = orbit_cameras(1, radius=2.0, elevation=90.0, width=24, height=24, focal=24.0)
     scene = replace(builtin_scene(8, train_views=2, test_views=1), background=None, box=None, near=0.5, far=4.0)
@@ -62,8 +62,8 @@ def test_photographs_alone_are_filled():
         seen = render_camera(renderer, other, cameras, 0, **options).colour[12, 12]
         assert seen.tolist() == [hole] * 3
 
-    there = torch.ones(24, 24, dtype=torch.bool)
-    there[:4] = False
-    with mock.patch.object(Cameras, "has_ray", return_value=there):
+    inside = torch.ones(24, 24, dtype=torch.bool)
+    inside[:4] = False
+    with mock.patch.object(Cameras, "has_ray", return_value=inside):
         seen = render_camera(renderer, scene, cameras, 0).colour
-    assert torch.equal(seen, filled * there[..., None])
+    assert torch.equal(seen, filled * inside[..., None])

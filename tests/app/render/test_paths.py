@@ -1,4 +1,4 @@
-"""Camera paths: the file, smooth ways through keyframes, and where cameras were."""
+"""Tests of camera paths: their files, smooth paths through keyframes, and paths along the cameras of a capture."""
 
 import json
 import math
@@ -20,27 +20,27 @@ from voronerf.app.render.paths import (
 from voronerf.nerf import Cameras, focus_point, orbit_cameras, turntable_cameras
 from voronerf.nerf.cameras import look_at, shared_focus
 
-LEVEL = [1, 0, 0, 4, 0, 0, -1, -5, 0, 1, 0, 6, 0, 0, 0, 1]  # at (4, -5, 6), looking along +y, z up
+LEVEL = [1, 0, 0, 4, 0, 0, -1, -5, 0, 1, 0, 6, 0, 0, 0, 1]  # at (4, -5, 6), looks along +y, z is up
 
 
 def by_hand(**changes):
-    """The least that nerfstudio's own reader asks for."""
+    """Returns a path with only the entries that nerfstudio's reader requires."""
     frame = {"camera_to_world": LEVEL, "fov": 90, "aspect": 2}
     return {"render_width": 80, "render_height": 40, "camera_path": [frame, frame], **changes}
 
 
 def columns(matrix):
-    """The numbers of a pose column by column, as three.js and keyframes of nerfstudio's first viewer have them."""
+    """Returns a pose in column-major order, as in three.js and in keyframes of nerfstudio's first viewer."""
     return [number for column in range(4) for number in matrix[column::4]]
 
 
 def scaled(matrix, factor):
-    """The pose of a camera beside an object that was scaled by 1 / factor."""
+    """Returns a pose (a row-major list) with its axes multiplied by the factor."""
     return [number * factor if place % 4 < 3 and place < 12 else number for place, number in enumerate(matrix)]
 
 
 def nerfstudio_rays(kind, pose, width, height, fov):
-    """Directions [h, w, 3] in the world by the formulas of nerfstudio's `Cameras` for a frame of a path."""
+    """Computes the world directions [h, w, 3] of a path's frame by the formulas of nerfstudio's `Cameras`."""
     focal = height / 2 / math.tan(math.radians(fov) / 2)
     fx, fy = (width / 2, height) if kind == "equirectangular" else (focal, focal)
     y, x = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) + 0.5 for side in (height, width)), indexing="ij")
@@ -83,7 +83,7 @@ ROWS = [LEVEL[row : row + 4] for row in (0, 4, 8, 12)]
         {"camera_to_world": ROWS},
         {"camera_to_world": ROWS[:3]},
         {"camera_to_world": LEVEL[:12]},
-        {"camera_to_world": scaled(LEVEL, 0.125)},  # Blender's, beside a mesh eight times as large
+        {"camera_to_world": scaled(LEVEL, 0.125)},  # from Blender, with a mesh eight times as large
         {"camera_to_world": [*LEVEL[:15], 1.0000001], "render_time": 0.5},
     ],
     ids=["4 x 4", "3 x 4", "12", "scaled", "rounded"],
@@ -93,7 +93,7 @@ def test_poses_in_every_form(tmp_path, frame):
     file.write_text(json.dumps(by_hand(camera_path=[frame], default_fov=90)))
     read = read_camera_path(file).frames
     torch.testing.assert_close(read.poses[0], torch.tensor(ROWS, dtype=torch.float32))
-    assert read.intrinsics[0].tolist() == pytest.approx([20, 20, 40, 20])  # of default_fov
+    assert read.intrinsics[0].tolist() == pytest.approx([20, 20, 40, 20])  # from default_fov
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_the_rate_of_a_file(tmp_path, changes, fps):
     [
         (LEVEL, True),
         (ROWS, True),
-        (json.dumps([float(x) for x in columns(LEVEL)]), True),  # nerfstudio's viewer before 1.0, add-ons
+        (json.dumps([float(x) for x in columns(LEVEL)]), True),  # by nerfstudio's viewer before 1.0, and by add-ons
         (json.dumps(LEVEL), False),
         ("[1, 2", False),
         ("7", False),
@@ -123,7 +123,7 @@ def test_keyframes_of_every_viewer(tmp_path, matrix, there):
     keyframe = {"matrix": matrix, "fov": 90, "aspect": 2, "properties": '[["FOV",90],["NAME","Camera 0"],["TIME",0]]'}
     (tmp_path / "path.json").write_text(json.dumps(by_hand(keyframes=[keyframe])))
     path = read_camera_path(tmp_path / "path.json")
-    assert len(path.frames) == 2 and (path.keyframes is not None) == there  # broken ones keep no frame from being shown
+    assert len(path.frames) == 2 and (path.keyframes is not None) == there  # broken keyframes are left out
     if there:
         assert torch.equal(path.keyframes.poses[0], path.frames.poses[0])
 
@@ -142,7 +142,7 @@ def test_a_file_of_nerfstudio(tmp_path):
     path = read_camera_path(file)
     assert (len(path.frames), path.fps, path.closed, path.frames.width, path.frames.height) == (2, 30, True, 80, 40)
     assert path.frames.origins[1].tolist() == [4, -5, 6] and path.frames.forward[1].tolist() == [0, 1, 0]
-    torch.testing.assert_close(path.frames.intrinsics[0], torch.tensor([20.0, 20, 40, 20]))  # 90 degrees are vertical
+    torch.testing.assert_close(path.frames.intrinsics[0], torch.tensor([20.0, 20, 40, 20]))  # fov 90 is vertical
     assert path.keyframes.intrinsics[0, 1] == pytest.approx(20 / math.tan(math.radians(30)))
     file.write_text(json.dumps(by_hand(keyframes=[])))
     assert read_camera_path(file).keyframes is None and read_camera_path(file).fps == 24
@@ -160,7 +160,7 @@ def test_frames_that_show_all_around(tmp_path):
     tilted = Cameras(down, torch.ones(2, 4), 6, 4)
     level = panoramas(tilted, (20, 10))
     assert torch.equal(level.origins, tilted.origins) and level.width == 20
-    torch.testing.assert_close(level.poses[:, 2, 1], torch.ones(2))  # the horizon is level, also of one straight down
+    torch.testing.assert_close(level.poses[:, 2, 1], torch.ones(2))  # level, also for a camera that looks down
     refuses("must be 2 to 1, got 20 x 11", panoramas, tilted, (20, 11))
 
 
@@ -233,13 +233,13 @@ def test_smooth_paths_pass_their_keyframes_evenly(closed):
     turns = frames.poses[:, :3, :3]
     torch.testing.assert_close(turns @ turns.mT, torch.eye(3).expand(count, 3, 3), atol=1e-5, rtol=0)
     moves = (frames.poses.roll(-1, 0) - frames.poses).flatten(1).norm(dim=-1)[: count - (not closed)]
-    assert moves.max() < 2 * moves.min()  # no jump, also not from the last frame to the first
+    assert moves.max() < 2 * moves.min()  # no jump, nor from the last frame to the first
     assert smooth_path(keyframes[:1], 3).poses.sub(keyframes.poses[0]).abs().max() < 1e-5
     refuses("keyframes and count must be at least 1, got 6 and 0", smooth_path, keyframes, 0)
 
 
 def ring(degrees, radius=3.0, climb=20.0):
-    """Cameras at these angles around (1, 0, 0), some of them higher than others."""
+    """Returns cameras at these angles in degrees around (1, 0, 0), alternating between two heights."""
     angles = torch.tensor(degrees, dtype=torch.float32).deg2rad()
     target = torch.tensor([1.0, 0, 0])
     climbs = torch.where(torch.arange(len(angles)) % 2 == 0, climb, climb + 30).deg2rad()
@@ -250,18 +250,18 @@ def ring(degrees, radius=3.0, climb=20.0):
 
 def test_a_path_around_something_is_as_far_and_as_high_as_the_cameras_near_it():
     seen = ring(range(0, 360, 10))
-    far = torch.arange(36) >= 18  # on the other side twice as far
+    far = torch.arange(36) >= 18  # the far half is at twice the distance
     seen.poses[far, :3, 3] = 2 * (seen.origins[far] - torch.tensor([1.0, 0, 0])) + torch.tensor([1.0, 0, 0])
     frames = capture_path(seen, 40, near=1, far=9)
     offset = frames.origins - focus_point(seen)
     reach = offset.norm(dim=-1)
-    assert 2.5 < reach[10] < 3.2 and 5.0 < reach[30] < 6.2  # in the middle of either side
+    assert 2.5 < reach[10] < 3.2 and 5.0 < reach[30] < 6.2  # the middles of both halves
     assert reach.min() > 2.5 and reach.max() < 6.2 and (offset[:, 2] / reach).asin().rad2deg().sub(35).abs().max() < 5
     pixels, depth = zip(*(frames.project(focus_point(seen)[None], index) for index in range(40)))
     torch.testing.assert_close(torch.cat(pixels), torch.tensor([[16.0, 12]]).expand(40, 2), atol=1e-2, rtol=0)
     assert min(torch.cat(depth)) > 0 and (frames.width, frames.height) == (32, 24)
     moves = (frames.origins.roll(-1, 0) - frames.origins).norm(dim=-1)
-    assert moves.max() < 4 * moves.min()  # a round, without a jump
+    assert moves.max() < 4 * moves.min()  # a closed path without a jump
 
 
 def test_a_path_does_not_cross_a_gap_between_cameras():
@@ -269,13 +269,13 @@ def test_a_path_does_not_cross_a_gap_between_cameras():
     angles = torch.atan2(frames.origins[:, 1], frames.origins[:, 0] - 1).rad2deg() % 360
     assert angles.min() > 57 and angles.max() < 303 and angles.max() - angles.min() > 230
     moves = (frames.origins.roll(-1, 0) - frames.origins).norm(dim=-1)
-    assert moves.max() < 0.8  # there and back, the last frame beside the first
+    assert moves.max() < 0.8  # back and forth: the last frame is near the first
 
 
 def test_a_path_of_cameras_that_look_outwards_goes_through_them_in_order():
     angles = torch.arange(12) * torch.pi / 6
-    away = torch.stack((angles.cos(), angles.sin(), 0 * angles), -1)
-    poses = torch.cat([look_at(place[None], 2 * place, torch.tensor([0.0, 0, 1])) for place in away])
+    outward = torch.stack((angles.cos(), angles.sin(), 0 * angles), -1)
+    poses = torch.cat([look_at(place[None], 2 * place, torch.tensor([0.0, 0, 1])) for place in outward])
     seen = Cameras(poses, torch.tensor([[40.0, 40, 16, 12]]).repeat(12, 1), 32, 24)
     assert focus_point(seen) is None
     frames = capture_path(seen, 48, near=1, far=9)
@@ -285,7 +285,7 @@ def test_a_path_of_cameras_that_look_outwards_goes_through_them_in_order():
 
 
 def test_a_path_of_people_who_walk_and_look_around_is_theirs():
-    """The point closest to all axes lies ahead of most cameras by chance."""
+    """The path follows the cameras, although the point closest to their axes lies ahead of most by chance."""
     torch.manual_seed(0)
     along = torch.linspace(-2, 2, 12)
     origins = torch.stack((along, 0.3 * torch.rand(12), torch.full((12,), 1.5)), 1)
@@ -307,14 +307,14 @@ def test_frames_have_the_size_of_most_images_or_another():
     assert (seen.width, seen.height) == (32, 32)
     frames = capture_path(seen, 5, near=1, far=9)
     assert (frames.width, frames.height) == (32, 24) and frames.intrinsics[0].tolist() == [40, 40, 16, 12]
-    wide = resized(frames, (128, 72))  # what is above and below is cut off
+    wide = resized(frames, (128, 72))  # the top and the bottom are cut off
     assert (wide.width, wide.height) == (128, 72) and wide.intrinsics[0].tolist() == [160, 160, 64, 36]
     assert resized(wide, (32, 24)).intrinsics[0].tolist() == pytest.approx([160 / 3, 160 / 3, 16, 12])
     around = resized(replace(frames, distortion=torch.zeros(5, 8), models=torch.ones(5, dtype=torch.int32)), (128, 72))
-    assert around.models.tolist() == [1] * 5 and torch.equal(around.intrinsics, wide.intrinsics)  # still fisheyes
+    assert around.models.tolist() == [1] * 5 and torch.equal(around.intrinsics, wide.intrinsics)  # still fisheye
 
 
-@pytest.mark.parametrize("towards", [0.0, 4.0])  # parallel cameras, and ones that look at a point
+@pytest.mark.parametrize("towards", [0.0, 4.0])  # parallel, or aimed at a point
 def test_a_spiral_before_a_scene_looks_where_its_cameras_do(towards):
     x, z = torch.meshgrid(torch.linspace(-0.5, 0.5, 4), torch.linspace(-0.3, 0.3, 3), indexing="ij")
     origins = torch.stack((x, torch.full_like(x, -4), z), -1).reshape(-1, 3)
@@ -325,7 +325,7 @@ def test_a_spiral_before_a_scene_looks_where_its_cameras_do(towards):
     offset = frames.origins - torch.tensor([0.0, -4, 0])
     assert (offset.abs().amax(0) <= torch.tensor([0.51, 0.2, 0.31])).all() and offset[:, 0].abs().max() > 0.45
     assert frames.forward[:, 1].min() > 0.97
-    middle = torch.tensor([[0.0, 0 if towards else 4, 0]])  # at the focus, or at 1 / (0.25 / near)
+    middle = torch.tensor([[0.0, 0 if towards else 4, 0]])  # the focus, or depth 1 / (0.25 / near)
     pixels = torch.cat([frames.project(middle, index)[0] for index in range(30)])
     torch.testing.assert_close(pixels, torch.tensor([[16.0, 12]]).expand(30, 2), atol=0.05, rtol=0)
     assert len(turntable_cameras(seen, 5)) == 5

@@ -1,4 +1,4 @@
-"""Scenes written to folders, as Blender's and as captures."""
+"""Writes scenes to folders in the formats of Blender, nerfstudio, COLMAP and LLFF."""
 
 import json
 import os
@@ -17,21 +17,21 @@ from voronerf.nerf.cameras import orbit_cameras
 Contents = dict[str, Any]
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
 
-#: Cameras around something, the size of their images, and points that they see.
+#: The number of cameras around an object, the image size (width, height), and points that all cameras see.
 COUNT, SIZE = 9, (12, 10)
 POSES = orbit_cameras(COUNT, radius=4, elevation=20, width=12, height=10, focal=20, centre=(1, 2, 3)).poses
 POINTS = np.random.default_rng(0).normal(size=(60, 3)) * 0.4 + (1, 2, 3)
 
 
 def needs(name):
-    """The folder of a downloaded scene."""
+    """Returns the folder of a downloaded scene; skips the test if the folder is absent."""
     if not (DATA / name).is_dir():
         pytest.skip(f"{DATA / name} is not there; set VORONERF_DATA to a folder that holds {name}")
     return DATA / name
 
 
 def write_blender(folder, scene, angle):
-    """Writes a scene the way Blender's are stored."""
+    """Writes a scene in the format of NeRF's Blender scenes."""
     for name, split in (("train", scene.train), ("test", scene.test)):
         (folder / name).mkdir(parents=True)
         frames = []
@@ -42,7 +42,7 @@ def write_blender(folder, scene, angle):
 
 
 def write_capture(folder, cameras, **entries):
-    """A capture whose image i is of grey i; its frames are listed from the last to the first."""
+    """Writes a nerfstudio capture whose image i has grey value i; the frames are listed in reverse order."""
     folder.mkdir(exist_ok=True)
     frames = []
     for index, pose in enumerate(cameras.poses):
@@ -53,7 +53,7 @@ def write_capture(folder, cameras, **entries):
 
 
 def rewrite(folder, change, name="transforms", **options):
-    """Changes the contents of a file of transforms; returns them."""
+    """Applies a function to the contents of a transforms file; returns the changed contents."""
     path = folder / f"{name}.json"
     contents = json.loads(path.read_text())
     change(contents)
@@ -62,14 +62,14 @@ def rewrite(folder, change, name="transforms", **options):
 
 
 def write_images(folder, sizes, **save):
-    """Image i is of grey i, as JPEG."""
+    """Writes JPEG images of (width, height) sizes, where image i has grey value i."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for index, (width, height) in enumerate(sizes):
         Image.fromarray(np.full((height, width, 3), index, np.uint8)).save(folder / f"images/{index:02d}.jpg", **save)
 
 
 def quaternion(turn):
-    """(w, x, y, z) of a rotation."""
+    """Returns the unit quaternion (w, x, y, z) of a rotation matrix."""
     rows = (
         [turn[0, 0] - turn[1, 1] - turn[2, 2], 0, 0, 0],
         [turn[0, 1] + turn[1, 0], turn[1, 1] - turn[0, 0] - turn[2, 2], 0, 0],
@@ -82,9 +82,10 @@ def quaternion(turn):
 
 
 def write_colmap(folder, poses, sizes, points, *, binary=True, lenses=None):
-    """A COLMAP model with a camera for each image, in an order that is not that of the names.
+    """Writes a COLMAP model with one camera per image; the images are not in the order of their names.
 
-    The cameras are of `lenses`, a model and its parameters each, or of SIMPLE_RADIAL. Every image sees every point.
+    `lenses` holds a camera model and its parameters for each image, SIMPLE_RADIAL if absent. Every image sees every
+    point.
     """
     lenses = lenses or [("SIMPLE_RADIAL", (20.0, 6.0, 5.0, 0.02))] * len(sizes)
     numbers = {name: number for number, (name, _) in MODELS.items()}
@@ -123,7 +124,7 @@ def write_colmap(folder, poses, sizes, points, *, binary=True, lenses=None):
 
 
 def write_llff(folder, poses, size, focal, bounds):
-    """LLFF's file: the axes down, right and backwards, the position, and height, width and focal length."""
+    """Writes LLFF's file of the axes (down, right, backwards), position, height, width, focal length and bounds."""
     poses = np.asarray(poses, np.float64)
     lens = np.broadcast_to(np.array([size[1], size[0], focal]), (len(poses), 3))
     matrix = np.stack((-poses[:, :3, 1], poses[:, :3, 0], poses[:, :3, 2], poses[:, :3, 3], lens), axis=-1)
@@ -138,6 +139,6 @@ def write_both(folder, sizes=(SIZE,) * COUNT, *, binary=True, **save):
 
 
 def every(scene):
-    """Names and poses of all views, in the order of the names."""
+    """Returns (names, poses) of all views, sorted by name."""
     rows = [*zip(scene.train.names, scene.train.cameras.poses), *zip(scene.test.names, scene.test.cameras.poses)]
     return [name for name, _ in sorted(rows)], torch.stack([pose for _, pose in sorted(rows)])

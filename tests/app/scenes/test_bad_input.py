@@ -1,4 +1,4 @@
-"""Every broken scene is one clear line that names the file."""
+"""Tests that every broken scene is refused with one clear line that names the file."""
 
 import json
 import math
@@ -20,7 +20,7 @@ NOISE = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
 
 
 def write_noise(folder, count=3, **entries):
-    """A capture of noise images from one place."""
+    """Writes a capture of noise images from one camera pose."""
     folder.mkdir(exist_ok=True)
     for index in range(count):
         Image.fromarray(NOISE).save(folder / f"{index}.png")
@@ -29,7 +29,7 @@ def write_noise(folder, count=3, **entries):
 
 
 def deep_png(width, height, colour):
-    """A PNG of 16 bits a channel: 0 grey, 2 RGB, 4 grey and alpha, 6 RGBA."""
+    """Returns the bytes of a PNG with 16 bits a channel; colour 0 is grey, 2 RGB, 4 grey with alpha, 6 RGBA."""
     rows = bytes(1 + width * 2 * {0: 1, 2: 3, 4: 2, 6: 4}[colour]) * height
     chunks = {
         b"IHDR": struct.pack(">IIBBBBB", width, height, 16, colour, 0, 0, 0),
@@ -148,7 +148,7 @@ def test_images(tmp_path):
     ):
         path.write_bytes(broken)
         fails(tmp_path, f"2.png: {reason}")
-    for colour in (0, 2, 4, 6):  # grey, RGB, and both with alpha
+    for colour in (0, 2, 4, 6):  # grey, RGB, grey with alpha, RGBA
         path.write_bytes(deep_png(8, 6, colour))
         fails(tmp_path, "2.png: has more than 8 bits a channel")
     for kind in ("EPS", "GIF", "TIFF", "PPM"):  # for EPS, Pillow starts Ghostscript
@@ -259,7 +259,7 @@ def test_images_outside_of_the_folder(tmp_path, kind):
     rewrite(scene, lambda contents: contents["frames"][1].update(file_path=name))
     fails(scene, f"transforms.json: frame 1 ({name}): file_path: must lie in the folder of the scene")
     assert len(load_scene(scene, allow_outside=True).train.names) == 2
-    (tmp_path / "link").symlink_to(scene)  # how the folder itself is named does not matter
+    (tmp_path / "link").symlink_to(scene)  # the scene folder itself may be a link
     (scene / "1.png.JPG").unlink(missing_ok=True)
     (scene / "1.png").unlink(missing_ok=True)
     (elsewhere / "1.png").rename(scene / "1.png")

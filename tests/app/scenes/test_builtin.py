@@ -1,4 +1,4 @@
-"""The built-in scene against its own formulas, and the box that is carved from its masks."""
+"""Tests of the built-in scene against its own formulas, and of the box carved from its masks."""
 
 from dataclasses import replace
 
@@ -26,17 +26,17 @@ def white(points, normals):
 
 
 def cast(origins, directions, solids=SOLIDS):
-    """(colour [r, 3], depth [r]) of any rays, each tested with every solid."""
+    """Returns (colour [r, 3], depth [r]) of rays; every ray is tested with every solid."""
     caster = Caster(solids, LIGHT)
     origins = np.broadcast_to(origins, directions.shape)
-    every = np.arange(len(solids))
-    none = np.zeros_like(every)
-    depth, number = caster.first(origins.T, directions.T, every, none, none, none + len(origins))
+    indices = np.arange(len(solids))
+    none = np.zeros_like(indices)
+    depth, number = caster.first(origins.T, directions.T, indices, none, none, none + len(origins))
     return shaded(origins, directions, depth, number, caster), depth
 
 
 def inside(solid, points):
-    """Whether points are in a solid, from its definition."""
+    """Returns which points are in a solid, by its definition, bool [n]."""
     local = points - np.array(solid.centre)
     if solid.turn is not None:
         local = local @ solid.turn
@@ -67,20 +67,20 @@ def test_hits_against_marching(solid):
     origins = (2 * origins / np.linalg.norm(origins, axis=-1, keepdims=True)).astype(np.float32)
     directions = generator.normal(size=(150, 3)) * 0.35 - origins
     directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
-    _, found = cast(origins, directions, [solid])
+    _, depths = cast(origins, directions, [solid])
     steps = np.arange(0.5, 3.5, 1e-3)
     hits = 0
-    for origin, direction, distance in zip(origins, directions, found):
+    for origin, direction, distance in zip(origins, directions, depths):
         within = inside(solid, origin + steps[:, None] * direction)
         hits += within.any()
-        # a ray may graze for less than a step
+        # A ray may graze a solid for less than a step.
         assert np.isfinite(distance) or within.sum() < 20
         if within.any() and np.isfinite(distance):
             first = steps[within][0]
             assert distance <= first + 1e-3 and (distance > first - 3e-3 or within.sum() < 60)
     assert 20 < hits < 150
-    seen = np.isfinite(found)
-    points = origins[seen] + found[seen, None] * directions[seen]
+    seen = np.isfinite(depths)
+    points = origins[seen] + depths[seen, None] * directions[seen]
     normals, _ = solid.surface(points)
     assert np.abs(np.linalg.norm(normals, axis=-1) - 1).max() < 1e-4
     assert inside(solid, points - 5e-3 * normals).mean() > 0.99
@@ -101,7 +101,7 @@ def test_every_solid_is_seen_and_in_the_box():
 
 
 def test_pixels_are_the_average_of_their_rays(scene):
-    """A pixel against rays cast by the cameras themselves, 3 x 3 of them."""
+    """A pixel is the mean of 3 x 3 camera rays."""
     cameras = scene.test.cameras
     offsets = (torch.arange(3) + 0.5) / 3
     for y, x in ((12, 20), (25, 14), (30, 25), (1, 1)):
@@ -109,8 +109,8 @@ def test_pixels_are_the_average_of_their_rays(scene):
         rays = cameras.rays(4, u.reshape(-1), v.reshape(-1))
         colour, depth = cast(rays.origins[:1].numpy(), rays.directions.numpy())
         expected = colour.mean(axis=0) + 1 - np.isfinite(depth).mean()
-        found = scene.test.truth(4, torch.ones(3))[y, x]
-        assert np.abs(found.numpy() - expected).max() < 2.5 / 255
+        pixel = scene.test.truth(4, torch.ones(3))[y, x]
+        assert np.abs(pixel.numpy() - expected).max() < 2.5 / 255
 
 
 def test_shape_and_determinism(scene):
@@ -120,7 +120,7 @@ def test_shape_and_determinism(scene):
     assert torch.equal(first, again)
     alpha = scene.train.images[..., 3]
     assert 0.3 < float((alpha > 0).float().mean()) < 0.6
-    assert ((alpha > 0) & (alpha < 255)).any()  # edges are smooth
+    assert ((alpha > 0) & (alpha < 255)).any()  # edges are antialiased
     colours = scene.train.images[..., :3][alpha == 255].float()
     assert float(colours.min()) < 20 and float(colours.max()) == 255
     radius = scene.train.cameras.origins.norm(dim=-1)
@@ -130,11 +130,11 @@ def test_shape_and_determinism(scene):
 
 
 def test_shadows_are_cast_by_the_same_solids():
-    """A patch of floor behind a wall, seen from the lamp's side and from above: dark only where the wall stands."""
+    """The floor behind a wall is dark, and the floor on the lamp's side is not."""
     floor = Box((0, 0, -0.1), lambda p, n: np.ones_like(p), gloss=0.0, half=(2.0, 2.0, 0.1))
     wall = Box((0, 0, 0.5), lambda p, n: np.ones_like(p), gloss=0.0, half=(0.3, 0.02, 0.5))
     origin = np.array([[0.0, 0.0, 4.0]], np.float32)
-    # A point in the wall's shadow: the lamp stands at (0.45, -0.55, 0.70), so shadows fall towards (-x, +y).
+    # The lamp is in direction (0.45, -0.55, 0.70), so shadows fall towards (-x, +y).
     targets = np.array([[-0.2, 0.3, 0.0], [0.2, -0.3, 0.0]], np.float32)
     directions = (targets - origin) / np.linalg.norm(targets - origin, axis=1, keepdims=True)
     colour, depth = cast(origin, directions, [floor, wall])
@@ -149,7 +149,7 @@ def test_sizes():
 
 
 def test_carved_box_holds_the_scene_and_is_tight(scene):
-    """One wrong mask does not cut it."""
+    """The carved box holds the scene even with one empty mask."""
     masks = scene.train.images[..., 3]
     wrong = masks.clone()
     wrong[50] = 0
@@ -159,7 +159,7 @@ def test_carved_box_holds_the_scene_and_is_tight(scene):
         assert (box[0] <= scene.box[0]).all() and (box[1] >= scene.box[1]).all()
     sides = float((scene.box[1] - scene.box[0]).max())
     assert (box[1] - scene.box[1]).max() < 0.12 * sides
-    # below the plinth no view from above can carve everything
+    # Views from above cannot carve all space below the plinth.
     assert (scene.box[0] - box[0])[:2].max() < 0.12 * sides and (scene.box[0] - box[0])[2] < 0.5 * sides
 
 
@@ -171,14 +171,14 @@ def test_box_is_carved_by_masks_of_a_lens(scene, k1):
     cameras = replace(straight, distortion=lenses)
     masks = scene.train.images[..., 3]
     bent = torch.zeros_like(masks)
-    for index in range(len(cameras)):  # what each pixel of the lens sees
+    for index in range(len(cameras)):  # looks up the straight mask along each ray
         rays = cameras.image_rays(index)
         column, row = straight.project(rays.origins + rays.directions, index)[0].floor().long().unbind(-1)
         seen = (column >= 0) & (column < 40) & (row >= 0) & (row < 40)
         bent[index].view(-1)[seen] = masks[index, row[seen], column[seen]]
-    found, expected = carve_box(cameras, bent, 2.0, 6.0), carve_box(straight, masks, 2.0, 6.0)
-    assert found is not None and expected is not None
-    assert (found - expected).abs().max() < 0.02
+    carved, expected = carve_box(cameras, bent, 2.0, 6.0), carve_box(straight, masks, 2.0, 6.0)
+    assert carved is not None and expected is not None
+    assert (carved - expected).abs().max() < 0.02
     without = carve_box(straight, bent, 2.0, 6.0)
     assert without is not None and (without - expected).abs().max() > 0.05
 
@@ -186,13 +186,13 @@ def test_box_is_carved_by_masks_of_a_lens(scene, k1):
 @pytest.mark.parametrize("cut", [False, True])
 def test_what_a_picture_does_not_show_may_be_an_object_that_it_cuts(scene, cut):
     lenses = torch.zeros(len(scene.train.cameras), 8)
-    lenses[:, 0] = 0.8  # a camera without the lens sees more at its borders
+    lenses[:, 0] = 0.8  # a camera without the lens sees a wider area
     visible = np.zeros((40, 40), dtype=bool)
     visible[18:22, 18:] = cut
     visible[18:22, 18:22] = True
     silhouette = _Silhouette(replace(scene.train.cameras, distortion=lenses), 0, visible, 1)
     straight = silhouette.masks[0][MARGIN:-MARGIN, MARGIN:-MARGIN]
-    assert silhouette.whole != cut and straight[20, 20] and straight[0, 0] == cut
+    assert silhouette.shows_all != cut and straight[20, 20] and straight[0, 0] == cut
 
 
 def test_no_box_without_silhouettes(scene):

@@ -1,4 +1,4 @@
-"""The built-in city: what grows, what stays, and that its rays see the first of all solids."""
+"""Tests of the built-in city: what grows with its size, what stays, and that rays hit the nearest solid."""
 
 import numpy as np
 import pytest
@@ -25,34 +25,34 @@ def test_other_cameras_see_the_same_city(scene):
 
 
 def test_rays_meet_the_first_of_all_solids(monkeypatch):
-    """Each solid tested alone against every ray gives the same, bit for bit, seen from a camera and from the lamp."""
+    """Culled solids give the same hits, bit for bit, as testing every ray with every solid, for views and shadows."""
     caster, cameras = Caster(city((2, 2)), LIGHT), city_cameras(9, (2, 2), 2, 0)
-    every, tested, first = np.arange(len(caster.solids)), [], caster.first
+    indices, tested, first = np.arange(len(caster.solids)), [], caster.first
 
     def compared(origins, directions, solid, near, start, end):
-        depth, which = first(origins, directions, solid, near, start, end)
+        depth, hit_solid = first(origins, directions, solid, near, start, end)
         rays = np.broadcast_shapes(origins.shape, directions.shape)[1]
-        none = np.zeros_like(every)
-        alone, number = first(origins, directions, every, none, none, none + rays)
-        if directions.shape[1] == 1:  # a shadow, of whatever
+        none = np.zeros_like(indices)
+        alone, number = first(origins, directions, indices, none, none, none + rays)
+        if directions.shape[1] == 1:  # shadow rays: any hit counts
             assert np.array_equal(np.isinf(depth), np.isinf(alone))
         else:
-            assert np.array_equal(depth, alone) and np.array_equal(which, number)
-        tested.append((np.isfinite(depth).mean(), len(np.unique(which)), (end - start).sum() / rays))
-        return depth, which
+            assert np.array_equal(depth, alone) and np.array_equal(hit_solid, number)
+        tested.append((np.isfinite(depth).mean(), len(np.unique(hit_solid)), (end - start).sum() / rays))
+        return depth, hit_solid
 
     monkeypatch.setattr(caster, "first", compared)
     assert _images(cameras, range(len(cameras)), caster).shape == (8, 9, 9, 4)
     (hit, number, share), (dark, _, shadows) = tested
     assert hit > 0.5 and number > 100 and 0.1 < dark < 0.9
-    assert share < 0.1 * len(every) and shadows < 0.1 * len(every), "most solids are left out"
+    assert share < 0.1 * len(indices) and shadows < 0.1 * len(indices), "most solids are left out"
 
 
 def test_a_larger_city_holds_the_smaller_one():
     small, large = city((1, 1))[1:], city((3, 3))[1:]
     assert [type(solid) for solid in small] == [type(solid) for solid in large[: len(small)]]
-    away = np.array([s.centre for s in large[: len(small)]]) - np.array([s.centre for s in small])
-    np.testing.assert_allclose(away, np.broadcast_to((-1, -1, 0), away.shape), atol=1e-6)
+    shift = np.array([s.centre for s in large[: len(small)]]) - np.array([s.centre for s in small])
+    np.testing.assert_allclose(shift, np.broadcast_to((-1, -1, 0), shift.shape), atol=1e-6)
     assert len({len(block(column, 0)) for column in range(3)}) > 1, "blocks differ"
 
 

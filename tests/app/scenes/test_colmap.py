@@ -1,4 +1,4 @@
-"""COLMAP's folders as people have them: models, names, masks, and broken ones."""
+"""Tests of COLMAP folders as users have them: models, file names, masks, and broken folders."""
 
 import shutil
 import struct
@@ -14,7 +14,7 @@ from voronerf.app.scenes import SceneError, load_scene
 
 
 def write_models(folder, counts, pictures="images"):
-    """Models of the first so many images each, by their places in the folder."""
+    """Writes COLMAP models; `counts` maps each model's place in the folder to its number of leading images."""
     for place, count in counts.items():
         write_colmap(folder / "made", POSES[:count], [SIZE] * count, POINTS, binary=place.endswith(("0", "2")))
         shutil.copytree(folder / "made/sparse/0", folder / place, dirs_exist_ok=True)
@@ -51,12 +51,12 @@ def test_of_several_models_the_largest_is_read_or_the_one_that_is_named(tmp_path
 
 
 def test_the_folder_of_undistorted_images_is_a_scene(tmp_path):
-    """COLMAP's image_undistorter writes it, and it may lie in the folder of the scene."""
+    """The output of COLMAP's image_undistorter loads, also from within the scene's folder."""
     write_models(tmp_path, {"dense/sparse": COUNT}, "dense/images")
     for folder in (tmp_path, tmp_path / "dense", tmp_path / "dense/sparse"):
         assert len(load_scene(folder).train) == 7
     (tmp_path / "transforms.json").write_text("{}")
-    refuses("transforms.json: has no frames", load_scene, tmp_path, error=SceneError)  # which says more
+    refuses("transforms.json: has no frames", load_scene, tmp_path, error=SceneError)  # the more informative error
     write_models(tmp_path / "outside", {"sparse/0": 3})
     (tmp_path / "sparse").mkdir()
     (tmp_path / "sparse/1").symlink_to(tmp_path / "outside/sparse/0")
@@ -77,7 +77,7 @@ def test_a_model_is_read_of_the_files_that_belong_together(tmp_path, missing):
 
 
 def write_named(folder, name, file, pictures="images", size=SIZE):
-    """A model whose images have the names that `name` makes of their numbers, and files with those of `file`."""
+    """Writes a model; `name` and `file` map an image's number to its name in the model and on disk."""
     write_colmap(folder, POSES, [SIZE] * COUNT, POINTS, binary=False)
     listed = folder / "sparse/0/images.txt"
     text = listed.read_text()
@@ -94,7 +94,7 @@ def write_named(folder, name, file, pictures="images", size=SIZE):
     [
         ("IMG_{}.JPG", "IMG_{}.png", False),
         ("IMG_{}", "IMG_{}.JPG", False),
-        ("frame.{:03d}", "frame.{:03d}.png", False),  # which is no suffix
+        ("frame.{:03d}", "frame.{:03d}.png", False),  # ".000" is no suffix
         ("{}.jpg", "{}.jpg.png", False),
         ("img_{}.jpg", "IMG_{}.JPG", False),
         ("IMG_{}.HEIC", "img_{}.jpeg", False),
@@ -119,7 +119,7 @@ def test_images_are_found_by_their_names_or_else_by_their_order(tmp_path, name, 
 
 @pytest.mark.parametrize(("name", "file"), [("{}.jpg", "image_{:03d}.png"), ("IMG_{:03d}.JPG", "{}.png")])
 def test_an_order_of_which_there_are_two_is_none(tmp_path, name, file):
-    """10 stands before 9 in one of them."""
+    """Files do not match by order if numeric and alphabetic order differ: "10" sorts before "9" as text."""
     write_named(tmp_path, lambda index: name.format(index + 5), lambda index: file.format(index + 5))
     refuses("none of its 9 images exists", load_scene, tmp_path, error=SceneError)
 
@@ -164,12 +164,12 @@ def test_the_folder_of_a_model_is_known_from_within(tmp_path, monkeypatch, place
 
 
 def test_images_are_reduced_ones_of_the_same_order(tmp_path):
-    """All images of the folder count, whether the model has them or not."""
+    """A reduced image is found by its position among all images of the folder, also those not in the model."""
     write_named(tmp_path, "IMG_{}.JPG".format, "IMG_{}.JPG".format)
     write_named(tmp_path, "IMG_{}.JPG".format, "image{:03d}.png".format, "images_2", (6, 5))
     path = tmp_path / "sparse/0/images.txt"
     lines = path.read_text().splitlines()
-    path.write_text("\n".join(lines[5:]) + "\n")  # without the last two, which come first
+    path.write_text("\n".join(lines[5:]) + "\n")  # drops the last two images, listed first
     scene = load_scene(tmp_path, downscale=2, normalise=False)
     assert scene.train.images.shape == (6, 5, 6, 3)
     for image, pose in zip(scene.train.images, scene.train.cameras.poses):
@@ -195,7 +195,7 @@ def test_images_that_may_be_others_are_not_taken(tmp_path, caplog):
 
 
 def test_a_file_is_that_of_one_name_alone(tmp_path, caplog):
-    """3.png is not taken for a missing 3.jpg where the model has 3.png itself, nor where two names fit it."""
+    """3.png does not replace a missing 3.jpg if the model also lists 3.png, or if two listed names match it."""
     for lost in ("3.jpg", "3"):
         write_named(tmp_path / lost, lambda index, lost=lost: lost if index == 4 else f"{index}.png", "{}.png".format)
         scene = load_scene(tmp_path / lost, normalise=False)
@@ -211,7 +211,7 @@ def test_a_file_is_that_of_one_name_alone(tmp_path, caplog):
 
 
 def test_names_of_files_elsewhere_are_those_in_the_folder(tmp_path):
-    """Unless reading files elsewhere is allowed."""
+    """A name in another folder means the file of that name in this folder, unless outside files are allowed."""
     elsewhere = tmp_path / "elsewhere"
     write_named(tmp_path / "scene", lambda index: f"{elsewhere}/{index}.png", "{}.png".format)
     elsewhere.mkdir()
@@ -239,8 +239,8 @@ def half_black(path, size):
 @pytest.mark.parametrize(
     ("name", "file", "mask", "size"),
     [
-        ("{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.jpg.png", SIZE),  # COLMAP's
-        ("{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.png", SIZE),  # nerfstudio's
+        ("{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.jpg.png", SIZE),  # COLMAP's naming
+        ("{:02d}.jpg", "{:02d}.jpg", "masks/{:02d}.png", SIZE),  # nerfstudio's naming
         ("{:02d}.png", "{:02d}.png", "Masks/{:02d}.png", SIZE),
         ("{:02d}", "{:02d}.JPG", "masks/{:02d}.JPG.png", SIZE),
         ("a/{:02d}.jpg", "a/{:02d}.jpg", "masks/a/{:02d}.jpg.png", SIZE),
@@ -251,7 +251,7 @@ def half_black(path, size):
     ],
 )
 def test_masks_beside_the_images_of_a_model(tmp_path, name, file, mask, size):
-    """Some images have one, or all; masks may have the size that the images had before."""
+    """Masks beside the images are found for some or all images; masks may have the size of the original images."""
     write_named(tmp_path, name.format, file.format)
     for index in (0, 1, 4):
         half_black(tmp_path / mask.format(index), size)
@@ -278,7 +278,7 @@ def test_masks_of_reduced_images(tmp_path):
     Image.fromarray(block).save(tmp_path / "masks/02.jpg.png")
     scene = load_scene(tmp_path, downscale=4)
     assert [int(mask.sum()) for mask in scene.train.masks] == [60, 119, 60, 60, 60, 60, 60]
-    assert not scene.train.masks[1][2, 3]  # a block that has a black pixel
+    assert not scene.train.masks[1][2, 3]  # a block with a black pixel
     half_black(tmp_path / "masks_4/03.png", (12, 10))
     scene = load_scene(tmp_path, downscale=4)
     assert "1 of 9 images have a mask in masks_4, whose black pixels do not count" in scene.notes
@@ -333,7 +333,7 @@ def broken(path, at, layout, *values):
 
 
 def test_numbers_of_points_that_are_none_are_passed_over(tmp_path):
-    """COLMAP writes 2^64 - 1 for a sighting of no point."""
+    """An invalid point number is ignored: COLMAP writes 2^64 - 1 for a feature without a point."""
     write_both(tmp_path, binary=False)
     model, before = tmp_path / "sparse/0", load_scene(tmp_path)
     (model / "points3D.txt").write_text((model / "points3D.txt").read_text() + f"{2**63} 1 2 3 0 0 0 1 1 0 2 0 3 0\n")

@@ -1,5 +1,5 @@
-"""Captures and camera paths that other people's programs have written, which once went wrong: each is read rightly, or
-refused in one line that says what to do."""
+"""Regression tests on captures and camera paths of other programs: each file is read correctly, or refused with one
+line that says what to do."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ CASES = DATA.parent / "cases"
 
 
 def gathered(source, out):
-    """The images that `process` takes of a source, and the lines about them."""
+    """Returns (names, messages): the images that `process` takes from a source, and its messages."""
     said = []
     gather(source, emptied(out / "images"), out / "masks", 150, say=said.append, progress=lambda *_: None)
     return listed_images(out / "images"), " ".join(said)
 
 
 def case(name):
-    """The folder of a case."""
+    """Returns the folder of a test case; skips the test if the folder is absent."""
     if not (CASES / name).is_dir():
         pytest.skip(f"{CASES / name} is not there; set VORONERF_DATA to a folder beside it")
     return CASES / name
@@ -85,7 +85,7 @@ def test_models_of_another_size_than_their_pictures():
     folder = case("images_smaller_than_model")
     small, large = load_scene(folder), load_scene(folder / "big")
     assert size_of(small) == (504, 378) and size_of(large) == (400, 300)
-    for scene in (small, large):  # the focal length is that of the model, scaled
+    for scene in (small, large):  # the focal length is the model's, scaled
         model = read_model(folder / ("big" if scene is large else "") / "sparse/0").images[0].camera
         across = size_of(scene)[0] / model.width
         assert float(scene.train.cameras.intrinsics[0, 0]) == pytest.approx(model.lens.intrinsics[0] * across)
@@ -104,7 +104,7 @@ def test_names_of_pictures(name, downscale):
     folder = case("colmap_names") / name
     scene = load_scene(folder, downscale=downscale)
     assert len(scene.train) + len(scene.test) == 9
-    if downscale:  # the pictures of images_4 are those of images, in the same order
+    if downscale:  # images_4 has the reduced images, in the same order
         full = load_scene(folder, downscale=1)
         assert torch.equal(scene.train.cameras.poses, full.train.cameras.poses)
 

@@ -1,4 +1,4 @@
-"""Signs of what misleads a mapper, on matches of points that cameras on a circle see."""
+"""Tests of detecting ambiguous matches and folded models, on simulated matches of cameras on a circle."""
 
 import itertools
 import math
@@ -30,20 +30,20 @@ LENS = colmap_lens("SIMPLE_RADIAL", (FOCAL, WIDTH / 2, HEIGHT / 2, 0.05))
 
 
 def images(turned=()):
-    """Images on a circle; the turned ones lie on its other side."""
+    """Returns images on a circle; the cameras of the `turned` indices are on its opposite side."""
     poses = orbit_cameras(COUNT, radius=4.0, elevation=20.0, width=WIDTH, height=HEIGHT, focal=FOCAL).poses.double()
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
-    made = []
+    result = []
     for index, name in enumerate(NAMES):
         pose = torch.eye(4).double()
         pose[:3] = half_turn @ poses[index, :3] if index in turned else poses[index, :3]
         camera = ColmapCamera("SIMPLE_RADIAL", LENS, WIDTH, HEIGHT)
-        made.append(ColmapImage(name, camera, pose.numpy(), np.zeros(0, dtype=np.int64)))
-    return made
+        result.append(ColmapImage(name, camera, pose.numpy(), np.zeros(0, dtype=np.int64)))
+    return result
 
 
 def matches():
-    """All images see 200 points; neighbours match all of them, others 40 that lie together."""
+    """Returns matches of 200 points that all images see: neighbours share 200, other pairs the 40 close together."""
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
     points[:40] *= 0.2
     features = {}
@@ -59,17 +59,17 @@ def matches():
 
 
 def test_a_background_that_stands_still_is_seen_in_pairs_that_differ_by_a_shift():
-    found = matches()
-    assert still_pairs(found) == (0, len(found.pairs))
+    simulated = matches()
+    assert still_pairs(simulated) == (0, len(simulated.pairs))
     generator = np.random.default_rng(0)
     background = generator.uniform((0, 0), (WIDTH, HEIGHT), (250, 2))
-    for name, places in found.features.items():  # each image is cut out at another place
-        found.features[name] = np.concatenate((places, background + generator.uniform(-30, 30, 2)))
+    for name, places in simulated.features.items():  # the background shifts in each image
+        simulated.features[name] = np.concatenate((places, background + generator.uniform(-30, 30, 2)))
     behind = np.arange(200, 450)[:, None].repeat(2, 1)
-    moved = {pair: np.concatenate((rows, behind)) for pair, rows in found.pairs.items()}
-    assert still_pairs(Matches(found.features, moved)) == (len(moved), len(moved))
+    moved = {pair: np.concatenate((rows, behind)) for pair, rows in simulated.pairs.items()}
+    assert still_pairs(Matches(simulated.features, moved)) == (len(moved), len(moved))
     few = {pair: rows[: WIDE_MATCHES - 1] for pair, rows in moved.items()}
-    assert still_pairs(Matches(found.features, few)) == (0, 0)
+    assert still_pairs(Matches(simulated.features, few)) == (0, 0)
 
 
 def neighbours():
@@ -77,39 +77,39 @@ def neighbours():
 
 
 def test_pairs_that_match_over_much_of_both_images_are_wide():
-    found = matches()
-    assert set(wide_pairs(found, spreads(found))) == neighbours()
-    few = {pair: rows[:29] if pair == (NAMES[0], NAMES[1]) else rows for pair, rows in found.pairs.items()}
-    assert set(wide_pairs(Matches(found.features, few), spreads(found))) == neighbours() - {(NAMES[0], NAMES[1])}
+    simulated = matches()
+    assert set(wide_pairs(simulated, spreads(simulated))) == neighbours()
+    few = {pair: rows[:29] if pair == (NAMES[0], NAMES[1]) else rows for pair, rows in simulated.pairs.items()}
+    assert set(wide_pairs(Matches(simulated.features, few), spreads(simulated))) == neighbours() - {(NAMES[0], NAMES[1])}
     bare = {"a": np.zeros((0, 2)), "b": np.ones((40, 2))}
     assert spreads(Matches(bare, {("a", "b"): np.zeros((0, 2), dtype=np.int64)})) == {("a", "b"): 0}
 
 
 def test_an_image_without_strong_pairs_keeps_its_best_pairs():
-    pairs = {  # matches, and the share of the images over which they reach
+    pairs = {  # number of matches, and their extent as a share of the image
         ("a", "b"): (200, 0.5),
         ("a", "c"): (100, 0.5),
-        ("b", "d"): (49, 0.5),  # wide, but of few matches
+        ("b", "d"): (49, 0.5),  # wide, but few matches
         ("a", "d"): (190, 0.02),
         ("c", "d"): (90, 0.1),
         ("b", "c"): (90, 0.03),
         ("d", "e"): (29, 0.1),
     }
-    found = Matches(dict.fromkeys("abcdef"), {pair: np.zeros((n, 2)) for pair, (n, _) in pairs.items()})
+    simulated = Matches(dict.fromkeys("abcdef"), {pair: np.zeros((n, 2)) for pair, (n, _) in pairs.items()})
     spread = {pair: share for pair, (_, share) in pairs.items()}
-    wide = wide_pairs(found, spread)
-    assert wide == [("a", "b"), ("a", "c"), ("b", "d")] and strong_pairs(found, wide) == wide[:2]
-    assert trusted_pairs(found, spread) == {*wide, ("c", "d"), ("a", "d")}
+    wide = wide_pairs(simulated, spread)
+    assert wide == [("a", "b"), ("a", "c"), ("b", "d")] and strong_pairs(simulated, wide) == wide[:2]
+    assert trusted_pairs(simulated, spread) == {*wide, ("c", "d"), ("a", "d")}
 
 
 def test_a_model_contradicts_the_pairs_that_a_fold_tears_apart():
-    found = matches()
-    strong = strong_pairs(found, wide_pairs(found, spreads(found)))
-    assert contradicted_pairs(found, strong, images()) == (0, COUNT)
+    simulated = matches()
+    strong = strong_pairs(simulated, wide_pairs(simulated, spreads(simulated)))
+    assert contradicted_pairs(simulated, strong, images()) == (0, COUNT)
     folded = images(turned=range(3, 9))
-    assert contradicted_pairs(found, strong, folded) == (2, COUNT)  # at both ends of the turned part
-    assert contradicted_pairs(found, strong, folded[:6]) == (1, 5)
-    assert contradicted_pairs(found, strong, []) == (0, 0)
+    assert contradicted_pairs(simulated, strong, folded) == (2, COUNT)  # at both ends of the turned arc
+    assert contradicted_pairs(simulated, strong, folded[:6]) == (1, 5)
+    assert contradicted_pairs(simulated, strong, []) == (0, 0)
     assert [is_folded(*counts) for counts in ((2, 12), (3, 12), (3, 300), (4, 300), (0, 0))] == [0, 1, 0, 1, 0]
 
 
@@ -121,6 +121,6 @@ def test_rays_miss_each_other_by_the_angle_to_the_epipolar_plane(missed):
     across = torch.nn.functional.normalize(torch.linalg.cross((right - left).expand_as(b), b), dim=-1)
     turned = math.cos(missed) * b + math.sin(missed) * across
     angles = epipolar_angles(a, turned, right - left)
-    # Sampson's distance spreads the angle over both rays.
+    # Sampson's distance divides the error between both rays.
     torch.testing.assert_close(angles, torch.full_like(angles, missed / math.sqrt(2)), rtol=0.1, atol=1e-9)
     assert (epipolar_angles(a, turned, torch.zeros(3).double()) == 0).all()

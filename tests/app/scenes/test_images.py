@@ -1,4 +1,4 @@
-"""Decoding and downscaling, against slow averages."""
+"""Tests of decoding and downscaling against slow averages."""
 
 import sys
 
@@ -21,12 +21,12 @@ def test_area_average_is_that_of_the_composited_image():
     for background in (0.0, 1.0):
         values = image.astype(np.float64) / 255
         over = values[..., :3] * values[..., 3:] + background * (1 - values[..., 3:])
-        found = small.astype(np.float64) / 255
-        found = found[..., :3] * found[..., 3:] + background * (1 - found[..., 3:])
+        reduced = small.astype(np.float64) / 255
+        reduced = reduced[..., :3] * reduced[..., 3:] + background * (1 - reduced[..., 3:])
         for y in range(4):
             for x in range(3):
                 block = over[3 * y : 3 * y + 3, 3 * x : 3 * x + 3].reshape(9, 3).mean(axis=0)
-                assert np.abs(found[y, x] - block).max() <= 1.01 / 255
+                assert np.abs(reduced[y, x] - block).max() <= 1.01 / 255
 
 
 def test_area_average_does_not_bleed_hidden_colours():
@@ -50,16 +50,16 @@ def test_jpeg_reduction_is_the_area_average(tmp_path, factor, size):
     smooth = np.stack((127 + 100 * np.sin(x / 9), 127 + 100 * np.cos(y / 7), x + y), axis=-1).astype(np.uint8)
     path = tmp_path / "a.jpg"
     Image.fromarray(smooth).save(path, quality=97, subsampling=0)
-    found = read_image(path, factor)
+    reduced = read_image(path, factor)
     expected = area_average(smooth, factor)
-    assert found.shape == expected.shape == (height // factor, width // factor, 3)
-    assert np.abs(found.astype(int) - expected.astype(int)).mean() < 2
+    assert reduced.shape == expected.shape == (height // factor, width // factor, 3)
+    assert np.abs(reduced.astype(int) - expected.astype(int)).mean() < 2
 
 
 @pytest.mark.parametrize("tag", [1, 3, 6, 8])
 @pytest.mark.parametrize("mode", ["RGB", "L"])
 def test_a_jpeg_with_a_second_picture_is_read_like_one_without(tmp_path, tag, mode):
-    """Phones and Sony's cameras add a preview, or a map of brightness, by an index of pictures (MPF)."""
+    """A preview or gain map in the JPEG (an MPF index, as phones and Sony cameras write) is ignored."""
     pixels = np.random.default_rng(tag).integers(0, 256, (48, 64, 3), np.uint8)
     picture, exif = Image.fromarray(pixels).convert(mode), Image.Exif()
     exif[0x0112] = tag
@@ -69,7 +69,7 @@ def test_a_jpeg_with_a_second_picture_is_read_like_one_without(tmp_path, tag, mo
     with Image.open(two) as file:
         assert file.format == "MPO"
     assert read_header(one) == read_header(two) and read_header(two).turns == {1: 0, 3: 2, 6: 3, 8: 1}[tag]
-    for factor in (1, 2, 3, 8):  # by 8, an area average of all pixels differs
+    for factor in (1, 2, 3, 8):  # by 8, an area average would differ
         assert np.array_equal(read_image(one, factor), read_image(two, factor))
 
 
@@ -107,7 +107,7 @@ def test_bands_of_rows_are_parts_of_the_whole(tmp_path, monkeypatch, mode, facto
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="units of ru_maxrss")
 def test_large_images_are_reduced_one_after_another(tmp_path):
-    """16 million grey pixels each, which are 48 MB in colour and 192 MB as float32."""
+    """Memory holds one large image at a time: 16 million pixels, 48 MB in RGB and 192 MB as float32."""
     for index in range(3):
         Image.new("L", (4000, 4000), index).save(tmp_path / f"{index}.png")
     code = (
@@ -122,7 +122,7 @@ def test_what_does_not_fit_into_memory_is_not_decoded(tmp_path, monkeypatch):
     paths = [tmp_path / f"{index}.png" for index in range(4)]
     for path in paths:
         Image.new("RGB", (100, 50)).save(path)
-    needed = 100 * 50 * (4 * 3 + 550)  # of the images, and of a view while it is scored
+    needed = 100 * 50 * (4 * 3 + 550)  # bytes of the images and of scoring a view
     monkeypatch.setattr(images, "available_memory", lambda: needed / 0.75)
     assert read_images(paths, 1)[0].shape == (4, 50, 100, 3)
     monkeypatch.setattr(images, "available_memory", lambda: (needed - 1) / 0.75)

@@ -1,7 +1,7 @@
-"""Rays of every camera model of COLMAP, against pixels by pycolmap 4.2.
+"""Tests of the rays of every COLMAP camera model against pixels by pycolmap 4.2.
 
-OpenCV 5.0 (`projectPoints`, `fisheye.projectPoints`) gives the same pixels to 1e-13 for all but FOV and
-THIN_PRISM_FISHEYE, which it has not.
+OpenCV 5.0 (`projectPoints`, `fisheye.projectPoints`) gives the same pixels to 1e-13 for all models that it has, which
+excludes FOV and THIN_PRISM_FISHEYE.
 """
 
 import json
@@ -39,7 +39,7 @@ def test_rays_go_where_colmap_and_opencv_see_the_points(model):
 
 
 def test_each_image_of_a_folder_has_its_own_model(tmp_path):
-    """And its own size: files are a tenth or a twentieth of what their lens is for."""
+    """Each image has its own camera model and size; files are reduced 10 or 20 times against their lens."""
     names = [name for name, _ in MODELS.values()]
     poses = orbit_cameras(len(names), radius=4, elevation=20, width=1, height=1, focal=1).poses
     write_images(tmp_path, [(64, 48) if index % 3 else (32, 24) for index in range(len(names))])
@@ -56,12 +56,12 @@ def test_each_image_of_a_folder_has_its_own_model(tmp_path):
                 points = torch.tensor(row["points"]) * torch.tensor([1.0, -1.0, -1.0])  # OpenGL's axes
                 expected = torch.nn.functional.normalize(points, dim=-1) @ poses[view, :3, :3].T
                 assert float((rays.directions - expected).norm(dim=-1).max()) * max(row["params"]) * scale < 1e-4
-                found, _ = cameras.project(points @ poses[view, :3, :3].T + poses[view, :3, 3], index)
-                torch.testing.assert_close(found, pixels, atol=1e-4, rtol=0)
+                projected, _ = cameras.project(points @ poses[view, :3, :3].T + poses[view, :3, 3], index)
+                torch.testing.assert_close(projected, pixels, atol=1e-4, rtol=0)
 
 
 def test_pictures_all_around(tmp_path):
-    """As nerfstudio writes them: the focal length says nothing, and rays are reduced and kept with the images."""
+    """nerfstudio's equirectangular images load: the focal length is ignored, and rays follow the reduced size."""
     poses = orbit_cameras(3, radius=4, elevation=20, width=1, height=1, focal=1).poses
     write_images(tmp_path, [(64, 32)] * 3)
     frames = [
@@ -82,7 +82,7 @@ def test_pictures_all_around(tmp_path):
 @pytest.mark.parametrize("height", [32, 40])
 @pytest.mark.parametrize("binary", [True, False])
 def test_pictures_all_around_of_a_model(tmp_path, binary, height):
-    """Its two parameters are the size; depths are distances, since points lie on all sides."""
+    """Equirectangular COLMAP cameras load: their two parameters are the size, and depths are distances."""
     poses = orbit_cameras(9, radius=4, elevation=20, width=1, height=1, focal=1).poses
     points = torch.nn.functional.normalize(torch.randn(60, 3, generator=torch.Generator().manual_seed(0)), dim=-1) * 20
     lens = ("EQUIRECTANGULAR", (64.0, float(height)))
@@ -118,7 +118,7 @@ def test_a_picture_all_around_stands_upright_or_on_its_head(tmp_path, tag):
         ({"k1": -0.25}, PERSPECTIVE, 2 / 3**0.5),
         ({"k1": -0.25, "k2": 1e-20, "k3": -1e-18}, PERSPECTIVE, 2 / 3**0.5),
         ({"k1": 0.1, "k2": 0.2}, PERSPECTIVE, math.inf),
-        ({"k4": -0.25}, PERSPECTIVE, 2.0),  # a pole
+        ({"k4": -0.25}, PERSPECTIVE, 2.0),  # the denominator is 0 at 2
         ({"k1": -0.1}, FISHEYE, (10 / 3) ** 0.5),
         ({"k4": -1e-4}, FISHEYE, (1e4 / 9) ** 0.125),
         ({}, EQUIRECTANGULAR, math.inf),

@@ -1,4 +1,4 @@
-"""Which pixels count: masks, alpha, and what a lens shows."""
+"""Tests of the pixels that count: masks, alpha, and the image circle of a lens."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def test_masks_leave_pixels_out_of_training_and_scores(tmp_path):
 
 
 def disc(side, radius, columns=0):
-    """Which pixels of side x side lie within a radius of the middle, or beside it."""
+    """Returns a bool image [side, side] of a disc about the middle, shifted to the right by `columns`."""
     x = torch.arange(side) + 0.5 - side / 2
     return torch.hypot(x - columns, x[:, None]) < radius
 
@@ -52,13 +52,13 @@ def disc(side, radius, columns=0):
 @pytest.mark.parametrize(
     ("clear", "kind"),
     [
-        (lambda index: (torch.arange(400).view(20, 20) == 57) & (index == 3), "unbounded"),  # a pixel of one picture
-        (lambda index: disc(20, 4, columns=index), "unbounded"),  # somebody who walks through
-        (lambda index: disc(20, 9) & (index in (1, 2)), "unbounded"),  # and twice comes near
-        (lambda index: ~disc(20, 12.5), "unbounded"),  # corners after straightening
+        (lambda index: (torch.arange(400).view(20, 20) == 57) & (index == 3), "unbounded"),  # one pixel of one image
+        (lambda index: disc(20, 4, columns=index), "unbounded"),  # a person walks through
+        (lambda index: disc(20, 9) & (index in (1, 2)), "unbounded"),  # a person comes near in two images
+        (lambda index: ~disc(20, 12.5), "unbounded"),  # empty corners after undistortion
         (lambda index: torch.arange(20)[:, None].expand(20, 20) >= 15, "unbounded"),  # a car's bonnet
         (lambda index: ~disc(20, 6, columns=index - 4), "object"),
-        (lambda index: ~disc(20, 6) if index else ~disc(20, 14), "object"),  # of which one picture is full
+        (lambda index: ~disc(20, 6) if index else ~disc(20, 14), "object"),  # an object that fills one image
     ],
 )
 @pytest.mark.parametrize("keep", ["memory", "disk"])
@@ -140,7 +140,7 @@ def test_a_mask_lies_as_its_image_is_stored_or_as_it_is_seen(tmp_path, tag, upri
 
 
 def test_a_jpeg_may_be_a_mask(tmp_path):
-    """Its black is never quite black."""
+    """A JPEG mask works although its black pixels are not exactly black."""
     write_capture(tmp_path, orbit_cameras(9, radius=2, elevation=5, width=48, height=48, focal=12))
     Image.fromarray(255 * disc(48, 15).numpy().astype(np.uint8)).save(tmp_path / "mask.jpg", quality=70)
     rewrite(tmp_path, lambda contents: [frame.update(mask_path="mask.jpg") for frame in contents["frames"]])
@@ -151,7 +151,7 @@ def test_a_jpeg_may_be_a_mask(tmp_path):
 @pytest.mark.parametrize(
     ("focal", "lens", "limit"),
     [
-        (10.0, {"k1": -0.25}, 10 * 2 / 3 / 0.75**0.5),  # an action camera: r (1 - r^2 / 4) is 0.77 at the most
+        (10.0, {"k1": -0.25}, 10 * 2 / 3 / 0.75**0.5),  # an action camera: r (1 - r^2 / 4) is at most 0.77
         (12.0, {"k1": -0.3, "k2": 0.02}, None),
         (9.0, {"k1": -0.28, "k2": 0.05, "k3": -0.002}, None),
         (11.0, {"k1": -0.2, "p1": 0.004, "p2": -0.003}, None),
@@ -160,7 +160,7 @@ def test_a_jpeg_may_be_a_mask(tmp_path):
     ],
 )
 def test_corners_without_a_ray_are_masked(tmp_path, focal, lens, limit):
-    """A ray that is left is that of its pixel, and no point that lies beyond is shown there."""
+    """Unmasked rays project to their own pixels, and points beyond the lens's limit project to no unmasked pixel."""
     rig = orbit_cameras(9, radius=2, elevation=5, width=20, height=20, focal=6)
     write_capture(tmp_path, rig, fl_x=focal, **lens)
     scene = load_scene(tmp_path, normalise=False)
@@ -177,7 +177,7 @@ def test_corners_without_a_ray_are_masked(tmp_path, focal, lens, limit):
     directions = torch.nn.functional.normalize(torch.randn(5000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     pixels, depth = cameras.project(cameras.origins[0] + 3 * directions, 0)
     seen = ((pixels >= 0) & (pixels < 20)).all(-1) & ((depth > 0) | (cameras.models is not None))
-    inner = torch.nn.functional.max_pool2d((~mask).float()[None], 3, 1, 1)[0] == 0  # the border is steep in between
+    inner = torch.nn.functional.max_pool2d((~mask).float()[None], 3, 1, 1)[0] == 0  # leaves the steep border out
     seen[seen.clone()] &= inner[tuple(pixels[seen].long().flip(-1).T)]
     back = cameras.rays(0, *pixels[seen].unbind(-1)).directions
     assert seen.sum() > 100 and float((back - directions[seen]).norm(dim=-1).max()) < 1e-3
@@ -185,7 +185,7 @@ def test_corners_without_a_ray_are_masked(tmp_path, focal, lens, limit):
 
 def test_the_corners_that_a_fisheye_does_not_reach_are_left_out(tmp_path):
     rig = orbit_cameras(9, radius=2, elevation=5, width=20, height=20, focal=6)
-    write_capture(tmp_path, rig, fl_x=6.0, k1=-0.1, is_fisheye=True)  # the angle t is at 6 (t - 0.1 t^3), at most 7.3
+    write_capture(tmp_path, rig, fl_x=6.0, k1=-0.1, is_fisheye=True)  # angle t maps to 6 (t - 0.1 t^3) <= 7.3
     scene = load_scene(tmp_path)
     y, x = torch.meshgrid(torch.arange(20) - 9.5, torch.arange(20) - 9.5, indexing="ij")
     assert torch.equal(scene.train.masks[0], torch.hypot(x, y) < 7.3)
@@ -196,7 +196,7 @@ def test_the_corners_that_a_fisheye_does_not_reach_are_left_out(tmp_path):
 
 @pytest.mark.parametrize("lens", [{"k1": -0.25}, {"k1": -0.28, "k2": 0.02, "p1": 0.002}])
 def test_rays_that_are_none_change_nothing(tmp_path, lens):
-    """Neither the space of a scene that faces forward, nor what its cameras look through."""
+    """Pixels without a ray change neither the space of a forward-facing scene nor the region its cameras see."""
     poses = torch.eye(4).repeat(9, 1, 1)
     poses[:, 0, 3] = torch.arange(9) / 20
     write_capture(tmp_path, Cameras(poses, torch.full((9, 4), 10.0), 20, 16), fl_x=10.0, **lens)

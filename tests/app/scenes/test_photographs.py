@@ -1,4 +1,4 @@
-"""Folders of photographs: COLMAP's, LLFF's and nerfstudio's readers, what they share, and what they refuse."""
+"""Tests of photograph folders: the readers of COLMAP, LLFF and nerfstudio, their shared code, and their errors."""
 
 import json
 import math
@@ -68,7 +68,7 @@ def test_the_scene_is_normalised_by_a_similarity_that_it_keeps(tmp_path):
     assert scene.kind == "unbounded" and scene.spacing == "disparity" and scene.box is None
     _, poses = every(scene)
     assert float(poses[:, :3, 3].norm(dim=-1).max()) == pytest.approx(1, abs=1e-5)
-    assert float(poses[:, :3, 3].mean(0)[:2].norm()) < 1e-5 and float(poses[0, 2, 3]) > 0  # around z, above
+    assert float(poses[:, :3, 3].mean(0)[:2].norm()) < 1e-5 and float(poses[0, 2, 3]) > 0  # around z, above 0
     homogeneous = torch.cat((POSES[:, :3, 3], torch.ones(COUNT, 1)), dim=1).double()
     torch.testing.assert_close((homogeneous @ scene.transform.T)[:, :3].float(), poses[:, :3, 3])
     scale = float(torch.linalg.det(scene.transform[:3, :3])) ** (1 / 3)
@@ -78,7 +78,7 @@ def test_the_scene_is_normalised_by_a_similarity_that_it_keeps(tmp_path):
 
 
 def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
-    """Of images of two sizes, reduced; a quarter of the rays ends at points."""
+    """A quarter of the rays ends at points of the sparse model, for reduced images of two sizes."""
     write_both(tmp_path, [(48, 40) if index % 2 else (32, 56) for index in range(COUNT)])
     scene = load_scene(tmp_path, downscale=4)
     points = torch.from_numpy(POINTS) @ scene.transform[:3, :3].T + scene.transform[:3, 3]
@@ -87,15 +87,15 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     assert (config.sparse_depth, space.full_gradient) == (0.0015, 1.0)
     assert config.occupancy and config.samples == (384,)
     assert resolve(TrainConfig(budget=15), scene).samples == (128,)
-    states = [build(config, each) for each in (scene, replace(scene, background="white"))]
-    assert [each.ray_loss.robust for each in states] == [ROBUST, 0.0]  # of photographs alone
+    states = [build(config, state) for state in (scene, replace(scene, background="white"))]
+    assert [state.ray_loss.robust for state in states] == [ROBUST, 0.0]  # for photographs only
     batch = make_batches(config, scene).draw(400, torch.Generator().manual_seed(0))
     assert len(batch.rays) == 400 and len(batch.sparse_depths) == 100
-    assert batch.background.shape == (400, 3) and batch.background.unique().numel() > 1000  # drawn for each
+    assert batch.background.shape == (400, 3) and batch.background.unique().numel() > 1000  # one drawn per ray
     rays = batch.rays[:100]
     depths = batch.sparse_depths
     apart = torch.cdist(rays.origins + depths[:, None] * rays.directions, points.float()).amin(1)
-    assert bool((apart <= 0.75 * depths / scene.train.cameras.intrinsics[:, :2].min()).all())  # within their pixel
+    assert bool((apart <= 0.75 * depths / scene.train.cameras.intrinsics[:, :2].min()).all())  # within a pixel
     seen = sum(
         int(((places >= 0) & (places < torch.tensor(cameras.size(index)))).all(-1).sum())
         for cameras in [scene.train.cameras]
@@ -110,7 +110,7 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
 
 
 def test_space_before_the_rays_of_cameras_stays_empty(tmp_path):
-    """Where cameras look to; not behind them, and not beyond."""
+    """Only space between a camera and the near distance stays empty, not space behind the camera or beyond."""
     write_both(tmp_path)
     scene = load_scene(tmp_path)
     state = build(TrainConfig(steps=20, rays=32, samples=(16,), cells=(), field_options=("log2_entries=10",)), scene)
@@ -124,13 +124,13 @@ def test_space_before_the_rays_of_cameras_stays_empty(tmp_path):
         assert not any(occupied(part).any() for part in (0.1, 0.5, 0.9)) and occupied(1.1).all()
         assert occupied(-0.5).all() and 0.002 < float((~grid.occupied).float().mean()) < 0.2
         train(state)
-    assert not build(state.config, replace(scene, near=0.01)).sampler.empty.any()  # nearer than a voxel is wide
+    assert not build(state.config, replace(scene, near=0.01)).sampler.empty.any()  # near is less than a voxel
 
 
 def test_rays_from_elsewhere_end_the_sooner_the_more_points_there_are(tmp_path):
-    """They are of photographs of something that cameras stand around, most of whose tiles have no point."""
+    """Unseen rays are used around an object with few sparse points, and end the sooner the more points there are."""
     write_both(tmp_path)
-    scene = load_scene(tmp_path)  # whose pixels are its tiles
+    scene = load_scene(tmp_path)  # each pixel is a tile
     pixels = torch.arange(len(scene.train) * 120)
 
     def known(share):
@@ -140,15 +140,15 @@ def test_rays_from_elsewhere_end_the_sooner_the_more_points_there_are(tmp_path):
         )
 
     few, many = known(0.51 * COVERED), known(1.01 * COVERED)
-    config, found = TrainConfig(steps=64, rays=32, samples=(16,), cells=(), field_options=("log2_entries=10",)), []
+    config, shares = TrainConfig(steps=64, rays=32, samples=(16,), cells=(), field_options=("log2_entries=10",)), []
 
     class Note(Callback):
         def after_step(self, state):
-            found.append((state.step <= 32, state.batches.unseen))
+            shares.append((state.step <= 32, state.batches.unseen))
 
     train(build(config, few), [Note()])
-    assert set(found) == {(True, BESIDE), (False, 0.0)}
-    states = [build(replace(config, steps=40), few) for _ in range(2)]  # half of which is within a group of steps
+    assert set(shares) == {(True, BESIDE), (False, 0.0)}
+    states = [build(replace(config, steps=40), few) for _ in range(2)]  # half the steps end within a group
     for state, callbacks in zip(states, ([Note()], [])):
         train(state, callbacks)
     assert torch.equal(*(state.router.module.features for state in states))
@@ -169,7 +169,7 @@ def test_the_kind_is_told_by_the_cameras_and_can_be_set(tmp_path, kind, turn):
     write_llff(tmp_path, poses, SIZE, 20.0, (2.0, 6.0))
     scene = load_scene(tmp_path)
     assert scene.kind == kind and any("--kind" in note for note in scene.notes)
-    if kind == "forward":  # y is ahead, the nearest depth at 1
+    if kind == "forward":  # looks along y, with the nearest depth at 1
         torch.testing.assert_close(scene.train.cameras.forward, torch.tensor([[0.0, 1, 0]]).expand(7, 3))
         assert scene.near == pytest.approx(0.75)
     assert load_scene(tmp_path, kind="inside-out").kind == "inside-out"
@@ -182,13 +182,13 @@ def looking(origins, targets):
 
 
 def on_a_sphere(count, turn, climb, generator):
-    """Directions whose azimuth and height are drawn from 0 to these angles, in radians."""
+    """Returns unit vectors [count, 3] whose azimuth and elevation are drawn from 0 to `turn` and `climb` radians."""
     azimuth, height = turn * torch.rand(count, generator=generator), climb * torch.rand(count, generator=generator)
     return torch.stack((azimuth.cos() * height.cos(), azimuth.sin() * height.cos(), height.sin()), dim=1)
 
 
 def test_people_who_walk_and_look_around_are_inside_out():
-    """Whether the point that is closest to their axes lies ahead of most cameras is chance."""
+    """A walk is "inside-out" even if the point closest to the camera axes lies ahead of most cameras by chance."""
     generator = torch.Generator().manual_seed(0)
     ahead = 0
     for _ in range(200):
@@ -204,7 +204,7 @@ def test_people_who_walk_and_look_around_are_inside_out():
 @pytest.mark.parametrize("turn", [2.0, math.pi, 2 * math.pi])
 @pytest.mark.parametrize("climb", [0.2, 1.5])
 def test_cameras_around_something_are_unbounded(turn, climb, middle, noise):
-    """Along an arc or over a dome, around an object or beside it, and not well aimed."""
+    """Cameras on an arc or a dome are "unbounded", also if their aim is noisy or beside the middle."""
     generator = torch.Generator().manual_seed(0)
     origins = on_a_sphere(60, turn, climb, generator)
     targets = torch.tensor((-middle, 0.0, 0.0)) + noise * torch.randn(60, 3, generator=generator)
@@ -212,7 +212,7 @@ def test_cameras_around_something_are_unbounded(turn, climb, middle, noise):
 
 
 def outward(extent):
-    """Poses of cameras that look outwards from a circle of this radius, float64 [24, 4, 4]."""
+    """Returns poses that look outwards from a circle of radius `extent`, float64 [24, 4, 4]."""
     poses = orbit_cameras(24, radius=extent, elevation=0, width=1, height=1, focal=1).poses.double()
     poses[:, :3, [0, 2]] *= -1
     return poses
@@ -224,7 +224,7 @@ def outward(extent):
     ids=["far", "a walk", "on the spot"],
 )
 def test_the_sphere_of_a_walk_goes_through_its_farthest_camera(extent, length):
-    """But for cameras that only turn, and for those that see less far than they go; near is before the points."""
+    """The unit sphere reaches the farthest camera, unless cameras only turn or see less far; near is before points."""
     bounds = torch.tensor((0.5, 20.0), dtype=torch.float64).repeat(24, 1)
     frame = find_frame(outward(extent), "inside-out", bounds)
     assert 1 / frame.scale == pytest.approx(length)
@@ -287,7 +287,7 @@ def test_images_of_different_sizes_train_and_are_scored_as_they_are(tmp_path):
 
 @pytest.mark.parametrize("lens", [{"latlong": True}, {"latlong": 1, "fl_x": None}, {"camera_model": "EQUIRECTANGULAR"}])
 def test_pictures_all_around_of_instant_ngp(tmp_path, lens):
-    """Its `latlong` looks ahead in the middle, as nerfstudio's EQUIRECTANGULAR does."""
+    """instant-ngp's `latlong` has the same rays as nerfstudio's EQUIRECTANGULAR: the middle looks ahead."""
     write_capture(tmp_path, orbit_cameras(9, radius=2, elevation=5, width=16, height=8, focal=10), **lens)
     cameras = load_scene(tmp_path, normalise=False).train.cameras
     assert cameras.models.tolist() == [3] * 7
@@ -301,13 +301,13 @@ def test_pictures_all_around_of_instant_ngp(tmp_path, lens):
         ({}, (60, 45), 480, 360),
         ({"cx": 230.0, "cy": 185.5}, (160, 120), 480, 360),
         ({"k1": 0.05, "p1": 0.003}, (126, 94), 504.0, 376.0),
-        ({"k1": 0.05}, (61, 45), 487, 365),  # by 8, and rounded
+        ({"k1": 0.05}, (61, 45), 487, 365),  # 1/8 of the lens's size, rounded
         ({"is_fisheye": True, "k1": 0.01, "fisheye_crop_radius": 170}, (60, 45), 480, 360),
-        ({"fl_y": 420.0}, (960, 720), 480, 360),  # larger
+        ({"fl_y": 420.0}, (960, 720), 480, 360),  # larger than the lens's size
     ],
 )
 def test_pictures_smaller_than_their_lens_says(tmp_path, lens, size, w, h):
-    """Points are where they would be in pictures of the lens's size, scaled."""
+    """Images smaller than their lens's size show points at the scaled pixels."""
     rig = orbit_cameras(9, radius=2, elevation=5, width=size[0], height=size[1], focal=10)
     for folder, stated in (("small", {"w": w, "h": h}), ("full", {})):
         write_capture(tmp_path / folder, rig, fl_x=0.9 * w, **lens, **stated)
@@ -327,8 +327,7 @@ def test_pictures_smaller_than_their_lens_says(tmp_path, lens, size, w, h):
 @pytest.mark.parametrize("scale", [None, 0.5, 2, 1e-3])
 @pytest.mark.parametrize("normalise", [True, False])
 def test_nerfstudio_files(tmp_path, scale, normalise):
-    """Its applied_transform and applied_scale lead from the original coordinates to those of the file; depth is not
-    used."""
+    """applied_transform and applied_scale map the original coordinates to the file's; depth images are ignored."""
     applied = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 2], [0, 0, 0, 1]])
     poses = applied @ POSES
     poses[:, :3, 3] *= scale or 1
@@ -345,7 +344,7 @@ def test_nerfstudio_files(tmp_path, scale, normalise):
 
 
 def test_a_picture_that_is_listed_twice_counts_once(tmp_path):
-    """By another spelling, or as a link."""
+    """A file listed again under another spelling or as a link counts once."""
     write_capture(tmp_path, orbit_cameras(9, radius=2, elevation=5, width=12, height=10, focal=12))
     (tmp_path / "99.png").symlink_to("03.png")
 
@@ -362,7 +361,7 @@ def test_a_picture_that_is_listed_twice_counts_once(tmp_path):
 @pytest.mark.parametrize("tag", [3, 6, 8])
 @pytest.mark.parametrize("lens", [("OPENCV", (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02)), ("THIN_PRISM_FISHEYE", None)])
 def test_an_orientation_tag_turns_pixels_and_cameras_alike(tmp_path, tag, lens):
-    """Each pixel keeps its ray, its colour, its mask and its depth: that of the stored image, which COLMAP has seen."""
+    """A turned pixel keeps the ray, colour, mask and depth of the stored image, which COLMAP has used."""
     lens = lens if lens[1] else (lens[0], (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02, 0.01, 0.002, 0.04, 0.03))
     poses, generator = POSES.numpy(), np.random.default_rng(1)
     exif, turns = Image.Exif(), {3: 2, 6: -1, 8: 1}[tag]
@@ -373,7 +372,7 @@ def test_an_orientation_tag_turns_pixels_and_cameras_alike(tmp_path, tag, lens):
     for index in range(COUNT):
         picture = Image.fromarray(generator.integers(0, 255, (10, 13, 3), np.uint8))
         picture.save(tmp_path / f"plain/images/{index:02}.jpg")
-        # The second has no tag, so that sizes differ.
+        # The second image has no tag, so sizes differ.
         picture.save(tmp_path / f"tagged/images/{index:02}.jpg", **({} if index == 1 else {"exif": exif}))
     for downscale in (1, 2):
         plain, tagged = (
@@ -387,13 +386,13 @@ def test_an_orientation_tag_turns_pixels_and_cameras_alike(tmp_path, tag, lens):
                 rays = [rays[0].reshape(height, width, 3), rays[1].reshape(*other.truth(index, None).shape)]
                 torch.testing.assert_close(torch.rot90(rays[0], turned), rays[1], atol=2e-6, rtol=0)
                 assert torch.equal(torch.rot90(one.truth(index, None), turned), other.truth(index, None))
-        found = [sorted(split.sparse_depth.distances.tolist()) for split in (plain.train, tagged.train)]
-        assert found[0] == pytest.approx(found[1], abs=1e-5)
+        depths = [sorted(split.sparse_depth.distances.tolist()) for split in (plain.train, tagged.train)]
+        assert depths[0] == pytest.approx(depths[1], abs=1e-5)
 
 
 @pytest.mark.parametrize("format", ["colmap", "llff", "transforms"])
 def test_up_is_that_of_the_pictures_which_people_see(tmp_path, format):
-    """A camera that was held upright stores its pictures on their side, with a tag, and COLMAP sees them so."""
+    """Up follows the orientation tag: a camera held upright stores its images, which COLMAP uses, on their side."""
     exif, on_side = Image.Exif(), POSES.clone()
     exif[0x0112] = 6
     on_side[:, :3, 0], on_side[:, :3, 1] = -POSES[:, :3, 1], POSES[:, :3, 0]
@@ -419,7 +418,7 @@ def test_which_folder_of_images_and_by_how_much_they_are_reduced(tmp_path, monke
     for downscale, width in ((1, 12), (4, 12), (8, 6)):
         cameras = load_scene(tmp_path, downscale=downscale).train.cameras
         assert cameras.width == width and float(cameras.intrinsics[0, 0]) == pytest.approx(20 * width / 12)
-    monkeypatch.setattr(photographs, "LONGEST_SIDE", 5)  # the images have 12 pixels a side, images_4 says 48
+    monkeypatch.setattr(photographs, "LONGEST_SIDE", 5)  # images have 12 pixels a side, images_4 implies 48
     scene = load_scene(tmp_path)
     assert scene.train.cameras.width == 4 and any("images are reduced by 3, to 4 x 3" in note for note in scene.notes)
     refuses("--downscale must be 1 or a multiple of 4, got 6", load_scene, tmp_path, downscale=6, error=SceneError)
@@ -434,18 +433,18 @@ def test_which_folder_of_images_and_by_how_much_they_are_reduced(tmp_path, monke
         ((3966, 2974), (504, 378), None, (504, 378)),
         ((3966, 2974), (504, 378), 2, (252, 189)),
         ((400, 300), (1600, 1200), None, (400, 300)),
-        ((400, 267), (1600, 1066), None, (400, 266)),  # of 1602 x 1067, say
+        ((400, 267), (1600, 1066), None, (400, 266)),  # an original of 1602 x 1067, say
         ((4031, 3023), (1008, 756), None, (504, 378)),
     ],
 )
 def test_pictures_are_reduced_by_their_own_size(tmp_path, monkeypatch, format, lens, size, downscale, read):
-    """Not by that for which the model is; and each header is read once."""
+    """The downscale factor follows the image files, not the model's camera size; each header is read once."""
     write_images(tmp_path, [size] * COUNT)
     focal = 1.5 * lens[0]
     pinhole = ("SIMPLE_PINHOLE", (focal, lens[0] / 2, lens[1] / 2))
     write_colmap(tmp_path, POSES, [lens] * COUNT, POINTS, lenses=[pinhole] * COUNT)
     write_llff(tmp_path, POSES, lens, focal, (2.5, 5.5))
-    monkeypatch.setattr(images, "read_header", None)  # which reads those that a loader has not
+    monkeypatch.setattr(images, "read_header", None)  # fails if a header is read again
     cameras = load_scene(tmp_path, format=format, downscale=downscale).train.cameras
     assert (cameras.width, cameras.height) == read
     factor = size[0] // read[0]
@@ -471,14 +470,14 @@ def test_a_forward_facing_scene_fills_the_cube_of_its_contraction(tmp_path):
             places.append(space.points(rays.origins + ends * rays.directions).reshape(-1, 3))
         low, high = torch.cat(places).aminmax(dim=0)
         assert (low > -1.001).all() and (high < 1.001).all() and (high - low > 1.4).all()
-    again = load_scene(tmp_path, downscale=5)  # drops pixels at the border
+    again = load_scene(tmp_path, downscale=5)  # drops border pixels
     assert space.slopes == again.contraction.slopes
     unbounded = load_scene(tmp_path, kind="unbounded")
     refuses("contraction ndc needs forward-facing cameras", unbounded.space, "ndc", error=SceneError)
 
 
 def test_a_folder_trains_is_scored_and_opened_again(tmp_path):
-    """With images of two sizes and a mask."""
+    """A folder with two image sizes and a mask trains, is scored and opens again."""
     rig = orbit_cameras(9, radius=2, elevation=5, width=12, height=14, focal=12)
     write_capture(tmp_path / "scene", rig)
     mask = np.full((14, 12), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""`voronerf process` on pictures of two walls with a pattern, and on models that have faults."""
+"""Tests of `voronerf process` on rendered images of two textured walls, and on simulated mapper results."""
 
 import contextlib
 import itertools
@@ -36,7 +36,7 @@ def cameras():
 
 
 def pattern(generator):
-    """Grey values [512, 512] with detail of several sizes."""
+    """Returns a random grey texture, uint8 [512, 512], with detail at several scales."""
     total = np.zeros((512, 512))
     for size in (16, 32, 64, 128, 256):
         total += np.kron(generator.normal(size=(size, size)), np.ones((512 // size, 512 // size))) / size**0.25
@@ -45,7 +45,7 @@ def pattern(generator):
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    """A folder of pictures of a floor and a wall behind it."""
+    """A folder of images of a floor and a wall behind it."""
     folder, generator = tmp_path_factory.mktemp("walls"), np.random.default_rng(0)
     floor, wall, views = pattern(generator), pattern(generator), cameras()
     back = views.origins.mean(0)[:2] / views.origins.mean(0)[:2].norm()
@@ -66,7 +66,7 @@ def pictures(tmp_path_factory):
 
 
 def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pictures, monkeypatch):
-    monkeypatch.setattr(process, "FEW_IMAGES", 4)  # so that the largest features choose the pairs
+    monkeypatch.setattr(process, "FEW_IMAGES", 4)  # pairs are chosen by the largest features
     monkeypatch.setattr(process, "LEAST_SIDE", 64)
     seen, said = [], []
 
@@ -89,12 +89,12 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     )
     with pycolmap.Database.open(out / "colmap/database.db") as opened:
         counts = [len(opened.read_keypoints(image.image_id)) for image in opened.read_all_images()]
-        assert all(100 < count <= 300 for count in counts)  # SIFT finds more
+        assert all(100 < count <= 300 for count in counts)  # SIFT finds more than 300
     seen.clear()
     process.process(pictures, out, max_features=300, say=said.append, progress=lambda *now: seen.append(now))
     stages = {stage for stage, *_ in seen}
-    assert "pairs" not in stages  # they were chosen before
-    assert any(stage.startswith("global mapping: ") for stage in stages)  # as COLMAP's log tells
+    assert "pairs" not in stages  # the stopped run chose the pairs
+    assert any(stage.startswith("global mapping: ") for stage in stages)  # from COLMAP's log
     assert said[-1].startswith(f"wrote {out}: cameras of {COUNT} of {COUNT} images")
     kept = {"images", "images_2", "sparse", "transforms.json", "colmap"}
     assert {path.name for path in out.iterdir()} == kept
@@ -103,9 +103,9 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
 
     images = read_model(out / "sparse/0").images
     assert abs(images[0].camera.lens.intrinsics[0] / FOCAL - 1) < 0.05
-    found = np.stack([image.pose[:3, 3] for image in images])
+    positions = np.stack([image.pose[:3, 3] for image in images])
     truth = cameras().origins.double().numpy()
-    steps = [np.linalg.norm(np.diff(places, axis=0), axis=1) for places in (found, truth)]
+    steps = [np.linalg.norm(np.diff(places, axis=0), axis=1) for places in (positions, truth)]
     ratio = steps[0] / steps[1]
     assert ratio.std() / ratio.mean() < 0.05
 
@@ -142,7 +142,10 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
 
 
 def write_database(path, scales, matches=()):
-    """Writes a database of images 0.png, 1.png ... with features of these scales, and numbers of matches of pairs."""
+    """Writes a COLMAP database of images 0.png, 1.png, ...; returns its path.
+
+    Every image has features of the `scales`; `matches` maps pairs of images to their numbers of matches.
+    """
     with pycolmap.Database.open(path) as opened:
         camera = opened.write_camera(pycolmap.Camera(model="SIMPLE_RADIAL", width=9, height=9, params=[9, 4, 4, 0]))
         for number in range(max([0, *(image for pair in matches for image in pair)]) + 1):
@@ -157,17 +160,21 @@ def write_database(path, scales, matches=()):
     return path
 
 
-def models(tmp_path, monkeypatch, pictures, **found):
-    """Has the mappers find cameras at places [c, 3], these and how many pairs they contradict, nothing, or an error."""
-    asked = []
+def models(tmp_path, monkeypatch, pictures, **results):
+    """Replaces COLMAP's mappers; returns the list of mappers that were called.
+
+    `found` maps a mapper to its result: camera positions [c, 3], (positions, number of contradicted pairs), None for
+    no model, or an exception to raise.
+    """
+    called = []
 
     def map_images(stages, name, *_):
-        asked.append(name)
-        if found[name] is None:
+        called.append(name)
+        if results[name] is None:
             return None
-        if isinstance(found[name], Exception):
-            raise found[name]
-        origins, contradicted = found[name] if isinstance(found[name], tuple) else (found[name], 0)
+        if isinstance(results[name], Exception):
+            raise results[name]
+        origins, contradicted = results[name] if isinstance(results[name], tuple) else (results[name], 0)
         names = [f"{number:02}.png" for number in lost_cameras(origins).nonzero()[:, 0].tolist()]
         kept = [None] * (len(origins) - len(names))
         faults = camera_faults(origins)
@@ -175,7 +182,7 @@ def models(tmp_path, monkeypatch, pictures, **found):
 
     monkeypatch.setattr(process, "_match", lambda *_: None)
     monkeypatch.setattr(process, "_map", map_images)
-    return asked
+    return called
 
 
 def circle(count=COUNT):
@@ -185,11 +192,11 @@ def circle(count=COUNT):
 
 def test_a_model_with_faults_is_not_a_scene(tmp_path, monkeypatch, pictures):
     collapsed = circle() * torch.tensor([1e-6] * (COUNT - 2) + [1.0] * 2)[:, None]
-    asked = models(tmp_path, monkeypatch, pictures, **{"global": collapsed, "incremental": None})
+    called = models(tmp_path, monkeypatch, pictures, **{"global": collapsed, "incremental": None})
     said = []
     with pytest.raises(SceneError, match=r"no sound model of 8 images: the cameras have collapsed.* --matching"):
         process.process(pictures, tmp_path / "out", say=said.append)
-    assert asked == ["global", "incremental"] and said[-1] == "incremental mapping: no model"
+    assert called == ["global", "incremental"] and said[-1] == "incremental mapping: no model"
     assert not (tmp_path / "out/sparse").exists()
     models(tmp_path, monkeypatch, pictures, **{"global": circle()[:3], "incremental": None})
     refuses("less than half of the images", process.process, pictures, tmp_path / "out", error=SceneError)
@@ -199,36 +206,36 @@ def test_a_model_with_faults_is_not_a_scene(tmp_path, monkeypatch, pictures):
 
 def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, monkeypatch, pictures):
     def found(**of_mappers):
-        """The mappers that were asked, what was said, and which model is the best of 10 images."""
-        asked, said = models(tmp_path, monkeypatch, pictures, **of_mappers), []
+        """Returns (called mappers, messages, best model) for 10 images."""
+        called, said = models(tmp_path, monkeypatch, pictures, **of_mappers), []
         stages = process.Stages(pycolmap, tmp_path, pictures, print)
-        made = process._find_models(stages, process._read_matches(stages), "auto", 10, said.append)
-        return asked, said, process._best(made, 10)
+        candidates = process._find_models(stages, process._read_matches(stages), "auto", 10, said.append)
+        return called, said, process._best(candidates, 10)
 
     folded = (circle(10), 4)
-    asked, said, best = found(**{"global": folded, "global_again": circle(10)})
-    assert asked == ["global", "global_again"] and best.folder.name == "global_again" and not best.folded
+    called, said, best = found(**{"global": folded, "global_again": circle(10)})
+    assert called == ["global", "global_again"] and best.folder.name == "global_again" and not best.folded
     assert said == [
         "global mapping: 10 of 10 images, points off by 0.50 pixels; contradicts 4 of 50 pairs of images that match "
         "well over much of both: something may look alike from several sides",
         "global mapping by 0 pairs of 0: 10 of 10 images, points off by 0.50 pixels",
     ]
     others = {"incremental": None, "incremental_again": None}
-    asked, _, best = found(**{"global": folded, "global_again": circle(4)}, **others)  # too few cameras are left
-    assert asked == ["global", "global_again", "incremental"] and best.folder.name == "global"
-    asked, _, best = found(**{"global": folded, "global_again": (circle(10), 3)}, **others)
-    assert asked == ["global", "global_again", "incremental", "incremental_again"] and best.contradicted == 3
-    asked, *_ = found(**{"global": (circle(10), 2)})  # may be wrong pairs
-    assert asked == ["global"]
-    lost = circle(10) * torch.tensor([1.0] * 9 + [90.0])[:, None]  # so others may be wrong, too
-    asked, _, best = found(**{"global": lost, "incremental": circle(9)})
-    assert asked == ["global", "incremental"] and best.folder.name == "incremental"
+    called, _, best = found(**{"global": folded, "global_again": circle(4)}, **others)  # too few remain
+    assert called == ["global", "global_again", "incremental"] and best.folder.name == "global"
+    called, _, best = found(**{"global": folded, "global_again": (circle(10), 3)}, **others)
+    assert called == ["global", "global_again", "incremental", "incremental_again"] and best.contradicted == 3
+    called, *_ = found(**{"global": (circle(10), 2)})  # two pairs may be wrong matches
+    assert called == ["global"]
+    lost = circle(10) * torch.tensor([1.0] * 9 + [90.0])[:, None]  # others may be wrong too
+    called, _, best = found(**{"global": lost, "incremental": circle(9)})
+    assert called == ["global", "incremental"] and best.folder.name == "incremental"
     lost = circle(10) * torch.tensor([1.0] * 8 + [90.0, -200.0])[:, None]
-    _, _, best = found(**{"global": lost, "incremental": circle(7)})  # 8 cameras are more than 7
+    _, _, best = found(**{"global": lost, "incremental": circle(7)})  # 8 cameras beat 7
     assert best.folder.name == "global" and len(best.images) == 8
     broken = SceneError("cameras.bin: camera 1 must have a focal length")
-    asked, said, best = found(**{"global": broken, "incremental": circle(9)})
-    assert asked == ["global", "incremental"] and best.folder.name == "incremental"
+    called, said, best = found(**{"global": broken, "incremental": circle(9)})
+    assert called == ["global", "incremental"] and best.folder.name == "incremental"
     assert said[0] == f"global mapping: no model: {broken}"
 
 
@@ -238,11 +245,11 @@ def test_cameras_far_from_all_others_count_as_missing():
     assert not lost_cameras(origins[:2]).any() and not lost_cameras(origins[:1]).any()
     origins[7] *= 9
     assert lost_cameras(origins).nonzero().flatten().tolist() == [7]
-    assert camera_faults(origins) == []  # one is not all
+    assert camera_faults(origins) == []  # one lost camera is no fault
     origins[20:32] *= 30 + torch.arange(12)[:, None] ** 2
     assert lost_cameras(origins).nonzero().flatten().tolist() == [7, *range(20, 32)]
     together = circle(40) + 5000 * torch.arange(40)[:, None].ge(38)
-    assert lost_cameras(together).nonzero().flatten().tolist() == [38, 39]  # each is the other's neighbour
+    assert lost_cameras(together).nonzero().flatten().tolist() == [38, 39]  # two lost cameras side by side
     assert "depths from 0.02 to 3.52e+04" in camera_faults(circle(), torch.tensor([[0.02, 5.0], [1.0, 3.52e4]]))[0]
     lenses = [colmap_lens("OPENCV", (736, 700, 400, 266, 0.1, 0, p1, 0.01)) for p1 in (0.02, -0.09)]
     assert [camera_faults(circle(), lenses=[(lens, 800)]) for lens in lenses] == [
@@ -263,15 +270,15 @@ def test_cameras_beside_a_burst_are_not_lost():
 def test_a_lost_camera_is_named_left_out_and_another_mapper_is_tried(tmp_path, pictures):
     out, said = tmp_path / "out", []
     process.process(pictures, out, max_features=300)
-    found = pycolmap.Reconstruction(out / "colmap/global/0")
-    images = {image.name: image for image in found.images.values()}
+    model = pycolmap.Reconstruction(out / "colmap/global/0")
+    images = {image.name: image for image in model.images.values()}
     bare, far = images["03_a.png"], images["05_a.png"]
     for point in bare.get_observation_point2D_idxs()[2:]:
-        found.delete_observation(bare.image_id, point)
-    frame = found.frames[far.frame_id]
+        model.delete_observation(bare.image_id, point)
+    frame = model.frames[far.frame_id]
     turn = frame.rig_from_world.rotation
     frame.rig_from_world = pycolmap.Rigid3d(turn, -turn.matrix() @ (3e4, 0, 0))
-    found.write_binary(out / "colmap/global/0")
+    model.write_binary(out / "colmap/global/0")
 
     for mapper, kept in (("global", COUNT - 2), ("auto", COUNT)):
         shutil.rmtree(out / "sparse")
@@ -314,7 +321,7 @@ def test_a_lost_camera_does_not_give_a_scene_its_scale(tmp_path):
     assert f"{line} left out (--keep-far keeps them): 03.jpg" in scene.notes
     assert f"{line} kept, as asked: 03.jpg" in kept.notes and len(kept.train) + len(kept.test) == 17
     assert not any("check the cameras" in note for note in scene.notes)
-    for ours, without in ((scene.train, sound.train), (scene.test, sound.test)):  # as if it was not there
+    for ours, without in ((scene.train, sound.train), (scene.test, sound.test)):  # same as without the far camera
         assert ours.names == without.names and torch.equal(ours.cameras.poses, without.cameras.poses)
     assert kept.train.cameras.origins.norm(dim=-1).median() < 1e-3
 
@@ -328,7 +335,7 @@ def test_the_largest_features_are_kept(tmp_path):
 
 def test_images_are_matched_with_those_that_share_most(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "NEIGHBOURS", 1)
-    shared = {(0, 3): 90, (0, 4): 20, (1, 4): 90, (2, 5): 9}  # the fewest are no pair
+    shared = {(0, 3): 90, (0, 4): 20, (1, 4): 90, (2, 5): 9}  # 9 matches are too few for a pair
     pairs = process._choose_pairs(pycolmap, write_database(tmp_path / "few.db", [1], shared))
     following = [(a, a + step) for a in range(6) for step in (1, 2) if a + step < 6]
     assert pairs == sorted((f"{a}.png", f"{b}.png") for a, b in {(0, 3), (1, 4), *following})
@@ -389,7 +396,7 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a process of its own")
 @pytest.mark.parametrize(("count", "reason"), [(2, "must have at least 3 images, got 2"), (3, "COLMAP finds no model")])
 def test_a_process_that_is_killed_in_its_first_moments_goes_on(tmp_path, monkeypatch, count, reason):
-    """Before each change of a folder, while it begins and while it removes what it has begun."""
+    """A process killed before any change of a folder, at its start or its clean-up, can run again."""
     models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
     write_images(tmp_path, [(12, 10)] * count)
     for moment in range(1, 40):
@@ -428,7 +435,7 @@ def test_a_process_that_is_killed_while_it_copies_features_goes_on(tmp_path, mon
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_command_that_is_stopped_says_how_to_go_on(monkeypatch, capsys, number, status):
     monkeypatch.setattr("voronerf.app.cli.process.make_scene", lambda *_, **__: os.kill(os.getpid(), number))
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests without it
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have disabled it
     try:
         assert main(["process", "in", "out"]) == status
     finally:
@@ -462,9 +469,9 @@ def test_images_of_phones_become_jpeg(tmp_path, monkeypatch):
         exif[0x0110] = "a phone"
         heif.from_pillow(image).save(tmp_path / f"phone/{number}.HEIC", exif=exif.tobytes())
     refuses("no model", process.process, tmp_path / "phone", tmp_path / "out", error=SceneError)
-    made = [Image.open(path) for path in sorted((tmp_path / "out/images").iterdir())]
-    assert [image.format for image in made] == ["JPEG"] * 3 and made[0].size == (32, 20)
-    assert made[0].getexif()[0x0110] == "a phone" and abs(made[2].getpixel((5, 5))[0] - 80) < 6
+    copies = [Image.open(path) for path in sorted((tmp_path / "out/images").iterdir())]
+    assert [image.format for image in copies] == ["JPEG"] * 3 and copies[0].size == (32, 20)
+    assert copies[0].getexif()[0x0110] == "a phone" and abs(copies[2].getpixel((5, 5))[0] - 80) < 6
     (tmp_path / "phone/3.heic").write_bytes(b"no image")
     refuses("3.heic: cannot be read", process.process, tmp_path / "phone", tmp_path / "new", error=SceneError)
 
@@ -486,7 +493,10 @@ def picture(number, size=(32, 20), mode="RGB"):
 
 
 def gathered(tmp_path, monkeypatch, files):
-    """Processes files: the number of a picture, an image or bytes each. Returns names of copies, and lines on them."""
+    """Processes files and returns (names of the copied images, messages).
+
+    `files` maps a file name to its content: the number of a picture, an image, or bytes.
+    """
     models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
     folder, out, said = tmp_path / "in", tmp_path / "out", []
     for name, content in files.items():
@@ -501,7 +511,7 @@ def gathered(tmp_path, monkeypatch, files):
 
 
 def numbered(*patterns, first=0, count=3):
-    """Names by patterns, each of another picture."""
+    """Returns {file name: picture number} for `count` names of each pattern, all with different pictures."""
     names = [pattern.format(number) for pattern in patterns for number in range(count)]
     return {name: number for number, name in enumerate(names, first)}
 
@@ -567,7 +577,7 @@ def test_images_of_two_folders_must_not_get_one_name(tmp_path):
 
 
 def quarters():
-    """Red, black, blue and green quarters, so that turns show."""
+    """Returns an image with red, black, blue and green quarters, which shows rotations."""
     image = Image.new("RGB", (32, 20))
     for place, colour in (((0, 0, 16, 10), "red"), ((0, 10, 16, 20), "blue"), ((16, 10, 32, 20), "lime")):
         image.paste(colour, place)
@@ -575,7 +585,7 @@ def quarters():
 
 
 def turned():
-    """The tag of a camera that is held upright."""
+    """Returns the Exif tags of a camera that is held upright."""
     exif = Image.Exif()
     exif[0x0110], exif[0x0112], exif[0x8769] = "a camera", 6, {0xA405: 26}
     return exif
@@ -588,7 +598,7 @@ def turned():
         ("a.webp", {"exif": turned(), "lossless": True}, "a.png"),
         ("a.tif", {"compression": "tiff_lzw", "tiffinfo": {0x0110: "a camera", 0x0112: 6}}, "a.png"),
         ("a.tif", {"compression": "jpeg", "quality": 95, "tiffinfo": {0x0110: "a camera", 0x0112: 6}}, "a.png"),
-        ("a.jpg", {"format": "WebP", "exif": turned()}, "a.jpg"),  # by its content
+        ("a.jpg", {"format": "WebP", "exif": turned()}, "a.jpg"),  # the content decides, not the name
     ],
 )
 def test_converted_images_are_upright_and_keep_their_lens(tmp_path, name, options, kept):
@@ -601,7 +611,7 @@ def test_converted_images_are_upright_and_keep_their_lens(tmp_path, name, option
         assert image.format == ("JPEG" if kept.endswith("jpg") else "PNG")
         assert exif[0x0110] == "a camera" and 0x0112 not in exif
     upright = np.asarray(quarters().transpose(Image.Transpose.ROTATE_270)).astype(int)
-    inside = np.s_[[8, 24], [[5], [15]]]  # of each quarter
+    inside = np.s_[[8, 24], [[5], [15]]]  # a pixel of each quarter
     assert shown.shape == (32, 20, 3) and np.abs(shown[inside] - upright[inside]).max() < 12
     camera = pycolmap.infer_camera_from_image(copy)
     assert camera.has_prior_focal_length == ("exif" in options)
@@ -618,7 +628,7 @@ def test_transparent_images_stay_transparent(tmp_path, name):
 
 
 def write_deep(path, values):
-    """Writes colours of 16 bits [h, w, 3], as PNG or as TIFF."""
+    """Writes 16-bit colours [h, w, 3] as PNG or TIFF."""
     height, width, _ = values.shape
     if path.suffix == ".png":
         rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
@@ -647,8 +657,8 @@ def test_of_16_bits_a_channel_8_are_kept(tmp_path, monkeypatch, suffix):
     assert said[0] == f"{folder}: of 3 images with 16 bits a channel the upper 8 are kept: " + ", ".join(
         f"{number}{suffix}" for number in range(3)
     )
-    made = [np.asarray(Image.open(tmp_path / f"out/images/{number}.png")) for number in range(3)]
-    assert (np.stack(made) == values >> 8).all()
+    copies = [np.asarray(Image.open(tmp_path / f"out/images/{number}.png")) for number in range(3)]
+    assert (np.stack(copies) == values >> 8).all()
 
 
 @pytest.mark.parametrize(("name", "dtype"), [("a.png", "u2"), ("a.tif", "u2"), ("a.tif", "i4"), ("a.tif", "f4")])
@@ -659,14 +669,14 @@ def test_grey_values_of_unknown_range_are_refused(tmp_path, name, dtype):
 
 
 def half(size=(32, 20)):
-    """A mask whose right half is black."""
+    """Returns a mask with a black right half."""
     mask = Image.new("L", size)
     mask.paste(255, (0, 0, size[0] // 2, size[1]))
     return mask
 
 
 def clear(mask):
-    """A white picture that is transparent where a mask is black."""
+    """Returns a white image that is transparent where the mask is black."""
     picture = Image.new("RGBA", mask.size, "white")
     picture.putalpha(mask)
     return picture
@@ -692,8 +702,8 @@ def clear(mask):
     ],
 )
 def test_masks_go_along(tmp_path, monkeypatch, files, names, line):
-    made, said = gathered(tmp_path, monkeypatch, files)
-    assert len(made) == 3 and line in "".join(said[-1:])
+    copies, said = gathered(tmp_path, monkeypatch, files)
+    assert len(copies) == 3 and line in "".join(said[-1:])
     masks = tmp_path / "out/masks"
     assert masks.is_dir() == bool(names)
     assert sorted(path.name for path in masks.glob("*")) == [f"{name}.png" for name in names]
@@ -735,8 +745,8 @@ def test_masked_parts_have_no_features_and_do_not_train(tmp_path, pictures):
     process.process(tmp_path / "in", out, max_features=300)
     with pycolmap.Database.open(out / "colmap/database.db") as opened:
         images = sorted(opened.read_all_images(), key=lambda image: image.name)
-        left = [opened.read_keypoints(image.image_id)[:, 0].min() for image in images]
-    assert [x > WIDTH // 4 - 1 for x in left] == [number == 5 for number in range(COUNT)]
+        leftmost = [opened.read_keypoints(image.image_id)[:, 0].min() for image in images]
+    assert [x > WIDTH // 4 - 1 for x in leftmost] == [number == 5 for number in range(COUNT)]
     scene = load_scene(out, format="transforms")
     names = [f"{'ab'[number // 4]}_{number}" for number in range(COUNT)]
     assert sorted([*scene.train.names, *scene.test.names]) == names
@@ -759,7 +769,7 @@ def test_pycolmap_is_needed_once_the_images_were_looked_at(tmp_path, monkeypatch
 def test_images_of_one_size_share_a_camera(tmp_path, pictures, monkeypatch):
     (tmp_path / "mixed").mkdir()
     for number, path in enumerate(sorted(pictures.iterdir())[:6]):
-        with Image.open(path) as image:  # every third one held upright
+        with Image.open(path) as image:  # every third image is upright
             image.rotate(90 * (number % 3 == 0), expand=True).save(tmp_path / f"mixed/{number}.png")
     monkeypatch.setattr(process, "_map", lambda *_: None)
     said = []
@@ -768,7 +778,7 @@ def test_images_of_one_size_share_a_camera(tmp_path, pictures, monkeypatch):
     sizes = f"4 of {WIDTH} x {HEIGHT}, 2 of {HEIGHT} x {WIDTH}"
     assert said[0].startswith(f"6 images with 2 cameras, one for each size: {sizes}; ")
     with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
-        cameras = {each.camera_id: (each.width, each.height) for each in opened.read_all_cameras()}
+        cameras = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
         taken = [cameras[opened.read_image_with_name(f"{number}.png").camera_id] for number in range(6)]
     assert len(cameras) == 2 and taken == 2 * [(HEIGHT, WIDTH), (WIDTH, HEIGHT), (WIDTH, HEIGHT)]
 
@@ -791,7 +801,7 @@ def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch
 def test_transparent_parts_have_no_features(tmp_path, pictures, monkeypatch):
     (cut := tmp_path / "cut").mkdir()
     for number, path in enumerate(sorted(pictures.iterdir())):
-        with Image.open(path) as image:  # the first one stays opaque
+        with Image.open(path) as image:  # the first image stays opaque
             if number:
                 alpha = Image.fromarray(np.arange(WIDTH)[None].repeat(HEIGHT, 0) < WIDTH // 2)
                 image.putalpha(alpha.convert("L"))
@@ -853,9 +863,9 @@ def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, p
 def test_pictures_with_few_features_are_enlarged(tmp_path, pictures, monkeypatch):
     octaves, extract = [], pycolmap.extract_features
 
-    def recorded(*given, extraction_options, **more):
+    def recorded(*arguments, extraction_options, **more):
         octaves.append(extraction_options.sift.first_octave)
-        extract(*given, extraction_options=extraction_options, **more)
+        extract(*arguments, extraction_options=extraction_options, **more)
 
     monkeypatch.setattr(pycolmap, "extract_features", recorded)
     monkeypatch.setattr(process, "_map", lambda *_: None)

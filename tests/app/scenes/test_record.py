@@ -1,4 +1,4 @@
-"""The record of a scene in a run directory, from which a run is rendered without its images."""
+"""Tests of scene.json in a run's folder, which lets the run render without the scene's images."""
 
 from __future__ import annotations
 

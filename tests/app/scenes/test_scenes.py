@@ -1,4 +1,4 @@
-"""Loading good scenes: cameras fit their images, normalisation, splits."""
+"""Tests of loading valid scenes: cameras match images, normalisation, splits."""
 
 import json
 import logging
@@ -47,7 +47,7 @@ def test_blender_without_alpha_has_no_box(tmp_path):
 
 
 def test_a_capture_that_others_split(tmp_path):
-    """As torch-ngp's scripts write it: Blender's files, but with a principal point and distortion."""
+    """Split files by torch-ngp's scripts load: Blender's format with a principal point and distortion."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     rig = orbit_cameras(9, radius=2, elevation=5, width=12, height=10, focal=4)
     lens = {"camera_angle_x": 0.9, "fl_x": 20.0, "fl_y": 21.0, "cx": 5.0, "cy": 5.5, "k1": 0.02, "w": 12.6, "h": 10}
@@ -55,8 +55,8 @@ def test_a_capture_that_others_split(tmp_path):
         write_capture(folder, rig, **lens)
     contents = rewrite(parts, lambda contents: contents["frames"].reverse())
     (parts / "transforms.json").unlink()
-    held = [0, 8]
-    for name, chosen in (("train", [i for i in range(9) if i not in held]), ("test", held)):
+    test_indices = [0, 8]
+    for name, chosen in (("train", [i for i in range(9) if i not in test_indices]), ("test", test_indices)):
         frames = [contents["frames"][i] for i in chosen]
         (parts / f"transforms_{name}.json").write_text(json.dumps({**contents, "frames": frames}))
     ours, theirs = load_scene(whole), load_scene(parts)
@@ -70,7 +70,7 @@ def test_a_capture_that_others_split(tmp_path):
 
 
 def test_files_from_elsewhere(tmp_path):
-    """Names with the separators of Windows, a byte order mark, stems that come twice, suffixes in capitals."""
+    """Windows separators, a byte order mark, repeated stems and upper-case suffixes load."""
     original = builtin_scene(16, train_views=4, test_views=1)
     write_blender(tmp_path, original, 0.6911112)
 
@@ -95,7 +95,7 @@ def test_val_stands_in_for_test(tmp_path):
 
 
 def blender_nerf(folder, test, lens):
-    """A scene as BlenderNeRF exports it: test views, if any, are listed and not rendered."""
+    """Writes a scene as BlenderNeRF exports it: test views, if any, are listed without images."""
     write_blender(folder, builtin_scene(8, train_views=9, test_views=2), 0.69)
     if lens:
         for name in ("train", "test"):
@@ -163,7 +163,7 @@ def test_capture(tmp_path, caplog):
     assert not caplog.records
     assert scene.test.names == ("00", "10", "18")
     assert len(scene.train) == 15 and "10" not in scene.train.names
-    # images stay with their cameras through sorting and splitting
+    # Images stay with their cameras through sorting and splitting.
     for split in (scene.train, scene.test):
         for name, image in zip(split.names, split.images):
             assert (image == int(name)).all()
@@ -174,7 +174,7 @@ def test_capture(tmp_path, caplog):
     assert cameras.distortion is not None
     torch.testing.assert_close(cameras.distortion[0], torch.tensor((0.02, 0, 0, -0.001, 0, 0, 0, 0)))
     torch.testing.assert_close(cameras.origins.norm(dim=-1), torch.ones(15), atol=1e-4, rtol=0)
-    # neighbours of the orbit stay 18 degrees apart: the turn is rigid
+    # The normalisation is rigid: neighbours stay 18 degrees apart.
     by_name = dict(zip(scene.train.names, cameras.forward))
     angle = math.degrees(math.acos(float(by_name["01"] @ by_name["02"])))
     before = math.degrees(math.acos(float(orbit.forward[1] @ orbit.forward[2])))
@@ -183,7 +183,7 @@ def test_capture(tmp_path, caplog):
 
 @pytest.mark.parametrize("rig", ["outward", "parallel", "one place"])
 def test_rays_of_a_capture_without_a_common_focus_are_finite(tmp_path, rig):
-    """Among them one whose camera stands at the origin, from which near is measured."""
+    """All rays are finite, also for a camera at the origin, from which near is measured."""
     poses = orbit_cameras(9, radius=2, elevation=0, width=4, height=4, focal=4).poses
     if rig == "outward":
         poses[:, :3, [0, 2]] *= -1
@@ -228,7 +228,7 @@ def test_names_of_a_capture_are_all_different(tmp_path):
         return sorted(scene.train.names + scene.test.names)
 
     assert names() == [name.removesuffix(".png").replace("/", "_") for name in left_right]
-    contents["frames"][1]["file_path"] = "./left/../left/00.png"  # the first one's image again
+    contents["frames"][1]["file_path"] = "./left/../left/00.png"  # the first frame's image again
     path.write_text(json.dumps(contents))
     assert len(set(names())) == 7
     assert "of images that are listed twice the first counts: 00.png" in load_scene(tmp_path).notes
@@ -245,7 +245,7 @@ def test_capture_intrinsics_per_frame_and_from_angles(tmp_path):
     def change(contents):
         del contents["fl_x"]
         contents["camera_angle_x"] = 2 * math.atan(0.5)
-        contents["frames"][0] |= {"fl_x": 30.0, "fl_y": 31.0, "cx": 1.0, "k1": 0.05}  # the last by name
+        contents["frames"][0] |= {"fl_x": 30.0, "fl_y": 31.0, "cx": 1.0, "k1": 0.05}  # the last frame by name
 
     rewrite(tmp_path, change)
     train = load_scene(tmp_path).train
@@ -266,7 +266,7 @@ def test_capture_intrinsics_per_frame_and_from_angles(tmp_path):
     ],
 )
 def test_lists_of_file_names_split_a_capture(tmp_path, lists, train, test):
-    """As nerfstudio writes them."""
+    """nerfstudio's lists of file names split a capture."""
     write_capture(tmp_path, orbit_cameras(6, radius=2, elevation=5, width=4, height=4, focal=4))
     named = {f"{name}_filenames": [f"./{index:02d}.png" for index in chosen] for name, chosen in lists.items()}
     rewrite(tmp_path, lambda contents: contents.update(named))
@@ -313,7 +313,7 @@ def test_normalise_poses():
     focus = focus_point(cameras)
     assert focus is not None and float(focus.abs().max()) < 1e-3
     assert float(cameras.origins.norm(dim=-1).max()) == pytest.approx(1, abs=1e-4)
-    torch.testing.assert_close(cameras.origins[:, 2], torch.full((9,), 0.5), atol=1e-3, rtol=0)  # upright again
+    torch.testing.assert_close(cameras.origins[:, 2], torch.full((9,), 0.5), atol=1e-3, rtol=0)  # z is up again
     rotation = result[:, :3, :3]
     torch.testing.assert_close(rotation.mT @ rotation, torch.eye(3).double().expand(9, 3, 3), atol=1e-5, rtol=0)
 

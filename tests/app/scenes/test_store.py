@@ -1,4 +1,4 @@
-"""Images on disk: the same pixels and batches as in memory, a build that goes on, a store of other images."""
+"""Tests of image stores on disk: pixels and batches as in memory, resumed builds, and stores of other images."""
 
 import errno
 import fcntl
@@ -64,11 +64,11 @@ def test_sizes_and_masks(tmp_path):
     paths = sorted((tmp_path / "images").iterdir())
     mask = tmp_path / "mask.png"
     Image.fromarray(np.eye(11, 8, dtype=np.uint8) * 255).save(mask)
-    found = [read_images(paths, 1, keep=keep) for keep in ("memory", "disk")]
-    assert torch.equal(found[0].images, found[1].images) and torch.equal(found[0].sizes, found[1].sizes)
-    masks = [read_masks([None, mask, None], paths, read, 1) for read in found]
+    stores = [read_images(paths, 1, keep=keep) for keep in ("memory", "disk")]
+    assert torch.equal(stores[0].images, stores[1].images) and torch.equal(stores[0].sizes, stores[1].sizes)
+    masks = [read_masks([None, mask, None], paths, read, 1) for read in stores]
     assert torch.equal(*masks) and int(masks[0][1].sum()) == 8
-    for read in found:
+    for read in stores:
         upright = read._replace(images=read.images[:, :10], turns=[0, 3, 2])
         turned = read_masks([None, mask, None], paths, upright, 1)
         assert turned.shape == (3, 10, 12) and torch.equal(turned[1, :8, :11], torch.rot90(masks[0][1, :11, :8], 3))
@@ -82,11 +82,11 @@ def test_what_does_not_fit_into_memory_is_on_disk(folder, monkeypatch):
 
 
 def test_a_build_goes_on_and_other_images_are_built_again(folder, cache, monkeypatch, caplog):
-    made, ends = [], {7: True}
+    decoded, ends = [], {7: True}
 
     def decode(path, factor, read=images.read_image):
-        made.append(path.name)
-        if ends.pop(len(made), None):
+        decoded.append(path.name)
+        if ends.pop(len(decoded), None):
             raise KeyboardInterrupt
         return read(path, factor)
 
@@ -95,13 +95,13 @@ def test_a_build_goes_on_and_other_images_are_built_again(folder, cache, monkeyp
     monkeypatch.setattr(store, "RECORD_EVERY", 0)
     with pytest.raises(KeyboardInterrupt):
         load_scene(folder, images="disk")
-    before = len(made)
+    before = len(decoded)
     again = load_scene(folder, images="disk")
-    assert len(made) == before + 4, "the four that were recorded are not decoded again"
+    assert len(decoded) == before + 4, "the four that were recorded are not decoded again"
     assert torch.equal(again.train.images, load_scene(folder).train.images)
-    made.clear()
+    decoded.clear()
     load_scene(folder, images="disk")
-    assert not made
+    assert not decoded
     Image.open(folder / "train/r_1.png").save(folder / "train/r_0.png")
     other = load_scene(folder, images="disk")
     assert torch.equal(other.train.images[0], other.train.images[1])
@@ -212,7 +212,7 @@ def test_the_built_in_scene_is_kept(cache, monkeypatch):
     monkeypatch.setattr("voronerf.app.scenes.CACHED", 8)
     first = load_scene("builtin:8")
     assert len(list(cache.iterdir())) == 2 and not first.train.on_disk
-    monkeypatch.setattr("voronerf.app.scenes.builtin.pictures._images", None)  # which would make them
+    monkeypatch.setattr("voronerf.app.scenes.builtin.pictures._images", None)  # fails if images are made again
     for scene in (load_scene("builtin:8"), first):
         assert scene.train.images.equal(plain.train.images) and scene.test.images.equal(plain.test.images)
 

@@ -1,4 +1,4 @@
-"""Frames of videos, as phones, browsers and other programs write them."""
+"""Tests of extracting frames from videos by phones, browsers and other programs."""
 
 import struct
 import subprocess
@@ -17,13 +17,13 @@ TWO_SIZES = {"large": ("-c:v", "mpeg2video"), "small": ("-vf", "scale=40:32", "-
 
 
 def write_clip(path, count, *options):
-    """Writes a video of a square that moves from left to right in `count` steps."""
+    """Writes a video of a square that moves from left to right in `count` frames; returns its path."""
     frames = torch.zeros(count, 64, 80, 3, dtype=torch.uint8)
     for number in range(count):
         frames[number, 16:48, number : number + 32] = 220
-    write_video(made := path.parent / "made.mp4", frames, 10)
-    convert(made, path, *options or ("-c", "copy"))
-    made.unlink()
+    write_video(source := path.parent / "made.mp4", frames, 10)
+    convert(source, path, *options or ("-c", "copy"))
+    source.unlink()
     return path
 
 
@@ -33,7 +33,7 @@ def convert(source, path, *options, before=()):
 
 
 def steps_of(folder):
-    """The steps of the square in frames of a clip, in their order."""
+    """Returns the square's left edge in each extracted frame, in order."""
     edges = [np.asarray(Image.open(path).convert("L"))[32] > 110 for path in sorted(folder.iterdir())]
     return [int(edge.argmax()) for edge in edges]
 
@@ -64,10 +64,10 @@ H264, SILENT = ("-c:v", "libx264", "-bf", "2"), ("-f", "lavfi", "-i", "anullsrc=
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("a.webm", ("-c:v", "libvpx", "-f", "webm", "-live", "1")),  # no duration, as MediaRecorder writes it
+        ("a.webm", ("-c:v", "libvpx", "-f", "webm", "-live", "1")),  # without a duration, as by MediaRecorder
         ("a.webm", ("-c:v", "libvpx-vp9", "-b:v", "100k")),
-        ("a.mkv", (*H264, "-vf", "setpts='PTS*(1+floor(N/10))'", "-fps_mode", "vfr")),  # the rate varies
-        ("a.mov", SILENT),  # sound that is longer than the pictures
+        ("a.mkv", (*H264, "-vf", "setpts='PTS*(1+floor(N/10))'", "-fps_mode", "vfr")),  # variable frame rate
+        ("a.mov", SILENT),  # sound longer than the video
         ("a.ts", H264),
         ("a.avi", ("-c:v", "mpeg4", "-bf", "2")),
     ],
@@ -81,7 +81,7 @@ def test_frames_are_counted_whatever_a_container_says(tmp_path, name, options):
 
 def test_a_wrong_duration_does_not_matter(tmp_path):
     content = write_clip(tmp_path / "a.mkv", 20, *H264).read_bytes()
-    place = content.index(b"\x44\x89\x88") + 3  # the duration of the segment, a double
+    place = content.index(b"\x44\x89\x88") + 3  # the segment's duration, a double
     (tmp_path / "b.mkv").write_bytes(content[:place] + struct.pack(">d", 9e6) + content[place + 8 :])
     gather._take_frames(tmp_path / "b.mkv", tmp_path / "frames", 5, lambda _: None)
     assert steps_of(tmp_path / "frames") == [1, 5, 9, 13, 17]
@@ -109,7 +109,7 @@ def test_times_that_go_back_do_not_matter(tmp_path):
 
 
 def test_frames_of_two_sizes_are_counted_on(tmp_path):
-    """A browser changes the size when the network is slow; all frames get that of the first."""
+    """All frames get the size of the first one: browsers change the size when the network is slow."""
     large, small = (write_clip(tmp_path / f"{name}.ts", 20, *options) for name, options in TWO_SIZES.items())
     (tmp_path / "both.ts").write_bytes(large.read_bytes() + small.read_bytes())
     gather._take_frames(tmp_path / "both.ts", tmp_path / "frames", 10, print)

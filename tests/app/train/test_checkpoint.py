@@ -1,4 +1,4 @@
-"""Checkpoint files: exact, atomic, refused with the file's name when they are broken."""
+"""Tests of checkpoint files: exact, atomic, and refused with the file's name when broken."""
 
 import errno
 import os
@@ -70,14 +70,14 @@ def test_broken_files_are_named(tmp_path):
 
 
 def test_tensors_are_pages_of_files(tmp_path):
-    x, y = torch.randn(4, 5 << 19), torch.arange(4)  # 40 MiB, which malloc gives back when they are free
+    x, y = torch.randn(4, 5 << 19), torch.arange(4)  # 40 MiB: malloc returns freed blocks of this size
     save_checkpoint(tmp_path / "whole", Checkpoint({"x": x, "y": y}, {}))
     before = anonymous_memory()
-    found = load_checkpoint(tmp_path / "whole").tensors
+    tensors = load_checkpoint(tmp_path / "whole").tensors
     assert anonymous_memory() - before < x.nbytes / 4
-    assert found["x"].equal(x) and found["y"].equal(y)
+    assert tensors["x"].equal(x) and tensors["y"].equal(y)
     data = bytearray((tmp_path / "whole").read_bytes())
-    data[-x.nbytes // 2] ^= 1  # within x, the larger
+    data[-x.nbytes // 2] ^= 1  # within x
     (tmp_path / "damaged").write_bytes(data)
     refuses("damaged: a damaged checkpoint, x has", load_checkpoint, tmp_path / "damaged", error=CheckpointError)
     assert load_checkpoint(tmp_path / "damaged", keep=lambda entry: entry != "x").tensors.keys() == {"y"}
@@ -102,7 +102,7 @@ def test_as_many_checkpoints_are_kept_as_asked_for(tmp_path):
         assert [path.stem for path in paths] == names[count]
         assert [int(load_checkpoint(path).tensors["x"]) for path in paths] == [number - i for i in range(count)]
     keep_checkpoint(tmp_path, saved[5], 3)
-    # A crash while they are renamed leaves a gap.
+    # A crash while checkpoints are renamed leaves a gap.
     checkpoint_path(tmp_path).unlink()
     assert int(last_checkpoint(tmp_path).tensors["x"]) == 4
     keep_checkpoint(tmp_path, saved[5], 3)

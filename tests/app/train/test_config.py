@@ -1,4 +1,4 @@
-"""Settings: every rule has its message, and JSON gives back what went in."""
+"""Tests of the settings: every rule has its message, and settings survive a JSON round trip."""
 
 import dataclasses
 import json
@@ -118,7 +118,7 @@ def test_a_training_on_auto_keeps_the_device_that_it_has(scene):
 
 
 def test_defaults_of_the_architectures(scene):
-    """Wide networks learn slower."""
+    """Each field has its default width and depth; networks of width 256 have a smaller learning rate."""
     for settings, expected in (
         ({}, (32, 1, 0.02)),
         ({"field": "nerf"}, (64, 4, 0.02)),
@@ -136,7 +136,7 @@ def test_defaults_of_the_architectures(scene):
     ("peak", "speed"), [(0.01, 1), (0.7, 1), (1.4, 1), (1.5, 2), (2.8, 2), (2.9, 4), (8, 8), (90, 64)]
 )
 def test_a_faster_machine_is_so_by_a_power_of_two(monkeypatch, peak, speed):
-    """A slower one, or one that others use meanwhile, is as the one of the rules."""
+    """The speed is a power of two; slow or busy machines count as the reference machine."""
     monkeypatch.setattr("voronerf.ops._core.native.measure_peak", lambda kind: peak * PEAK)
     assert machine_speed() == speed
     monkeypatch.setattr("voronerf.ops._core.native.missing", lambda device: "not built")
@@ -179,7 +179,7 @@ def test_long_trainings_of_objects_take_more_rays_a_step():
     def rays(**settings):
         return resolve(TrainConfig(**settings), scene).rays
 
-    large = builtin_scene(400, train_views=1, test_views=1)  # some 350 pixels along the box
+    large = builtin_scene(400, train_views=1, test_views=1)  # the box is about 350 pixels long
     assert [resolve(TrainConfig(budget=seconds), large).rays for seconds in (60, 75, 180, 300)] == [
         512,
         1024,

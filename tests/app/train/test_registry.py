@@ -1,4 +1,4 @@
-"""The table of fields: networks of other kinds are trained, split, resumed and scored by their name."""
+"""Tests of the field registry: registered modules are trained, split, resumed and scored by name."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from voronerf.router import CellProgram, layered_program
 
 
 class Table(nn.Module):
-    """A layer table that is no NeRF: sines of the position, without a view direction."""
+    """A layer table of sine layers on the position, without a view direction."""
 
     def __init__(self, width: int = 12, omega: float = 3.0) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class Table(nn.Module):
 
 
 class OwnEncoding(NeRF):
-    """A table behind an encoding of its own, learned by each cell."""
+    """A NeRF with a custom encoding, whose frequencies each cell learns."""
 
     def __init__(self, width: int = 8, depth: int = 1) -> None:
         super().__init__(width, depth, position_octaves=2, view_directions=False)
@@ -55,7 +55,7 @@ class OwnEncoding(NeRF):
 
 
 class Fourier(nn.Module):
-    """Linear layers behind random waves, an encoding of its own that all cells share."""
+    """Linear layers on fixed Fourier features, which all cells share."""
 
     router_options: ClassVar[dict[str, Any]] = {"fuse": True}
 
@@ -70,7 +70,7 @@ class Fourier(nn.Module):
 
 
 class Foreign(nn.Module):
-    """Any module of positions and directions, with a learning rate and an option of its own."""
+    """A plain module of positions and directions with its own learning rate and option."""
 
     def __init__(self, hidden: int, growth: float = 1.0, kind: str = "relu") -> None:
         super().__init__()
@@ -88,7 +88,7 @@ class Foreign(nn.Module):
 
 
 class Balls(nn.Module):
-    """A module that is asked about Gaussians."""
+    """A module that takes Gaussians as inputs."""
 
     inputs = "gaussians"
     router_options: ClassVar[dict[str, Any]] = {"fuse": True}
@@ -113,7 +113,7 @@ KINDS: dict[str, tuple[type[nn.Module], dict[str, Any]]] = {
 
 @pytest.fixture(autouse=True)
 def table() -> Iterator[None]:
-    """The fields of this file, entered and taken out again."""
+    """Registers the fields of this file, and restores the registry afterwards."""
     before = dict(FIELDS)
     for name, (kind, _) in KINDS.items():
         register_field(name)(kind)
@@ -146,13 +146,13 @@ def test_every_kind_of_field_is_trained_split_resumed_and_scored(tmp_path: Path,
     whole, resumed = (load_checkpoint(checkpoint_path(tmp_path / run)).tensors for run in ("whole", "part"))
     assert whole.keys() == resumed.keys() and all(torch.equal(whole[key], resumed[key]) for key in whole)
     changed = [key for key in whole if key.startswith("router.module.") and not torch.equal(*whole[key][:2])]
-    assert changed  # cells have learned different things since the split
+    assert changed  # cells differ since the split
 
     run = open_run(tmp_path / "whole", scene=scene)
     assert isinstance(run.router.module, KINDS[name][0])
     assert run.evaluate()["psnr"] == summary["psnr"]
     assert run.render(1).colour.shape == (16, 16, 3)
-    if name in ("table", "fourier", "balls"):  # a layer table, or a class whose router has fuse=True
+    if name in ("table", "fourier", "balls"):  # a layer table, or fuse=True
         assert "fused" in run.router.explain()
     del FIELDS[name]
     with pytest.raises(ConfigError, match=f"register_field adds others, got '{name}'"):
@@ -163,11 +163,11 @@ def test_steps_of_what_is_one_program_do_not_depend_on_threads(scene: Scene) -> 
     states = {name: build(small(Path("run"), field=name, **KINDS[name][1]), scene) for name in KINDS}
     alone = {name for name, state in states.items() if state.thread_deterministic}
     assert alone == {"table", "fourier", "balls"}, "given, or traced for the question"
-    states["fourier"].router.way = "fastest"  # timings may decide for another way
+    states["fourier"].router.way = "fastest"  # timings may choose another way
     assert not states["fourier"].thread_deterministic
 
     def four_steps() -> list[Tensor]:
-        # Torch shares work on 32,768 elements and more among threads, here in parts of odd sizes.
+        # 521 x 67 elements: PyTorch splits 32,768 and more among threads, here into odd parts.
         config = replace(small(Path("run"), field="fourier"), steps=4, rays=521, samples=(67,), split_at=(0.5,))
         state = steps_of(build(config, scene), 4)
         return [tensor for _, tensor in sorted(snapshot(state).tensors.items())]

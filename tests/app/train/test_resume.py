@@ -1,4 +1,4 @@
-"""Runs that are stopped, loaded and resumed: bit for bit, and refused where they are another's."""
+"""Tests of stopped and resumed runs: they match bit for bit, and other runs' checkpoints are refused."""
 
 import json
 import math
@@ -30,7 +30,7 @@ from voronerf.ops._core import backends
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory, scene):
-    """The settings of a run that was stopped after 14 steps."""
+    """The settings of a run that stopped after 14 steps."""
     config = small(tmp_path_factory.mktemp("stopped"))
     trained(config, scene, stop_at=14)
     return config
@@ -100,7 +100,7 @@ def test_a_loaded_run_renders_the_same(tmp_path, scene):
         assert evaluate(opened.renderer, scene, views=2) == evaluate(state.renderer, scene, views=2)
     coarser = open_run(tmp_path, scene=scene, samples=(3, 2), backend="reference").renderer
     assert (coarser.sampler.samples, coarser.sampler.fine_samples, coarser.backend) == (3, 2, "reference")
-    # Another configuration, another architecture.
+    # a checkpoint of another configuration or architecture
     checkpoint = load_checkpoint(checkpoint_path(tmp_path))
     with pytest.raises(CheckpointError, match=r"a checkpoint of another configuration: --width 8 -> 16; --lr"):
         load(build(replace(config, width=16, lr=1e-4), scene), checkpoint)
@@ -175,27 +175,27 @@ def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, con
     monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 2)
     for name in ("SETTLING_STEPS", "WARMUP_STEPS"):
         monkeypatch.setattr(f"voronerf.nerf.samplers.{name}", 5)
-    monkeypatch.setattr("voronerf.nerf.schedule.FILL", 1.5)  # other numbers of rays in every step
+    monkeypatch.setattr("voronerf.nerf.schedule.FILL", 1.5)  # the number of rays varies
     settings = {"contraction": contraction, "precision": "fp32" if contraction == "none" else "bf16"}
-    found = assert_resumes(tmp_path, scene, 15, occupancy=True, field="hashgrid", depth=1, **settings)
-    assert len(found["occupancy.density"].unique()) > 1
+    saved = assert_resumes(tmp_path, scene, 15, occupancy=True, field="hashgrid", depth=1, **settings)
+    assert len(saved["occupancy.density"].unique()) > 1
 
 
-@pytest.mark.parametrize("stop_at", [4, 7])  # before and after it begins again
+@pytest.mark.parametrize("stop_at", [4, 7])  # before and after the restart
 def test_a_start_that_failed_is_begun_again_and_resumed(tmp_path, scene, monkeypatch, stop_at):
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 2)
     monkeypatch.setattr("voronerf.app.train.start.JUDGED", 3)
     monkeypatch.setattr("voronerf.app.train.start.why_nothing_is_learnt", lambda batch, output: "planted")
     assert_resumes(tmp_path, scene, stop_at, occupancy=True, field="hashgrid", depth=1, split_at=(0.9,))
     stages = read_json(tmp_path / "part" / "summary.json")["stages"]
-    assert [(each["cells"], each["started_at_step"]) for each in stages] == [(1, 0), (1, 5), (1, 10), (1, 15), (4, 22)]
+    assert [(stage["cells"], stage["started_at_step"]) for stage in stages] == [(1, 0), (1, 5), (1, 10), (1, 15), (4, 22)]
 
 
 def test_averages_are_resumed_and_shown(tmp_path, scene):
-    found = assert_resumes(tmp_path, scene, 40, steps=50, split_at=(0.7,), **HIERARCHICAL)
-    assert any(name.endswith(".average") for name in found)
+    saved = assert_resumes(tmp_path, scene, 40, steps=50, split_at=(0.7,), **HIERARCHICAL)
+    assert any(name.endswith(".average") for name in saved)
     opened = open_run(tmp_path / "part", scene=scene)
-    assert any(not torch.equal(p, found[f"router.{name}"]) for name, p in opened.router.named_parameters())
+    assert any(not torch.equal(p, saved[f"router.{name}"]) for name, p in opened.router.named_parameters())
 
 
 def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, scene, monkeypatch):
@@ -229,7 +229,7 @@ def test_turns_leave_checkpoints(tmp_path, scene):
     checkpoints = Checkpoints(tmp_path, every=0.05)
     while state.seconds < 0.15:
         assert state.seconds >= 0.05 or not checkpoint_path(tmp_path).exists()
-        train(state, [checkpoints], until=state.seconds + 1e-4, clock=lambda: 0.01 * next(ticks))  # a step
+        train(state, [checkpoints], until=state.seconds + 1e-4, clock=lambda: 0.01 * next(ticks))  # one step
     checkpoints.writer.wait()
     assert checkpoint_path(tmp_path).exists()
 

@@ -1,4 +1,4 @@
-"""Evaluations of a training: within their share of the budget, and with what makes them poor; steps that go wrong."""
+"""Tests of evaluations during training: their share of the budget, warnings about poor scores, and bad steps."""
 
 import json
 import math
@@ -23,7 +23,7 @@ def weights(state):
 
 
 class Clock:
-    """A second for each step, at whose beginning and end it is read, and for each view what its pixels take."""
+    """A simulated clock: a step, which reads it twice, takes 1 s; a view takes `view_seconds` scaled by its pixels."""
 
     def __init__(self, monkeypatch, view_seconds):
         self.now, self.read, self.views, pixels = 0.0, 0, [], SIDE**2
@@ -46,7 +46,7 @@ SIDE = 96
 
 
 def scored(monkeypatch, view_seconds, **settings):
-    """A training at a budget of 40 s that takes a second a step: state, scores and clock."""
+    """Returns (state, scores, clock) of a training with a budget of 40 s and steps of 1 s."""
     clock = Clock(monkeypatch, view_seconds)
     settings = {"steps": None, "budget": 40.0, "eval_views": None, "evaluations": 4, **settings}
     state = build(small(**settings), builtin_scene(SIDE, train_views=2, test_views=8))
@@ -57,14 +57,14 @@ def scored(monkeypatch, view_seconds, **settings):
 
 @pytest.mark.parametrize("seconds", [0.001, 0.1, 0.3, 1.0, 3.0, 20.0])
 def test_evaluations_take_a_tenth_of_the_budget(monkeypatch, seconds):
-    """However long a view takes: fewer of them, none on the way, or the middle of one at the end."""
+    """Slow views lead to fewer views, to one evaluation at the end, or to only the middle of one view."""
     state, scores, clock = scored(monkeypatch, lambda now: seconds)
     spent = clock.now - state.seconds
-    found = [line["views"] for line in scores.metrics]
-    assert spent <= 4 + seconds / 9 and 38 <= clock.now <= 42.5  # the first view tells what they take
+    views = [line["views"] for line in scores.metrics]
+    assert spent <= 4 + seconds / 9 and 38 <= clock.now <= 42.5  # the first view is timed
     assert scores.summary["complete"] and scores.summary["views"] >= 1 and scores.summary["psnr"] > 0
     assert (scores.summary["part"] == 1) == (seconds <= 3)
-    assert len(found) == (4 if seconds < 1 else 2 if seconds < 3 else 1)
+    assert len(views) == (4 if seconds < 1 else 2 if seconds < 3 else 1)
 
 
 def test_the_middle_of_several_views_is_scored_where_time_is_short_for_one(monkeypatch):
@@ -77,7 +77,7 @@ def test_the_middle_of_several_views_is_scored_where_time_is_short_for_one(monke
 
 
 def test_views_that_become_cheaper_are_scored_later(monkeypatch):
-    """Empty space is found in the first seconds, so that a later view takes less."""
+    """Views are scored once they are cheap: early views are slow since empty space is not known yet."""
     _, scores, clock = scored(monkeypatch, lambda now: 2.0 if now < 25 else 0.1)
     assert [line["views"] for line in scores.metrics] == [8, 8] and min(clock.views) < SIDE
     assert scores.metrics[0]["seconds"] > 25 and {line["part"] for line in scores.metrics} == {1}
@@ -90,15 +90,15 @@ def test_views_that_are_asked_for_are_scored_beside_the_budget(monkeypatch):
 
 
 def test_evaluations_change_no_bit_of_a_training(scene):
-    """However many there are, of whole views or of their middle."""
-    found = []
+    """Any number of evaluations, of whole views or of their middle, leaves the training the same bit for bit."""
+    results = []
     for evaluations, middle in ((1, False), (4, False), (4, True)):
         state = build(small(steps=24, evaluations=evaluations), scene)
         scores = Scores(None)
         looks = Each(lambda state, scores=scores, middle=middle: scores._probe(state, 2) if middle else None)
         run(state, [scores, looks])
-        found.append(weights(state))
-    assert same(found[0], found[1]) and same(found[0], found[2])
+        results.append(weights(state))
+    assert same(results[0], results[1]) and same(results[0], results[2])
 
 
 def test_as_many_panels_are_drawn_as_a_tenth_of_the_budget_allows(monkeypatch):
@@ -124,9 +124,9 @@ def test_infinite_scores_are_null_in_files(tmp_path, scene, monkeypatch):
         for name in ("metrics.jsonl", "summary.json"):
             text = (tmp_path / name).read_text()
             for value in [text] if name == "summary.json" else text.splitlines():
-                found = json.loads(value, parse_constant=pytest.fail)
-                assert found["psnr"] is None
-                assert found["not_finite"] == {"psnr": "inf", "psnr_of_mean_error": "inf"}
+                entries = json.loads(value, parse_constant=pytest.fail)
+                assert entries["psnr"] is None
+                assert entries["not_finite"] == {"psnr": "inf", "psnr_of_mean_error": "inf"}
         assert write_curve(tmp_path) is None
     for line, message in (
         ('{"step": "x"}', "step must be an integer, got 'x'"),
@@ -189,5 +189,5 @@ def test_a_run_that_diverges_before_its_first_checkpoint_ends(tmp_path, scene):
 )
 def test_poor_scores_are_told_with_their_likely_cause(scene, psnrs, lr, settled, said):
     config = resolve(TrainConfig(lr=lr), scene)
-    found = why_scores_are_poor([{"psnr": psnr} for psnr in psnrs], config, 9.0, settled=settled)
-    assert found is None if said is None else re.search(said, found)
+    cause = why_scores_are_poor([{"psnr": psnr} for psnr in psnrs], config, 9.0, settled=settled)
+    assert cause is None if said is None else re.search(said, cause)

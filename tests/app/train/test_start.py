@@ -1,4 +1,4 @@
-"""The first steps of a training: a grid that does not empty all, and another draw where nothing is learnt."""
+"""Tests of the first steps: the grid does not become empty, and a start that learns nothing is redrawn."""
 
 import itertools
 from dataclasses import replace
@@ -18,7 +18,7 @@ from voronerf.nerf.volume import Samples
 @pytest.mark.slow
 @pytest.mark.native
 def test_steps_of_many_rays_do_not_empty_the_grid_before_the_field_is_dense():
-    """A seed whose training stayed without a sample, at 9 dB."""
+    """Regression: this seed's training lost all its samples and stayed at 9 dB."""
     scene = builtin_scene(32, train_views=30, test_views=2)
     config = TrainConfig(steps=6000, split_at=(0.9,), rays=4096, samples=(128,), seed=3)
     state = steps_of(build(config, scene), 115)
@@ -61,12 +61,12 @@ def test_every_new_start_is_another_draw(scene, monkeypatch):
 
 
 def test_a_start_of_one_colour_has_failed():
-    """Rays of other colours through samples of one; not where all of them should have it."""
+    """A start has failed if its samples have one colour, unless the rays' target is that colour."""
     generator = torch.Generator().manual_seed(0)
     background, target = torch.rand(2, 50, 3, generator=generator)
     light = torch.linspace(0, 1, 50)[:, None]
-    for own, wanted, failed in ((0.4, target, True), (0.4, 0.4 + 0 * target, False), (target, target, False)):
-        colour = light * own + (1 - light) * background
+    for sampled, wanted, failed in ((0.4, target, True), (0.4, 0.4 + 0 * target, False), (target, target, False)):
+        colour = light * sampled + (1 - light) * background
         nothing, places = torch.zeros(50), torch.zeros(50, 3)
         batch = Batch(Rays(places, places), nothing, nothing, wanted, background)
         samples = Samples(places, torch.arange(50), torch.arange(51), nothing, nothing)

@@ -1,4 +1,4 @@
-"""Which terms the loss of a training has."""
+"""Tests of the terms in a training's loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps of training are the same bit for bit on any number of threads."""
+"""Tests that training steps are the same bit for bit on any number of threads."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ VARIANTS = {
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_steps_do_not_depend_on_threads(scene, variant):
     def four_steps():
-        # Torch shares work on 32,768 elements and more among threads, here in parts of odd sizes.
+        # 521 x 67 elements: PyTorch splits 32,768 and more among threads, here into odd parts.
         few = {"steps": 4, "rays": 521, "samples": (67,), "depth": 1, "split_at": (2,)}
         state = steps_of(build(small(**{**few, **VARIANTS[variant]}), scene), 4)
         return [tensor for _, tensor in sorted(snapshot(state).tensors.items())]
@@ -36,10 +36,10 @@ def test_what_a_sampler_of_the_users_gives_is_checked_in_every_step(scene, monke
     class Late(Stratified):
         steps = 0
 
-        def sample(self, *given, **more):
+        def sample(self, *arguments, **more):
             self.steps += 1
-            found = super().sample(*given, **more)
-            return found._replace(deltas=found.deltas[:-8], edges=None) if self.steps == 3 else found
+            samples = super().sample(*arguments, **more)
+            return samples._replace(deltas=samples.deltas[:-8], edges=None) if self.steps == 3 else samples
 
     monkeypatch.setitem(SAMPLERS, "late", Late)
     state = build(small(sampling="late", steps=5), scene)
@@ -49,7 +49,7 @@ def test_what_a_sampler_of_the_users_gives_is_checked_in_every_step(scene, monke
 
 
 def test_torch_on_one_thread():
-    """Also one in another; ops keep their threads."""
+    """PyTorch runs on one thread within the context, also when nested; the ops keep their threads."""
     before = torch.get_num_threads()
     with backends.torch_on_one_thread():
         with backends.torch_on_one_thread():

@@ -1,4 +1,4 @@
-"""The loop of a training on a tiny built-in scene: stages, splits, files, the grid, and that it never dies."""
+"""Tests of the training loop on a tiny built-in scene: stages, splits, files, the occupancy grid, and robustness."""
 
 import math
 import re
@@ -62,7 +62,7 @@ def test_training_learns_and_the_reference_learns_the_same(scene):
 
 
 def test_the_middle_of_a_view_is_that_of_the_whole_view(scene):
-    """Of views of several sizes and bent lenses, to the bit; with the same rows of the truth and of the mask."""
+    """The middle of a view is rendered bit for bit as in the whole view, with its truth and mask."""
     state = started(scene, 4)
     count, cameras = len(scene.test), scene.test.cameras
     distortion = torch.zeros(count, 8)
@@ -81,7 +81,7 @@ def test_the_middle_of_a_view_is_that_of_the_whole_view(scene):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_no_collapse_to_white(scene, seed):
-    """A NeRF that gives up paints every ray white; its opacity is then 0 and no gradient brings it back."""
+    """The opacity does not collapse to 0, where every ray is white and has no gradient."""
     state = started(scene, 100, steps=100, seed=seed, rays=256, samples=(24,), width=32, cells=())
     image = render_camera(state.renderer, scene, scene.test.cameras, 0)
     alpha = scene.test.images[0][..., 3].float() / 255
@@ -96,7 +96,7 @@ def test_nested_levels_and_cells_too_small(scene, monkeypatch):
     settings = {"cells": (3, 3), "split_at": (0.5, 0.9)}
     coarse, first, second = started(scene, 24, **settings).stages
     assert (coarse.cells, first.cells) == (1, 3) and second.cells in (3, 5, 7, 9)
-    # No cell holds that many samples, so none is split on the second level, and training goes on.
+    # No cell has 10,000 samples, so the second level is not split, and training continues.
     lines = []
     state = build(small(**settings), scene, on_event=lines.append)
     state.strategy.min_samples = 10_000
@@ -108,7 +108,7 @@ def test_nested_levels_and_cells_too_small(scene, monkeypatch):
     ("settings", "at", "cells"),
     [
         ({"split_at": (7,)}, [0, 7], [1, 4]),
-        # The worst cell first until there are enough, the last of them into what is missing: 4, 4 and 3.
+        # The worst cell is split first, into 4, 4 and then the remaining 3.
         (
             {"cells": (3, 4), "max_cells": 11, "split_at": (0.2, 0.8), "steps": 50},
             [0, 10, 20, 30, 40],
@@ -146,7 +146,7 @@ def test_children_inherit_or_start_afresh(scene):
 
 
 def test_coarse_and_fine_networks_inherit_alike(scene):
-    """After the split every cell of both networks has its parent's parameters and Adam's moments."""
+    """After a split every cell of both networks has its parent's parameters and Adam moments."""
     state = started(scene, 12, **HIERARCHICAL)
 
     def found():
@@ -162,7 +162,7 @@ def test_coarse_and_fine_networks_inherit_alike(scene):
     assert torch.equal(state.routers["coarse"].diagram.centres, state.router.diagram.centres)
 
 
-# --- what depends on the scene ---------------------------------------------------------------------------------------
+# --- settings that depend on the scene -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("field", ["nerf", "kilonerf"])
@@ -174,15 +174,14 @@ def test_parameters_decide_the_width(scene, field):
     steps_of(state, 13)
     assert count_parameters(config) == state.parameter_count
     again = build(replace(small(field=field, parameters=30_000, width=None, depth=None), **HIERARCHICAL), scene)
-    assert again.config.width < config.width  # two networks share them
+    assert again.config.width < config.width  # two networks share the parameters
     refuses("--parameters must be at least", build, small(parameters=7), scene, error=ConfigError)
 
 
 def test_octaves_follow_the_pixels(scene):
-    """100 x 100 images of a Blender-like scene: 8 octaves; the paper's 10 at 400 x 400; one more for half the pixel.
+    """A 100 x 100 image has 8 octaves, and half the pixel size adds one: 10 at 400 x 400, as in the paper.
 
-    Of cones, those that a pixel leaves: at the middle of the scene the last keeps more than a thousandth, the next
-    would keep nothing.
+    Cones have two more: the last octave keeps a visible amplitude at the middle of the scene, the next one none.
     """
     some = scene.train.cameras
     for size, octaves in ((50, 7), (100, 8), (200, 9), (400, 10)):
@@ -193,8 +192,8 @@ def test_octaves_follow_the_pixels(scene):
         assert cones == octaves + 2
         rays = cameras.rays(0, torch.tensor([size // 2]), torch.tensor([size // 2]), cones=True)
         variance = float(4 * rays.radii) ** 2 / 4
-        left = [math.exp(-0.5 * 4.0**octave * variance) for octave in (cones - 1, cones)]
-        assert left[0] > 1e-4 and left[1] < 1e-9
+        amplitudes = [math.exp(-0.5 * 4.0**octave * variance) for octave in (cones - 1, cones)]
+        assert amplitudes[0] > 1e-4 and amplitudes[1] < 1e-9
 
 
 def test_a_panorama_from_one_place_trains(scene):
@@ -222,7 +221,7 @@ def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch):
     def only_below(grid, *_, **__):
         grid.occupied[:, :, grid.occupied.shape[2] // 2 :] = False
 
-    # What is empty: the upper half of the box, which the field is then never asked about.
+    # The upper half of the box is empty, so the field is never evaluated there.
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 0)
     for method in ("update", "observe"):
         monkeypatch.setattr(OccupancyGrid, method, only_below)
@@ -246,8 +245,8 @@ def test_a_grid_settles_before_it_learns(scene, monkeypatch, contraction, settli
     new, learnt, most = state.sampler.grid.density.clone(), [], []
     sample = state.sampler.sample
 
-    def counted(*rays, **given):
-        samples = sample(*rays, **given)
+    def counted(*rays, **options):
+        samples = sample(*rays, **options)
         most.append(int(samples.ray_offsets.diff().max()))
         return samples
 
@@ -266,30 +265,30 @@ def test_holes_of_the_grid_are_filled_once_at_the_end_by_the_averaged_field(scen
     with state.averaged():
         assert len(filled) == 1 and torch.equal(filled[0], weight_of(state))
     assert not torch.equal(filled[0], weight_of(state))
-    train(build(small(occupancy=True, contraction="none"), scene))  # what is in a box gains nothing by it
+    train(build(small(occupancy=True, contraction="none"), scene))  # not needed in a box
     assert len(filled) == 1
 
 
 @pytest.mark.native
 def test_results_do_not_depend_on_how_many_steps_are_made_at_once(scene, monkeypatch):
-    """One by one, as a callback wants it; in groups; and stopped in the middle of some."""
+    """Single steps (for a callback), groups of steps and interrupted groups give the same bits."""
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
-    monkeypatch.setattr("voronerf.nerf.schedule.FILL", 1.5)  # other numbers of rays
-    given = {"field": "hashgrid", "depth": 1, "occupancy": True, "steps": 90, "split_at": (0.6,), "cells": (3,)}
-    alone, groups, stopped = (build(small(**given), scene) for _ in range(3))
-    made = []
+    monkeypatch.setattr("voronerf.nerf.schedule.FILL", 1.5)  # the number of rays varies
+    settings = {"field": "hashgrid", "depth": 1, "occupancy": True, "steps": 90, "split_at": (0.6,), "cells": (3,)}
+    alone, groups, stopped = (build(small(**settings), scene) for _ in range(3))
+    steps = []
     train(groups)
-    steps_of(alone, 90, Each(lambda state: made.append(state.step)))
+    steps_of(alone, 90, Each(lambda state: steps.append(state.step)))
     for count in (7, 30, 53):
         steps_of(stopped, count)
-    assert made == list(range(1, 91)) and groups.step == stopped.step == 90 and groups.rays > 64
+    assert steps == list(range(1, 91)) and groups.step == stopped.step == 90 and groups.rays > 64
     for other in (alone, stopped):
         assert same(groups.router.state_dict(), other.router.state_dict())
         assert same(groups.sampler.grid.state_dict(), other.sampler.grid.state_dict())
 
 
 def test_a_step_takes_more_rays_where_space_is_empty(scene, monkeypatch):
-    """A quarter of the samples of the first steps, by at most eight times the rays."""
+    """Steps take up to eight times as many rays while space becomes empty."""
     monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 1)
     state = build(small(field="hashgrid", depth=1, occupancy=True, steps=12, cells=()), scene)
     rays, voxels = [], state.sampler.grid.occupied.numel()
@@ -330,7 +329,7 @@ def test_refused_before_anything_is_written(tmp_path, scene, monkeypatch):
 @pytest.mark.warp
 @pytest.mark.parametrize("field", ["hashgrid", "nerf"])
 def test_warp_trains_as_the_reference_does(scene, field):
-    """Steps and a split by kernels of Warp and plain torch alone, with losses that are those of the reference."""
+    """Steps and a split on the Warp backend give the losses of the reference backend."""
     losses = {"reference": [], "warp": []}
     for backend, found in losses.items():
         config = small(backend=backend, field=field, width=17, occupancy=field == "hashgrid", split_at=(8,))
@@ -341,13 +340,13 @@ def test_warp_trains_as_the_reference_does(scene, field):
 @pytest.mark.native
 @pytest.mark.parametrize("occupancy", [False, True])
 def test_the_reference_calls_nothing_compiled(scene, monkeypatch, occupancy):
-    """Three steps and a split, counted at the compiled module; the native backend does call it."""
+    """Three steps and a split on the reference backend never use the compiled module; the native backend does."""
     calls = []
     real = native.compiled
 
     class Counted:
         def __getattr__(self, name):
-            calls.extend({name} - {"Unchanged"})  # which computes nothing
+            calls.extend({name} - {"Unchanged"})  # computes nothing
             return getattr(real, name)
 
     for backend in ("reference", "warp", "native"):
@@ -384,10 +383,10 @@ def test_callbacks_are_called_in_their_order(scene):
 
 
 def test_the_example_is_the_whole_method(scene, monkeypatch):
-    """On the library alone: it learns in a second, and has made its split."""
+    """The example uses only the library, learns within a second, and splits its cell."""
     file = Path(__file__).resolve().parents[3] / "examples" / "train.py"
     lines = file.read_text().splitlines()
     assert len(lines) <= 45 and not any("voronerf.app.train" in line for line in lines)
     monkeypatch.setattr("voronerf.app.scenes.load_scene", lambda name: scene)
-    found = re.search(r"(\d+) steps, 16 cells, PSNR ([\d.]+)", script(file, "builtin", 1))
-    assert int(found[1]) > 10 and float(found[2]) > 12
+    match = re.search(r"(\d+) steps, 16 cells, PSNR ([\d.]+)", script(file, "builtin", 1))
+    assert int(match[1]) > 10 and float(match[2]) > 12

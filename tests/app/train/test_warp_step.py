@@ -1,7 +1,6 @@
-"""A default step on Warp reads nothing on the host, shown without a GPU: its tensors are on the meta device.
+"""Tests without a GPU that a default step on Warp reads nothing on the host: its tensors are on the meta device.
 
-Such tensors have no values, so that whoever reads one raises. What asks whether a tensor is on the CPU is told that it
-is not, as on a GPU.
+Meta tensors have no values, so reading one raises. Checks whether a tensor is on the CPU fail, as on a GPU.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ pytestmark = pytest.mark.warp
 
 
 def on_meta(tensor: Tensor, memo: dict[int, object]) -> Tensor:
-    """A tensor of the same shape and kind without values, once for each."""
+    """Copies a tensor to the meta device, once per tensor (the memo of `deepcopy`)."""
     if id(tensor) not in memo:
-        found = torch.empty_strided(tensor.shape, tensor.stride(), dtype=tensor.dtype, device="meta")
+        copied = torch.empty_strided(tensor.shape, tensor.stride(), dtype=tensor.dtype, device="meta")
         of_parameter = isinstance(tensor, torch.nn.Parameter)
-        memo[id(tensor)] = torch.nn.Parameter(found, tensor.requires_grad) if of_parameter else found
+        memo[id(tensor)] = torch.nn.Parameter(copied, tensor.requires_grad) if of_parameter else copied
     return memo[id(tensor)]
 
 
@@ -39,16 +38,16 @@ def test_a_default_step_reads_nothing_on_the_host(scene, monkeypatch):
     monkeypatch.setitem(copy._deepcopy_dispatch, torch.Generator, lambda generator, memo: generator)
     memo = {id(kept): kept for kept in (before.scene, before.config)}
     state = copy.deepcopy(before, memo)
-    for name in vars(before.optimizer).keys() - vars(state.optimizer).keys():  # which an optimiser leaves behind
+    for name in vars(before.optimizer).keys() - vars(state.optimizer).keys():  # not copied by deepcopy
         setattr(state.optimizer, name, copy.deepcopy(getattr(before.optimizer, name), memo))
 
-    # To PyTorch and Warp the device is unknown; ``random_`` of it needs a generator.
+    # PyTorch and Warp do not support the device here; ``random_`` would need a generator on it.
     empty = torch.empty(1, dtype=torch.int32, device="meta")
     for module in (batches, samplers):
         monkeypatch.setattr(module, "draw_seed", lambda device, generator: empty)
-    asked = backends.why_not
+    why_not = backends.why_not
     monkeypatch.setattr(
-        backends, "why_not", lambda op, name, device, dtype: asked(op, name, torch.device("cpu"), dtype)
+        backends, "why_not", lambda op, name, device, dtype: why_not(op, name, torch.device("cpu"), dtype)
     )
     monkeypatch.setattr(torch, "is_autocast_enabled", lambda *device: False)
     monkeypatch.setattr(torch, "autocast", lambda *device, **options: contextlib.nullcontext())

@@ -1,4 +1,4 @@
-"""Runs of a few steps on a scene of 16 x 16 pixels, for all tests of training."""
+"""Defines runs of a few steps on a scene of 16 x 16 pixels, for the training tests."""
 
 from dataclasses import replace
 
@@ -14,21 +14,21 @@ HIERARCHICAL = {"sampling": "hierarchical", "samples": (12, 6)}
 
 
 def small(out=None, **settings):
-    """24 steps, split into four cells after 12 of them where neither cells nor splits are given."""
+    """Returns the settings of 24 steps; by default the cell is split into four after 12 steps."""
     if not {"cells", "split_at"} & settings.keys():
         settings["split_at"] = (0.5,)
     return TrainConfig(out=out, **{**SMALL, **settings})
 
 
 class Each(Callback):
-    """Calls a function after every step."""
+    """A callback that calls a function after every step."""
 
     def __init__(self, call):
         self.after_step = call
 
 
 def steps_of(state, count, *callbacks, **options):
-    """Makes so many steps more, and no evaluation or file."""
+    """Trains `count` more steps without evaluations and files; returns the state."""
     last = state.step + count
     train(state, [Each(lambda s: s.stop() if s.step == last else None), *callbacks], **options)
     state.stopped = False
@@ -36,7 +36,7 @@ def steps_of(state, count, *callbacks, **options):
 
 
 def started(scene, count, **settings):
-    """A state after so many steps, without a run directory."""
+    """Returns a new training's state after `count` steps, without a run folder."""
     return steps_of(build(small(**settings), scene), count)
 
 
@@ -45,18 +45,18 @@ def tensors(run):
 
 
 def scores(run):
-    """Step and PSNR of every evaluation."""
+    """Returns (step, PSNR) of every evaluation of a run."""
     return [(line["step"], line["psnr"]) for line in read_json_lines(run / "metrics.jsonl")]
 
 
 def assert_resumes(folder, scene, stop_at, **settings):
-    """A run that is stopped and resumed ends bit for bit as one that is not; returns the tensors of its checkpoint."""
+    """Fails unless a stopped and resumed run equals an unstopped one bit for bit; returns its checkpoint's tensors."""
     whole = small(folder / "whole", **settings)
     trained(whole, scene)
     part = replace(whole, out=folder / "part")
     summary = trained(part, scene, stop_at=stop_at)
     assert not summary["complete"] and summary["steps"] == stop_at
     trained(part, scene, resume=True)
-    found = tensors(folder / "part")
-    assert same(tensors(folder / "whole"), found) and scores(folder / "whole") == scores(folder / "part")
-    return found
+    resumed = tensors(folder / "part")
+    assert same(tensors(folder / "whole"), resumed) and scores(folder / "whole") == scores(folder / "part")
+    return resumed

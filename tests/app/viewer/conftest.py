@@ -1,4 +1,4 @@
-"""A run of nested cells on a scene of 24 x 24 pixels, and viewers of it."""
+"""Fixtures: a run of nested cells on a scene of 24 x 24 pixels, and its viewers."""
 
 from __future__ import annotations
 

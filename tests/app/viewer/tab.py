@@ -1,4 +1,4 @@
-"""A browser's tab without a browser: what viser's page sends, and what it is sent."""
+"""A simulated browser tab, which exchanges viser's messages with a viewer."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ CLICK = {"event_type": "click", "ray_origin": [0.0] * 3, "ray_direction": [0.0, 
 
 
 def found(value, buffers):
-    """A value of a message, which may be the number of a buffer behind it."""
+    """Returns a message's value, or the binary buffer that it refers to."""
     return buffers[value["__binary_index"]] if isinstance(value, dict) and "__binary_index" in value else value
 
 
 class Tab:
-    """Connects to a viewer, whose thread renders when :meth:`until` waits for something.
+    """A client of a viewer, which renders while :meth:`until` waits.
 
     Args:
-        viewer: serves it.
-        cameras: one of them is where it stands at first.
-        index: which.
-        size: of its canvas, width and height.
-        number: how many tabs came before it.
+        viewer: The viewer that serves the tab.
+        cameras: Cameras that include the tab's first camera.
+        index: The index of the first camera.
+        size: The canvas size in pixels, (width, height).
+        number: The number of earlier tabs of this viewer.
 
     Attributes:
-        pictures: of the background, uint8 arrays [h, w, 3] in order.
-        gui: properties of the parts of the panel, by label or, for text, by their first words.
-        nodes: what is drawn into the scene, by name.
+        pictures: The received background images in order, uint8 arrays [h, w, 3].
+        gui: The properties of the panel's controls, by label or, for a text, by its first 20 characters.
+        nodes: The scene nodes by name.
     """
 
     def __init__(self, viewer, cameras, index=0, *, size=(48, 48), number=0) -> None:
@@ -57,7 +57,7 @@ class Tab:
         self.socket.send(msgspec.msgpack.encode({"type": kind, **values}))
 
     def look(self, cameras, index=0) -> None:
-        """Goes to a camera; the angle of view is the camera's."""
+        """Moves to a camera and takes its angle of view."""
         pose = cameras.poses[index].double().numpy()
         fov = 2 * math.atan(cameras.height / 2 / float(cameras.intrinsics[index, 1]))
         place = {"position": pose[:3, 3].tolist(), "look_at": (pose[:3, 3] - pose[:3, 2]).tolist(), "fov": fov}
@@ -66,11 +66,11 @@ class Tab:
         self.send("ViewerCameraMessage", **{**CAMERA, **place})
 
     def set(self, label, value) -> None:
-        """Changes a part of the panel, or presses a button."""
+        """Changes a control of the panel, or presses a button."""
         self.send("GuiUpdateMessage", uuid=self.gui[label]["uuid"], updates={"value": value})
 
     def drag(self, name, place, wxyz=(1.0, 0.0, 0.0, 0.0)) -> None:
-        """Drags arrows of the scene to a place, when they are there."""
+        """Waits for a transform control of the scene, and drags it to a position."""
         self.until(lambda: name in self.nodes)
         node = {"name": name, "owner": self.nodes[name].get("owner", "")}
         self.send("TransformControlsDragStartMessage", **node)
@@ -81,7 +81,7 @@ class Tab:
         self.send("ScenePointerMessage", **CLICK, screen_pos=[[x, y]])
 
     def read(self) -> None:
-        """Takes what has come."""
+        """Processes the received messages."""
         while True:
             try:
                 data = self.socket.recv(timeout=0.02)
@@ -112,8 +112,8 @@ class Tab:
             }
         elif kind.startswith("Gui") and "uuid" in message:
             label = props.get("label") or props.get("_markdown", kind)[:20]
-            own = {"uuid": message["uuid"], "folder": message.get("container_uuid"), "value": message.get("value")}
-            self.gui[label] = own | props
+            control = {"uuid": message["uuid"], "folder": message.get("container_uuid"), "value": message.get("value")}
+            self.gui[label] = control | props
         elif kind == "RemoveSceneNodeMessage":
             self.nodes = {name: node for name, node in self.nodes.items() if not name.startswith(message["name"])}
         elif "name" in message and props:
@@ -122,18 +122,18 @@ class Tab:
             self.notes.append(props or message)
 
     def until(self, done, seconds=20.0):
-        """Lets the viewer render until something holds, and returns it."""
+        """Lets the viewer render until ``done()`` is true, and returns its value."""
         end = time.monotonic() + seconds
         while True:
             self.viewer.render_next()
             self.read()
-            found = done()
-            if found:
-                return found
+            value = done()
+            if value:
+                return value
             assert time.monotonic() < end, f"waited {seconds} s in vain"
 
     def rest(self):
-        """The sharp picture after a change, when it has come."""
+        """Waits for the sharp picture after a change and returns it, uint8 [h, w, 3]."""
         client = self.until(lambda: self.viewer.clients.get(self.number))
         self.until(lambda: client.version != self.version and not (client.wants_sharp or client.wants_coarse))
         self.version = client.version

@@ -1,4 +1,4 @@
-"""The viewer in a real browser."""
+"""Tests of the viewer in a real browser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def browser(tmp_path):
 
 @pytest.fixture
 def served(viewer):
-    """The viewer, with a thread that renders for it."""
+    """The viewer, served by a thread."""
     stop = threading.Event()
     thread = threading.Thread(target=viewer.serve, args=(stop.is_set,))
     thread.start()
@@ -40,7 +40,7 @@ def test_chromium_shows_the_scene_and_its_cells(run, served, browser) -> None:
     client = until(lambda: next(iter(served.clients.values()), None))
     canvas = until(lambda: browser.find_elements("tag name", "canvas"))[0]
     height, width = canvas.size["height"], canvas.size["width"]
-    middle = (slice(height // 3, height), slice(width // 3, 3 * width // 5))  # nothing lies over it
+    middle = (slice(height // 3, height), slice(width // 3, 3 * width // 5))  # no control covers this part
 
     def seen():
         page = screenshot(browser)
@@ -48,7 +48,7 @@ def test_chromium_shows_the_scene_and_its_cells(run, served, browser) -> None:
         return np.array(page.crop((left, top, left + width, top + height)), dtype=float)[middle]
 
     def far(picture):
-        """Whether the canvas is not yet like a picture, in the mean over channels and pixels."""
+        """Returns whether the canvas differs from a picture by more than 4 levels on average."""
         return np.abs(seen() - picture).mean() > 4
 
     image = (run.render(client.camera(128)).colour.clamp(0, 1) * 255).round().byte()
@@ -70,7 +70,7 @@ def test_chromium_shows_the_scene_and_its_cells(run, served, browser) -> None:
 
 
 def wide(camera, view):
-    """The camera, if it sees all of the width that another one sees: once the page has told its window's size."""
+    """Returns the camera if it sees the whole width of `view`, else None (the page's size is not known yet)."""
     sees = camera.width / camera.intrinsics[0, 0]
     return camera if sees >= 0.99 * view.width / view.intrinsics[0, 0] else None
 
@@ -82,10 +82,10 @@ def test_a_phone_has_the_panel_beside_all_of_the_scene(run, served, browser) -> 
     client = until(lambda: next(iter(served.clients.values()), None))
     body = browser.find_element("tag name", "body")
     until(lambda: re.search(r"\d+ x 128 pixels in \d+\.\d\d s", body.text))
-    assert "Drag: turn." in body.text and "Click or tap a cell." in body.text  # the first folder is open
+    assert "Drag: turn." in body.text and "Click or tap a cell." in body.text  # the first panel folder is open
 
     def seen(part):
-        """Where a part of the page is, if all of it is in the window and nothing lies over its middle."""
+        """Returns an element's [left, top, right, bottom], or None if it is covered or partly outside the window."""
         at = browser.execute_script(
             "const r = arguments[0].getBoundingClientRect(), x = r.x + r.width / 2, y = r.y + r.height / 2;"
             "const top = document.elementFromPoint(x, y), over = top && !arguments[0].contains(top);"

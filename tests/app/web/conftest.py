@@ -1,4 +1,4 @@
-"""Runs that a page draws."""
+"""Fixtures of the web page's tests."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from voronerf.app.run import Run
 
 @pytest.fixture(scope="session")
 def runs():
-    """Makes a run of a kind, once."""
-    made: dict[str, Run] = {}
+    """A function that returns the random run of a kind, made once."""
+    cache: dict[str, Run] = {}
 
     def run(kind: str) -> Run:
-        if kind not in made:
-            made[kind] = random_run(kind)
-        return made[kind]
+        if kind not in cache:
+            cache[kind] = random_run(kind)
+        return cache[kind]
 
     return run

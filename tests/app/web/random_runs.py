@@ -1,4 +1,4 @@
-"""Runs of random networks, of every kind that a page draws, on views of the built-in scene."""
+"""Runs of random networks, one for every kind that a page can draw, on views of the built-in scene."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from voronerf.nerf.fields import KiloNeRF
 from voronerf.nerf.fields.radiance import RadianceField
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-AXES = torch.tensor([[1.0, 0, 0], [0.0, 0, 1], [0.0, 1, 0]])  # right, up, ahead
+AXES = torch.tensor([[1.0, 0, 0], [0.0, 0, 1], [0.0, 1, 0]])  # right, up, forward
 SPHERE = Contraction(torch.tensor([0.1, 0.0, -0.1]), 0.7)
 PERSPECTIVE = Perspective(torch.tensor([0.0, -3.0, 0.2]), AXES, 1.0, (0.8, 0.7))
-#: A field, the options of its router, the contraction, and the spacing of the strata.
+#: (field, router options, contraction, spacing of the strata) by kind.
 KINDS = {
     "hash grid": (lambda: HashGridField(width=16, log2_entries=12, box=BOX), {"share": ["features"]}, None, "linear"),
     "a table for each cell": (
@@ -55,19 +55,19 @@ KINDS = {
 
 
 class Rotated(torch.nn.Module):
-    """A field of another codebase, with activations of its own, which is traced."""
+    """A foreign field with its own activations, which is traced."""
 
     def __init__(self):
         super().__init__()
         self.first, self.last = torch.nn.Linear(6, 10), torch.nn.Linear(10, 4)
 
     def forward(self, positions, directions):
-        found = self.last(torch.nn.functional.silu(self.first(torch.cat([positions, directions], -1))))
-        return torch.tanh(found[:, :3]) * 0.5 + 0.5, torch.nn.functional.leaky_relu(found[:, 3:], 0.0) * 4
+        raw = self.last(torch.nn.functional.silu(self.first(torch.cat([positions, directions], -1))))
+        return torch.tanh(raw[:, :3]) * 0.5 + 0.5, torch.nn.functional.leaky_relu(raw[:, 3:], 0.0) * 4
 
 
 class Branches(torch.nn.Module):
-    """A traced field: a layer is read before and after its ReLU, and one column is read in the place of three."""
+    """A traced field: a layer is read before and after its ReLU, and one column is broadcast to three."""
 
     def __init__(self):
         super().__init__()
@@ -75,8 +75,8 @@ class Branches(torch.nn.Module):
 
     def forward(self, positions, directions):
         layer = self.first(torch.cat([positions, directions], -1))
-        found = self.last(torch.relu(layer) * 3 - layer)
-        return (found[:, :3] * found[:, 3:4]).sigmoid(), 4 * torch.nn.functional.softplus(found[:, 4], beta=2)
+        raw = self.last(torch.relu(layer) * 3 - layer)
+        return (raw[:, :3] * raw[:, 3:4]).sigmoid(), 4 * torch.nn.functional.softplus(raw[:, 4], beta=2)
 
 
 class Spherical(RadianceField):
@@ -101,19 +101,19 @@ KINDS["branches"] = (Branches, {"fuse": True, "coords": "first3"}, None, "linear
 
 @functools.cache
 def views() -> Scene:
-    """The built-in scene, which no test changes."""
+    """Returns the built-in scene; tests must not change it."""
     return builtin_scene(40, train_views=9, test_views=5)
 
 
 def random_run(kind: str) -> Run:
-    """Eight nested cells of random networks in a random grid, seen from around."""
+    """Returns a run with nested cells of random networks in a random occupancy grid."""
     make, options, contraction, spacing = KINDS[kind]
     torch.manual_seed(4)
     field = make()
     first = VoronoiDiagram(torch.rand(3, 3, generator=seeded()) - 0.5)
     router = VoronoiRouter(field, first.centres, **options)
     points = torch.rand(500, 3, generator=seeded()) * 1.6 - 0.8
-    optimizer = Adam(router.parameters(), lr=0.1)  # without one, all objects of the process are looked at
+    optimizer = Adam(router.parameters(), lr=0.1)  # otherwise all objects are searched for one
     router.subdivide(3, points=points, weights=torch.ones(500), optimizer=optimizer)
     assert router.diagram.depth == 2 and router.num_cells > 4
     with torch.no_grad():
@@ -125,6 +125,6 @@ def random_run(kind: str) -> Run:
     scene = scene if contraction is None else replace(scene, box=None, near=0.4, far=40.0)
     grid = OccupancyGrid(box, (9, 8, 11), threshold=1.0, contraction=contraction)
     grid.occupied.copy_(torch.rand(9, 8, 11, generator=seeded()) < 0.3)
-    given = {"samples": 40, "picture_samples": 70, "occupancy": grid, "contraction": contraction, "spacing": spacing}
+    settings = {"samples": 40, "picture_samples": 70, "occupancy": grid, "contraction": contraction, "spacing": spacing}
     space = SimpleNamespace(budget=1)
-    return Run(Path("unused"), space, scene, router, renderer_of({"field": router}, **given))
+    return Run(Path("unused"), space, scene, router, renderer_of({"field": router}, **settings))

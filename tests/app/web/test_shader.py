@@ -1,4 +1,4 @@
-"""Shaders of a page draw, without a browser, the picture that `Run.render` renders."""
+"""Tests without a browser that a page's shaders draw the picture that `Run.render` renders."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from wgsl import compiled
 from voronerf.app import web
 from voronerf.app.web import pack
 
-#: A few pixels, drawn in two strips of rows.
+#: The image size in pixels, and two strips of rows that are drawn one after the other.
 WIDTH, HEIGHT, STRIPS = 12, 9, ((0, 5), (5, 9))
 LENS = torch.tensor([[13.0, 14.0, 5.0, 5.5]])
-#: What is done for each pixel, in C++.
+#: C++ code that draws the pixel x, y.
 DRAW = "draw(vec3u(x, y, 0));"
 SHOW = "static_cast<vec4f*>(bound[4])[y * width + x] = show(vec4f(x + 0.5f, y + 0.5f, 0, 1));"
 CONTRACTED = ("ahead", "a sphere")
@@ -26,7 +26,7 @@ CONTRACT = "vec4f& place = static_cast<vec4f*>(bound[7])[x]; place = vec4f(contr
 
 @pytest.fixture(scope="module")
 def shaders(runs, tmp_path_factory):
-    """Runs a shader, given by its name: a kind of run, "contract" and a kind, or "screen"."""
+    """A function that runs a shader by its name: a kind of run, "contract" and a kind, or "screen"."""
     texts = {kind: pack(runs(kind)).shader for kind in KINDS}
     parts = {kind: (text, DRAW) for kind, text in texts.items()}
     parts |= {f"contract {kind}": (texts[kind], CONTRACT) for kind in CONTRACTED}
@@ -39,7 +39,7 @@ def camera(run):
 
 
 def drawn(shaders, run, kind, *, cut=(3.0, 0.0), hidden=()):
-    """Draws a picture as renderer.js does: what the screen shows, [h, w, 3], and the pixels, uint32 [h, w, 4]."""
+    """Draws a picture as renderer.js does; returns (screen colours [h, w, 3], pixels as uint32 [h, w, 4])."""
     packed, cameras = pack(run), camera(run)
     parts = {
         key: np.frombuffer(packed.data, np.uint8)[at : at + size] for key, (at, size) in packed.scene["parts"].items()
@@ -88,7 +88,7 @@ def test_what_is_cut_away_or_hidden_is_not_seen(shaders, runs):
     run, rest, axis, first = runs("traced"), random_run("traced"), 0, 5
     rest.renderer.occupancy.occupied[first:] = False
     low, high = run.scene.box[:, axis].tolist()
-    cut = axis, low + (high - low) * first / 9  # every ray goes towards it
+    cut = axis, low + (high - low) * first / 9  # all rays approach the plane
     seen, _ = drawn(shaders, run, "traced", cut=cut)
     whole, pixels = drawn(shaders, run, "traced")
     assert np.abs(seen - whole).max() > 0.1

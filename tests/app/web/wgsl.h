@@ -1,4 +1,4 @@
-// WGSL's types and functions in C++, as far as shaders of a page use them: wgsl.py translates their text.
+// The WGSL types and functions that a page's shaders use, in C++. wgsl.py translates the shaders' text.
 #pragma once
 
 #include <array>
@@ -18,7 +18,7 @@ struct vec {
   T values[N] = {};
 
   vec() = default;
-  // Numbers and vectors, N numbers in all; or one number N times.
+  // Concatenates numbers and vectors of N numbers in all, or repeats one number N times.
   template <class... Parts>
   explicit vec(const Parts&... parts) {
     constexpr bool kSplat = sizeof...(parts) == 1 && (std::is_arithmetic_v<Parts> && ...);
@@ -49,7 +49,7 @@ using vec4u = vec<u32, 4>;
 template <class T, u32 N>
 using array = std::array<T, N>;
 
-// A lane of a vector; all lanes of a number are that number.
+// Returns lane i of a vector; a number has the same value in all lanes.
 template <class T, int N>
 T lane(const vec<T, N>& x, int i) {
   return x[i];
@@ -58,7 +58,7 @@ template <class T>
 T lane(T x, int) {
   return x;
 }
-// How many lanes the first vector of some arguments has; 0 where all are numbers.
+// The number of lanes of the first vector among the arguments; 0 if all are numbers.
 template <class... X>
 constexpr int lanes_of = 0;
 template <class T, int N, class... X>

@@ -1,4 +1,4 @@
-"""Shaders of a page on the CPU, without a browser: their text becomes C++ line by line, which wgsl.h completes."""
+"""Runs a page's shaders on the CPU without a browser: WGSL is translated to C++ line by line, with wgsl.h's types."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 
 def declared(members: str, end: str) -> str:
-    """Members of a struct, or parameters of a function: types come before names."""
+    """Translates a struct's members or a function's parameters to C++: types before names."""
     pairs = [member.strip().split(": ") for member in members.split(",") if member.strip()]
     return "".join(f"{kind} {name}{end}" for name, kind in pairs).removesuffix(",")
 
@@ -27,7 +27,7 @@ def lanes(names: str) -> str:
     return f"[{places[0]}]" if len(places) == 1 else f".lanes<{str(places)[1:-1]}>()"
 
 
-#: Patterns of WGSL, and what takes their place in C++.
+#: Patterns of WGSL, and their C++ replacements.
 RULES = (
     (r"//.*", ""),
     (r"@group\(0\) @binding\((\d)\) var<uniform> (\w+): (\w+);", r"\3& \2 = *static_cast<\3*>(bound[\1]);"),
@@ -48,7 +48,7 @@ RULES = (
 )
 
 
-#: A shader as a class, and the function that runs it; ``bound`` are the addresses of its buffers.
+#: The C++ class of a shader and the function that runs it; ``bound`` holds the addresses of its buffers.
 CLASS = """
 struct Shader{number} {{
 void* const* bound;
@@ -63,17 +63,17 @@ for (u32 y = 0; y < height; ++y) for (u32 x = 0; x < width; ++x) shader.pixel(x,
 
 
 def translated(text: str) -> str:
-    """The members of a class in C++."""
+    """Translates a shader to the members of a C++ class."""
     for pattern, by in RULES:
         text = re.sub(pattern, by, text, flags=re.MULTILINE)
     return text
 
 
 def compiled(folder: Path, shaders: dict[str, tuple[str, str]]) -> Callable[..., None]:
-    """Compiles shaders: of each the text, and what is done for the pixel x, y of a picture, in C++.
+    """Compiles shaders; ``shaders`` maps a name to (WGSL text, C++ code that handles the pixel x, y).
 
     Returns:
-        A function of a shader's name, a width and a height, and the buffers in the order of their bindings.
+        A function that runs a shader; it takes the shader's name, width, height, and the buffers in binding order.
     """
     compiler = shlex.split(os.environ.get("CXX", "g++"))
     if shutil.which(compiler[0]) is None:

@@ -1,6 +1,6 @@
-"""The command line, ``voronerf train | eval | ...``: a file for each command, and their table in ``program``.
+"""The command line, ``voronerf train | eval | ...``: one file per command, and the table of commands in ``program``.
 
-What a process decides for itself is set here, before torch is loaded, and not by the library.
+Process-wide settings are made here, before torch is loaded; the library itself makes none.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ def main(args: list[str] | None = None) -> int:
         return _fail("voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch")
     try:
         from voronerf.app.cli.program import run
-    except BackendUnavailable as error:  # the compiled module is missing or of another version
+    except BackendUnavailable as error:  # the compiled module is missing or has another version
         return _fail(str(error))
     return run(args)
 
@@ -34,25 +34,25 @@ def _fail(line: str) -> int:
 
 
 def _prepare() -> None:
-    """Sets how threads wait, and what holds while the program is loaded."""
-    # OpenMP's threads spin for milliseconds by default while they wait for each other, on cores that others may need:
-    # beside ten busy processes a step of training takes twenty times as long. Read when torch loads its runtime.
+    """Sets up the process before torch is imported: OpenMP wait policy, malloc limits, no GC, quiet Ctrl-C."""
+    # By default, waiting OpenMP threads spin for milliseconds on cores that other processes may need: beside ten busy
+    # processes a training step takes twenty times as long. OpenMP reads the variable when torch loads its runtime.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    # They spin for some ten microseconds before that: to sleep and wake takes as long, many times in a step.
+    # Threads still spin for some ten microseconds before they sleep, since to sleep and wake takes as long.
     if os.environ["OMP_WAIT_POLICY"] == "passive":
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     keep_freed_memory()
-    # Garbage is collected again when the command runs: while torch is loaded there is none, and to look for it takes a
-    # tenth of the time.
+    # Loading torch makes no garbage, and the collector would take a tenth of the loading time. `program.run` enables
+    # it again.
     gc.disable()
-    # Ctrl-C ends the program without a traceback while it is loaded.
+    # During loading, Ctrl-C ends the program without a traceback.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def keep_freed_memory() -> None:
-    """Makes the C library keep freed memory, so that the next step does not wait for the same pages again."""
+    """Makes the C library keep freed memory, so that the next step does not fault the same pages in again."""
     with contextlib.suppress(AttributeError, TypeError):  # a C library without these limits
         limit = ctypes.CDLL(None).mallopt
-        limit(-3, 1 << 25)  # glibc's M_MMAP_THRESHOLD, which takes no more
+        limit(-3, 1 << 25)  # glibc's M_MMAP_THRESHOLD, at its maximum
         limit(-1, 1 << 30)  # M_TRIM_THRESHOLD

@@ -22,20 +22,20 @@ FIGURES = (
     *(("cells", "cells", 0), ("parameters", "parameters", 0), ("steps", "steps", 0), ("seconds", "training [s]", 0)),
     *(("rays_per_second", "rays/s", 0), ("psnr", "PSNR [dB]", 2), ("ssim", "SSIM", 4), ("lpips", "LPIPS", 4)),
 )
-#: Figures of test views, and their mark where only the middle of views was scored.
+#: Scores of test views, and the mark of scores of view centres only.
 SCORES, PARTLY = ("psnr", "ssim", "lpips"), "*"
-#: Settings that say where a run is, rather than what it is.
+#: Settings about the location and outputs of a run, which are not compared.
 PLACES = ("out", "resume", "allow_outside", "panels", "tensorboard")
 
 
 def compare(runs: tuple[Path, ...], /) -> int:
     """Show the scores of trained runs side by side, and the settings in which they differ.
 
-    A star marks scores of the middle of views, which are not to be compared with those of whole ones.
+    A star marks scores of the centres of views, which are not comparable with scores of whole views.
 
     Args:
-        runs: The run directories, at least two. A run that has not ended shows its last evaluation, and one that was
-            made of others the scores of voronerf eval.
+        runs: The run directories, at least two. An unfinished run shows its last evaluation. A run that was made by
+            join, cut or place shows the scores of voronerf eval.
     """
     if len(runs) < 2:
         raise ConfigError(f"compare needs at least two runs, got {len(runs)}")
@@ -65,8 +65,8 @@ def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns the figures and the settings of a run.
 
     Raises:
-        ConfigError: There is no run, or a folder of it leads elsewhere.
-        ValueError: A file cannot be read as that of a run.
+        ConfigError: There is no run, or one of its folders is a link to elsewhere.
+        ValueError: A file of the run is damaged.
     """
     check_folders(run)
     if not (run / "config.json").is_file():
@@ -87,7 +87,7 @@ def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def count_parts(run: Path) -> dict[str, Any]:
-    """Returns the numbers of cells and parameters of a run that was made of others."""
+    """Returns the numbers of cells and parameters of a run of several parts."""
     parts = open_parts(run, last_checkpoint(run))
     networks = {id(network): network.checkpoint for part in parts for network in part.networks}
     sizes = (value.numel() for network in networks.values() for value in network.group("router.module").values())
@@ -95,5 +95,5 @@ def count_parts(run: Path) -> dict[str, Any]:
 
 
 def shown(value: object, places: int) -> str:
-    """Returns a number as the table shows it; a dash for anything else."""
+    """Formats a number for the table; anything else becomes a dash."""
     return f"{value:,.{places}f}" if isinstance(value, int | float) else "-"

@@ -1,4 +1,4 @@
-"""``voronerf demo``: a built-in scene after half a minute, turning beside its cells, and standing on itself."""
+"""``voronerf demo``: trains a built-in scene for half a minute; draws it, its cells, and a small copy on top of it."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from voronerf.nerf.cameras import Cameras, orbit_cameras
 from voronerf.town import editing
 from voronerf.town import open_run as open_town
 
-#: Pixels along a side of the images, of the pictures and of the video.
+#: Pixels along a side of the images, the pictures and the video.
 SIZE = 400
 FRAMES, FPS = 48, 16
-#: Place of a copy of the scene in it, on the globe, and its size.
+#: Position of the scene's copy, on top of the globe, and its scale.
 TOP, SCALE = (0.0, 0.0, 1.0), 0.35
 
 
@@ -39,7 +39,7 @@ def demo(out: Path | None = None, budget: float = 35.0) -> int:
 
     Args:
         out: A new run directory, which also gets the pictures and the video; default runs/demo, runs/demo-2, ...
-        budget: Training seconds.
+        budget: Training time in seconds.
     """
     config = TrainConfig(data=f"builtin:{SIZE}", out=out, budget=budget, evaluations=1, eval_views=8)
     say(f"computing the built-in scene: 125 views of {SIZE} x {SIZE} pixels")
@@ -60,37 +60,37 @@ def demo(out: Path | None = None, budget: float = 35.0) -> int:
 
 
 def show(run: Path, scene: Scene, scores: dict[str, Any], budget: float) -> None:
-    """Writes pictures, video and page of a trained run into it, and says what they are."""
+    """Writes pictures, a video and a page into a trained run, and prints a line about each."""
     opened, around = open_run(run, scene=scene), turn(FRAMES)
     score = f"{scores['psnr']:.1f} dB after {budget:g} s"
     save_picture(run / "turn.png", next(frames(opened, around, [FRAMES // 8], score)))
     write_video(run / "turn.mp4", frames(opened, around, tracked(range(FRAMES), "the video"), score), FPS)
     editing.place(run, run, TOP, run / "placed", scale=SCALE)
-    above = turn(FRAMES, height=0.3, away=1.25)
+    above = turn(FRAMES, height=0.3, distance=1.25)
     image = open_town(run / "placed", scene=scene).render(above, FRAMES // 8, heaviest=False)
     save_picture(run / "placed.png", picture_of_colour(image.colour))
-    path = sys.argv[0] if Path(sys.argv[0]).name == "voronerf" else "python -m voronerf"  # such as .venv/bin/voronerf
+    path = sys.argv[0] if Path(sys.argv[0]).name == "voronerf" else "python -m voronerf"  # or .venv/bin/voronerf
     program = "voronerf" if shutil.which("voronerf") else path
-    here = shlex.quote(str(run))
-    at = " ".join(f"{x:g}" for x in TOP)
+    quoted = shlex.quote(str(run))
+    xyz = " ".join(f"{x:g}" for x in TOP)
     say(
         f"{score} on {scores['views']} views it has not seen, {counted(scores['cells'], 'cell')}, "
         f"{scores['steps']:,} steps: {run}"
     )
     say(f"wrote {run / 'turn.png'} and {run / 'turn.mp4'}: the scene, and in colour which cell each point belongs to")
-    say(f"wrote {run / 'placed.png'}: {program} place {here} {here} --at {at} --scale {SCALE:g}, without training")
+    say(f"wrote {run / 'placed.png'}: {program} place {quoted} {quoted} --at {xyz} --scale {SCALE:g}, without training")
     _, size = export_web(opened, run / "scene.html")
     say(f"wrote {run / 'scene.html'}, {size / 1e6:.1f} MB: the scene in any browser with WebGPU, a phone's too")
     has_viewer = importlib.util.find_spec("viser") is not None
-    say(f"next: {program} {f'view {here}' if has_viewer else 'train --data DIR, with your pictures'}")
+    say(f"next: {program} {f'view {quoted}' if has_viewer else 'train --data DIR, with your pictures'}")
     say(f"open {run / 'scene.html'}")
 
 
-def turn(count: int, *, height: float = 0.0, away: float = 1.0) -> Cameras:
-    """Cameras around the scene, whose middle is so much higher and farther."""
+def turn(count: int, *, height: float = 0.0, distance: float = 1.0) -> Cameras:
+    """Returns a turntable around the scene, ``height`` higher and ``distance`` times as far away as usual."""
     return orbit_cameras(
         count,
-        radius=3.9 * away,
+        radius=3.9 * distance,
         elevation=25.0,
         width=SIZE,
         height=SIZE,
@@ -101,7 +101,7 @@ def turn(count: int, *, height: float = 0.0, away: float = 1.0) -> Cameras:
 
 
 def frames(run: Run, cameras: Cameras, numbers: Iterable[int], score: str) -> Iterator[Tensor]:
-    """Pictures uint8 [h, w, 3]: what some of the cameras see, and beside it the cells."""
+    """Yields pictures uint8 [h, w, 3] of some of the cameras: the view, and its cells beside it."""
     for number in numbers:
         image = run.render(cameras, number)
         cells = run.diagram.locate(image.heaviest)

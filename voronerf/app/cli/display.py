@@ -27,20 +27,20 @@ from voronerf.app.train.state import State
 from voronerf.nerf.schedule import GROUP
 
 LONGEST_LINE = 900
-#: Width of a bar, and of all in the live line of a training beside its name and its text.
+#: Width of a bar; width of the live line of a training without its name and text.
 BAR = 24
 BESIDE = BAR + len(" 100 %    0:00:00 ")
 
-#: Seconds between lines of a long task where there is no terminal.
+#: Seconds between lines of a long task without a terminal.
 EVERY = 20.0
 
-#: The one of rich, so that a bar of another module can show below one of these.
+#: rich's global console, so that progress bars of different modules can be shown together.
 console = rich.get_console()
 console.soft_wrap = True
 
 
 def _raise_again() -> None:
-    """In place of rich's exit with status 1 for a pipe that was closed: see main."""
+    """Re-raises the BrokenPipeError, for which rich would exit with status 1; `program.run` handles it."""
     raise
 
 
@@ -53,12 +53,12 @@ def say(line: str) -> None:
 
 
 def tracked(parts: Sequence[Any], name: str) -> Iterable[Any]:
-    """Yields the parts of a task, with a progress bar on a terminal, and a line now and then elsewhere."""
-    return track(parts, description=name, console=console) if console.is_terminal else told(parts, name)
+    """Yields the parts of a task, with a progress bar on a terminal, or a line every `EVERY` seconds elsewhere."""
+    return track(parts, description=name, console=console) if console.is_terminal else with_lines(parts, name)
 
 
-def told(parts: Sequence[Any], name: str) -> Iterator[Any]:
-    """Yields the parts of a task, with a line every `EVERY` seconds where there is no terminal."""
+def with_lines(parts: Sequence[Any], name: str) -> Iterator[Any]:
+    """Yields the parts of a task, with a line every `EVERY` seconds without a terminal."""
     last = time.monotonic()
     for number, part in enumerate(parts):
         if not console.is_terminal and time.monotonic() - last >= EVERY:
@@ -69,9 +69,9 @@ def told(parts: Sequence[Any], name: str) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def busy(name: str) -> Iterator[None]:
-    """A context that shows a name and its seconds on a terminal, for what takes long and tells nothing on the way.
+    """A context that shows a name and the elapsed time on a terminal, for long tasks that report no progress.
 
-    Elsewhere the name is a line after `EVERY` seconds.
+    Without a terminal, it prints the name after `EVERY` seconds.
     """
     if not console.is_terminal:
         late = threading.Timer(EVERY, say, (name,))
@@ -88,19 +88,22 @@ def busy(name: str) -> Iterator[None]:
 
 
 def printable(text: str) -> str:
-    """Text with its control characters escaped, since a terminal would obey them."""
+    """Escapes the control characters of a text, since a terminal would obey them."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def one_line(text: str) -> str:
-    """Printable text as a line of at most `LONGEST_LINE` characters, shortened in its middle."""
+    """Returns a text as one printable line of at most `LONGEST_LINE` characters, shortened in its middle."""
     line = printable(" ".join(text.split()))
     head, tail = 2 * LONGEST_LINE // 3, LONGEST_LINE // 3 - 5
     return line if len(line) <= LONGEST_LINE else f"{line[:head]} ... {line[-tail:]}"
 
 
 def fitting(parts: Sequence[tuple[int, str]], room: int) -> str:
-    """Parts of a line in so many characters: those of the lowest ranks are left out first, but never the last one."""
+    """Joins (rank, text) parts into a line of at most ``room`` characters.
+
+    Parts of the lowest rank are left out first; one part always stays.
+    """
     kept = list(parts)
     while len(kept) > 1 and len("  ".join(text for _, text in kept)) > room:
         kept.remove(min(kept))
@@ -108,13 +111,14 @@ def fitting(parts: Sequence[tuple[int, str]], room: int) -> str:
 
 
 class TrainingDisplay(Callback):
-    """Shows step, stage, rays/s, loss, PSNR and the time left in a live line, while ``progress`` is entered.
+    """A callback that shows step, stage, rays/s, loss, PSNR and the remaining time in a live line.
 
-    Where there is no terminal, a line every `EVERY` seconds without another.
+    The line shows inside the context manager ``progress``. Without a terminal, the display prints a line when none was
+    printed for `EVERY` seconds.
 
     Args:
         label: Name of the run.
-        quiet: Leave out lines that stay.
+        quiet: Print only the live line.
     """
 
     group = GROUP
@@ -132,12 +136,12 @@ class TrainingDisplay(Callback):
             refresh_per_second=4,
         )
         self.task = self.progress.add_task(escape(printable(label)), total=1.0, text="")
-        self.loss = math.nan  # until the first is read
+        self.loss = math.nan  # until the first step
         self.scores: Scores | None = None
         self.told = time.monotonic()
 
     def following(self, scores: Scores) -> TrainingDisplay:
-        """This display, which shows the last of these scores from now on."""
+        """Makes the display show the PSNR of the last of these scores; returns the display."""
         self.scores = scores
         return self
 
@@ -146,22 +150,22 @@ class TrainingDisplay(Callback):
         self.loss = state.loss if math.isnan(self.loss) else 0.7 * self.loss + 0.3 * state.loss
         cells = state.router.num_cells
         psnr = self.scores.metrics[-1].get("psnr") if self.scores is not None and self.scores.metrics else None
-        shown = [
+        parts = [
             *((2, f"step {state.step}"), (3, "coarse" if cells == 1 else counted(cells, "cell"))),
             (0, f"{state.rays_done / max(state.seconds, 1e-9) / 1000:.1f} k rays/s"),
             (1, f"loss {self.loss:.5f}"),
             *([] if psnr is None else [(4, f"psnr {psnr:.2f} dB")]),
         ]
         room = console.width - len(self.progress.tasks[0].description) - BESIDE
-        self.progress.update(self.task, completed=state.fraction, text=fitting(shown, room))
+        self.progress.update(self.task, completed=state.fraction, text=fitting(parts, room))
         if not console.is_terminal and time.monotonic() - self.told >= EVERY:
-            self.on_event("  ".join((f"{state.fraction:5.0%}", *(text for _, text in shown))))
+            self.on_event("  ".join((f"{state.fraction:5.0%}", *(text for _, text in parts))))
 
     def track(self, parts: Sequence[Any], name: str) -> Iterable[Any]:
-        """Yields the parts of a task beside the training, with a bar below its live line."""
+        """Yields the parts of a task during the training, with a bar below its live line."""
         task = self.progress.add_task(name, total=len(parts), text="")
         try:
-            for number, part in enumerate(told(parts, name)):
+            for number, part in enumerate(with_lines(parts, name)):
                 self.progress.update(task, completed=number, text=f"{number} of {len(parts)}")
                 yield part
         finally:

@@ -27,7 +27,7 @@ def evaluate_run(
 
     Args:
         run: The run directory.
-        opening: How the run is opened.
+        opening: The settings with which the run is opened.
         views: Number of test views, evenly spread; default all.
         panels: Number of views drawn.
         lpips: LPIPS weights, a file or folder, or "off"; default as in training, else VORONERF_LPIPS, the folder lpips
@@ -37,10 +37,10 @@ def evaluate_run(
         raise ConfigError(f"--panels must not be negative, got {panels}")
     check_counts(views=views)
     opened = opening.open(run)
-    perceived, source = opened.find_lpips(lpips)
-    if perceived is None:
+    metric, source = opened.find_lpips(lpips)
+    if metric is None:
         say(source)
-    result = opened.evaluate(views=views, lpips=perceived or "off", track=tracked)
+    result = opened.evaluate(views=views, lpips=metric or "off", track=tracked)
     table = Table("view", "PSNR, dB", "SSIM", "LPIPS")
     for view in result["views"]:
         table.add_row(escape(printable(view["name"])), *_figures(view))
@@ -56,6 +56,6 @@ def evaluate_run(
 
 
 def _figures(score: dict[str, Any]) -> list[str]:
-    """What a table shows of a score; a dash for what was not computed."""
+    """Formats the scores of a view for the table; a missing score is a dash."""
     places = {"psnr": 2, "ssim": 4, "lpips": 4}
     return ["-" if score[name] is None else f"{score[name]:.{digits}f}" for name, digits in places.items()]

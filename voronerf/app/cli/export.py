@@ -1,4 +1,4 @@
-"""``voronerf export``: what a trained run looks like, as files for other programs."""
+"""``voronerf export``: a trained run as files for other programs."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ def export(
         run: The run directory.
         points: Coloured points with normals on the surface, .ply.
         mesh: The surface as a coloured mesh, .ply, .glb or .obj.
-        cells: The cells of the diagram, clipped to the box, an object of its own colour each, .glb.
+        cells: The cells of the diagram, clipped to the box, as objects with a colour each, .glb.
         web: A page that draws the scene in any browser with WebGPU, one file that loads nothing from elsewhere, .html.
-        count: Points at the most.
-        resolution: Cubes of the mesh along the longest side of the box; default 256, or what fits into memory.
-        faces: Triangles of the mesh at the most.
-        crop: What is exported, x y z of the lowest and of the highest corner, or "saved" for the viewer's crop; default
-            the scene's box; of other scenes, what the cameras look at for the mesh, and for points and cells the box
+        count: Greatest number of points.
+        resolution: Cubes of the mesh along the longest side of the box; default 256, or fewer if memory is short.
+        faces: Greatest number of triangles of the mesh.
+        crop: The exported box, x y z of the lowest and of the highest corner, or "saved" for the viewer's crop. Default
+            the scene's box. Without one, the mesh has the region that the cameras look at, points and cells the box
             around the sphere of the contraction.
-        coordinates: Positions of points, meshes and cells are those of the scene as it is rendered, or those of its
-            files: in metres, if the capture is in metres.
-        opening: How the run is opened.
+        coordinates: Coordinates of points, meshes and cells: of the scene as it is rendered, or of its files, which
+            are in metres if the capture is.
+        opening: The settings with which the run is opened.
     """
     check_counts(count=count)
     outputs = {
@@ -73,7 +73,7 @@ def export(
         surface = mesh_files.export_mesh(
             opened, mesh, resolution=resolution, faces=faces, box=box, to_files=to_files, track=tracked, say=say
         )
-        # An edge of one triangle is the end of a surface.
+        # An edge with only one triangle is a boundary.
         end = "open" if np.bincount(surface.edges_unique_inverse).min() == 1 else "closed"
         extent = " x ".join(f"{side:.3g}" for side in surface.extents)
         say(f"wrote {mesh}: {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {end}, {extent}")

@@ -1,4 +1,4 @@
-"""``voronerf info``: what an installation can use, and the extras of the package."""
+"""``voronerf info``: backends, instruction set and optional extras of this installation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from voronerf.ops._core import backends
 
 
 class Extra(NamedTuple):
-    """What an extra of the package adds, and the modules that it installs."""
+    """An optional extra of the package: a line about its use, and the modules that it installs."""
 
     adds: str
     modules: tuple[str, ...]
@@ -39,8 +39,8 @@ def info(run: Path | None = None, /, *, ops: bool = False) -> int:
     """Show what this installation can use: build, instruction set, extras, backends, and why something is missing.
 
     Args:
-        run: A run directory: show instead how a step of its training is computed, and why not in a faster way.
-        ops: Show instead where each implementation of each operation runs, and for which dtypes.
+        run: A run directory. Shows instead how a step of its training is computed, and why not in a faster way.
+        ops: Show instead the devices and dtypes of each implementation of each operation.
     """
     if run is not None:
         opened = open_run(run)

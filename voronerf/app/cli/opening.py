@@ -18,44 +18,45 @@ from voronerf.app.train.config import ConfigError, check_backend_name
 from voronerf.town.run import is_town
 from voronerf.town.run import open_run as open_parts
 
-#: Six numbers of a box, or the one that the viewer has saved.
+#: Six numbers of a box, or the box that the viewer has saved.
 Crop = tuple[float, float, float, float, float, float] | Literal["saved"] | None
 
 
 @dataclass(frozen=True)
 class Opening:
-    """How a run is opened; what is None is as in training."""
+    """The settings with which a run is opened; None keeps the setting of the training."""
 
     data: str | None = None
-    """Scene folder; default as in training, if you named it there, or it lies in the run directory, the working
-    directory or VORONERF_DATA, since a run may be another person's."""
+    """Scene folder. By default the folder of the training, but only if you named it there, or it lies in the run
+    directory, the working directory or VORONERF_DATA, since a run may be another person's."""
     downscale: int | None = None
-    """Factor on the images, and on the frames of a camera path; default as in training, and 1 for a path."""
+    """Factor by which images and the frames of a camera path are reduced; default as in training, 1 for a path."""
     allow_outside: bool = False
     """Also read images that lie outside of the scene folder."""
     samples: tuple[int, ...] | None = None
     """Samples per ray of each pass; default as in training."""
     occupancy: bool = False
-    """Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses its own grid."""
+    """Skip empty space, which is found by evaluating the field once. A run trained with --occupancy always uses its
+    grid."""
     device: str = "cpu"
-    """cpu, cuda, cuda:1, ...; auto is a GPU that this package has kernels for, else the CPU."""
+    """cpu, cuda, cuda:1, ...; auto is a GPU for which this package has kernels, else the CPU."""
     backend: str = "auto"
     """Backend of the operations."""
 
     def open_without_images(self, run: Path) -> Run:
-        """Opens the run with the cameras of its record, unless other data or other sizes are asked for."""
+        """Opens the run with the cameras in its scene.json, unless ``data`` or ``downscale`` is set."""
         record = run / "scene.json"
-        known = self.data is None and self.downscale is None and record.is_file()
-        return self.open(run, scene=read_scene(record) if known else None)
+        use_record = self.data is None and self.downscale is None and record.is_file()
+        return self.open(run, scene=read_scene(record) if use_record else None)
 
     def open(self, run: Path, *, scene: Scene | None = None) -> Run:
         """Opens a run of any kind."""
         check_counts(downscale=self.downscale)
         check_backend_name(self.backend)
         opener: Callable[..., Run] = open_parts if is_town(run) else open_run
-        kept = inspect.signature(opener).parameters
+        accepted = inspect.signature(opener).parameters
         with busy(f"opening {run}"):
-            return opener(run, scene=scene, **{name: value for name, value in vars(self).items() if name in kept})
+            return opener(run, scene=scene, **{name: value for name, value in vars(self).items() if name in accepted})
 
 
 AS_IN_TRAINING = Opening()
@@ -69,7 +70,7 @@ def check_counts(**counts: int | None) -> None:
 
 
 def crop_box(run: Run, crop: Crop) -> Tensor | None:
-    """The box [2, 3] of --crop, or None.
+    """Returns the box [2, 3] of --crop, or None.
 
     Raises:
         ConfigError: No crop was saved with the run.

@@ -1,4 +1,4 @@
-"""From the words of a command line to a command with its arguments: tyro's parser, told to be brief."""
+"""Parses the words of a command line into a command with its arguments, by tyro, with one-line errors."""
 
 from __future__ import annotations
 
@@ -25,67 +25,67 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from voronerf.app.cli.meant import meant
+from voronerf.app.cli.suggest import suggest
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.wording import did_you_mean, either
 
 RULES = ConstructorRegistry()
-#: Words for the kinds of numbers.
+#: Names of the number types in error messages.
 NUMBERS = {int: "a whole number", float: "a number"}
-#: Defaults that are none.
+#: Defaults that the help does not show.
 NOTHING = (None, (), inspect.Parameter.empty)
-#: Codes that set the colours of a terminal.
+#: ANSI colour codes of a terminal.
 COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def parse(name: str, command: Callable[..., int], words: Sequence[str]) -> Callable[[], int]:
-    """The command with the arguments that words give it; prints its help and exits for ``--help``.
+    """Returns the command with the arguments in ``words`` bound; for ``--help``, prints the help and exits.
 
     Raises:
-        ConfigError: For words that are none of its arguments. The message is one line.
+        ConfigError: The words do not parse. The message is one line.
     """
 
     @functools.wraps(command)
-    def later(*arguments: Any, **options: Any) -> Callable[[], int]:
+    def bind(*arguments: Any, **options: Any) -> Callable[[], int]:
         return functools.partial(command, *arguments, **options)
 
     hints, signature = get_type_hints(command, include_extras=True), inspect.signature(command)
-    later.__annotations__ = {k: _argument(hints[k], part.default) for k, part in signature.parameters.items()}
-    later.__doc__ = re.sub(r"\n {12}", " ", command.__doc__ or "")  # tyro would keep these breaks
-    later.__signature__ = signature  # type: ignore[attr-defined]
-    del later.__wrapped__  # tyro would read its annotations
-    said = io.StringIO()
+    bind.__annotations__ = {k: _argument(hints[k], part.default) for k, part in signature.parameters.items()}
+    bind.__doc__ = re.sub(r"\n {12}", " ", command.__doc__ or "")  # tyro would keep these line breaks
+    bind.__signature__ = signature  # type: ignore[attr-defined]
+    del bind.__wrapped__  # tyro would read its annotations
+    stderr = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(stderr):
             markers = (tyro.conf.OmitArgPrefixes, tyro.conf.PositionalMetavarFromFieldName)
-            return tyro.cli(later, prog=f"voronerf {name}", args=words, config=markers, registry=RULES)
+            return tyro.cli(bind, prog=f"voronerf {name}", args=words, config=markers, registry=RULES)
     except SystemExit as stop:
         if stop.code == 0:
             raise
-        line = in_a_line(said.getvalue())
-        end = "" if line.endswith("?") else meant(name, command, list(words), line) or f"; see voronerf {name} --help"
+        line = in_a_line(stderr.getvalue())
+        end = "" if line.endswith("?") else suggest(name, command, list(words), line) or f"; see voronerf {name} --help"
         raise ConfigError(line + end) from None
 
 
 def in_a_line(box: str) -> str:
-    """The message in a box of tyro's."""
+    """Returns the message in an error box of tyro as one line."""
     _, *rows = (line[2:].rstrip(" │") for line in COLOURS.sub("", box).splitlines())
     parts = [[*part] for is_rule, part in itertools.groupby(rows, lambda row: row[:1] in ("─", "-")) if not is_rule]
-    if missing := re.fullmatch("Missing from voronerf (.*):", parts[0][0]):  # each argument, and its text further in
+    if missing := re.fullmatch("Missing from voronerf (.*):", parts[0][0]):  # each argument, its help indented
         names = [row.strip() for row in parts[0][1:] if re.match(r" {4}\S", row)]
         return f"{missing[1]} needs {' and '.join([', '.join(names[:-1]), names[-1]] if names[1:] else names)}"
     message = re.sub("^Error parsing ([^:]+):", r"\1", " ".join(" ".join(parts[0]).split())).rstrip(".")
-    return re.sub(r"^Missing value for argument '(-*)(.*)'\. Expected (\d+) values$", needed, message)
+    return re.sub(r"^Missing value for argument '(-*)(.*)'\. Expected (\d+) values$", too_few_values, message)
 
 
-def needed(match: re.Match[str]) -> str:
-    """The words for an argument that has too few values."""
+def too_few_values(match: re.Match[str]) -> str:
+    """Returns the message for an argument with too few values."""
     dashes, name, count = match.groups()
     return f"{dashes + name if dashes else name.upper()} needs {'a value' if count == '1' else f'{count} values'}"
 
 
 def _argument(hint: Any, default: Any) -> Any:
-    """A type as tyro takes it: the settings go into groups of their own, and a default that is nothing is not shown."""
+    """Returns an argument's type for tyro: settings get a group each, and empty defaults are not shown."""
     if hint is TrainConfig:
         return Annotated[hint, tyro.conf.arg(name="")]
     return Annotated[hint, tyro.conf.arg(help_behavior_hint="")] if default in NOTHING else hint
@@ -93,7 +93,7 @@ def _argument(hint: Any, default: Any) -> Any:
 
 @RULES.struct_rule
 def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """Dataclasses: those of a training in a box for each group, and texts without the breaks of their source."""
+    """Tells tyro how to show dataclasses: a box per group of training settings, and helps without line breaks."""
     if info.type is TrainConfig:
         defaults = vars(info.default) if isinstance(info.default, TrainConfig) else {}
         groups = {
@@ -115,7 +115,7 @@ def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 @RULES.primitive_rule
 def values(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Numbers, lists of them, words of a choice, and what may be None: errors say the rule and what came."""
+    """Tells tyro how to parse numbers, lists of numbers, choices and optional values; errors name rule and value."""
     kind, origin, parts = info.type, get_origin(info.type), get_args(info.type)
     if kind in NUMBERS:
         return _spec(1, kind.__name__.upper(), NUMBERS[kind], lambda words: kind(words[0]))
@@ -153,14 +153,14 @@ def _spec(
     read: Callable[[list[str]], Any],
     choices: Sequence[str] = (),
 ) -> PrimitiveConstructorSpec:
-    """How words become a value; ``rule`` says what they must be."""
+    """Returns tyro's description of a value of ``count`` words; errors say ``rule``."""
 
     def value(words: list[str]) -> Any:
         try:
             return read(words)
         except (KeyError, ValueError):
-            came = " ".join(words)
-            raise ValueError(f"must be {rule}, got {came!r}{did_you_mean(came, choices)}") from None
+            text = " ".join(words)
+            raise ValueError(f"must be {rule}, got {text!r}{did_you_mean(text, choices)}") from None
 
     def shown(instance: Any) -> list[str]:
         return [str(part) for part in (instance if isinstance(instance, tuple) else (instance,))]
@@ -169,12 +169,12 @@ def _spec(
 
 
 def group_name(kind: type) -> str:
-    """The name of a group of settings in the help, "scene" for `SceneSettings`."""
+    """Returns the name of a group of settings in the help, "scene" for `SceneSettings`."""
     return kind.__name__.removesuffix("Settings").lower()
 
 
 def field_docs(kind: type) -> dict[str, str]:
-    """The strings that stand below the fields of a dataclass, each as one line."""
+    """Returns the docstrings below the fields of a dataclass, each as one line."""
     (tree,) = ast.parse(inspect.getsource(kind)).body
     assert isinstance(tree, ast.ClassDef)
     return {

@@ -1,4 +1,4 @@
-"""``voronerf process``: a scene of a video or of photographs."""
+"""``voronerf process``: makes a scene from a video or photographs."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ def process(
     size: int = 1600,
     verbose: bool = False,
 ) -> int:
-    """Make a scene of a video or of images: COLMAP finds the cameras. A stopped one goes on with the same command.
+    """Make a scene from a video or images: COLMAP finds the cameras. The same command continues after a stop.
 
     Args:
-        source: A video, or a folder of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC images, or of folders of
-            these. Its folder masks may have a mask of each, whose black pixels do not count.
+        source: A video, or a folder, also with subfolders, of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC
+            images. Its folder masks may have a mask for each image; pixels that are black in it are ignored.
         out: The folder to make; it gets images, masks if there are any, sparse/0, transforms.json and colmap, which
             keeps every stage.
-        frames: Frames taken of a video, evenly spread; of a shorter one all.
-        matching: Which images are compared: all with all, each with those next to it by name, or those that share
-            their largest features (auto).
+        frames: Number of frames taken from a video, evenly spread; at most all of them.
+        matching: The pairs of images that are compared: all pairs (exhaustive), neighbours by name (sequential), or
+            images that share their largest features (auto).
         camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
-        mapper: How cameras are found; auto is global, and incremental too if that model has faults or loses
-            cameras. A model that contradicts pairs of images is made again, without pairs that may mislead.
-        max_features: Of an image.
-        size: Pixels of an image's longer side, to which it is reduced where features are searched.
-        verbose: Show what COLMAP says.
+        mapper: COLMAP's mapper; auto is global, and incremental too if that model has faults or loses cameras. A
+            model that contradicts pairs of images is made again without the doubtful pairs.
+        max_features: Greatest number of features of an image.
+        size: Pixels along the longer side to which images are reduced for the search of features.
+        verbose: Show the output of COLMAP.
     """
     check_counts(frames=frames, max_features=max_features, size=size)
     display = StageDisplay()
@@ -70,34 +70,34 @@ def process(
         status = stop.code if isinstance(stop, SystemExit) and isinstance(stop.code, int) else 130
         if any(thread.name == MAPPER for thread in threading.enumerate()):
             sys.stdout.flush()
-            os._exit(status)  # COLMAP's thread still runs, and crashes when Python's shutdown takes its memory
+            os._exit(status)  # COLMAP's thread still runs, and would crash when Python's shutdown frees its memory
         return status
     return 0
 
 
-#: Width of a bar beside the longest name of a stage, in 80 columns.
+#: Width of a bar in characters; it fits beside the longest name of a stage in 80 columns.
 BAR = 10
 
 
 class TimeLeft(ProgressColumn):
-    """The time that is left of a stage, from what it has done since it began; else the time that it has taken.
+    """A column with a stage's remaining time, extrapolated from its start, or if unknown, with its elapsed time.
 
-    The column of rich knows the last 30 seconds alone, in which few images may be done.
+    rich's own column extrapolates from the last 30 seconds alone, in which few images may be done.
     """
 
     def render(self, task: Task) -> Text:
-        """The text of the column."""
-        taken = task.finished_time if task.finished else task.elapsed
-        if task.finished or not task.total or not task.completed or not taken:
-            return Text(f"{timedelta(seconds=round(taken or 0))}", style="progress.elapsed")
-        left = timedelta(seconds=round(taken * (task.total / task.completed - 1)))
-        return Text(f"{left} left", style="progress.remaining")
+        """Returns the text of the column."""
+        elapsed = task.finished_time if task.finished else task.elapsed
+        if task.finished or not task.total or not task.completed or not elapsed:
+            return Text(f"{timedelta(seconds=round(elapsed or 0))}", style="progress.elapsed")
+        remaining = timedelta(seconds=round(elapsed * (task.total / task.completed - 1)))
+        return Text(f"{remaining} left", style="progress.remaining")
 
 
 class StageDisplay:
-    """Shows the stages of a long command: a bar for each on a terminal, with the time left; plain lines elsewhere.
+    """A display of the stages of a long command: bars with the remaining time on a terminal, plain lines elsewhere.
 
-    Its ``progress`` are the bars, which show while it is entered.
+    Its ``progress`` is the context manager that shows the bars.
     """
 
     def __init__(self) -> None:
@@ -113,10 +113,10 @@ class StageDisplay:
         self.tasks: dict[str, TaskID] = {}
 
     def show(self, stage: str, done: int, total: int) -> None:
-        """Shows how much of a stage is done; a total of 0 is not known."""
+        """Shows the progress of a stage; a total of 0 means unknown."""
         if stage not in self.tasks:
             for task in self.progress.tasks:
-                if task.total is None:  # of unknown length, and over now
+                if task.total is None:  # a finished stage of unknown length
                     self.progress.update(task.id, completed=1, total=1)
             self.tasks[stage] = self.progress.add_task(stage, total=None, count="")
             if not console.is_terminal:

@@ -27,10 +27,10 @@ from voronerf.app.cli.display import console, one_line, say
 from voronerf.app.cli.eval import evaluate_run
 from voronerf.app.cli.export import export
 from voronerf.app.cli.info import info
-from voronerf.app.cli.meant import named
 from voronerf.app.cli.parsing import parse
 from voronerf.app.cli.process import process
 from voronerf.app.cli.render import render
+from voronerf.app.cli.suggest import argument_names
 from voronerf.app.cli.town import cut, join, place, train_territories
 from voronerf.app.cli.train import WHAT_TO_TRY, train, with_stored_settings
 from voronerf.app.cli.view import view
@@ -45,14 +45,14 @@ EXPECTED = (
     *(MemoryError, torch.OutOfMemoryError),
 )
 
-#: What messages say when a CPU has no memory left: RuntimeErrors of torch, for a tensor or a thread, and SystemErrors
-#: of Python, for an import.
+#: Texts of errors for exhausted CPU memory: RuntimeErrors of torch for a tensor or a thread, SystemErrors of Python
+#: for an import.
 NO_MEMORY = (
     *("can't allocate memory", "Cannot allocate memory", "not enough memory", "bad_alloc", "can't start new thread"),
     *("error return without exception set", "returned NULL without setting an exception"),
 )
 
-#: What ``voronerf NAME`` runs; arguments and docstring of each function are its options and its help.
+#: The function that ``voronerf NAME`` runs; its arguments are the options, its docstring is the help.
 COMMANDS: dict[str, Callable[..., int]] = {
     "train": train,
     "train-territories": train_territories,
@@ -69,7 +69,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "process": process,
 }
 
-#: The commands that train, which take stored settings and end with a checkpoint when they are stopped.
+#: The training commands; they take stored settings, and write a checkpoint when they are stopped.
 TRAININGS = ("train", "train-territories")
 
 
@@ -80,8 +80,8 @@ def run(args: list[str] | None = None) -> int:
         args: The command line without the program's name; default ``sys.argv[1:]``.
 
     Returns:
-        0 when all went well, 1 for an error, 130 when training was stopped, 141 when nobody reads the output any more.
-        Errors are one line on stderr; with VORONERF_TRACEBACK=1 they are shown whole.
+        0 for success, 1 for an error, 130 if training was stopped, 141 if the reader of the output has closed it.
+        Errors are one line on stderr; with VORONERF_TRACEBACK=1 they have a traceback.
     """
     args = sys.argv[1:] if args is None else args
     if not gc.isenabled():  # see voronerf/app/cli/__init__.py
@@ -101,26 +101,26 @@ def run(args: list[str] | None = None) -> int:
             status = 0
         if not _nobody_reads():
             return status
-        # What is not written yet would print a traceback at the end of the process.
+        # At exit Python flushes stdout, and would print a traceback for the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return status or 128 + 13  # SIGPIPE, such as of `voronerf train --help | head`
+        return status or 128 + 13  # SIGPIPE, as for `voronerf train --help | head`
 
 
 def _nobody_reads() -> bool:
-    """Whether what is printed goes into a pipe that was closed."""
+    """Returns whether stdout is a pipe whose reader has closed it."""
     try:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), 0)
-        return bool(poll.poll(0))  # only of errors
-    except (AttributeError, OSError, ValueError):  # Windows, no output, or none with a file
+        return bool(poll.poll(0))  # reports errors only
+    except (AttributeError, OSError, ValueError):  # Windows, no stdout, or a stdout without a file descriptor
         return False
 
 
 @contextlib.contextmanager
 def _exit_on_sigterm() -> Iterator[None]:
-    """A context in which SIGTERM unwinds the stack, so that a command removes what it has half written."""
-    here = threading.current_thread() is threading.main_thread()
-    if not here or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+    """A context in which SIGTERM unwinds the stack, so that a command removes its incomplete files."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
         return
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
@@ -136,10 +136,10 @@ def _run(args: list[str]) -> int:
         for line in WHAT_TO_TRY.splitlines():
             say(line)
     try:
-        for word in args:  # the parser prints a word that it does not know as it is
+        for word in args:  # the parser prints unknown words without escaping them
             if any(unicodedata.category(char) == "Cc" for char in word):
                 raise ConfigError(f"arguments must have no control characters, got {word}")
-        return chosen(*args)()
+        return parse_command(*args)()
     except KeyboardInterrupt:
         print("voronerf: interrupted", file=sys.stderr)
         return 130
@@ -148,24 +148,24 @@ def _run(args: list[str]) -> int:
             return 0
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
-        said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
-        print(f"voronerf: error: {one_line(said) or type(error).__name__}", file=sys.stderr)
+        message = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
+        print(f"voronerf: error: {one_line(message) or type(error).__name__}", file=sys.stderr)
         return 1
     except (RuntimeError, SystemError) as error:
         text = str(error)
         if os.environ.get("VORONERF_TRACEBACK") or not any(sign in text for sign in NO_MEMORY):
             raise
-        wanted = re.search(r"tried to allocate (\d+) bytes", text)
-        size = f" for {int(wanted[1]) / 2**30:.1f} GiB" if wanted else ""
+        allocation = re.search(r"tried to allocate (\d+) bytes", text)
+        size = f" for {int(allocation[1]) / 2**30:.1f} GiB" if allocation else ""
         print(f"voronerf: error: not enough memory{size}; try a smaller --width, --rays or --samples", file=sys.stderr)
         return 1
 
 
-def chosen(name: str = "--help", *words: str) -> Callable[[], int]:
-    """The command that a command line names, with its arguments.
+def parse_command(name: str = "--help", *words: str) -> Callable[[], int]:
+    """Returns the command of a command line, with its arguments bound.
 
     Raises:
-        ConfigError: There is no such command, or no such argument.
+        ConfigError: The command or one of its arguments is unknown.
     """
     if name in ("-h", "--help"):
         return _show_commands
@@ -174,19 +174,19 @@ def chosen(name: str = "--help", *words: str) -> Callable[[], int]:
         return lambda: 0
     if name not in COMMANDS:
         word = name.lstrip("-")
-        if name.startswith("--") and word.partition("=")[0] in named(train)[1]:
-            end = f"did you mean {shlex.join(['voronerf', 'train', name, *words])}?"
+        if name.startswith("--") and word.partition("=")[0] in argument_names(train)[1]:
+            hint = f"did you mean {shlex.join(['voronerf', 'train', name, *words])}?"
         elif near := nearest(word, [*COMMANDS, "help", "version"]):
-            end = f"did you mean {near if near in COMMANDS else f'voronerf --{near}'}?"
+            hint = f"did you mean {near if near in COMMANDS else f'voronerf --{near}'}?"
         else:
-            end = "see voronerf --help"
-        raise ConfigError(f"there is no command {name}; {end}")
+            hint = "see voronerf --help"
+        raise ConfigError(f"there is no command {name}; {hint}")
     command = COMMANDS[name]
     return parse(name, with_stored_settings(command, list(words)) if name in TRAININGS else command, words)
 
 
 def _show_commands() -> int:
-    """Prints the commands, with the first paragraph of what each says of itself."""
+    """Prints the commands, each with the first paragraph of its docstring."""
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, command in COMMANDS.items():
         table.add_row(f"  {name}", escape(" ".join((command.__doc__ or "").partition("\n\n")[0].split())))
@@ -199,7 +199,7 @@ def _show_commands() -> int:
 
 
 def _show_thread_error(args: threading.ExceptHookArgs) -> None:
-    """A thread that cannot start for lack of memory prints nothing: whoever waits for it reports the error."""
+    """Prints the traceback of a thread, except for lack of memory: the thread that waits for it reports that."""
     if not isinstance(args.exc_value, (MemoryError, SystemError)):
         threading.__excepthook__(args)
 

@@ -27,22 +27,22 @@ def render(
     crop: Crop = None,
     opening: Opening = AS_IN_TRAINING,
 ) -> int:
-    """Render a video of a trained run: a turntable of an object, else where its cameras were, or a camera path.
+    """Render a video of a trained run: a turntable of an object, else along its cameras, or a camera path.
 
     Args:
         run: The run directory.
         out: The video file, .mp4, or with --images a new folder; default video, or the name of the path, in the run
             directory.
-        path: Camera path in nerfstudio's format, such as the viewer saves; it has the frames and their size. Positions
-            are those of this run's scene.
-        frames: Frames of a video without a path.
-        fps: Frames per second; default 24, or those of the path.
-        size: Width and height of the frames, such as 1280x720; default those of the training images, or of the path.
+        path: Camera path in nerfstudio's format, as the viewer saves it, in the coordinates of this run's scene. It
+            gives the frames and their size.
+        frames: Number of frames of a video without a path.
+        fps: Frames per second; default 24, or the rate of the path.
+        size: Width and height of the frames, such as 1280x720; default the size of the training images, or of the path.
         images: Write the frames as PNG images into a folder.
-        depth: Show how far away things are, near ones in yellow.
-        panorama: Show all around, in equirectangular frames with the horizon in the middle; --size must be 2 to 1.
-        crop: Show a box only, x y z of its lowest and of its highest corner, or "saved" for the viewer's.
-        opening: How the run is opened.
+        depth: Show the depth instead of the colour, near surfaces in yellow.
+        panorama: Render 360-degree equirectangular frames with the horizon in the middle; --size must be 2 to 1.
+        crop: Render only a box: x y z of its lowest and of its highest corner, or "saved" for the viewer's crop.
+        opening: The settings with which the run is opened.
     """
     check_counts(frames=frames)
     if fps is not None and not 0.01 <= fps <= 1000:
@@ -68,7 +68,7 @@ def render(
 
 
 def _sides(size: str) -> tuple[int, int]:
-    """Width and height of "1280x720"."""
+    """Parses a size such as "1280x720" into width and height."""
     match = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", size)
     if not match or max(sides := (int(match[1]), int(match[2]))) > LONGEST_SIDE:
         raise ConfigError(f"--size must be WIDTHxHEIGHT, such as 1280x720, at most {LONGEST_SIDE} each, got {size!r}")

@@ -33,13 +33,13 @@ from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.group import Group, local_rank, restarts
 from voronerf.town.run import stored_territories
 
-#: The rule of a transform on the command line.
+#: The text that describes a transform in error messages.
 MOVE = "seven finite numbers tx ty tz rx ry rz s, the scale s 1e-9 to 1e9"
 
 
-def tell(out: Path, made: Source) -> int:
-    """Says what was written."""
-    counts = {"cell": made.parts.num_cells, "part": len(made.parts.parts)}
+def tell(out: Path, written: Source) -> int:
+    """Prints the path, cells, parts and size of a written run."""
+    counts = {"cell": written.parts.num_cells, "part": len(written.parts.parts)}
     cells, parts = (counted(count, name) for name, count in counts.items())
     size = sum(file.stat().st_size for file in (out / "checkpoints").iterdir())
     say(f"wrote {out}: {cells} in {parts}, {size / 2**20:.1f} MiB")
@@ -53,14 +53,15 @@ def join(
     move: tyro.conf.UseAppendAction[tuple[tuple[str, str], ...]] = (),
     align: bool = False,
 ) -> int:
-    """Make one run of several. Where they overlap the nearest centre decides; the runs stay as they are.
+    """Join several runs into one. Where they overlap, the nearest centre decides; the runs are not changed.
 
     Args:
         runs: Two run directories or more; the first gives data, background and settings.
         out: The new run directory.
-        move: N "tx ty tz rx ry rz s", once for each run that moves: the run with this number, the first being 1, is
-            scaled by s, turned by angles in degrees about x, y, z and moved.
-        align: Find the transforms of all runs but the first, from the cameras of images with names that both have.
+        move: N "tx ty tz rx ry rz s", once for each run to move: run N, counted from 1, is scaled by s, turned by
+            angles in degrees about x, y, z, then moved.
+        align: Find the transforms of all runs but the first, from the cameras of images that have the same name in
+            both runs.
     """
     check_out(out)
     if len(runs) < 2:
@@ -77,14 +78,14 @@ def join(
                 f"their cameras {error:.3g} scene units apart"
             )
             frames[number] = frame
-    every = [frames.get(number, Similarity()) for number in range(len(runs))]
+    transforms = [frames.get(number, Similarity()) for number in range(len(runs))]
     with busy("joining"):
-        made = editing.join(runs, out, frames=every)
-    return tell(out, made)
+        written = editing.join(runs, out, frames=transforms)
+    return tell(out, written)
 
 
 def given_frames(runs: int, move: Sequence[tuple[str, str]]) -> dict[int, Similarity]:
-    """The transforms of --move, by the number of their run from 0."""
+    """Parses --move into transforms by the number of the run, from 0."""
     frames: dict[int, Similarity] = {}
     for number, text in move:
         if not number.isdecimal() or not 1 <= int(number) <= runs:
@@ -108,7 +109,7 @@ def cut(
     cells: tuple[int, ...] | None = None,
     outside: bool = False,
 ) -> int:
-    """Make a run of a region of another, or of all but the region; the run stays as it is.
+    """Make a new run with only a region of a run, or with --outside all but the region; the run is not changed.
 
     Args:
         run: The run directory.
@@ -116,13 +117,13 @@ def cut(
         box: x y z of the lowest and of the highest corner.
         sphere: x y z of the centre, and the radius.
         cells: Numbers of cells, as the viewer shows them.
-        outside: Keep what lies outside.
+        outside: Keep everything outside the region instead.
     """
     check_out(out)
     named = {name: value for name, value in (("box", box), ("sphere", sphere), ("cells", cells)) if value is not None}
     if len(named) != 1:
-        came = " and ".join(f"--{name}" for name in named) or "none"
-        raise ConfigError(f"cut needs one of --box, --sphere and --cells, got {came}")
+        options = " and ".join(f"--{name}" for name in named) or "none"
+        raise ConfigError(f"cut needs one of --box, --sphere and --cells, got {options}")
     try:
         solid = Solid.box(box[:3], box[3:]) if box is not None else None if sphere is None else Solid(ball=sphere)
     except ValueError:
@@ -131,8 +132,8 @@ def cut(
         raise ConfigError(f"--{name} must be {rule}, got {as_typed(value)}") from None
     kept = list(cells or ()) if solid is None else solid
     with busy("cutting"):
-        made = editing.cut(run, kept, out, outside=outside)
-    return tell(out, made)
+        written = editing.cut(run, kept, out, outside=outside)
+    return tell(out, written)
 
 
 def place(
@@ -144,15 +145,15 @@ def place(
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
 ) -> int:
-    """Make a run of a scene with an object in it; its density comes on top of the scene's. Both stay as they are.
+    """Place an object into a scene, as a new run; its density is added to the scene's. Neither run is changed.
 
     Args:
         run: The run directory of the scene.
-        thing: That of the object, cut out with voronerf cut, or trained on white.
+        thing: The run directory of the object, cut out with voronerf cut, or trained on white.
         out: The new run directory.
-        at: x y z, where the middle of the bottom of the object's box shall be.
+        at: x y z of the object: the centre of the bottom of its box goes there.
         turn: Degrees about the axes x, y, z, in this order.
-        scale: Of the object's size.
+        scale: Factor on the object's size.
     """
     check_out(out)
     for name, value in (("at", at), ("turn", turn)):
@@ -163,8 +164,8 @@ def place(
     except ValueError:
         raise ConfigError(f"--scale must be 1e-9 to 1e9, got {as_typed(scale)}") from None
     with busy("placing"):
-        made = editing.place(run, thing, at, out, degrees=turn, scale=scale)
-    return tell(out, made)
+        written = editing.place(run, thing, at, out, degrees=turn, scale=scale)
+    return tell(out, written)
 
 
 def train_territories(
@@ -176,19 +177,20 @@ def train_territories(
     checkpoint_every: float = CHECKPOINT_EVERY,
     panels: int = 4,
 ) -> int:
-    """Train a large scene in territories, each with cells, table, views and rays of its own; rays cross their borders.
+    """Train a large scene in territories, each with its own cells, table, views and rays; rays cross their borders.
 
-    `torchrun --nproc-per-node 4 -m voronerf train-territories --out RUN` shares them out over processes, on any number
-    of which the run is the same bit for bit. The finished run is scored; `eval`, `view`, `join` and `cut` open it.
+    `torchrun --nproc-per-node 4 -m voronerf train-territories --out RUN` distributes the territories over processes.
+    The run is the same bit for bit on any number of processes. The finished run is scored; `eval`, `view`, `join` and
+    `cut` open it.
 
     Args:
         config: The settings of each territory.
-        territories: How many; default those of the run that goes on, else the least power of two that gives each
+        territories: Number of territories; default as in a resumed run, else the least power of two that gives every
             process one.
         resume: Continue the run in --out from its last checkpoint.
-        file: JSON of settings by their names, such as the config.json of a run; options that are given come first.
+        file: JSON of settings by name, such as the config.json of a run; options on the command line override it.
         checkpoint_every: Seconds of training between checkpoints.
-        panels: Test views drawn as panels at the end.
+        panels: Number of test views drawn as panels at the end.
     """
     name = present_device(config.device)
     device = torch.device(present_device(f"cuda:{local_rank()}") if name == "cuda" else name)
@@ -196,7 +198,7 @@ def train_territories(
     group = Group.join(device)
     try:
         with contextlib.ExitStack() as stack:
-            if group.rank:  # the first speaks
+            if group.rank:  # only rank 0 prints
                 null = stack.enter_context(open(os.devnull, "w"))
                 stack.enter_context(contextlib.redirect_stdout(null))
                 stack.enter_context(contextlib.redirect_stderr(null))
@@ -213,17 +215,17 @@ def train_territories(
 def _train_territories(
     config: TrainConfig, group: Group, count: int, resume: bool, checkpoint_every: float, panels: int
 ) -> int:
-    """Trains on this rank; the first writes the scores of the finished run."""
+    """Trains on this rank; rank 0 writes the scores of the finished run."""
     group.check_same(config, count)
     territories_train.check_territories(config, count, group.size)
     out, reading = config.out, dict(config.reading)
     assert out is not None
-    if group.size > 1 and config.data != BUILTIN:  # each rank reads its own of one copy
+    if group.size > 1 and config.data != BUILTIN:  # ranks read their images from one copy on disk
         reading["images"] = "disk"
     with busy(f"reading {config.data}"):
         scene = load_scene(config.data, **reading)
     group.check_same_scene(scene)
-    if group.rank == 0:  # alone, for what it writes is there already when others look
+    if group.rank == 0:  # only rank 0: other ranks would find the directory that it has made
         resume = resume or (restarts() > 0 and bool(checkpoint_paths(out)))
         choose_directory(config, scene, resume=resume)
     resume = group.gather(resume)[0]
@@ -236,7 +238,7 @@ def _train_territories(
             with stopped_by_signals(town.stop):
                 territories_train.train(town, [display], checkpoint_every=checkpoint_every)
         summary = territories_train.summary_of(town)
-        group.leave()  # the others would wait for the pictures
+        group.leave()  # so that the other ranks do not wait for the pictures
         if group.rank == 0:
             if summary["complete"]:
                 opened = open_run(out, scene=scene, backend=config.backend)

@@ -1,4 +1,4 @@
-"""``voronerf train``: a training with its display, its signals and its pictures."""
+"""``voronerf train``: runs a training, with its display, signal handling and pictures."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ from voronerf.app.train.run_directory import (
 from voronerf.app.train.state import HALVES, State
 from voronerf.ops._core import backends
 
-#: Bytes of a picture's name without its end, which most file systems take.
+#: Bytes of a picture's name without its suffix that most file systems allow.
 LONGEST_NAME = 255 - len(".png")
-#: Panels of a training that is not told how many.
+#: Default number of panels.
 PANELS = 4
 #: Signals that end a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
@@ -86,22 +86,22 @@ def train(
 ) -> int:
     """Train a scene: coarse network, balanced Voronoi cells, cells trained further.
 
-    With --resume, options that are not given keep their value from the run in --out.
+    With --resume, omitted options keep their value from the run in --out.
 
     Args:
         config: The settings.
         resume: Continue the run in --out from its last checkpoint.
-        file: JSON of settings by their names, such as the config.json of a run; options that are given come first.
-        checkpoint_every: Seconds of training between checkpoints, which are written while it goes on.
-        panels: Test views drawn as panels at the end: truth, render, error, depth, cells; default 4, with a --budget as
-            many as a tenth of it allows, and at least one.
+        file: JSON of settings by name, such as the config.json of a run; options on the command line override it.
+        checkpoint_every: Seconds of training between checkpoints, which are written in the background.
+        panels: Number of test views drawn as panels at the end: truth, render, error, depth, cells. Default 4; with a
+            --budget, as many as fit into a tenth of it, at least one.
         tensorboard: Also write loss, speed, cells and scores for TensorBoard, into the folder tensorboard of the run.
         view: Show the training in a browser, and its result until Ctrl-C.
         host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
-        port: Port that --view listens at; 0 is any that is free.
-        explain: Only say how a training step is computed, and what keeps it from a faster way.
+        port: Port that --view listens at; 0 is any free port.
+        explain: Only print how a training step is computed, and why not in a faster way.
     """
-    present_device(config.device)  # before a scene is read
+    present_device(config.device)  # fails before the scene is read
     if panels is not None and panels < 0:
         raise ConfigError(f"--panels must be 0 or more, got {panels}")
     if not checkpoint_every > 0:
@@ -153,7 +153,7 @@ def train(
 
 
 def continuation(command: str, config: TrainConfig) -> str:
-    """The command that goes on with a stopped run."""
+    """Returns the command line that continues a stopped run."""
     assert config.out is not None
     words = [*command.split(), "--resume", "--out", str(config.out)]
     for option, path in (("--data", config.data), ("--lpips", config.lpips)):
@@ -164,11 +164,11 @@ def continuation(command: str, config: TrainConfig) -> str:
 
 def _remove_empty(folder: Path) -> None:
     with contextlib.suppress(OSError):
-        folder.rmdir()  # fails if something was written, and is then not needed
+        folder.rmdir()  # fails for a folder with files, which stays
 
 
 def _compile_kernels(config: TrainConfig) -> None:
-    """Compiles what a step calls of Warp, with a bar, and says on a GPU what runs the operations."""
+    """Compiles the Warp kernels of a step, with a progress bar; on a GPU, prints which backend runs the operations."""
     device, dtype = torch.device(config.device), HALVES.get(config.precision, torch.float32)
     if device.type == "cuda" and config.backend == "auto":
         say(f"operations run on {backends.automatic(device)}")
@@ -197,10 +197,10 @@ def run_training(
 ) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 
-    ``watch`` makes what shows the training in a viewer. ``quiet`` leaves out all lines but the live one.
+    ``watch`` makes the callback that shows the training in a viewer. ``quiet`` prints only the live line.
 
-    Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the step in hand: the checkpoint and the summary are written,
-    the pictures are not. A second one ends the process at once.
+    Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the current step: the checkpoint and the summary are written,
+    the pictures are not. A second signal ends the process at once.
     """
     out = config.out
     assert out is not None
@@ -213,7 +213,7 @@ def run_training(
         with display.progress:
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
-            # A run that goes on keeps its settings.
+            # A resumed run keeps its settings.
             measured = config.budget is not None and not resume and present_device(config.device) == "cpu"
             speed = machine_speed() if measured else 1.0
             state = build(config, scene, on_event=display.on_event, speed=speed)
@@ -234,7 +234,7 @@ def run_training(
             with stopped_by_signals(state.stop):
                 try:
                     run(state, callbacks)
-                except SceneError:  # of images on disk that were cut short: what was learnt stays
+                except SceneError:  # truncated image files: the checkpoint keeps the training so far
                     checkpoints.on_end(state)
                     raise
         if not scores.summary["complete"]:
@@ -254,19 +254,19 @@ def run_training(
 @contextlib.contextmanager
 def stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
     """A context in which the first of the signals of ``STOPPING`` calls ``stop``, and a second ends the process."""
-    # One that is ignored stays so, as under nohup or where a shell started it in the background.
-    before = {number: signal.getsignal(number) for number in STOPPING}
-    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    # An ignored signal stays ignored, as under nohup or in a shell's background job.
+    handlers = {number: signal.getsignal(number) for number in STOPPING}
+    handlers = {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
 
     def restore() -> None:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop()
         restore()
 
-    for number in before:
+    for number in handlers:
         signal.signal(number, handle)
     try:
         yield
@@ -275,8 +275,8 @@ def stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 
 def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callable[..., int]:
-    """A command that trains, whose defaults are the settings of --config, or for --resume those of the run in --out."""
-    file, out = _given_path(args, "--config"), _given_path(args, "--out")
+    """Returns a training command whose defaults are the settings of --config, or with --resume of the run in --out."""
+    file, out = _option_path(args, "--config"), _option_path(args, "--out")
     if file is None and "--resume" not in args:
         return command
     if file is not None and "--resume" in args:
@@ -291,14 +291,15 @@ def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callab
         nothing = "--resume needs --out, the run directory to continue"
         raise ConfigError(nothing if out is None else f"no run at {out}: there is nothing to resume")
 
-    def given(name: str) -> bool:
+    def is_given(name: str) -> bool:
         return any(word == f"--{name}" or word.startswith(f"--{name}=") for word in args)
 
     check_stored_paths(
-        folder, data=None if given("data") else stored.data, lpips=None if given("lpips") else stored.lpips
+        folder, data=None if is_given("data") else stored.data, lpips=None if is_given("lpips") else stored.lpips
     )
-    # A given --steps replaces a stored budget and the other way round; the number that is set here is replaced in turn.
-    length = {name for name in ("budget", "steps") if given(name)}
+    # --steps on the command line replaces a stored budget, and --budget stored steps. The placeholder set here is
+    # overwritten by the option.
+    length = {name for name in ("budget", "steps") if is_given(name)}
     if length == {"steps"} and stored.budget is not None:
         stored = replace(stored, budget=None, steps=2**53 - 1)
     elif length == {"budget"} and stored.steps is not None:
@@ -314,8 +315,8 @@ def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callab
     return with_settings
 
 
-def _given_path(args: list[str], option: str) -> Path | None:
-    """The value of an option that is a path, or None."""
-    path = next((after for word, after in itertools.pairwise(args) if word == option), None)
+def _option_path(args: list[str], option: str) -> Path | None:
+    """Returns the value of an option that is a path, or None."""
+    path = next((value for word, value in itertools.pairwise(args) if word == option), None)
     path = next((word.removeprefix(f"{option}=") for word in args if word.startswith(f"{option}=")), path)
     return None if path is None else Path(path)

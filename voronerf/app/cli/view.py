@@ -17,8 +17,8 @@ def view(run: Path, /, host: str = "127.0.0.1", port: int = 8080, opening: Openi
     Args:
         run: The run directory.
         host: Address to listen at; the default is for this machine only, 0.0.0.0 lets others in.
-        port: Port to listen at; 0 is any that is free.
-        opening: How the run is opened.
+        port: Port to listen at; 0 is any free port.
+        opening: The settings with which the run is opened.
     """
     viewers = import_viewer()
     viewers.check_address(host, port)
@@ -31,7 +31,7 @@ def view(run: Path, /, host: str = "127.0.0.1", port: int = 8080, opening: Openi
 
 
 def import_viewer() -> ModuleType:
-    """The viewer, which needs viser."""
+    """Imports and returns the viewer, which needs viser."""
     try:
         return importlib.import_module("voronerf.app.viewer")
     except ImportError as error:

@@ -35,7 +35,7 @@ SMALLEST = 31
 OFF = "off"
 VARIABLE = "VORONERF_LPIPS"
 SUFFIXES = (".safetensors", ".pth", ".pt")
-ALEXNET = "alexnet-owt-7be5be79.pth"  # what torchvision calls the file that it downloads
+ALEXNET = "alexnet-owt-7be5be79.pth"  # the name of torchvision's download
 
 
 class LpipsError(ValueError):
@@ -43,13 +43,13 @@ class LpipsError(ValueError):
 
 
 class Lpips:
-    """The distance of two images: 0 for equal ones, about 0.05 for good renderings, 0.5 for unrelated pictures.
+    """The LPIPS metric: 0 for equal images, about 0.05 for good renderings, 0.5 for unrelated pictures.
 
     Each of AlexNet's five ReLU maps is scaled to unit length over the channels of a pixel; the squared differences are
     weighted by channel (the learnt linear layers), averaged over the pixels and summed over the maps.
 
     Args:
-        weights: the tensors of `SHAPES` by name.
+        weights: the tensors by their names in `SHAPES`.
 
     Examples:
         >>> import torch
@@ -64,14 +64,14 @@ class Lpips:
         self.weights = {name: weights[name].detach().to(torch.float32) for name in SHAPES}
 
     def __call__(self, image: Tensor, truth: Tensor) -> Tensor:
-        """LPIPS of two images, float32, one number.
+        """Returns the LPIPS of two images, a float32 scalar.
 
         Args:
             image: [h, w, 3] in 0..1, at least 31 pixels on a side.
-            truth: [h, w, 3] in 0..1, what it should be.
+            truth: [h, w, 3] in 0..1, the reference image.
 
         Raises:
-            ValueError: shapes, or images that are too small.
+            ValueError: the shapes differ or are not [h, w, 3], or the images are too small.
         """
         if image.shape != truth.shape or image.dim() != 3 or image.shape[-1] != 3:
             raise ValueError(
@@ -103,24 +103,24 @@ class Lpips:
 def find_lpips(
     setting: Path | None, data: str = "", size: tuple[int, int] = (SMALLEST, SMALLEST)
 ) -> tuple[Lpips | None, str]:
-    """LPIPS with the weights found on this machine.
+    """Finds LPIPS weights on this machine and returns the metric.
 
-    They are searched for in this order: `setting`, VORONERF_LPIPS, the folder `lpips` of VORONERF_DATA, the folder
-    `lpips` beside the folder of the scene, and the installed `lpips` package with the AlexNet that torchvision
+    The function looks for weights in this order: `setting`, VORONERF_LPIPS, the folder `lpips` of VORONERF_DATA, the
+    folder `lpips` beside the folder of the scene, and the installed `lpips` package with the AlexNet that torchvision
     downloaded for it.
 
     Args:
         setting: a file, or a folder of files; "off" for no LPIPS.
         data: the folder of the scene.
-        size: of the images, rows and columns. LPIPS is skipped for images that are too small, unless `setting` is
+        size: rows and columns of the images. LPIPS is skipped for images that are too small, unless `setting` is
             given.
 
     Returns:
-        The metric, or None; and a line that says where its weights came from, or why it has no weights.
+        The metric or None, and a line with the source of the weights or the reason why there are none.
 
     Raises:
-        LpipsError: the given file or folder, or the first one found, cannot be used; or the images are too small and
-            `setting` names weights.
+        LpipsError: the first file or folder of weights cannot be used, or the images are too small and `setting` names
+            weights.
 
     Examples:
         >>> from pathlib import Path
@@ -144,7 +144,7 @@ def find_lpips(
         return Lpips(read_weights(_files(path))), f"LPIPS weights from {path}"
     folders = [Path(root) / "lpips" for root in (os.environ.get("VORONERF_DATA"),) if root]
     if data and Path(data).exists():
-        place = Path(data).resolve()  # a folder, or a file that stands for it
+        place = Path(data).resolve()  # the scene's folder, or a file in it
         folders.append((place if place.is_dir() else place.parent).parent / "lpips")
     for folder in folders:
         if any(file.suffix in SUFFIXES for file in folder.glob("*")):
@@ -153,16 +153,16 @@ def find_lpips(
 
 
 def read_weights(files: list[Path]) -> dict[str, Tensor]:
-    """The tensors of `SHAPES` from one or several files, in any of the namings in use.
+    """Reads the tensors of `SHAPES` from one or several files, in any of the usual naming schemes.
 
-    Those are torchvision's (`features.0.weight`), that of the `lpips` package's own files (`lin0.model.1.weight`) and
-    of its whole network (`net.slice1.0.weight`).
+    The schemes are torchvision's (`features.0.weight`), the `lpips` package's for its linear layers
+    (`lin0.model.1.weight`) and for its whole network (`net.slice1.0.weight`).
 
     Args:
-        files: safetensors, or state dicts saved by torch, which are read without running what they may contain.
+        files: safetensors, or state dicts saved by torch, which are loaded with ``weights_only=True``.
 
     Raises:
-        LpipsError: a file that cannot be read, a tensor that is missing or has another shape.
+        LpipsError: a file cannot be read, or a tensor is missing or has another shape.
     """
     weights: dict[str, Tensor] = {}
     for file in files:
@@ -190,7 +190,7 @@ def read_weights(files: list[Path]) -> dict[str, Tensor]:
 
 
 def _files(path: Path) -> list[Path]:
-    """A file, or the files of weights in a folder: one that names AlexNet and LPIPS, or all."""
+    """Lists the weight files of a path: the file itself, or a folder's files with "alex" in their names, else all."""
     if path.is_file():
         return [path]
     files = sorted(file for file in path.glob("*") if file.suffix in SUFFIXES)
@@ -200,7 +200,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _from_package() -> tuple[Lpips | None, str]:
-    """The weights of the installed `lpips` package; never downloads."""
+    """Returns LPIPS with the weights of the installed `lpips` package; never downloads."""
     package = importlib.util.find_spec("lpips")
     ask = f"pass --lpips FILE or set {VARIABLE}"
     if package is None or not package.submodule_search_locations:

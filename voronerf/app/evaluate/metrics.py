@@ -1,4 +1,4 @@
-"""How close an image is to the truth. Images are [..., h, w, c] in 0..1; scores are in float64, one number."""
+"""PSNR and SSIM. Images are [..., h, w, c] in 0..1; scores are float64 scalars."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ K1, K2 = 0.01, 0.03
 
 
 def psnr(image: Tensor, truth: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio in dB, -10 log10 of the mean squared error; infinite for equal images.
+    """Returns the peak signal-to-noise ratio in dB, -10 log10 of the mean squared error; infinite for equal images.
 
     Raises:
         ValueError: the shapes differ.
@@ -28,15 +28,16 @@ def psnr(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def ssim(image: Tensor, truth: Tensor) -> Tensor:
-    """Structural similarity (Wang et al. 2004), the mean over pixels and channels.
+    """Returns the structural similarity (Wang et al. 2004), the mean over pixels and channels.
 
-    As in the NeRF literature (mip-NeRF's `compute_ssim`): a Gaussian window of 11 x 11 pixels with sigma 1.5, only
-    where it lies inside the image, K1 = 0.01, K2 = 0.03, on colours. Variances are clamped so that rounding does not
-    make them negative. For an image with a side below 11 pixels, the window is the largest odd one that fits.
+    The definition follows the NeRF literature (mip-NeRF's `compute_ssim`): on colours, with a Gaussian window of
+    11 x 11 pixels and sigma 1.5 that lies inside the image, K1 = 0.01 and K2 = 0.03. Variances are clamped so that
+    rounding does not make them negative. For an image with a side below 11 pixels, the window is the largest odd one
+    that fits.
 
     Args:
-        image: [..., h, w, c], the picture, in 0..1.
-        truth: [..., h, w, c], what it should be, in 0..1.
+        image: [..., h, w, c] in 0..1.
+        truth: [..., h, w, c] in 0..1, the reference image.
 
     Raises:
         ValueError: the shapes differ.
@@ -72,7 +73,7 @@ def ssim(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def _gaussian(extent: int, device: torch.device) -> Tensor:
-    """The window along one axis, sum 1, at most `extent` wide."""
+    """Returns the Gaussian window along one axis, with sum 1, at most `extent` wide."""
     size = min(WINDOW, extent if extent % 2 else extent - 1)
     offset = torch.arange(size, dtype=torch.float64, device=device) - size // 2
     weight = torch.exp(-0.5 * (offset / SIGMA) ** 2)

@@ -22,18 +22,18 @@ from voronerf.app.scenes import Scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.renderer import RenderedImage, Renderer
 
-# Steps of hue, saturation and value; their multiples modulo 1 fill the range evenly for any count (Roberts 2018).
+# Steps of hue, saturation and value. The multiples of a step modulo 1 fill 0..1 evenly for any count (Roberts 2018).
 HUE_STEP, SATURATION_STEP, VALUE_STEP = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
-ERROR_SCALE = 0.3  # mean absolute error over the channels that gets the last colour of the map
-SOLID = 0.5  # opacity above which the depth of a pixel counts for the scale
-PICTURE_HEIGHT, PICTURE_WIDTH = 240, 1200  # pictures are enlarged to about this height, and never beyond this width
+ERROR_SCALE = 0.3  # mean absolute error over the channels at the end of the colour map
+SOLID = 0.5  # opacity above which a pixel's depth counts for the range of the colours
+PICTURE_HEIGHT, PICTURE_WIDTH = 240, 1200  # pictures are enlarged to about this height, at most to this width
 CAPTION, FONT, GAP = 24, 16, 6
 
 
 def palette(count: int) -> Tensor:
-    """Colours of cells, uint8 [k, 3], all different; cell i has the same colour whatever the count.
+    """Returns the colours of cells, uint8 [k, 3], all different; the colour of cell i is independent of the count.
 
-    Hues follow the golden ratio, so that cells of close numbers (the children of one cell) look different.
+    Hues follow the golden ratio, so that cells with close numbers (the children of one cell) look different.
     """
     colours: dict[tuple[int, int, int], None] = {}
     index = 0
@@ -47,29 +47,29 @@ def palette(count: int) -> Tensor:
 
 
 def picture_of_colour(colour: Tensor) -> Tensor:
-    """Colours [h, w, 3], clipped to 0..1, as a picture."""
+    """Draws colours [h, w, 3], clipped to 0..1."""
     return (colour.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 def picture_of_error(colour: Tensor, truth: Tensor) -> Tensor:
-    """Mean absolute error over the channels, black (0) to pale yellow (0.3 and above)."""
+    """Draws the mean absolute error over the channels, black (0) to pale yellow (0.3 and above)."""
     return mapped((colour - truth).abs().mean(-1) / ERROR_SCALE, "inferno")
 
 
 def picture_of_depth(depth: Tensor, opacity: Tensor, among: Tensor | None = None) -> Tensor:
-    """Depth [h, w] from near (yellow) to far (dark blue), fading to white with the opacity.
+    """Draws depth [h, w] from near (yellow) to far (dark blue), fading to white with the opacity.
 
-    The colours range from the least to the greatest of the depths ``among`` [n], by default those of the picture.
+    The colours span the 1 % to 99 % quantiles of the depths ``among`` [n], by default the solid pixels' depths.
     """
     solid = depth[opacity > SOLID] if among is None else among
-    solid = solid[:: 1 + solid.numel() // 2**20]  # torch takes no quantile of more than 2^24
+    solid = solid[:: 1 + solid.numel() // 2**20]  # torch.quantile takes at most 2^24 values
     low, high = (solid.quantile(0.01), solid.quantile(0.99)) if solid.numel() else (depth.min(), depth.max())
     near_to_far = (depth - low) / (high - low).clamp_min(1e-6)
     return _on_white(mapped(1 - near_to_far, "viridis"), opacity)
 
 
 def picture_of_cells(cells: Tensor, opacity: Tensor, colour: Tensor | None = None) -> Tensor:
-    """Each pixel in the colour of its cell, fading to white with the opacity (figure 1 of the paper).
+    """Draws each pixel in the colour of its cell, fading to white with the opacity (figure 1 of the paper).
 
     Args:
         cells: integer [h, w].
@@ -84,13 +84,13 @@ def picture_of_cells(cells: Tensor, opacity: Tensor, colour: Tensor | None = Non
 
 
 def contact_sheet(pictures: Mapping[str, Tensor]) -> Tensor:
-    """Captioned pictures of one size in a row; small ones are enlarged by a whole number.
+    """Arranges pictures of one size in a row with captions; small pictures are enlarged by a whole factor.
 
     Args:
-        pictures: by caption.
+        pictures: the pictures by caption.
 
     Raises:
-        ValueError: no pictures, or of different sizes.
+        ValueError: there are no pictures, or their sizes differ.
     """
     sizes = {tuple(picture.shape) for picture in pictures.values()}
     if len(sizes) != 1:
@@ -121,7 +121,10 @@ def save_picture(path: Path, picture: Tensor) -> None:
 
 
 def save_panel(path: Path, truth: Tensor, image: RenderedImage, cells: Tensor) -> None:
-    """Writes truth [h, w, 3], render, error, depth and cells int [h, w] of a view on the CPU side by side, as PNG."""
+    """Writes truth [h, w, 3], render, error, depth and cells, int [h, w], of a view side by side as PNG.
+
+    All tensors are on the CPU.
+    """
     pictures = {
         "truth": picture_of_colour(truth),
         "render": picture_of_colour(image.colour),
@@ -133,8 +136,8 @@ def save_panel(path: Path, truth: Tensor, image: RenderedImage, cells: Tensor) -
 
 
 def mapped(values: Tensor, name: str) -> Tensor:
-    """Values [h, w], clipped to 0..1 and NaN as 0, in the colours of a map of matplotlib."""
-    import matplotlib  # which the viewer's first picture need not wait for
+    """Draws values [h, w], clipped to 0..1, in a colour map of matplotlib; NaN counts as 0."""
+    import matplotlib  # imported here, so that the viewer's first picture does not wait for it
 
     table = torch.from_numpy((matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).round().astype(np.uint8))
     return table[(values.nan_to_num(0).clamp(0, 1) * 255).round().long()]
@@ -148,11 +151,11 @@ def _on_white(picture: Tensor, opacity: Tensor) -> Tensor:
 def write_panels(
     renderer: Renderer, diagram: VoronoiDiagram, scene: Scene, folder: Path, *, views: int, track: Track = in_silence
 ) -> list[Path]:
-    """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths."""
+    """Draws truth, render, error, depth and cells of evenly spread test views, a PNG for each; returns the paths."""
     paths = []
     for view in track(view_numbers(len(scene.test), views), "panels"):
         image = render_camera(renderer, scene, scene.test.cameras, view)
-        # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
+        # A pixel shows the cell of its heaviest sample, as in figure 1 of the paper.
         cells = diagram.locate(image.heaviest.reshape(-1, 3), backend=renderer.backend)
         paths.append(folder / f"{scene.test.names[view]}.png")
         truth = scene.test.truth(view, scene.background_colour())

@@ -22,7 +22,7 @@ def plot_curves(
         path: The file.
         curves: For each label the points (seconds, PSNR in dB).
         splits: For each label the seconds at which its cells were split, drawn as dotted lines.
-        title: Above the axes.
+        title: The title above the axes.
     """
     import matplotlib
 

@@ -16,12 +16,12 @@ from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.renderer import Renderer
 
-#: Shows progress: yields the items of a sequence, and is given its name.
+#: Shows progress: takes a sequence and the task's name, and yields the items.
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
 
 
 def in_silence(items: Sequence[Any], name: str) -> Iterable[Any]:
-    """The items of a sequence, whose progress nobody is shown."""
+    """Returns the items of a sequence without showing progress."""
     return items
 
 
@@ -42,7 +42,7 @@ class ViewScore:
 
 
 def view_numbers(count: int, views: int | None) -> list[int]:
-    """``views`` of ``count`` test views, evenly spread from the first; all of them for None."""
+    """Returns the numbers of ``views`` of ``count`` test views, evenly spread from the first; None means all."""
     if views is None or views >= count:
         return list(range(count))
     return [i * count // views for i in range(views)]
@@ -58,17 +58,17 @@ def evaluate(
     stop: Callable[[], bool] | None = None,
     track: Track = in_silence,
 ) -> list[ViewScore]:
-    """PSNR, SSIM and, where given, LPIPS of test views.
+    """Scores test views by PSNR, SSIM and, if given, LPIPS.
 
-    PSNR leaves out the pixels that a mask leaves out. For SSIM and LPIPS these pixels have the colour of the truth.
+    PSNR ignores masked pixels. For SSIM and LPIPS these pixels have the colour of the truth.
 
     Args:
-        renderer: Of the field.
-        scene: With the test views.
-        views: So many, evenly spread, or these, by their numbers; None is all.
-        lpips: None for no LPIPS.
-        middle: Of each view, only the middle this many times narrower and lower is rendered and scored.
-        stop: Asked before each view but the first whether it and those behind it shall be left out.
+        renderer: The field's renderer.
+        scene: The scene with the test views.
+        views: The number of views, evenly spread, or a list of their numbers; None for all.
+        lpips: The LPIPS metric, or None.
+        middle: The factor by which width and height are reduced: only the centre of each view is rendered and scored.
+        stop: Called before each view but the first; True skips this view and the rest.
         track: Shows progress.
 
     Examples:
@@ -90,21 +90,21 @@ def evaluate(
         image = render_camera(renderer, scene, camera, 0, heaviest=False)
         target = scene.test.truth(view, scene.background_colour())[rows, columns].to(renderer.device)
         colour = image.colour.clamp(0, 1)
-        kept = scene.test.mask(view)
-        if kept is None:
+        mask = scene.test.mask(view)
+        if mask is None:
             noise = psnr(colour, target)
         else:
-            kept = kept[rows, columns].to(renderer.device)
-            colour = torch.where(kept[..., None], colour, target)
-            noise = psnr(colour[kept][None], target[kept][None])
-        perceived = None if lpips is None else float(lpips(colour, target))
+            mask = mask[rows, columns].to(renderer.device)
+            colour = torch.where(mask[..., None], colour, target)
+            noise = psnr(colour[mask][None], target[mask][None])
+        distance = None if lpips is None else float(lpips(colour, target))
         name = scene.test.names[view]
-        scores.append(ViewScore(name, float(noise), float(ssim(colour, target)), perceived))
+        scores.append(ViewScore(name, float(noise), float(ssim(colour, target)), distance))
     return scores
 
 
 def _middle_of(cameras: Cameras, view: int, factor: int) -> tuple[Cameras, slice, slice]:
-    """The camera of the middle of a view, `factor` times narrower and lower, and the rows and columns of that."""
+    """Returns the camera of the centre of a view, `factor` times narrower and lower, and its rows and columns."""
     (width, height), camera = cameras.size(view), cameras[[view]]
     part = max(width // factor, 1), max(height // factor, 1)
     left, top = (width - part[0]) // 2, (height - part[1]) // 2
@@ -113,10 +113,10 @@ def _middle_of(cameras: Cameras, view: int, factor: int) -> tuple[Cameras, slice
 
 
 def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
-    """Means per image, as the literature's tables have them, and the PSNR of the mean squared error over all views.
+    """Averages the scores over the views, as the literature's tables do.
 
-    The latter, "psnr_of_mean_error", is what the paper's curves show; it is never above the mean of the PSNRs. "lpips"
-    is None unless every view has one.
+    "psnr_of_mean_error" is the PSNR of the mean squared error over all views, as in the paper's curves; it is never
+    above the mean of the PSNRs. "lpips" is None unless every view has one.
 
     Examples:
         >>> from voronerf.app.evaluate import ViewScore, mean_scores
@@ -124,11 +124,11 @@ def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
         >>> means["psnr"], round(means["psnr_of_mean_error"], 2), means["lpips"]
         (25.0, 22.6, None)
     """
-    perceived = [s.lpips for s in scores if s.lpips is not None]
+    distances = [s.lpips for s in scores if s.lpips is not None]
     error = sum(10 ** (-s.psnr / 10) for s in scores) / len(scores)
     return {
         "psnr": sum(s.psnr for s in scores) / len(scores),
         "ssim": sum(s.ssim for s in scores) / len(scores),
-        "lpips": sum(perceived) / len(scores) if len(perceived) == len(scores) else None,
+        "lpips": sum(distances) / len(scores) if len(distances) == len(scores) else None,
         "psnr_of_mean_error": math.inf if error == 0 else -10 * math.log10(error),
     }

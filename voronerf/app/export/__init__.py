@@ -1,4 +1,4 @@
-"""A trained run as files for other programs: points, a mesh, cells, videos."""
+"""Exports a trained run to files for other programs: points, a mesh, cells, videos."""
 
 from voronerf.app.export.cells import cell_meshes, export_cells
 from voronerf.app.export.mesh import export_mesh

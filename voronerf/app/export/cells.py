@@ -1,8 +1,8 @@
-"""The cells of a diagram as coloured polyhedra.
+"""Exports the cells of a diagram as coloured polyhedra.
 
-A cell is where its centre is the nearest one among its siblings, on each level of the diagram. Each of these conditions
-is a half-space, `2 (b - a) . x <= |b|^2 - |a|^2` for a centre a and its sibling b, and
-the box adds six. Their intersection is convex.
+A point is in a cell if, on each level of the diagram, its centre is nearer than all siblings. Each such condition is a
+half-space, `2 (b - a) . x <= |b|^2 - |a|^2` for a centre a and its sibling b. The box adds six half-spaces. Their
+intersection is a convex polyhedron.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from voronerf.app.run import Run
 from voronerf.diagram import VoronoiDiagram
 
 SUFFIXES = (".glb",)
-#: Radius of the smallest cell that is written, as a share of the box.
+#: The least inscribed radius of an exported cell, as a share of the box's longest side.
 THINNEST = 1e-6
 
 
 def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None, to_files: bool = False) -> Any:
-    """Writes the cells of a run, clipped to the scene's box, as .glb with an object for each; returns the scene.
+    """Writes the cells of a run as .glb, clipped to a box, with an object per cell; returns the ``trimesh.Scene``.
 
-    The objects are named `cell_0000` and so on, and have the colours that the cells have in pictures. The file has y
-    up, as glTF asks for; the scene that is returned has z up.
+    The objects are named `cell_0000` and so on, and have the cells' colours in pictures. The file has y up, as glTF
+    requires; the returned scene has z up.
 
     Args:
         run: The run.
         path: File to write, .glb.
-        box: [2, 3]; default the scene's, or that around the sphere of the contraction.
-        to_files: Positions are those of the scene's files, rather than the scene's.
+        box: [2, 3]; default the scene's box, or the box around the sphere of the contraction.
+        to_files: Write coordinates of the scene's files instead of scene coordinates.
 
     Raises:
-        ConfigError: No box.
+        ConfigError: The scene has no box, and none is given.
         ImportError: trimesh or scipy is missing.
-        ValueError: Another suffix.
+        ValueError: The suffix is not .glb.
         OSError: The file cannot be written.
 
     Examples:
@@ -61,11 +61,11 @@ def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None, to_fi
 
 
 def cell_meshes(diagram: VoronoiDiagram, box: Tensor) -> dict[int, Any]:
-    """The leaves of a diagram, clipped to a box, as ``trimesh.Trimesh`` by their numbers; without those outside of it.
+    """Returns the leaves of a diagram that reach into a box, clipped to it, as ``trimesh.Trimesh`` by cell number.
 
     Args:
-        diagram: Of any depth.
-        box: [2, 3].
+        diagram: The diagram, of any depth.
+        box: [2, 3], the lowest and the highest corner.
 
     Raises:
         ImportError: trimesh or scipy is missing.
@@ -106,7 +106,7 @@ def cell_meshes(diagram: VoronoiDiagram, box: Tensor) -> dict[int, Any]:
 
 
 def _half_spaces(diagram: VoronoiDiagram) -> list[NDArray[np.float64]]:
-    """For each leaf the rows (n, d) of unit normals and offsets with n . x + d <= 0 inside of it."""
+    """Returns for each leaf the half-spaces, rows (n, d) of unit normal and offset, with n . x + d <= 0 inside."""
     centres = diagram.centres.double().cpu().numpy()
     offsets, paths = diagram.child_offsets.tolist(), diagram.paths().tolist()
     child = diagram.child.tolist()
@@ -117,19 +117,19 @@ def _half_spaces(diagram: VoronoiDiagram) -> list[NDArray[np.float64]]:
             if number < 0:
                 break
             rows = np.arange(offsets[node], offsets[node + 1])
-            mine, others = rows[number], np.delete(rows, number)
-            normals = 2 * (centres[others] - centres[mine])
-            shift = (centres[mine] ** 2).sum() - (centres[others] ** 2).sum(-1)
+            row, siblings = rows[number], np.delete(rows, number)
+            normals = 2 * (centres[siblings] - centres[row])
+            shift = (centres[row] ** 2).sum() - (centres[siblings] ** 2).sum(-1)
             length = np.linalg.norm(normals, axis=-1)
-            apart = length > 0  # of two centres in one place, one has no points, or both the same
-            planes.append(np.concatenate((normals, shift[:, None]), 1)[apart] / length[apart, None])
-            node = child[mine]
+            distinct = length > 0  # coincident centres have no plane between them
+            planes.append(np.concatenate((normals, shift[:, None]), 1)[distinct] / length[distinct, None])
+            node = child[row]
         leaves.append(np.concatenate(planes))
     return leaves
 
 
 def _middle(planes: NDArray[np.float64], extent: float) -> NDArray[np.float64] | None:
-    """The centre of the largest ball between planes, or None if there is no room for one."""
+    """Returns the centre of the largest ball between planes, or None if it is smaller than `THINNEST`."""
     from scipy.optimize import linprog
 
     rows = np.concatenate((planes[:, :3], np.ones((len(planes), 1))), 1)

@@ -1,7 +1,7 @@
-"""The conventions of glTF 2.0, for what trimesh writes of geometry with z up and colours as in pictures.
+"""Converts the glTF output of trimesh to the conventions of glTF 2.0.
 
-glTF has +Y up (section 3.4), linear colours (3.9.2) and a metallic material where a mesh names none (5.19). trimesh
-writes positions and colours as they are.
+glTF has +Y up (section 3.4), linear colours (3.9.2), and a metallic default material (5.19). voronerf's geometry has z
+up and sRGB colours, and trimesh writes both unchanged.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SRGB = np.arange(256) / 255
-#: The linear value of each byte of a picture, in sRGB (IEC 61966-2-1).
+#: The linear value of each sRGB byte (IEC 61966-2-1).
 LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)
-#: The material of meshes with vertex colours: matt, and seen from behind too, where a surface is open.
+#: The material of meshes with vertex colours: matt, and double-sided for open surfaces.
 MATT = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": True}
 #: glTF's name for uint16.
 UNSIGNED_SHORT = 5123
@@ -23,12 +23,12 @@ UNSIGNED_SHORT = 5123
 def follow_conventions(buffers: dict[Any, bytes], tree: dict[str, Any]) -> None:
     """Turns +Z into +Y, makes colours linear, and gives meshes with vertex colours a material.
 
-    It is a ``buffer_postprocessor`` of ``trimesh.exchange.gltf.export_glb``. Vertex colours become 16 bits, since in 8
-    a quarter of the bytes of a picture, the dark ones, would fall together.
+    A ``buffer_postprocessor`` of ``trimesh.exchange.gltf.export_glb``. Vertex colours become 16 bits: with 8 linear
+    bits, a quarter of the sRGB bytes, the dark ones, would become equal to others.
 
     Args:
-        buffers: The bytes of each buffer view.
-        tree: The JSON, whose accessors are a dictionary of their order.
+        buffers: The bytes of each buffer view; changed in place.
+        tree: The JSON, whose accessors are an ordered dictionary; changed in place.
     """
     accessors, keys = [*tree["accessors"].values()], [*buffers]
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]

@@ -1,10 +1,11 @@
-"""The surface of a trained run as a coloured mesh.
+"""Exports the surface of a trained run as a coloured mesh.
 
-The pictures of training views say how far away the surface is that each pixel shows. These distances are fused into one
-function, the signed distance from the surface along the rays, truncated, and averaged over the views (Curless and Levoy
-1996), then smoothed a little. It is zero on the surface or, of an object on a plain background, a little behind it.
-What one view takes for a surface and others look through is averaged away. A node of the grid has a value where a view
-sees it or where it lies shortly behind a surface; only blocks of nodes near what some pixel shows are filled.
+The training views are rendered, which gives each pixel the distance of its surface. These distances are fused into a
+truncated signed distance function: the distance from the surface along the rays, averaged over the views (Curless and
+Levoy 1996), then smoothed a little. The mesh is its zero level; for an object on a plain background, the level is
+shifted by `BEFORE`. The average removes surfaces that one view shows and other views look through. A node of the grid
+has a value if a view sees it, or if it lies shortly behind a surface. Only blocks of nodes near a shown surface are
+filled.
 """
 
 from __future__ import annotations
@@ -34,33 +35,33 @@ from voronerf.nerf.cameras import Cameras, shared_focus
 from voronerf.ops._core.checks import available_memory
 
 SUFFIXES = (".ply", ".glb", ".obj")
-#: Cubes along the longest side of the box, if memory allows, and triangles.
+#: Default numbers of cubes along the longest side of the box, if memory allows, and of triangles.
 RESOLUTION, FACES = 256, 100_000
-#: Pixels along the longer side of the pictures, at the most.
+#: Greatest number of pixels along the longer side of the rendered views.
 LONGEST = 512
-#: Cubes before and behind a surface in which its distance is averaged. Fewer leave holes where views disagree, more let
-#: the two sides of a thin thing meet.
+#: The truncation distance in cubes, before and behind a surface. Fewer cubes leave holes where views disagree; more
+#: let the two sides of a thin object meet.
 REACH = 8
-#: Distances are smoothed by a Gaussian of so many cubes, since a learnt surface is rough. Before, they are cut off at
-#: this share of a reach: farther ones are too long where views see a surface from the side, and only before it, which
-#: would move it inwards.
+#: Standard deviation in cubes of the Gaussian that smooths the distances, since a learnt surface is rough; and the
+#: share of `REACH` to which distances are clamped first. Unclamped, the distances before a surface that views see from
+#: the side are too long, which would move it inwards.
 SMOOTH, CUT = 1.0, 0.3
-#: The surface of an object on a plain background lies so far before the distances along rays, as a share of the longest
-#: side of the scene's box: views look a little into its field, and smoothing makes it smaller. Chosen on the built-in
-#: scene and Lego (docs/export.md); photographs without a box would lose by it.
+#: The distance by which the surface of an object on a plain background is moved towards the cameras, as a share of the
+#: longest side of the scene's box: views look a little into its field, and smoothing makes it smaller. The value was
+#: chosen on the built-in scene and Lego (docs/export.md). Scenes without a box get worse by it.
 BEFORE = 0.003
-#: Nodes along the side of a block, and blocks that are filled at a time.
+#: Nodes along the side of a block, and number of blocks that are filled at once.
 BLOCK, BLOCKS = 8, 256
-#: Bytes of memory that a node takes at the most, in marching cubes.
+#: Greatest number of bytes that a node takes in marching cubes.
 NODE = 16
-#: What cameras look at lies in this share of their pictures. The share of its points that may be outliers, at either
-#: end of the box; how much longer the box is than what lies between; and how many points tell it.
+#: Constants of :func:`looked_at`: the least share of the pictures that show a point of the box; the share of outliers
+#: at either end of an axis; the factor by which the box is enlarged; and the greatest number of points.
 SHARED, OUTLIERS, LONGER, POINTS = 0.5, 0.02, 1.2, 100_000
-#: The least side of that box, as a share of its longest: a wall is flat.
+#: The least side of that box as a share of its longest side, since the box of a wall would be flat.
 FLAT = 0.1
-#: Triangles of the smallest part that is kept, as a share of the largest part's.
+#: Triangles of the smallest connected component that is kept, as a share of the largest component.
 SMALLEST = 0.02
-#: Colours count by this power of the cosine between a view's direction and the normal.
+#: Exponent of the cosine between a view's direction and the normal, in the weights of colours.
 FRONTAL = 4
 
 
@@ -78,24 +79,23 @@ def export_mesh(
     """Writes the surface of a run as .ply, .glb or .obj, and returns it as a ``trimesh.Trimesh``.
 
     Each vertex has the colour that the training views show there. .ply and .obj have z up and sRGB colours, .glb has y
-    up and linear colours, as glTF asks for; the mesh that is returned has z up and sRGB colours. The mesh of a scene
-    with a box is closed: what is behind a surface in every view counts as solid. That of an unbounded scene ends where
-    the box ends, and where no camera looks; what the box leaves out is said. Parts with few triangles beside the
-    largest are left out.
+    up and linear colours, as glTF requires; the returned mesh has z up and sRGB colours. The mesh of a scene with a box
+    is closed: space that is behind a surface in every view counts as solid. The mesh of an unbounded scene is open at
+    the sides of the box and where no camera looks. Components with few triangles are left out.
 
     Args:
         run: The run.
         path: File to write, .ply, .glb or .obj.
-        resolution: Cubes along the longest side of the box; default 256, or what fits into memory.
-        faces: Triangles at the most.
-        box: [2, 3], what is exported; default the scene's, or that of what the cameras look at: :func:`looked_at`.
-        to_files: Positions are those of the scene's files, rather than the scene's.
-        track: Shows progress: yields the items of a sequence, and is given its name.
-        say: Takes a line about what a box leaves out.
+        resolution: Cubes along the longest side of the box; default 256, or fewer if memory is short.
+        faces: Greatest number of triangles.
+        box: [2, 3], the exported region; default the scene's box, or the box of :func:`looked_at`.
+        to_files: Write coordinates of the scene's files instead of scene coordinates.
+        track: Shows progress: takes a sequence and the task's name, and yields the items.
+        say: Called with a line about the share of surfaces outside of the box.
 
     Raises:
-        ConfigError: A resolution that does not fit into memory, fewer than 4 faces, or views that show no surface
-            in the box.
+        ConfigError: The resolution does not fit into memory, `faces` is below 4, or the views show no surface in the
+            box.
         ImportError: trimesh, scikit-image, scipy or fast-simplification is missing.
         ValueError: Another suffix.
         OSError: The file cannot be written.
@@ -114,8 +114,10 @@ def export_mesh(
 
 
 def looked_at(views: list[SurfaceView]) -> Tensor | None:
-    """The box [2, 3] of what cameras look at: of the points that views show, those that lie in the pictures of half of
-    the views, and nearer to what these look at than half of the cameras. None where there are none.
+    """Returns the box [2, 3] of the region that the cameras look at, or None if there is none.
+
+    The box is around the surface points that half of the views have in their pictures and that are nearer to the
+    cameras' focus than half of the cameras.
     """
     cameras = Cameras.joined([view.camera for view in views])
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])
@@ -137,7 +139,7 @@ def looked_at(views: list[SurfaceView]) -> Tensor | None:
 
 
 def _left_out(views: list[SurfaceView], box: Tensor) -> str:
-    """A line about the surfaces that lie outside of a box."""
+    """Returns a line about the share of surfaces outside of a box."""
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])
     points = points[points.isfinite().all(-1)]
     inside = ((points >= box[0]) & (points <= box[1])).all(-1)
@@ -163,9 +165,9 @@ def _surface(
         _resolution(box[1] - box[0], resolution)
     views = views_of(run, cameras, track)
     box = looked_at(views) if box is None else box
-    empty = ConfigError(f"{run.path}: the training views show no surface in the box")
+    no_surface = ConfigError(f"{run.path}: the training views show no surface in the box")
     if box is None:
-        raise empty
+        raise no_surface
     if not closed:
         say(_left_out(views, box))
     low, high = box
@@ -175,23 +177,23 @@ def _surface(
     value, seen = _fused(low, side, blocks, views, closed, track)
     shape = tuple(slice(count) for count in ((extent / side).round().long().clamp_min(1) + 1).tolist())
     bounds = run.scene.box
-    before = 0.0 if bounds is None else BEFORE * float((bounds[1] - bounds[0]).max()) / (REACH * side)
-    distance = gaussian_filter((value[shape] - before).clamp(-CUT, CUT).numpy(), SMOOTH)
+    shift = 0.0 if bounds is None else BEFORE * float((bounds[1] - bounds[0]).max()) / (REACH * side)
+    distance = gaussian_filter((value[shape] - shift).clamp(-CUT, CUT).numpy(), SMOOTH)
     if closed:
         distance = np.pad(distance, 1, constant_values=1)
     if not distance.min() < 0 < distance.max():
-        raise empty
+        raise no_surface
     vertices, triangles, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
     if closed:
         vertices -= 1
-    else:  # cubes with eight nodes that were seen
-        whole = minimum_filter(seen[shape].numpy(), size=2, origin=-1)
-        triangles = triangles[whole[tuple(vertices[triangles].mean(1).astype(np.int64).T)]]
+    else:  # keeps the triangles of cubes whose eight nodes were seen
+        complete = minimum_filter(seen[shape].numpy(), size=2, origin=-1)
+        triangles = triangles[complete[tuple(vertices[triangles].mean(1).astype(np.int64).T)]]
     if len(triangles) == 0:
-        raise empty
+        raise no_surface
     mesh: Any = trimesh.Trimesh(low.numpy() + side * vertices, triangles, process=False)
     mesh = _without_loose(mesh)
-    if len(mesh.faces) > faces:  # which parts where the surface is thin
+    if len(mesh.faces) > faces:  # simplification splits thin surfaces
         mesh = _without_loose(mesh.simplify_quadric_decimation(face_count=faces))
     points = torch.from_numpy(np.array(mesh.vertices, dtype=np.float32))
     normals = torch.from_numpy(np.array(mesh.vertex_normals, dtype=np.float32))
@@ -201,7 +203,7 @@ def _surface(
 
 
 def _without_loose(mesh: Any) -> Any:
-    """A mesh without parts of few triangles."""
+    """Removes the connected components with few triangles from a mesh; returns the mesh."""
     from trimesh.graph import connected_component_labels
 
     part = connected_component_labels(mesh.face_adjacency, len(mesh.faces))
@@ -211,35 +213,35 @@ def _without_loose(mesh: Any) -> Any:
     return mesh
 
 
-def _resolution(extent: Tensor, wanted: int | None) -> int:
+def _resolution(extent: Tensor, resolution: int | None) -> int:
     share = float((extent / extent.max()).prod())
-    most = int((available_memory() / 2 / NODE / share) ** (1 / 3))
-    if wanted is None:
-        return max(min(RESOLUTION, most), 8)
-    if not 8 <= wanted <= most:
-        raise ConfigError(f"--resolution must be 8 to {most}, for which there is memory, got {wanted}")
-    return wanted
+    greatest = int((available_memory() / 2 / NODE / share) ** (1 / 3))
+    if resolution is None:
+        return max(min(RESOLUTION, greatest), 8)
+    if not 8 <= resolution <= greatest:
+        raise ConfigError(f"--resolution must be 8 to {greatest}, for which there is memory, got {resolution}")
+    return resolution
 
 
 def _fused(
     low: Tensor, side: float, blocks: Tensor, views: list[SurfaceView], closed: bool, track: Track
 ) -> tuple[Tensor, Tensor]:
-    """The truncated distances of blocks of nodes, positive before a surface, and which of the nodes were seen."""
+    """Returns the truncated distances of the nodes, positive before a surface, and a mask of the seen nodes."""
     counts: list[int] = blocks.tolist()
     value, seen = torch.ones(counts), torch.zeros([BLOCK * count for count in counts], dtype=torch.bool)
     near = torch.zeros(counts, dtype=torch.bool)
     reach = REACH * side
-    if closed:  # far from a surface too, what is behind one counts as solid; what is between needs all nodes
-        middles = low + side * (BLOCK * near.logical_not().nonzero() + (BLOCK - 1) / 2)
-        value = _distance(middles, views, reach)[0].view(counts)
+    if closed:  # blocks far from a surface are solid or empty; blocks where these meet are filled
+        centres = low + side * (BLOCK * near.logical_not().nonzero() + (BLOCK - 1) / 2)
+        value = _distance(centres, views, reach)[0].view(counts)
         greatest, least = (sign * max_pool3d(sign * value[None], 3, 1, 1)[0] for sign in (1, -1))
         near |= greatest != least
-    shown = torch.zeros(counts)
+    has_surface = torch.zeros(counts)
     for view in views:
         points = view.surface[((view.surface > low) & (view.surface < low + BLOCK * side * blocks)).all(-1)]
         place = ((points - low) / (BLOCK * side)).long()
-        shown[torch.minimum(place, blocks - 1).unbind(-1)] = 1
-    near |= max_pool3d(shown[None], 3, 1, 1)[0] > 0  # a block is a reach wide
+        has_surface[torch.minimum(place, blocks - 1).unbind(-1)] = 1
+    near |= max_pool3d(has_surface[None], 3, 1, 1)[0] > 0  # blocks are `REACH` cubes wide, so neighbours suffice
     for axis in range(3):
         value = value.repeat_interleave(BLOCK, axis)
     inside = torch.cartesian_prod(*[torch.arange(BLOCK)] * 3)
@@ -250,23 +252,23 @@ def _fused(
 
 
 def _distance(points: Tensor, views: list[SurfaceView], reach: float) -> tuple[Tensor, Tensor]:
-    """Mean distances [n] of points [n, 3] from the surfaces behind them, in reaches and at most 1; and which were seen.
+    """Returns the mean distances [n] from points [n, 3] to the surfaces behind them, and a mask [n] of seen points.
 
-    Without a view that sees a point, or a surface shortly before it, it is -1 behind a surface and 1 outside of all
-    pictures.
+    Distances are in units of `reach`, at most 1. A point is seen if it lies before a surface of a view or shortly
+    behind it. The distance of an unseen point is -1 behind a surface, and 1 outside of all pictures.
     """
     total, count, inside = (torch.zeros(len(points)) for _ in range(3))
     for view in views:
         _, gap = _gap(points, view)
-        known = gap > -reach
-        total += torch.where(known, (gap / reach).clamp_max(1), 0)
-        count += known
+        sees = gap > -reach
+        total += torch.where(sees, (gap / reach).clamp_max(1), 0)
+        count += sees
         inside += gap == gap
     return torch.where(count > 0, total / count.clamp_min(1), torch.where(inside > 0, -1.0, 1.0)), count > 0
 
 
 def _in_picture(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
-    """Where a view has points [n, 3] in its picture, [n, 2], and which of them lie in it, bool [n]."""
+    """Projects points [n, 3] into the picture of a view: pixels [n, 2], and a mask [n] of the points inside."""
     height, width = view.colour.shape[:2]
     pixels, depth = view.camera.project(points, 0)
     limit = pixels.new_tensor((width, height))
@@ -274,7 +276,7 @@ def _in_picture(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
 
 
 def _gap(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
-    """Where a view has points in its picture [n, 2], and how far behind them the surface is [n]; NaN outside of it."""
+    """Returns the pixels [n, 2] of points, and the distances [n] by which the surface is behind them; NaN outside."""
     width = view.colour.shape[1]
     pixels, inside = _in_picture(points, view)
     x, y = torch.where(inside[:, None], pixels, 0).long().unbind(-1)
@@ -283,15 +285,15 @@ def _gap(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
 
 
 def _colours(points: Tensor, normals: Tensor, views: list[SurfaceView], margin: float) -> Tensor:
-    """The colours [n, 3] that views show of points: means, in which what is near and frontal counts most."""
+    """Returns the colours [n, 3] of points: means over the views, weighted by nearness and frontal direction."""
     from scipy.spatial import cKDTree
 
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
     for view in views:
         pixels, gap = _gap(points, view)
-        away = view.camera.origins[0] - points
-        distance = away.norm(dim=-1)
-        cosine = (away * normals).sum(-1) / distance
+        towards = view.camera.origins[0] - points
+        distance = towards.norm(dim=-1)
+        cosine = (towards * normals).sum(-1) / distance
         seen = ((gap.abs() < margin) & (cosine > 0)).nonzero()[:, 0]
         height, width = view.colour.shape[:2]
         places = (2 * pixels[seen] / pixels.new_tensor((width, height)) - 1)[None, None]
@@ -299,9 +301,9 @@ def _colours(points: Tensor, normals: Tensor, views: list[SurfaceView], margin: 
         share = cosine[seen] ** FRONTAL * (view.camera.intrinsics[0, 0] / distance[seen]).square()
         total[seen] += share[:, None] * colour[0, :, 0].T
         weight[seen] += share
-    known = weight > 0
-    if known.any():  # what no view sees has the colour of the nearest vertex that one does
-        total[known] /= weight[known, None]
-        nearest = cKDTree(points[known].numpy()).query(points[~known].numpy())[1]
-        total[~known] = total[known][torch.from_numpy(nearest)]
+    coloured = weight > 0
+    if coloured.any():  # unseen vertices get the colour of the nearest seen one
+        total[coloured] /= weight[coloured, None]
+        nearest = cKDTree(points[coloured].numpy()).query(points[~coloured].numpy())[1]
+        total[~coloured] = total[coloured][torch.from_numpy(nearest)]
     return total

@@ -1,4 +1,4 @@
-"""The surface of a trained run as coloured points with normals."""
+"""Exports the surface of a trained run as coloured points with normals."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
 
 SUFFIXES = (".ply",)
-#: Points that a normal is computed from.
+#: Number of points from which a normal is computed.
 NEIGHBOURS = 16
 
 
 def export_points(
     run: Run, path: Path | str, *, count: int = 200_000, box: Tensor | None = None, to_files: bool = False
 ) -> Any:
-    """Writes what the pixels of training views show as .ply, and returns it as a ``trimesh.Trimesh`` without faces.
+    """Writes the surface points of the training views as .ply; returns them as a ``trimesh.Trimesh`` without faces.
 
-    Each point has the colour of its pixel, and a normal towards its camera: the direction in which it and its nearest
-    neighbours spread the least.
+    Each point has the colour of its pixel, and a normal towards its camera: the direction of least spread of its
+    nearest neighbours.
 
     Args:
         run: The run.
         path: File to write, .ply.
-        count: Points at the most, drawn at random where the views have more.
-        box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
-        to_files: Positions are those of the scene's files, rather than the scene's.
+        count: Greatest number of points; a random subset if the views have more.
+        box: [2, 3], the exported region; default the scene's box, or the box around the sphere of the contraction.
+        to_files: Write coordinates of the scene's files instead of scene coordinates.
 
     Raises:
-        ConfigError: A count below 1, no box, or views that show nothing in it.
+        ConfigError: `count` is below 1, there is no box, or the views show nothing in it.
         ImportError: trimesh or scipy is missing.
-        ValueError: Another suffix.
+        ValueError: The suffix is not .ply.
         OSError: The file cannot be written.
 
     Examples:
@@ -57,16 +57,16 @@ def _surface(run: Run, count: int, box: Tensor | None) -> Any:
     if count < 1:
         raise ConfigError(f"--count must be at least 1, got {count}")
     cameras = run.scene.train.cameras
-    # Many pixels show the background; of an object often seven in eight.
+    # Seven in eight pixels may show the background of an object, hence the factor 8.
     side = int((8 * count / min(VIEWS, len(cameras)) * max(cameras.width / cameras.height, 1)) ** 0.5) + 1
     cameras = cameras.downscaled(max(max(cameras.width, cameras.height) // side, 1))
     low, high = box_of(run, box)
     points, colours, towards = [], [], []
     for view in views_of(run, cameras):
-        shown = ((view.surface >= low) & (view.surface <= high)).all(-1)
-        points.append(view.surface[shown])
-        colours.append(view.colour[shown])
-        towards.append(view.camera.origins.cpu() - view.surface[shown])
+        mask = ((view.surface >= low) & (view.surface <= high)).all(-1)
+        points.append(view.surface[mask])
+        colours.append(view.colour[mask])
+        towards.append(view.camera.origins.cpu() - view.surface[mask])
     positions = torch.cat(points)
     if len(positions) == 0:
         raise ConfigError(f"{run.path}: the training views show no surface in the box")

@@ -1,4 +1,4 @@
-"""Shared by exports: their files, and the surface that training views show.
+"""Shared functions of the exports: files, boxes, and the surfaces that training views show.
 
 n points, h x w pixels. Positions are in scene units.
 """
@@ -29,16 +29,16 @@ PACKAGES = {
     "scipy": "scipy",
     "fast_simplification": "fast-simplification",
 }
-#: Views that are rendered to find out what cameras see.
+#: Number of views that are rendered to find surfaces.
 VIEWS = 64
-#: Opacity from which a pixel shows a surface.
+#: Opacity above which a pixel shows a surface.
 SOLID = 0.5
-#: Distance from the origin beyond which a pixel of a contracted scene shows none.
+#: Distance from the origin beyond which a pixel of a contracted scene shows no surface.
 FARTHEST = 1e6
 
 
 def check_export(path: Path, suffixes: tuple[str, ...]) -> None:
-    """Makes the folder of a file."""
+    """Checks the suffix of a file and the packages of the extra `export`; makes the file's folder."""
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: the file must end in {' or '.join(suffixes)}")
     for module, package in PACKAGES.items():
@@ -50,9 +50,9 @@ def check_export(path: Path, suffixes: tuple[str, ...]) -> None:
 
 
 def write_geometry(path: Path, geometry: Any, **options: Any) -> None:
-    """Writes a mesh, points or a scene of trimesh in the format of the suffix, whole or not at all.
+    """Writes a mesh, points or a scene of trimesh in the format of the suffix, atomically.
 
-    Geometry has z up and colours as in pictures, which .ply and .obj keep; .glb has y up and linear colours.
+    The geometry has z up and sRGB colours, which .ply and .obj keep; .glb gets y up and linear colours.
     """
     kind = path.suffix[1:].lower()
     if kind == "glb":
@@ -62,14 +62,14 @@ def write_geometry(path: Path, geometry: Any, **options: Any) -> None:
 
 
 def placed(run: Run, geometry: Any, to_files: bool) -> Any:
-    """A mesh or points of trimesh, in the coordinates of the scene's files if ``to_files``."""
+    """Returns a mesh or points of trimesh, moved into the coordinates of the scene's files if ``to_files``."""
     if to_files and run.scene.transform is not None:
         geometry.apply_transform(torch.linalg.inv(run.scene.transform).numpy())
     return geometry
 
 
 def box_of(run: Run, box: Tensor | None = None) -> Tensor:
-    """The box [2, 3] that is exported: the one given, the scene's, or one around the sphere of a contraction."""
+    """Returns the box [2, 3] to export: the argument, the scene's box, or one around the sphere of a contraction."""
     if box is not None:
         run = run.cropped(box)
     if run.scene.box is not None:
@@ -84,37 +84,41 @@ def box_of(run: Run, box: Tensor | None = None) -> Tensor:
 class SurfaceView:
     """A rendered view and the surface in it."""
 
-    camera: Cameras  # the camera alone
+    camera: Cameras  # one camera
     colour: Tensor  # [h, w, 3]
-    surface: Tensor  # [h, w, 3], the point that each pixel shows; NaN where it shows none
+    surface: Tensor  # [h, w, 3], the surface point of each pixel; NaN for a pixel without one
 
     @cached_property
     def distance(self) -> Tensor:
-        """How far away these points are, [h, w]; infinite where there is none."""
+        """The distances [h, w] of the surface points from the camera; infinite for pixels without one."""
         return (self.surface - self.camera.origins[0]).norm(dim=-1).nan_to_num(torch.inf)
 
 
 def views_of(run: Run, cameras: Cameras, track: Track = in_silence) -> list[SurfaceView]:
-    """Renders cameras, or `VIEWS` of them, evenly spread."""
+    """Renders at most `VIEWS` of the cameras, evenly spread."""
     views, contraction = [], run.renderer.contraction
     numbers = torch.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().long().tolist()
     for number in track(numbers, "views"):
         image = run.render(cameras, number)
         surface = image.heaviest.cpu() if contraction is None else contraction.inverse(image.heaviest.cpu())
-        shown = (image.opacity.cpu() > SOLID) & (surface.abs().amax(-1) < FARTHEST)
-        if (there := cameras.has_ray(number)) is not None:
-            shown &= there
+        mask = (image.opacity.cpu() > SOLID) & (surface.abs().amax(-1) < FARTHEST)
+        if (has_ray := cameras.has_ray(number)) is not None:
+            mask &= has_ray
         views.append(
-            SurfaceView(cameras[[number]], image.colour.cpu(), torch.where(shown[..., None], surface, torch.nan))
+            SurfaceView(cameras[[number]], image.colour.cpu(), torch.where(mask[..., None], surface, torch.nan))
         )
     return views
 
 
 def spread_around(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """How the nearest points [n, 3] of each lie: axes [n, 3, 3], least spread first, and distances [n, count]."""
+    """Finds the principal axes of each point's nearest neighbours.
+
+    Returns:
+        [n, 3, 3], the axes in columns, least spread first; and [n, count], the distances of the neighbours.
+    """
     from scipy.spatial import cKDTree
 
-    apart, near = cKDTree(points.numpy()).query(points.numpy(), k=min(count, len(points)))
-    around = points[torch.from_numpy(near).view(len(points), -1)]
-    offsets = around - around.mean(1, keepdim=True)
-    return torch.linalg.eigh(offsets.mT @ offsets)[1], torch.from_numpy(apart).float().view(len(points), -1)
+    distances, numbers = cKDTree(points.numpy()).query(points.numpy(), k=min(count, len(points)))
+    neighbours = points[torch.from_numpy(numbers).view(len(points), -1)]
+    offsets = neighbours - neighbours.mean(1, keepdim=True)
+    return torch.linalg.eigh(offsets.mT @ offsets)[1], torch.from_numpy(distances).float().view(len(points), -1)

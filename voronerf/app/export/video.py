@@ -1,4 +1,4 @@
-"""A trained run as a video, or as its frames."""
+"""Exports a trained run as a video, or as images of its frames."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from voronerf.app.run import Run
 from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras, turntable_cameras
 
-#: Frames of a video that nobody says the number of.
+#: Default number of frames of a video.
 FRAMES = 60
-#: Frames that tell the range of depths of a video.
+#: Number of frames from which the range of depths of a video is found.
 RANGE_FRAMES = 4
 
 
@@ -38,17 +38,17 @@ def export_video(
     Args:
         run: The run.
         path: File to write, .mp4; for images a folder, new or empty.
-        cameras: The frames; None for 60 of :func:`video_cameras`.
+        cameras: A camera per frame; None for 60 frames of :func:`video_cameras`.
         fps: Frames a second.
         images: Write a PNG of each frame, 00000.png and so on.
-        depth: Show how far away things are, from near (yellow) to far (dark blue), rather than their colours.
-        box: [2, 3], what is shown; None for everything.
-        track: Shows progress: yields the items of a sequence, and is given its name.
+        depth: Show depth, from near (yellow) to far (dark blue), instead of colours.
+        box: [2, 3], the rendered region; None for everything.
+        track: Shows progress: takes a sequence and the task's name, and yields the items.
 
     Raises:
-        ConfigError: An empty box.
+        ConfigError: The box is empty.
         ImportError: imageio-ffmpeg is missing.
-        ValueError: Another suffix, or a folder that is not empty.
+        ValueError: The suffix is not .mp4, or the folder is not empty.
         OSError: A file cannot be written.
 
     Examples:
@@ -61,10 +61,10 @@ def export_video(
     path = Path(path)
     if images:
         check_folder(path)
-    shown = run if box is None else run.cropped(box)
+    cropped = run if box is None else run.cropped(box)
     cameras = video_cameras(run.scene, FRAMES) if cameras is None else cameras
     numbers = track(range(len(cameras)), "rendering")
-    pictures = _depths(shown, cameras, numbers) if depth else _colours(shown, cameras, numbers)
+    pictures = _depths(cropped, cameras, numbers) if depth else _colours(cropped, cameras, numbers)
     if not images:
         write_video(path, pictures, fps)
         return
@@ -73,20 +73,20 @@ def export_video(
 
 
 def video_cameras(scene: Scene, count: int) -> Cameras:
-    """The cameras of a video: a turntable of an object, else a path that stays where the training cameras were.
+    """Returns the cameras of a video: a turntable of an object, else a path near the training cameras.
 
     Args:
-        scene: Whose training cameras they are like.
-        count: Frames.
+        scene: The scene, whose training cameras give size and focal length.
+        count: Number of frames.
     """
-    seen = scene.train.cameras
+    cameras = scene.train.cameras
     if scene.kind == "object":
-        return turntable_cameras(seen, count)
-    return capture_path(seen, count, near=scene.near, far=scene.far)
+        return turntable_cameras(cameras, count)
+    return capture_path(cameras, count, near=scene.near, far=scene.far)
 
 
 def check_folder(folder: Path) -> None:
-    """Raises ValueError for what is no folder that images can be written into, which is new or empty."""
+    """Raises ValueError unless the folder for images is new or empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder}: must be a new or empty folder for the images")
 
@@ -97,14 +97,14 @@ def _colours(run: Run, cameras: Cameras, numbers: Iterable[int]) -> Iterator[Ten
 
 
 def _depths(run: Run, cameras: Cameras, numbers: Iterable[int]) -> Iterator[Tensor]:
-    """Pictures of depth, or of disparity where rays are sampled by it, on one scale for all frames."""
+    """Yields pictures of depth, or of disparity if rays are sampled by it, on one scale for all frames."""
 
     def measured(number: int) -> tuple[Tensor, Tensor]:
         image = run.render(cameras, number, heaviest=False)
         far = run.scene.spacing == "disparity"
         return -1 / image.depth.clamp_min(1e-6) if far else image.depth, image.opacity
 
-    some = torch.linspace(0, len(cameras) - 1, min(RANGE_FRAMES, len(cameras))).round().long().tolist()
-    solid = torch.cat([value[opacity > SOLID] for value, opacity in map(measured, some)])
+    numbers_of_range = torch.linspace(0, len(cameras) - 1, min(RANGE_FRAMES, len(cameras))).round().long().tolist()
+    solid = torch.cat([value[opacity > SOLID] for value, opacity in map(measured, numbers_of_range)])
     for number in numbers:
         yield picture_of_depth(*measured(number), among=solid)

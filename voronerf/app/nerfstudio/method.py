@@ -1,4 +1,4 @@
-"""The method that nerfstudio finds by the entry point ``nerfstudio.method_configs``."""
+"""The registration of the method, for nerfstudio's entry point ``nerfstudio.method_configs``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from voronerf.app.nerfstudio.optimizers import AdamConfig, DecaySchedulerConfig
 
 @dataclasses.dataclass
 class VoronerfDataManagerConfig(VanillaDataManagerConfig):
-    """nerfstudio's data manager; the model learns the cameras from it."""
+    """Settings of the data manager, which passes the cameras to the model."""
 
     _target: type = dataclasses.field(default_factory=lambda: VoronerfDataManager)
     train_num_rays_per_batch: int = 4096
@@ -27,10 +27,10 @@ class VoronerfDataManagerConfig(VanillaDataManagerConfig):
 
 
 class VoronerfDataManager(VanillaDataManager[InputDataset]):
-    """Adds the training cameras and the colour behind transparent pixels to what a model is told of the data."""
+    """Adds the training cameras and the background colour to the metadata for the model."""
 
     def create_train_dataset(self) -> InputDataset:
-        """The training images; their metadata go to the model."""
+        """Returns the training images, with cameras and background in the metadata."""
         dataset = super().create_train_dataset()
         alpha_color = self.train_dataparser_outputs.alpha_color
         dataset.metadata.update(cameras=dataset.cameras, background=alpha_color)
@@ -39,10 +39,10 @@ class VoronerfDataManager(VanillaDataManager[InputDataset]):
 
 @dataclasses.dataclass
 class VoronerfTrainerConfig(TrainerConfig):
-    """nerfstudio's trainer; schedulers without a length take that of the run."""
+    """Settings of nerfstudio's trainer; schedulers without ``max_steps`` take the number of iterations."""
 
     def setup(self, **options: Any) -> Any:
-        """The trainer."""
+        """Returns the trainer."""
         for group in self.optimizers.values():
             if group["scheduler"] is not None and group["scheduler"].max_steps is None:
                 group["scheduler"].max_steps = self.max_num_iterations

@@ -37,24 +37,24 @@ class VoronerfModelConfig(ModelConfig):
     field_options: tuple[str, ...] = ()
     """Further options of the field, each as NAME=VALUE, such as log2_entries=19."""
     width: int | None = None
-    """Channels of the networks' hidden layers; default that of the field."""
+    """Channels of the networks' hidden layers; default: the field's default."""
     cells: tuple[int, ...] = (16,)
     """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again."""
     split_at: tuple[float, ...] | None = None
     """When to split, as fractions of max_num_iterations, one per level; default: 0.2, or evenly spaced from 0.15 to
     0.5."""
     sampling: str = "stratified"
-    """Samples along a ray: stratified in one pass, or hierarchical, with a second where the first found something."""
+    """Samples along a ray: stratified in one pass, or hierarchical, with a second pass at the weights of the first."""
     samples: tuple[int, ...] | None = None
-    """Samples per ray of each pass; default: by the cameras where empty space is skipped, else 64, or 32 and 32."""
+    """Samples per ray of each pass; default: by the cameras if empty space is skipped, else 64, or 32 and 32."""
     contraction: Literal["auto", "none", "sphere"] = "auto"
-    """Only the scene box (none), or all of space, with what is outside of a sphere mapped into a shell (sphere); auto
-    is the box if all cameras stand outside of it."""
+    """The rendered space: only the scene box (none), or all of space, contracted outside of a sphere into a shell
+    (sphere); auto is the box if all cameras stand outside of it."""
     occupancy: bool = True
-    """Skip empty space, where samples are stratified."""
+    """Skip empty space, with stratified samples."""
 
     def train_config(self, *, contracted: bool) -> TrainConfig:
-        """The settings that ``voronerf train`` would have."""
+        """Returns the corresponding settings of ``voronerf train``."""
         return TrainConfig(
             seed=torch.initial_seed() % 2**31,
             field=self.field,
@@ -70,7 +70,7 @@ class VoronerfModelConfig(ModelConfig):
 
 
 class VoronerfModel(Model):
-    """Renders nerfstudio's rays by a network for each Voronoi cell, and splits the cells on the way.
+    """The model: renders nerfstudio's rays by a network per Voronoi cell, and splits the cells during training.
 
     The metadata of the training images must hold their ``cameras``, and may hold a ``background`` [3] in 0..1.
     """
@@ -78,7 +78,7 @@ class VoronerfModel(Model):
     config: VoronerfModelConfig
 
     def populate_modules(self) -> None:
-        """Makes the networks of one cell, from the cameras and the scene box."""
+        """Builds networks with one cell, grid, renderer and splits from the cameras and the scene box."""
         super().populate_modules()
         metadata, device = self.kwargs["metadata"], self.kwargs["device"]
         cameras, box = metadata["cameras"], self.scene_box.aabb
@@ -90,7 +90,7 @@ class VoronerfModel(Model):
         background = metadata.get("background")
         self.background = None if background is None else background.to(device)
         self.routers = make_routers(self.settings, device)
-        self.networks = nn.ModuleDict(self.routers)  # whose parameters torch finds
+        self.networks = nn.ModuleDict(self.routers)  # registers the parameters
         grid = make_grid(self.settings, self.scene, device) if self.settings.occupancy else None
         self.renderer = make_renderer(self.settings, self.scene, self.routers, grid=grid)
         self.ray_loss = RayLoss(self.renderer)
@@ -102,31 +102,31 @@ class VoronerfModel(Model):
 
     @property
     def num_cells(self) -> int:
-        """Cells of the diagram."""
+        """The number of cells of the diagram."""
         return self.routers["field"].num_cells
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """The networks, "fields", and the tables of hash grids, "tables", if there are any."""
+        """Returns the parameter groups: "fields", the networks, and "tables", the tables of hash grids if any."""
         dense, tables = parameter_groups(self.routers, self.settings.field_type.sparse_parameters)
         return {"fields": dense, "tables": tables} if tables else {"fields": dense}
 
     # --- training --------------------------------------------------------------------------------------------------
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:
-        """The callbacks before and after each step of nerfstudio's trainer."""
+        """Returns the callbacks before and after each step of nerfstudio's trainer."""
         trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
         assert trainer is not None and optimizers is not None
         steps, optimizer = trainer.config.max_num_iterations, optimizers.optimizers["fields"]
 
         def before(step: int) -> None:
-            done = self.strategy.step_pre_backward(optimizer, step / steps, step)
-            if done is not None and not done.split.balances:
-                kept = len(done.points)
+            result = self.strategy.step_pre_backward(optimizer, step / steps, step)
+            if result is not None and not result.split.balances:
+                kept = len(result.points)
                 CONSOLE.log(f"voronerf: no cell split at step {step}, none holds enough of the {kept} samples")
-            elif done is not None:  # parameters stay the same objects, with other shapes
+            elif result is not None:  # parameters stay the same objects, with other shapes
                 CONSOLE.log(f"voronerf: {self.num_cells} cells at step {step}")
             self.renderer.sampler.step_pre_backward(self.renderer.field, step, self.generator)
-            if not self.routers["field"].training:  # since the cells were looked at again, or a picture was made
+            if not self.routers["field"].training:  # after a split or a rendered picture
                 self.renderer.train()
 
         def after(step: int) -> None:
@@ -143,7 +143,7 @@ class VoronerfModel(Model):
     # --- rays ------------------------------------------------------------------------------------------------------
 
     def _rays(self, bundle: RayBundle) -> tuple[Rays, Tensor, Tensor]:
-        """Their rays as ours, and where each enters and leaves the scene, [r] and [r]."""
+        """Converts nerfstudio's rays; also returns the distances [r], [r] at which they enter and leave the scene."""
         # A cone's radius is 2 / sqrt(12) of the width of its pixel (mip-NeRF, section 3.1).
         radii = (bundle.pixel_area[:, 0] / 3).sqrt() if self.renderer.cones else None
         rays = Rays(bundle.origins, bundle.directions, radii)
@@ -154,9 +154,9 @@ class VoronerfModel(Model):
         return rays, near, far
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        """Colour, accumulation and depth of rays, and ``cells``, the colour of the cell that each shows.
+        """Returns colour, accumulation and depth of rays, and ``cells``, the colour of the cell that each ray shows.
 
-        In training the rays as they came: what they see is found together with the loss, see :meth:`get_loss_dict`.
+        In training, returns the rays: they are rendered together with the loss, see :meth:`get_loss_dict`.
         """
         rays, near, far = self._rays(ray_bundle)
         return {"rays": (rays, near, far)} if self.training else self._see(rays, near, far)
@@ -164,19 +164,19 @@ class VoronerfModel(Model):
     @torch.no_grad()
     def _see(self, rays: Rays, near: Tensor, far: Tensor) -> dict[str, Tensor]:
         colour, opacity, depth, places = self.renderer.see(rays, near, far)
-        background = renderers.BACKGROUND_COLOR_OVERRIDE  # of the viewer and of ns-render
+        background = renderers.BACKGROUND_COLOR_OVERRIDE  # set by the viewer and by ns-render
         background = self.background if background is None else background.to(colour)
         cells = self.routers["field"].diagram.locate(places)
-        shown = palette(self.num_cells).to(colour)[cells.long()] / 255
+        colours = palette(self.num_cells).to(colour)[cells.long()] / 255
         return {
             "rgb": _over(colour, opacity, background).clamp(0, 1),
             "accumulation": opacity[:, None],
             "depth": depth[:, None],
-            "cells": _over(shown * opacity[:, None], opacity, torch.ones_like(shown[0])),
+            "cells": _over(colours * opacity[:, None], opacity, torch.ones_like(colours[0])),
         }
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """An image [h, w, 4] without its background, for ``ns-export``."""
+        """Returns an RGBA image [h, w, 4] without its background, for ``ns-export``."""
         opacity = outputs["accumulation"]
         behind = 0.0 if self.background is None else self.background * (1 - opacity)
         return torch.cat(((outputs[output_name] - behind) / opacity.clamp_min(1e-10), opacity), dim=-1).clamp(0, 1)
@@ -184,20 +184,20 @@ class VoronerfModel(Model):
     # --- losses and scores -----------------------------------------------------------------------------------------
 
     def _truth(self, batch: dict[str, Tensor], background: Tensor | None) -> Tensor:
-        """The colours [..., 3] of a batch, over a background where it has an alpha channel."""
+        """Returns the colours [..., 3] of a batch; images with an alpha channel are composited over a background."""
         image = batch["image"].to(self.device)
         return image if image.shape[-1] == 3 else _over(image[..., :3] * image[..., 3:], image[..., 3], background)
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        """The loss of our trainer; images with an alpha channel lie over a colour that is drawn for each ray."""
+        """Returns the loss of voronerf's trainer; images with an alpha channel get a random background per ray."""
         if "rays" not in outputs:
             return {"rgb_loss": (outputs["rgb"] - self._truth(batch, self.background)).square().mean()}
         return {"rgb_loss": self._learn(outputs, batch).loss}
 
     def _learn(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> RenderOutput:
-        """What a training step finds, once for the outputs of a batch: losses and metrics ask for it."""
+        """Runs RayLoss once per batch and caches it in `outputs`, for both the loss and the metrics."""
         if "render" not in outputs:
             rays, near, far = outputs["rays"]
             background = self.background if batch["image"].shape[-1] == 3 else torch.rand_like(rays.origins)
@@ -207,16 +207,16 @@ class VoronerfModel(Model):
         return output
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """PSNR in dB of the rays of a batch, and the number of cells."""
+        """Returns the PSNR in dB of a batch of rays, and the number of cells."""
         if "rays" in outputs:
             error = self._learn(outputs, batch).error.mean() / 3
         else:
             error = (outputs["rgb"] - self._truth(batch, self.background)).square().mean()
         return {"psnr": -10 * error.log10(), "cells": torch.tensor(float(self.num_cells))}
 
-    @functools.cached_property  # not a part of the model's state; its weights are downloaded where it is first asked
+    @functools.cached_property  # not in the model's state; downloads its weights on first use
     def lpips(self) -> nn.Module:
-        """LPIPS as the other methods of nerfstudio compute it."""
+        """The LPIPS metric, as in nerfstudio's other methods."""
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
         return LearnedPerceptualImagePatchSimilarity(normalize=True).to(self.device)
@@ -224,7 +224,7 @@ class VoronerfModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR, SSIM and LPIPS of an image, and pictures: truth beside render, accumulation, depth, cells."""
+        """Returns PSNR, SSIM and LPIPS of an image, and pictures: truth beside render, accumulation, depth, cells."""
         from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
         truth, rgb, opacity = self._truth(batch, self.background), outputs["rgb"], outputs["accumulation"]
@@ -245,7 +245,7 @@ class VoronerfModel(Model):
     # --- checkpoints -----------------------------------------------------------------------------------------------
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The state in nerfstudio's checkpoints beside the parameters and the diagram."""
+        """Returns the state that nerfstudio's checkpoints hold beside the parameters and the diagram."""
         grid = self.renderer.occupancy
         return {
             "strategy": self.strategy.state_dict(),
@@ -253,12 +253,12 @@ class VoronerfModel(Model):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Goes on from :meth:`get_extra_state`; the cells follow from the parameters."""
+        """Restores a state of :meth:`get_extra_state`; the cells follow from the parameters."""
         self.strategy.load_state_dict(state["strategy"])
         if self.renderer.occupancy is not None and state["occupancy"] is not None:
             self.renderer.occupancy.load_state_dict(state["occupancy"])
 
 
 def _over(colour: Tensor, opacity: Tensor, background: Tensor | None) -> Tensor:
-    """Colours [..., 3] on black, of opacity [...], over a background [3] or [..., 3]; None is black."""
+    """Composites colours [..., 3], multiplied by opacity [...], over a background [3] or [..., 3]; None is black."""
     return colour if background is None else colour + (1 - opacity[..., None]) * background

@@ -25,10 +25,10 @@ class AdamConfig(OptimizerConfig):
     betas: tuple[float, float] = (0.9, 0.99)
     """Decay of the averages of gradients and of their squares."""
     sparse: bool = False
-    """On a CPU, leave entries without a gradient as they are."""
+    """On a CPU, do not update entries without a gradient."""
 
     def setup(self, params: Iterable[nn.Parameter]) -> Adam:
-        """The optimiser of one group of parameters."""
+        """Returns the optimiser of one group of parameters."""
         params = list(params)
         sparse = self.sparse and params[0].device.type == "cpu"
         groups = [{"params": params, "sparse": sparse}]
@@ -37,16 +37,16 @@ class AdamConfig(OptimizerConfig):
 
 @dataclasses.dataclass
 class DecaySchedulerConfig(SchedulerConfig):
-    """A linear rise of the learning rate and then an exponential decay, in numbers that a checkpoint can hold.
+    """Settings of a linear warm-up of the learning rate, followed by an exponential decay.
 
-    nerfstudio's own scheduler stores numbers of numpy, which torch 2.6 and newer refuse to load from a checkpoint.
+    nerfstudio's own scheduler stores NumPy numbers, which torch 2.6 and newer refuse to load from a checkpoint.
     """
 
     _target: type = dataclasses.field(default_factory=lambda: DecayScheduler)
     lr_final: float = 0.001
     """Learning rate at the end."""
     warmup_steps: int = 100
-    """Steps over which the learning rate rises from a hundredth, a fiftieth of the run at most."""
+    """Warm-up steps, from a hundredth of the learning rate; at most a fiftieth of the run."""
     max_steps: int | None = None
     """Steps until the end; default: max_num_iterations of the trainer."""
 
@@ -57,7 +57,7 @@ class DecayScheduler(Scheduler):
     config: DecaySchedulerConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> Any:
-        """The scheduler of one optimiser, whose learning rate at the start is ``lr_init``."""
+        """Returns the scheduler of one optimiser with initial learning rate ``lr_init``."""
         config, steps = self.config, self.config.max_steps
         assert steps is not None
         warmup = max(1, min(config.warmup_steps, steps // 50))

@@ -16,10 +16,10 @@ from voronerf.nerf.renderer import RenderedImage, Renderer
 def render_camera(
     renderer: Renderer, scene: Scene, cameras: Cameras, index: int, *, heaviest: bool = True, fill: bool = True
 ) -> RenderedImage:
-    """Renders one of several cameras on the background of a scene, without randomness; on the renderer's device.
+    """Renders one of several cameras on the background of a scene, without randomness, on the renderer's device.
 
-    Where a scene has none, as photographs, holes of a picture have the colour of what lies beside them; without
-    ``fill`` they are black. So are pixels that have no ray.
+    In a scene without background or box, such as photographs, holes of a picture take the colours beside them; without
+    ``fill`` they are black. Pixels without a ray are black too.
     """
     device = renderer.device
     image = renderer.train(False).image(
@@ -33,14 +33,14 @@ def render_camera(
     )
     if not fill or scene.background is not None or scene.box is not None:
         return image
-    filled, there = fill_holes(image.colour, image.opacity), cameras.has_ray(index)
-    return image._replace(colour=filled if there is None else filled * there[..., None].to(device))
+    filled, has_ray = fill_holes(image.colour, image.opacity), cameras.has_ray(index)
+    return image._replace(colour=filled if has_ray is None else filled * has_ray[..., None].to(device))
 
 
 def fill_holes(colour: Tensor, opacity: Tensor) -> Tensor:
-    """A picture [h, w, 3] whose transparent parts have the colour of what lies beside them.
+    """Fills the transparent parts of a picture [h, w, 3] with the colours beside them.
 
-    Every coarser picture of a pyramid fills the finer one where that is transparent (Gortler et al. 1996, "The
+    Each level of an image pyramid fills the transparent parts of the next finer level (Gortler et al. 1996, "The
     Lumigraph", section 3.4).
 
     Args:
@@ -60,6 +60,6 @@ def fill_holes(colour: Tensor, opacity: Tensor) -> Tensor:
 
 
 def crop_camera(camera: Cameras, left: int, top: int, width: int, height: int) -> Cameras:
-    """A camera that sees `width` x `height` pixels of another."""
+    """Returns a camera that sees a rectangle of `width` x `height` pixels of another camera."""
     moved = camera.intrinsics - camera.intrinsics.new_tensor((0, 0, left, top))
     return replace(camera, intrinsics=moved, width=width, height=height, sizes=None)

@@ -1,12 +1,12 @@
-"""Camera paths: where the cameras of a capture were, smooth ones through keyframes, and nerfstudio's file format.
+"""Camera paths: near the cameras of a capture, smooth through keyframes, or read from nerfstudio's files.
 
 c cameras, f frames. Poses and pixels as in :mod:`voronerf.nerf.cameras`.
 
-The file is JSON: `render_width`, `render_height`, `camera_type`, `fps`, and a list `camera_path` with a frame each,
-whose `camera_to_world` has the numbers of a pose row by row and whose `fov` is the vertical angle of view in degrees.
-Viewers keep the keyframes beside them: a list `keyframes` with `matrix` and `fov`, and `is_cycle`. The matrix of a
-keyframe is a list, row by row, or of nerfstudio's viewer before 1.0, its Blender add-on and its Maya plugin a string of
-JSON, column by column.
+The file is JSON: `render_width`, `render_height`, `camera_type`, `fps`, and a list `camera_path` of frames. The
+`camera_to_world` of a frame has the numbers of a pose row by row, its `fov` is the vertical angle of view in degrees.
+Viewers also store the keyframes: a list `keyframes` with `matrix` and `fov`, and `is_cycle`. The matrix of a keyframe
+is a list, row by row. In files of nerfstudio's viewer before 1.0, its Blender add-on and its Maya plugin, it is a
+string of JSON, column by column.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ from voronerf.app.files import json_text, read_json, write_text
 from voronerf.nerf.cameras import Cameras, focus_point, look_at, shared_focus
 from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE
 
-#: The camera models, by the names that paths have for them.
+#: The camera models by their names in path files.
 MODELS = {"perspective": PERSPECTIVE, "fisheye": FISHEYE, "equirectangular": EQUIRECTANGULAR}
-#: Frames of a path; at 24 a second they take more than an hour.
+#: Greatest number of frames of a path, more than an hour at 24 a second.
 MOST_FRAMES = 100_000
-#: Pixels along a side of a frame.
+#: Greatest number of pixels along a side of a frame.
 LONGEST_SIDE = 8192
-#: Distance from the origin.
+#: Greatest coordinate of a camera in scene units.
 FARTHEST = 1e9
-#: By which the product of a rotation and its transpose may differ from 1, and the last row of a pose from 0 0 0 1.
+#: Tolerance of a rotation times its transpose against the identity, and of a pose's last row against 0 0 0 1.
 ORTHONORMAL = 2e-3
-#: Above this length of their mean direction, cameras look one way rather than around or about something.
+#: Length of the mean direction above which cameras look one way.
 ONE_WAY = 0.95
-#: Angles around what cameras look at, in radians: a gap between cameras that no path crosses, and how far those lie, in
-#: standard deviations, whose distance and height a path has.
+#: Angles around the cameras' focus, in radians: the least gap between cameras that no path crosses, and the standard
+#: deviation of the Gaussian weights by which a path averages the distances and heights of near cameras.
 GAP, WINDOW = math.radians(60), math.radians(25)
-#: Frames of a path from one of the cameras to the next.
+#: Frames of a path between two of its cameras.
 BETWEEN = 4
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPath:
-    """The frames of a video, and the keyframes that they were made from.
+    """The frames of a video, and the keyframes from which they were made.
 
     Attributes:
-        frames: a camera for each, of the size of the video.
+        frames: a camera per frame, with the size of the video.
         fps: frames a second.
         keyframes: perspective cameras of the same size, or None.
-        closed: whether the last keyframe is followed by the first.
+        closed: whether the path returns to the first keyframe.
 
     Examples:
         >>> from voronerf.nerf import orbit_cameras
@@ -72,15 +72,15 @@ class CameraPath:
 def read_camera_path(file: Path | str) -> CameraPath:
     """Reads a path that nerfstudio's viewers, its add-ons or :func:`write_camera_path` have saved.
 
-    Positions are those of the scene that is rendered. A pose may be scaled, as that of a camera beside a scaled object
-    is: its scale has no effect, nor have crops, times and transitions of the file. Frames without an angle of view have
-    the file's `default_fov`, and a file without `fps` shows its frames in its `seconds`, else 24 a second. Keyframes
-    that are no cameras are left out.
+    Positions are in the coordinates of the rendered scene. The scale of a pose, as in exports of scaled objects, has no
+    effect, nor have crops, times and transitions of the file. The default angle of view is the file's `default_fov`.
+    Without `fps`, the rate follows from the file's `seconds`, else it is 24 frames a second. Invalid keyframes are left
+    out.
 
     Raises:
-        ValueError: the file is no such path, of another type of camera than perspective, fisheye or equirectangular,
-            or too large; it names the file, the frame and the field.
-        OSError: it cannot be read.
+        ValueError: the file is no camera path, is too large, or its cameras are not perspective, fisheye or
+            equirectangular; the message names the file, the frame and the field.
+        OSError: the file cannot be read.
 
     Examples:
         >>> import tempfile
@@ -114,16 +114,16 @@ def read_camera_path(file: Path | str) -> CameraPath:
         fps = len(frames) / _number(entries["seconds"], 1e-3, 1e9, f"{file}: seconds")
     fps = _number(24 if fps is None else fps, 0.01, 1000, f"{file}: fps")
     keyframes = None
-    with contextlib.suppress(RecursionError, TypeError, ValueError):  # the frames are there without them
+    with contextlib.suppress(RecursionError, TypeError, ValueError):  # a path is usable without keyframes
         keyframes = _read_cameras(entries.get("keyframes"), "matrix", angle, width, height, f"{file}: keyframes")
     return CameraPath(frames, fps, keyframes, entries.get("is_cycle") is True)
 
 
 def write_camera_path(file: Path | str, path: CameraPath) -> None:
-    """Writes a path that nerfstudio and :func:`read_camera_path` read.
+    """Writes a path in nerfstudio's format, which :func:`read_camera_path` reads too.
 
-    The file keeps poses, size, the camera model of the first frame and the vertical angle of view; the principal point
-    becomes the middle of the frame.
+    The file keeps poses, size, vertical angles of view, and the camera model of the first frame; the principal point
+    becomes the centre of the frame.
     """
     model = PERSPECTIVE if path.frames.models is None else int(path.frames.models[0])
     size = {"render_height": path.frames.height, "render_width": path.frames.width}
@@ -144,15 +144,15 @@ def write_camera_path(file: Path | str, path: CameraPath) -> None:
 
 
 def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Cameras:
-    """A smooth path through keyframes, by Catmull-Rom splines of the positions and of the rotations as quaternions.
+    """Returns a smooth path through keyframes, by Catmull-Rom splines of the positions and the rotations' quaternions.
 
     Args:
-        keyframes: at least one.
-        count: frames; each pair of keyframes has the same share of them.
-        closed: whether the path goes back to the first keyframe; its last frame is then the one before that.
+        keyframes: at least one camera.
+        count: number of frames, distributed equally over the pairs of keyframes.
+        closed: whether the path returns to the first keyframe; the last frame is then the one before it.
 
     Raises:
-        ValueError: no keyframe, or no frame.
+        ValueError: there is no keyframe, or `count` is below 1.
 
     Examples:
         >>> from voronerf.nerf import orbit_cameras
@@ -167,10 +167,10 @@ def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Came
         raise ValueError(f"smooth_path: keyframes and count must be at least 1, got {n} and {count}")
     device = keyframes.poses.device
     steps = torch.arange(count, dtype=torch.float64, device=device)
-    at = steps * n / count if closed else steps * (n - 1) / max(count - 1, 1)
-    first = at.floor().long().clamp(max=n - 1)
-    t = (at - first)[:, None]
-    around = first[:, None] + torch.arange(-1, 3, device=device)  # [f, 4], the keyframes that bear on a frame
+    position = steps * n / count if closed else steps * (n - 1) / max(count - 1, 1)
+    first = position.floor().long().clamp(max=n - 1)
+    t = (position - first)[:, None]
+    around = first[:, None] + torch.arange(-1, 3, device=device)  # [f, 4], the keyframes of a frame's spline
     around = around % n if closed else around.clamp(0, n - 1)
     weights = torch.cat(
         (-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2), dim=-1
@@ -187,21 +187,22 @@ def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Came
 
 
 def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Cameras:
-    """A path that stays where the given cameras were, so that it shows what they have seen.
+    """Returns a path that stays near the cameras of a capture, so that it shows regions that they have seen.
 
-    Cameras that look one way have the spiral of LLFF (Mildenhall et al. 2019): of their extent, it looks at what they
-    look at. Those around something have a turn around it, at the mean distance and height of the cameras that are near;
-    if they leave a gap, the path goes to its one side and back, without crossing it. Cameras that look outwards have a
-    smooth path through some of them, in their order. The frames have the size that most of the cameras have.
+    For cameras that look one way, the path is the spiral of LLFF (Mildenhall et al. 2019) around their focus, as large
+    as their extent. For cameras around a focus, it is a turn around it, at the mean distance and height of the nearest
+    cameras; if the cameras leave a gap, the path goes from one end of it to the other and back, without crossing it.
+    For cameras that look outwards, it is a smooth path through some of them, in their order. The frames have the
+    commonest size of the cameras.
 
     Args:
-        cameras: such as those of the training views; the focal length is their mean.
-        count: frames.
-        near: where the scene begins along a ray.
-        far: where it ends; both say what parallel cameras look at.
+        cameras: the cameras of the capture, such as the training views; the path has their mean focal length.
+        count: number of frames.
+        near: the distance at which the scene begins along a ray.
+        far: the distance at which it ends; near and far give the focus of parallel cameras.
 
     Raises:
-        ValueError: no frame.
+        ValueError: `count` is below 1.
 
     Examples:
         >>> from voronerf.nerf import orbit_cameras
@@ -214,30 +215,30 @@ def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Ca
     if count < 1:
         raise ValueError(f"capture_path: count must be at least 1, got {count}")
     forward = cameras.forward.double().mean(0)
-    alike = like_most(cameras)
+    common = like_most(cameras)
     if forward.norm() > ONE_WAY:
         poses = _spiral(cameras, count, focus_point(cameras), near, far)
     elif (focus := shared_focus(cameras)) is not None:
         poses = _around(cameras, count, focus.double())
     else:
-        some = torch.linspace(0, len(cameras) - 1, min(max(count // BETWEEN, 2), len(cameras))).round().long()
-        poses = smooth_path(cameras[some], count).poses
-    focal = float(alike.intrinsics[:, :2].mean())
-    intrinsics = cameras.intrinsics.new_tensor((focal, focal, alike.width / 2, alike.height / 2)).repeat(count, 1)
-    return Cameras(poses.float(), intrinsics, alike.width, alike.height)
+        chosen = torch.linspace(0, len(cameras) - 1, min(max(count // BETWEEN, 2), len(cameras))).round().long()
+        poses = smooth_path(cameras[chosen], count).poses
+    focal = float(common.intrinsics[:, :2].mean())
+    intrinsics = cameras.intrinsics.new_tensor((focal, focal, common.width / 2, common.height / 2)).repeat(count, 1)
+    return Cameras(poses.float(), intrinsics, common.width, common.height)
 
 
 def like_most(cameras: Cameras) -> Cameras:
-    """The cameras whose images have the commonest size, without their lenses."""
+    """Returns the cameras whose images have the commonest size, without their lens distortion."""
     cameras = cameras.perspective()
     sizes = [cameras.size(index) for index in range(len(cameras))]
     width, height = max(sizes, key=sizes.count)
-    alike = torch.tensor([size == (width, height) for size in sizes], device=cameras.poses.device)
-    return Cameras(cameras.poses[alike], cameras.intrinsics[alike], width, height)
+    mask = torch.tensor([size == (width, height) for size in sizes], device=cameras.poses.device)
+    return Cameras(cameras.poses[mask], cameras.intrinsics[mask], width, height)
 
 
 def resized(cameras: Cameras, size: tuple[int, int]) -> Cameras:
-    """Cameras for pictures of another (width, height), which show no more than theirs at either side."""
+    """Resizes cameras to another (width, height); the new pictures show no more than the old ones at any side."""
     scale = max(size[0] / cameras.width, size[1] / cameras.height)
     intrinsics = scale * cameras.intrinsics
     intrinsics[:, 2] += (size[0] - scale * cameras.width) / 2
@@ -246,15 +247,15 @@ def resized(cameras: Cameras, size: tuple[int, int]) -> Cameras:
 
 
 def see_all_around(cameras: Cameras) -> bool:
-    """Whether all cameras see all around."""
+    """Returns whether all cameras are equirectangular, with a view of 360 degrees."""
     return cameras.models is not None and bool((cameras.models == EQUIRECTANGULAR).all())
 
 
 def panoramas(cameras: Cameras, size: tuple[int, int]) -> Cameras:
-    """Cameras at the same places that see all around, z up, in pictures of (width, height), 2 to 1.
+    """Returns equirectangular 360-degree cameras at the same positions, z up, of a (width, height) of 2 to 1.
 
     Raises:
-        ValueError: another size.
+        ValueError: the size is not 2 to 1.
     """
     if size[0] != 2 * size[1]:
         raise ValueError(f"pictures all around must be 2 to 1, got {size[0]} x {size[1]}")
@@ -268,7 +269,7 @@ def panoramas(cameras: Cameras, size: tuple[int, int]) -> Cameras:
 
 
 def _spiral(cameras: Cameras, count: int, focus: Tensor | None, near: float, far: float) -> Tensor:
-    """Poses of two turns before a scene, which end where they began."""
+    """Returns the poses of a closed spiral of two turns before a scene."""
     poses = cameras.poses.double()
     angles = torch.arange(count, dtype=torch.float64, device=poses.device) * (4 * math.pi / count)
     centre, forward = poses[:, :3, 3].mean(0), -poses[:, :3, 2].mean(0)
@@ -283,7 +284,7 @@ def _spiral(cameras: Cameras, count: int, focus: Tensor | None, near: float, far
 
 
 def _around(cameras: Cameras, count: int, focus: Tensor) -> Tensor:
-    """Poses of a turn around a focus, or of a way to and fro in the part of it that has cameras."""
+    """Returns the poses of a turn around a focus, or of a way to and fro if the cameras leave a gap."""
     up = cameras.poses[:, :3, 1].double().mean(0)
     up = torch.nn.functional.normalize(up, dim=0) if up.norm() > 0.1 else up.new_tensor((0.0, 0.0, 1.0))
     axes = look_at(up[None], torch.zeros_like(up), torch.ones_like(up))[0, :3, :3]  # its third column is up
@@ -292,14 +293,14 @@ def _around(cameras: Cameras, count: int, focus: Tensor) -> Tensor:
     sorted_bearings = bearing.sort().values
     gaps = torch.cat((sorted_bearings.diff(), sorted_bearings[:1] + 2 * math.pi - sorted_bearings[-1:]))
     widest = int(gaps.argmax())
-    at = torch.arange(count, dtype=torch.float64, device=up.device) / count
+    share = torch.arange(count, dtype=torch.float64, device=up.device) / count
     if gaps[widest] < GAP:
-        angles = 2 * math.pi * at
+        angles = 2 * math.pi * share
     else:
         width = 2 * math.pi - gaps[widest]
-        angles = sorted_bearings[(widest + 1) % len(gaps)] + width * (1 - (2 * math.pi * at).cos()) / 2
-    apart = torch.remainder(angles[:, None] - bearing + math.pi, 2 * math.pi) - math.pi
-    shares = torch.softmax(-(apart / WINDOW).square() / 2, dim=-1)
+        angles = sorted_bearings[(widest + 1) % len(gaps)] + width * (1 - (2 * math.pi * share).cos()) / 2
+    difference = torch.remainder(angles[:, None] - bearing + math.pi, 2 * math.pi) - math.pi
+    shares = torch.softmax(-(difference / WINDOW).square() / 2, dim=-1)
     reach, height = shares @ reach, shares @ local[:, 2]
     origins = focus + torch.stack((reach * angles.cos(), reach * angles.sin(), height), dim=-1) @ axes.T
     return look_at(origins, focus, up)
@@ -308,34 +309,34 @@ def _around(cameras: Cameras, count: int, focus: Tensor) -> Tensor:
 def _read_cameras(
     entries: Any, key: str, angle: Any, width: int, height: int, where: str, model: int = PERSPECTIVE
 ) -> Cameras:
-    """The cameras of a list of frames; ``angle`` is the angle of view of those that have none."""
+    """Parses a list of frames into cameras; ``angle`` is the default angle of view in degrees."""
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_FRAMES:
         got = f"{len(entries)} of them" if isinstance(entries, list) else f"{entries!r:.60}"
         raise ValueError(f"{where} must be a list of 1 to {MOST_FRAMES} frames, got {got}")
     matrices, focals = [], []
     for number, entry in enumerate(entries):
-        at = f"{where}[{number}]"
+        label = f"{where}[{number}]"
         matrix = entry.get(key) if isinstance(entry, dict) else None
         if key == "matrix" and isinstance(matrix, str):
             columns = json.loads(matrix)
             matrix = [columns[row::4] for row in range(4)]
-        matrices.append(_matrix(matrix, f"{at}.{key}"))
+        matrices.append(_matrix(matrix, f"{label}.{key}"))
         if model != EQUIRECTANGULAR:
             fov = entry.get("fov")
-            fov = _number(angle if fov is None else fov, 0.01, 179.9, f"{at}.fov")
+            fov = _number(angle if fov is None else fov, 0.01, 179.9, f"{label}.fov")
             focals.append([height / 2 / math.tan(math.radians(fov) / 2)] * 2)
         else:
             focals.append([width / 2 / math.pi, height / math.pi])
     poses = torch.tensor(matrices, dtype=torch.float64).view(-1, 4, 4)
     poses[:, :3, :3] /= torch.linalg.det(poses[:, :3, :3]).clamp_min(1e-18)[:, None, None] ** (1 / 3)
     rotations = poses[:, :3, :3]
-    unlike = (rotations @ rotations.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2)) > ORTHONORMAL
-    unlike |= (poses[:, 3] - poses.new_tensor((0, 0, 0, 1))).abs().amax(-1) > ORTHONORMAL
-    if unlike.any():
-        raise ValueError(f"{where}[{int(unlike.nonzero()[0])}].{key} must be a rotation and a position")
+    invalid = (rotations @ rotations.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2)) > ORTHONORMAL
+    invalid |= (poses[:, 3] - poses.new_tensor((0, 0, 0, 1))).abs().amax(-1) > ORTHONORMAL
+    if invalid.any():
+        raise ValueError(f"{where}[{int(invalid.nonzero()[0])}].{key} must be a rotation and a position")
     poses[:, 3] = poses.new_tensor((0, 0, 0, 1))
-    middle = torch.tensor((width / 2, height / 2)).repeat(len(focals), 1)
-    cameras = Cameras(poses.float(), torch.cat((torch.tensor(focals), middle), dim=-1), width, height)
+    principal_point = torch.tensor((width / 2, height / 2)).repeat(len(focals), 1)
+    cameras = Cameras(poses.float(), torch.cat((torch.tensor(focals), principal_point), dim=-1), width, height)
     if model == PERSPECTIVE:
         return cameras
     models = torch.full((len(poses),), model, dtype=torch.int32)
@@ -343,7 +344,7 @@ def _read_cameras(
 
 
 def _matrix(value: Any, where: str) -> list[float]:
-    """The 16 numbers of a pose, given as numbers or as rows; the last row may be left out."""
+    """Parses a pose, a list of numbers or rows, into 16 numbers; the last row may be missing."""
     rows = value if isinstance(value, list) else []
     numbers = [number for row in rows for number in (row if isinstance(row, list) else [row])]
     if len(numbers) == 12:
@@ -354,7 +355,7 @@ def _matrix(value: Any, where: str) -> list[float]:
 
 
 def _number(value: Any, lowest: float, highest: float, where: str, *, whole: bool = False) -> float:
-    # The comparison takes integers of any size, and NaN fails it.
+    # The comparison works for integers of any size, and is false for NaN.
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and lowest <= value <= highest
     if is_number and not (whole and value % 1):
         return float(value)
@@ -372,10 +373,10 @@ def _entries(cameras: Cameras, key: str) -> list[dict[str, Any]]:
 
 
 def quaternions(rotations: Tensor) -> Tensor:
-    """Unit quaternions (w, x, y, z) [c, 4] of rotations [c, 3, 3], of either sign.
+    """Converts rotations [c, 3, 3] to unit quaternions (w, x, y, z) [c, 4], of either sign.
 
-    They are the eigenvectors of the largest eigenvalue of a symmetric matrix (Bar-Itzhack 2000), which is stable for
-    every rotation.
+    A quaternion is the eigenvector of the largest eigenvalue of a symmetric matrix (Bar-Itzhack 2000), which is stable
+    for every rotation.
     """
     r = rotations.mT
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in r.unbind(-2))
@@ -390,7 +391,7 @@ def quaternions(rotations: Tensor) -> Tensor:
 
 
 def rotations(quaternions: Tensor) -> Tensor:
-    """Rotations [c, 3, 3] of unit quaternions (w, x, y, z) [c, 4]."""
+    """Converts unit quaternions (w, x, y, z) [c, 4] to rotations [c, 3, 3]."""
     w, x, y, z = quaternions.unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

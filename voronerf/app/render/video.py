@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 
 def check_video(path: Path) -> None:
-    """Checks, before any frame is rendered, that :func:`write_video` can write them; makes the folder."""
+    """Checks, before any frame is rendered, that :func:`write_video` can write the file; makes its folder."""
     if path.suffix.lower() != ".mp4":
         raise ValueError(f"{path}: a video must end in .mp4")
     try:
@@ -23,7 +23,7 @@ def check_video(path: Path) -> None:
         raise ImportError("writing a video needs imageio-ffmpeg and its ffmpeg: pip install imageio-ffmpeg") from None
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = _partial(path)
-    partial.unlink(missing_ok=True)  # a link would be followed
+    partial.unlink(missing_ok=True)  # else touch would follow a link
     partial.touch()
     partial.unlink()
 
@@ -33,12 +33,12 @@ def _partial(path: Path) -> Path:
 
 
 def write_video(path: Path, frames: Iterable[Tensor], fps: float) -> None:
-    """Writes an H.264 video that players everywhere show; makes its folder. The file appears when it is complete.
+    """Writes an H.264 video that all common players show, atomically; makes its folder.
 
     Args:
         path: the file, .mp4.
-        frames: uint8 [h, w, 3] each, at least one; they are taken one by one. An odd size is padded by a copy of its
-            last row or column, since the format stores colour for pairs of pixels.
+        frames: at least one picture, uint8 [h, w, 3] each; the iterable is read one frame at a time. An odd size is
+            padded by a copy of the last row or column, since the format stores colour for pairs of pixels.
         fps: frames a second.
     """
     if fps <= 0:
@@ -69,7 +69,7 @@ def write_video(path: Path, frames: Iterable[Tensor], fps: float) -> None:
                 even = pad(frame.permute(2, 0, 1)[None], (0, width % 2, 0, height % 2), mode="replicate")[0]
                 writer.send(even.permute(1, 2, 0).cpu().contiguous().numpy())
                 count += 1
-        except OSError:  # whose message is ffmpeg's command and all that it says
+        except OSError:  # its message would be ffmpeg's command and whole output
             raise OSError(f"{path}: ffmpeg could not write it, it ended after {count} frames") from None
         finally:
             writer.close()

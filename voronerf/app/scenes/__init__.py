@@ -23,9 +23,9 @@ from voronerf.app.wording import similar_path
 __all__ = ["Scene", "SceneError", "Split", "builtin_scene", "city_scene", "load_scene"]
 
 BUILTIN_SIZE = 100
-BUILTIN, CITY = "builtin", "builtin-city"  # or with a size, builtin:400, and with blocks, builtin-city:4x4
-CACHED = 100  # pixels a side, from which on the built-in scene is kept
-MOST_PIXELS = 1600  # a side of the built-in scene
+BUILTIN, CITY = "builtin", "builtin-city"  # also with a size, builtin:400, or a number of blocks, builtin-city:4x4
+CACHED = 100  # side in pixels from which on the built-in scene is cached
+MOST_PIXELS = 1600  # largest side of the built-in scene
 
 
 #: Suffixes of videos that `voronerf process` may read.
@@ -33,18 +33,18 @@ VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".mpg")
 
 
 class Format(NamedTuple):
-    """A format of scenes: the file that shows it, its loader, and how it is found if not by a file of that name."""
+    """A scene format: the file that identifies it, its loader, and a search function where one file does not tell."""
 
     sign: str
     load: Callable[[Path, Reading], Scene]
     find: Callable[[Path], object] | None = None
 
-    def held(self, folder: Path) -> bool:
-        """Whether a folder has this format."""
+    def is_used_by(self, folder: Path) -> bool:
+        """Returns whether a folder holds a scene in this format."""
         return (folder / self.sign).is_file() if self.find is None else self.find(folder) is not None
 
 
-#: In the order in which a folder is tried.
+#: The scene formats by name, in the order in which "auto" tries them.
 FORMATS = {
     "blender": Format("transforms_train.json", load_blender),
     "colmap": Format("a COLMAP model in sparse/0", load_colmap, find_models),
@@ -54,22 +54,22 @@ FORMATS = {
 
 
 def _computed(size: int) -> Scene:
-    """The built-in scene, which is kept in the cache from a size on that takes seconds."""
+    """Returns the built-in scene, cached from the side `CACHED` on, which takes seconds to compute."""
     if size < CACHED:
         return builtin_scene(size)
     try:
         return builtin_scene(size, images="cached")
-    except SceneError:  # no cache can be written
+    except SceneError:  # the cache cannot be written
         return builtin_scene(size)
 
 
 def is_builtin(source: str | Path | None) -> bool:
-    """Whether a source names a scene that is computed, and no folder."""
+    """Returns whether a source names a built-in scene rather than a folder."""
     return str(source).partition(":")[0] in (BUILTIN, CITY)
 
 
 def has_images(folder: Path) -> bool:
-    """Whether a folder has images, with or without cameras."""
+    """Returns whether a folder has images, with or without cameras."""
     return any(path.suffix.lower() in (*SUFFIXES, *CONVERTED) for path in folder.iterdir())
 
 
@@ -87,26 +87,26 @@ def load_scene(
     """Loads a scene.
 
     Args:
-        source: "builtin", or "builtin:400" of 400 pixels; "builtin-city" of one block or "builtin-city:4x4" of 16; or a
-            folder with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a
-            COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`; such a file stands for its folder, and the folder
-            of a model for that of its scene.
-        downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels, or the size that is named,
-            divided by it. None is 1, and for photographs the least factor that leaves at most 512 pixels a side.
+        source: a folder, or the name of a built-in scene: "builtin", "builtin:400" with 400 pixels a side,
+            "builtin-city" with one block, or "builtin-city:4x4" with 16. The folder has `transforms_train.json`
+            (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, or LLFF's
+            `poses_bounds.npy`. The path of such a file, or of a COLMAP model's folder, also names the scene.
+        downscale: factor by which images are reduced, >= 1. None is 1, and for photographs the smallest factor that
+            leaves at most 512 pixels a side. For a built-in scene it divides the 100 pixels or the named size.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
             or a link.
-        format: of a folder, one of `FORMATS` such as "colmap"; "auto" is the first of them that it holds.
-        kind: of photographs: "object" (on white), "forward" (the cameras look the same way), "inside-out" or
-            "unbounded"; "auto" tells it by transparent pixels and by the cameras.
+        format: the format of a folder, one of `FORMATS` such as "colmap"; "auto" is the first that the folder has.
+        kind: the kind of photographs: "object" (on white), "forward" (the cameras look the same way), "inside-out" or
+            "unbounded"; "auto" decides by transparent pixels and by the cameras.
         normalise: move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera
-            at distance 1; else the coordinates of the files are kept.
-        images: of a folder: keep them in "memory"; on "disk", decoded once into a file of the cache (VORONERF_CACHE, or
-            `voronerf` in the user's caches) that is mapped into memory; or "auto": on disk if they do not fit.
-        keep_far: keep photographs whose cameras lie far from the others; they are left out otherwise, since one such
-            camera would give the scene its scale.
+            at distance 1; otherwise the coordinates of the files are kept.
+        images: the storage of a folder's images: "memory"; "disk", a file of the cache (VORONERF_CACHE, or `voronerf`
+            in the user's caches) that is mapped into memory; or "auto", which is disk if they do not fit into memory.
+        keep_far: keep photographs whose cameras lie far from the others. By default they are left out, since one such
+            camera would determine the scale of the scene.
 
     Raises:
-        SceneError: the data cannot be used; one line that names the file and what is wrong with it.
+        SceneError: the data cannot be used; the message is one line with the file and the fault.
 
     Examples:
         >>> from voronerf.app.scenes import load_scene
@@ -116,9 +116,9 @@ def load_scene(
     """
     if downscale is not None and downscale < 1:
         raise SceneError(f"{source}: downscale must be >= 1, got {downscale}")
-    for name, word, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
-        if word != "auto" and word not in known:
-            raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {word!r:.60}")
+    for name, value, choices in (("format", format, FORMATS), ("kind", kind, KINDS)):
+        if value != "auto" and value not in choices:
+            raise SceneError(f"{source}: {name} must be auto, {' or '.join(choices)}, got {value!r:.60}")
     if images not in ("auto", "memory", "disk"):
         raise SceneError(f"{source}: images must be auto, memory or disk, got {images!r:.60}")
     if is_builtin(source):
@@ -138,28 +138,28 @@ def load_scene(
             )
         return _computed(full // downscale)
     folder = Path(source)
-    if folder.is_file() and folder.name in (signs := {each.sign: name for name, each in FORMATS.items()}):
+    if folder.is_file() and folder.name in (signs := {item.sign: name for name, item in FORMATS.items()}):
         folder, format = folder.parent, signs[folder.name] if format == "auto" else format
     if not folder.exists():
-        beside = (path for path in folder.parent.glob("*") if path.is_dir())
-        raise SceneError(f"{folder}: there is no such folder{similar_path(folder, (Path(BUILTIN), *beside))}")
+        siblings = (path for path in folder.parent.glob("*") if path.is_dir())
+        raise SceneError(f"{folder}: there is no such folder{similar_path(folder, (Path(BUILTIN), *siblings))}")
     if not folder.is_dir():
         hint = f"; of a video, voronerf process {folder} DIR makes one" if folder.suffix.lower() in VIDEOS else ""
         raise SceneError(f"{folder}: is not a folder{hint}")
-    held = [name for name, each in FORMATS.items() if each.held(folder)]
+    formats = [name for name, item in FORMATS.items() if item.is_used_by(folder)]
     models = find_models(folder)
-    if "transforms" in held and models and models.paths[0].relative_to(models.folder).parts[1:2] == ("sparse",):
-        held.remove("colmap")  # as colmap/sparse/0 of nerfstudio, whose transforms.json was made of it and says more
-        held.append("colmap")
-    if not held:
-        none = f"{folder}: is not a scene, it has none of {', '.join(each.sign for each in FORMATS.values())}"
-        photographs = next((each for each in (folder, folder / "images") if each.is_dir() and has_images(each)), None)
+    if "transforms" in formats and models and models.paths[0].relative_to(models.folder).parts[1:2] == ("sparse",):
+        formats.remove("colmap")  # nerfstudio makes transforms.json from colmap/sparse/0, and adds to it
+        formats.append("colmap")
+    if not formats:
+        message = f"{folder}: is not a scene, it has none of {', '.join(item.sign for item in FORMATS.values())}"
+        photographs = next((item for item in (folder, folder / "images") if item.is_dir() and has_images(item)), None)
         raise SceneError(
-            none + (f"; voronerf process {photographs} DIR finds the cameras of its images" if photographs else "")
+            message + (f"; voronerf process {photographs} DIR finds the cameras of its images" if photographs else "")
         )
-    if format != "auto" and format not in held:
-        raise SceneError(f"{folder}: format must be {' or '.join(held)}, which it has, got {format}")
-    chosen = held[0] if format == "auto" else format
+    if format != "auto" and format not in formats:
+        raise SceneError(f"{folder}: format must be {' or '.join(formats)}, which it has, got {format}")
+    chosen = formats[0] if format == "auto" else format
     scene = FORMATS[chosen].load(folder, Reading(downscale, allow_outside, kind, normalise, images, keep_far))
-    others = tuple(f"--format {name} would read {FORMATS[name].sign}" for name in held if name != chosen)
+    others = tuple(f"--format {name} would read {FORMATS[name].sign}" for name in formats if name != chosen)
     return replace(scene, notes=(*scene.notes, *others))

@@ -27,14 +27,14 @@ NEAR, FAR = 2.0, 6.0
 def load_blender(folder: Path, reading: Reading) -> Scene:
     """Loads a Blender synthetic scene.
 
-    The test views are those of `transforms_test.json`, or of `transforms_val.json` if the former is missing or has no
-    image; without either, as BlenderNeRF exports scenes, every 8th training view is held out. Entries such as `fl_x`,
-    `cx` or `k1`, which Blender's files do not have, mark a capture that was split before. It is loaded like
-    `load_transforms` does, with that split.
+    `transforms_test.json` lists the test views, or `transforms_val.json` if the former is missing or has no image.
+    Without either file, as BlenderNeRF exports scenes, every 8th training view is held out. Entries such as `fl_x`,
+    `cx` or `k1`, which Blender's files do not have, mark a capture with a predefined split. It is loaded as by
+    `load_transforms`, with this split.
 
     Returns:
-        The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
-        the training views; without alpha the box is None. For a capture see `load_transforms`.
+        The scene, with near 2 and far 6 or the file's `near` and `far`, and a box carved from the alpha masks of the
+        training views; without alpha the box is None. For a capture see `load_transforms`.
     """
     train_file = folder / "transforms_train.json"
     entries, train_frames = read_transforms(train_file, reading.allow_outside)
@@ -74,14 +74,14 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
 
 
 def _test_frames(folder: Path, train_frames: Sequence[ListedImage], reading: Reading) -> list[ListedImage]:
-    """The images for testing of the first file that has some; images for training are left out, with a warning."""
+    """Returns the test images of the first file that has any, without training images, for which it warns."""
     training = {frame.path.resolve() for frame in train_frames}
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():
             frames = read_transforms(folder / name, reading.allow_outside, all_may_miss=True)[1]
             others = [frame for frame in frames if frame.path.resolve() not in training]
-            if both := len(frames) - len(others):
-                log.warning("%s: %d of its images are for training, and are not tested", folder / name, both)
+            if shared := len(frames) - len(others):
+                log.warning("%s: %d of its images are for training, and are not tested", folder / name, shared)
             if others:
                 return others
     return []

@@ -1,7 +1,7 @@
 """A tight box around an object, from its silhouettes (space carving; Kutulakos and Seitz 2000, without colours).
 
-c images of h x w pixels, n voxels. NumPy does the work, one thread for each view: parallel loops inside small array
-operations would cost more than the operations themselves on a busy machine.
+c images of h x w pixels, n voxels. NumPy processes each view in one thread: on a busy machine, parallel loops inside
+small array operations cost more than the operations themselves.
 """
 
 from __future__ import annotations
@@ -20,35 +20,34 @@ from voronerf.nerf.lenses import distort
 Array = NDArray[np.float32]
 
 RESOLUTIONS = (24, 32, 48)
-MASK_PIXELS, MOST_MASK_PIXELS = 100, 1000  # of the shorter side, and at most of the longer one
+MASK_PIXELS, MOST_MASK_PIXELS = 100, 1000  # target length of a mask's shorter side, limit of its longer side
 VIEWS = 100
-GROWTHS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # widths by which masks are widened, pixels
+GROWTHS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # mask dilations in pixels
 MARGIN = GROWTHS[-1] + 1
-SEEN_BY = 0.25  # an object is in the picture in at least this share of the views
-MISSED_BY = 1  # views whose masks may be wrong about a voxel
-OUTSIDE = 1e-3  # share of the masks' pixels whose rays may miss the box
+SEEN_BY = 0.25  # least share of the views that see a voxel of the object
+MISSED_BY = 1  # number of views whose masks may be wrong about a voxel
+OUTSIDE = 1e-3  # largest share of the masks' pixels whose rays miss the box
 
 
 def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tensor | None:
-    """The bounding box of the voxels that no mask rules out.
+    """Returns the bounding box of the voxels that at most one mask excludes.
 
-    A voxel is removed if two views see it entirely outside their mask. Each mask is widened by the size of the voxel in
+    A voxel is removed if two views see it entirely outside their mask. Each mask is dilated by the voxel's size in
     pixels, so that the box does not cut the object. The box is larger than the object by one or two voxels, each about
-    a fortieth of the object's size, and by concave parts that no silhouette shows.
+    a fortieth of the object's size, and includes concavities that no silhouette shows.
 
     Args:
         cameras: c perspective cameras that look at the object from around it.
         alpha: uint8 [c, h, w]; a pixel with alpha > 0 shows the object. Zero beside smaller images.
-        near: distance before which there is nothing.
-        far: distance behind which there is nothing; the search covers a cube of half side (far - near) / 2.
+        near: smallest distance of the object from a camera.
+        far: largest distance of the object; the search covers a cube of half side (far - near) / 2.
 
     Returns:
-        float32 [2, 3], or None if there is no such box: nothing or everything is opaque, a lens is a fisheye's or the
-        like, the cameras have no common focus, or the rays of more than a thousandth of the masks' pixels would miss
-        the box.
+        float32 [2, 3], or None if there is no box: nothing or everything is opaque, a lens is not perspective, the
+        cameras have no common focus, or the rays of more than a thousandth of the masks' pixels would miss the box.
     """
-    every = -(-len(cameras) // VIEWS)
-    cameras, visible = cameras[::every], (alpha[::every] > 0).numpy()
+    stride = -(-len(cameras) // VIEWS)
+    cameras, visible = cameras[::stride], (alpha[::stride] > 0).numpy()
     focus = focus_point(cameras)
     if focus is None or cameras.models is not None or not visible.any() or visible.all():
         return None
@@ -66,7 +65,7 @@ def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tenso
 
 
 class _Silhouette:
-    """One camera and its mask, widened by each of GROWTHS."""
+    """A camera and its mask, dilated by each width of `GROWTHS`."""
 
     def __init__(self, cameras: Cameras, index: int, visible: NDArray[np.bool_], shrink: int) -> None:
         width, height = cameras.size(index)
@@ -75,11 +74,11 @@ class _Silhouette:
         self.fx, self.fy, self.cx, self.cy = (cameras.intrinsics[index] / shrink).tolist()
         mask = _block_any(visible, shrink)
         self.height, self.width = mask.shape
-        # A view that shows the whole object also rules out what lies outside its picture.
-        self.whole = not _touches_border(mask)
+        # A view of the whole object also excludes all voxels outside its picture.
+        self.shows_all = not _touches_border(mask)
         if cameras.distortion is not None:
             mask = self._straightened(mask, cameras.distortion[index])
-            self.whole &= not _touches_border(mask)
+            self.shows_all &= not _touches_border(mask)
         mask = np.pad(mask, MARGIN)
         levels = []
         done = 0
@@ -88,30 +87,30 @@ class _Silhouette:
                 mask = _widen(mask)
             levels.append(mask)
             done = grow
-        levels.append(np.ones_like(mask))  # for voxels that are wider still
+        levels.append(np.ones_like(mask))  # for voxels wider than the last dilation
         self.masks = np.stack(levels)
 
     def _straightened(self, mask: NDArray[np.bool_], coefficients: Tensor) -> NDArray[np.bool_]:
-        """The mask as a camera without the lens would have it; what the picture does not show may be the object."""
+        """Returns the undistorted mask; pixels outside the picture count as the object unless it shows all of it."""
         row, column = torch.from_numpy(np.indices(mask.shape) + 0.5)
         u, v = distort((column - self.cx) / self.fx, (row - self.cy) / self.fy, coefficients)
         x, y = (u * self.fx + self.cx).floor().numpy(), (v * self.fy + self.cy).floor().numpy()
         shown = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
-        straight = np.full(mask.shape, not self.whole)
+        straight = np.full(mask.shape, not self.shows_all)
         straight[shown] = mask[y[shown].astype(np.int64), x[shown].astype(np.int64)]
         return straight
 
     def judge(self, points: Array, radius: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(seen [n], missed [n]): the balls that this view sees, and those of them that lie outside its mask."""
+        """Returns bool masks (seen [n], missed [n]): balls that this view sees, and seen balls outside its mask."""
         x, y, z = (points - self.pose[:3, 3]).T
         local = [self.pose[0, i] * x + self.pose[1, i] * y + self.pose[2, i] * z for i in range(3)]
         depth = -local[2]
-        ahead = depth > 2 * radius  # a ball that reaches behind the camera is not judged
+        ahead = depth > 2 * radius  # skips balls that reach behind the camera
         safe = np.maximum(depth, radius)
         column = np.floor(self.cx + self.fx * local[0] / safe)
         row = np.floor(self.cy - self.fy * local[1] / safe)
         inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
-        seen = ahead & (inside | self.whole)
+        seen = ahead & (inside | self.shows_all)
         reach = radius * max(self.fx, self.fy) / np.maximum(depth - radius, radius) + 1
         level = np.searchsorted(np.array(GROWTHS, dtype=np.float32), reach)
         height, width = self.masks.shape[1:]
@@ -121,7 +120,7 @@ class _Silhouette:
 
 
 def _carve(views: list[_Silhouette], pool: ThreadPoolExecutor, box: Array, resolution: int) -> Array | None:
-    """Carves a grid of resolution^3 voxels in `box`; returns the box of the voxels that are left."""
+    """Carves a grid of resolution^3 voxels in `box`; returns the box of the remaining voxels."""
     size = (box[1] - box[0]) / np.float32(resolution)
     steps = np.arange(resolution, dtype=np.float32) + np.float32(0.5)
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -131,15 +130,15 @@ def _carve(views: list[_Silhouette], pool: ThreadPoolExecutor, box: Array, resol
     for view_seen, view_missed in pool.map(lambda view: view.judge(points, radius), views):
         seen += view_seen
         missed += view_missed
-    stays = (seen >= SEEN_BY * len(views)) & (missed <= MISSED_BY)
-    if not stays.any():
+    remains = (seen >= SEEN_BY * len(views)) & (missed <= MISSED_BY)
+    if not remains.any():
         return None
-    kept = points[stays]
+    kept = points[remains]
     return np.stack((kept.min(axis=0) - size / 2, kept.max(axis=0) + size / 2))
 
 
 def _block_any(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
-    """For each block whether any pixel is set; incomplete blocks at the right and bottom count."""
+    """Returns for each block whether any pixel is set, with partial blocks at the right and bottom."""
     height, width = mask.shape
     padded = np.pad(mask, ((0, -height % size), (0, -width % size)))
     blocks = padded.reshape(padded.shape[0] // size, size, padded.shape[1] // size, size)
@@ -147,7 +146,7 @@ def _block_any(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
 
 
 def _touches_border(mask: NDArray[np.bool_]) -> bool:
-    """Whether any pixel at the border is set."""
+    """Returns whether any pixel at the border is set."""
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
@@ -163,7 +162,7 @@ def _widen(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _share_outside(cameras: Cameras, visible: NDArray[np.bool_], box: Array) -> float:
-    """Share of the masks' pixels whose rays miss the box."""
+    """Returns the share of the masks' pixels whose rays miss the box."""
     image, row, column = visible.nonzero()
     step = max(1, len(image) // 20_000)
     chosen = [torch.from_numpy(index[::step].copy()) for index in (image, column, row)]

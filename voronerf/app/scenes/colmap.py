@@ -1,10 +1,10 @@
 """Reads COLMAP's sparse models: `cameras`, `images` and `points3D`, binary or text.
 
 c images, n points, s observations of points in images. COLMAP's poses are world to camera, with axes x right, y down, z
-forward; ours are camera to world with OpenGL's axes. Every count of a file is compared with the bytes that are left, so
-that a broken one costs no memory.
+forward; voronerf's are camera to world with OpenGL's axes. Every count in a file is compared with the remaining bytes,
+so that a corrupt count allocates no memory.
 
-Source: COLMAP, "Output Format". Models of rigs keep the pose of each image in `images` too, where it is read.
+Source: COLMAP, "Output Format". Models of rigs, too, have the pose of each image in `images`, which is read.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from voronerf.app.scenes.transforms import LARGEST, LONGEST
 Array = NDArray[Any]
 
 FILES = ("cameras", "images", "points3D")
-#: The places of models in the folder of a scene, each a model or a folder of models 0, 1, ..., in the order in which
-#: they are tried, and of their images: COLMAP's, nerfstudio's, gaussian-splatting's before the images are undistorted,
-#: and image_undistorter's.
+#: Folders of models in a scene's folder, and the folders of their images, in the order of the search. A folder has one
+#: model, or models 0, 1, ... They are by COLMAP, nerfstudio, gaussian-splatting (before undistortion) and
+#: image_undistorter.
 PLACES = {
     "sparse": "images",
     "colmap/sparse": "images",
@@ -49,18 +49,18 @@ PLACES = {
     "dense/sparse": "dense/images",
     ".": "images",
 }
-#: Bytes of a file.
+#: The largest size of a file in bytes.
 MOST_BYTES = 2**31
-#: Points that fewer images than this have seen are too uncertain to tell where the scene is.
+#: The fewest images that must see a point: positions of other points are too uncertain.
 LEAST_SEEN = 3
-#: Numbers of points from here on are none: COLMAP writes the largest, 2^64 - 1, where an observation is of no point.
+#: The first invalid point number: COLMAP writes 2^64 - 1 for an observation without a point.
 NO_POINT = 2**63
-#: Share of the points of a view that may be wrong, at either end, and how many it needs.
+#: The share of a view's points cut off at either end of their depths, and the fewest points for depth bounds.
 OUTLIERS, LEAST_POINTS = 0.01, 20
 
 
 class ColmapCamera(NamedTuple):
-    """A lens, its model, and the size of its images in pixels."""
+    """A camera: its COLMAP model's name, its lens, and the size of its images in pixels."""
 
     model: str
     lens: Lens
@@ -69,8 +69,8 @@ class ColmapCamera(NamedTuple):
 
 
 class ColmapImage(NamedTuple):
-    """An image: its file, its camera, its pose float64 [4, 4], camera to world with OpenGL's axes, and the numbers of
-    the points that it sees, int64 [s]."""
+    """An image: its file name, its camera, its pose float64 [4, 4] (camera to world, OpenGL's axes), and the numbers
+    of its points, int64 [s]."""
 
     name: str
     camera: ColmapCamera
@@ -81,15 +81,15 @@ class ColmapImage(NamedTuple):
 class ColmapModel(NamedTuple):
     """A sparse model."""
 
-    path: Path  # of the file of images
-    images: list[ColmapImage]  # in the order of their names
-    numbers: Array  # int64 [n], of the points that at least three images see, rising
-    points: Array  # float64 [n, 3]
+    path: Path  # the file `images`
+    images: list[ColmapImage]  # sorted by name
+    numbers: Array  # int64 [n], ascending numbers of the points that at least three images see
+    points: Array  # float64 [n, 3], positions of these points
 
 
 class Models(NamedTuple):
-    """The sparse models of a scene, in the order of their numbers: its folder, the path of its images in it, and the
-    folders of the models."""
+    """The sparse models of a scene: the scene's folder, the path of its images in this folder, and the models' folders
+    in the order of their numbers."""
 
     folder: Path
     images: str
@@ -97,7 +97,7 @@ class Models(NamedTuple):
 
 
 def find_models(folder: Path) -> Models | None:
-    """The COLMAP models of a scene, or None; the folder of one or of all of them stands for that of the scene."""
+    """Returns the COLMAP models of a scene, or None; ``folder`` is the scene's, a model's, or the parent of models."""
     for place, images in PLACES.items():
         folder = Path(os.path.abspath(folder)) if place == "." else folder
         inside = folder / place
@@ -110,7 +110,7 @@ def find_models(folder: Path) -> Models | None:
 
 
 def _scene_around(folder: Path) -> tuple[Path, str]:
-    """The folder of a scene and the path of its images in it; the folder may be that of models in the scene."""
+    """Returns a scene's folder and its images' path there, given this folder or a folder of models inside it."""
     models = folder.parent if folder.name.isdecimal() else folder
     if not image_folders(folder):
         for place, images in PLACES.items():
@@ -121,7 +121,7 @@ def _scene_around(folder: Path) -> tuple[Path, str]:
 
 
 def _suffix(folder: Path) -> str | None:
-    """The suffix of the files of a model, binary ones before text; None for a folder that has none."""
+    """Returns the suffix of a model's files, preferably binary; None for a folder without a model."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{name}{suffix}").is_file() for name in FILES[:2]):
             return suffix
@@ -129,7 +129,7 @@ def _suffix(folder: Path) -> str | None:
 
 
 def _count_images(folder: Path) -> int:
-    """The number of images of a model; that of a binary one is in its first bytes. A broken model has none."""
+    """Returns the number of images of a model, from the first bytes of a binary one; 0 for a broken model."""
     path = folder / f"images{_suffix(folder)}"
     try:
         if path.suffix == ".txt":
@@ -142,7 +142,7 @@ def _count_images(folder: Path) -> int:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Reads a model; binary files come first where there are both. Without `points3D` it has no points."""
+    """Reads a model, from binary files if there are both kinds. Without `points3D` it has no points."""
     suffix = _suffix(folder) or ".bin"
     cameras_path, images_path, points_path = (folder / f"{name}{suffix}" for name in FILES)
     binary = suffix == ".bin"
@@ -178,39 +178,39 @@ def _check_size(path: Path) -> None:
 
 
 class _Reader:
-    """The values of a binary file, one after another."""
+    """A reader of the values in a binary file, one after another."""
 
     def __init__(self, path: Path) -> None:
         _check_size(path)
-        self.path, self.data, self.at = path, path.read_bytes(), 0
+        self.path, self.data, self.offset = path, path.read_bytes(), 0
 
     def count(self, least: int, what: str) -> int:
-        """A count of records of at least so many bytes each."""
+        """Reads the count of records, and checks that records of at least ``least`` bytes fit into the file."""
         (count,) = self.values("<Q")
-        left = len(self.data) - self.at
-        if count * least > left:
-            raise SceneError(f"{self.path}: is cut short or broken: {count} {what} do not fit into {left} bytes")
+        remaining = len(self.data) - self.offset
+        if count * least > remaining:
+            raise SceneError(f"{self.path}: is cut short or broken: {count} {what} do not fit into {remaining} bytes")
         return int(count)
 
     def values(self, layout: str) -> tuple[Any, ...]:
-        end = self.at + struct.calcsize(layout)
+        end = self.offset + struct.calcsize(layout)
         if end > len(self.data):
             raise SceneError(f"{self.path}: is cut short: it ends at byte {len(self.data)}, within a record")
-        numbers = struct.unpack_from(layout, self.data, self.at)
-        self.at = end
+        numbers = struct.unpack_from(layout, self.data, self.offset)
+        self.offset = end
         return numbers
 
     def name(self) -> str:
-        end = self.data.find(b"\0", self.at)
+        end = self.data.find(b"\0", self.offset)
         if end < 0:
             raise SceneError(f"{self.path}: is cut short: it ends within the name of an image")
-        text = self.data[self.at : end].decode(errors="replace")
-        self.at = end + 1
+        text = self.data[self.offset : end].decode(errors="replace")
+        self.offset = end + 1
         return text
 
     def records(self, count: int, kind: np.dtype[Any]) -> Array:
-        rows = np.frombuffer(self.data, kind, count, self.at)
-        self.at += count * kind.itemsize
+        rows = np.frombuffer(self.data, kind, count, self.offset)
+        self.offset += count * kind.itemsize
         return rows
 
 
@@ -223,7 +223,7 @@ def _cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
         yield number, _camera(path, number, name, width, height, reader.values(f"<{len(parameters.split())}d"))
 
 
-#: Bytes of an image without observations, whose name is empty.
+#: The bytes of the smallest image record: no observations and an empty name.
 LEAST_IMAGE = 64 + 1 + 8
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 RawImage = tuple[str, int, tuple[float, ...], Array]
@@ -242,16 +242,16 @@ def _points(path: Path) -> Iterator[tuple[int, float, float, float, int]]:
     reader = _Reader(path)
     for _ in range(reader.count(43 + 8, "points")):
         number, x, y, z = reader.values("<Q3d")
-        reader.at += 3 + 8  # colour and error
+        reader.offset += 3 + 8  # colour and error
         seen = reader.count(8, "observations")
-        reader.at += 8 * seen
+        reader.offset += 8 * seen
         yield number, x, y, z, seen
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The words of each line that is no comment, empty ones too, with its number."""
+    """Yields the number and the words of each line except comments; empty lines have no words."""
     _check_size(path)
-    with open(path, encoding="utf-8-sig", errors="replace") as file:  # Windows may begin it with a mark of its order
+    with open(path, encoding="utf-8-sig", errors="replace") as file:  # Windows programs may write a byte order mark
         for number, line in enumerate(file, 1):
             if not line.startswith("#"):
                 yield number, line.split()
@@ -281,7 +281,7 @@ def _text_images(path: Path) -> Iterator[RawImage]:
             continue
         with _line_of("an image", path, line):
             values, camera, name = tuple(map(float, words[1:8])), int(words[8]), " ".join(words[9:])
-        line, seen = next(lines, (line + 1, []))  # of its points, and empty without any
+        line, seen = next(lines, (line + 1, []))  # the line of its observations; empty without any
         with _line_of("the points of an image", path, line):
             numbers = [int(number) for number in seen[2::3]]
         yield name, camera, values, np.array([number for number in numbers if 0 <= number < NO_POINT], dtype=np.int64)
@@ -313,7 +313,7 @@ def _camera(path: Path, number: int, model: str, width: int, height: int, parame
 
 
 def _pose(values: tuple[float, ...], where: str) -> Array:
-    """The pose of a unit quaternion (w, x, y, z) and a translation, both world to camera."""
+    """Returns the camera-to-world pose [4, 4] of a world-to-camera unit quaternion (w, x, y, z) and translation."""
     numbers = np.array(values, dtype=np.float64)
     length = np.linalg.norm(numbers[:4]) if len(numbers) == 7 else 0.0
     if not ((np.abs(numbers) <= LARGEST).all() and abs(length - 1) < 0.01):
@@ -333,10 +333,10 @@ def _pose(values: tuple[float, ...], where: str) -> Array:
 
 
 def load_colmap(folder: Path, reading: Reading) -> Scene:
-    """Loads a capture with a COLMAP model; every 8th image in the order of their names is held out for testing.
+    """Loads a capture with a COLMAP model; every 8th image in the order of names is held out for testing.
 
-    Of several models the one with the most images is read. Black pixels of `masks` beside the images do not count. The
-    bounds of a view are the depths between which 98 % of its points lie.
+    If there are several models, the one with the most images is read. Black pixels of a mask in `masks` beside the
+    images are neither trained nor scored. The bounds of a view are the depths between which 98 % of its points lie.
     """
     models = find_models(folder)
     if models is None:
@@ -373,36 +373,36 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
 def _find_masks(
     source: Path, folder: ImageFolder, images: list[tuple[Path, ColmapImage]], allow_outside: bool
 ) -> tuple[list[Path | None], list[str]]:
-    """The masks of images: of 0.jpg 0.jpg.png, COLMAP's name, or 0.png; and a line about them."""
+    """Returns the masks of images, and a note on them; the mask of 0.jpg is 0.jpg.png (COLMAP's name) or 0.png."""
     masks = folder.masks
     if masks is None:
         return [None] * len(images), []
     names = [_name_inside(folder.path / image.name.replace("\\", "/"), folder.path) for _, image in images]
     files = [_name_inside(file, folder.path) for file, _ in images]
-    by_name, by_file = (named_files(source, masks, each, allow_outside) for each in (names, files))
-    found = [one or other for one, other in zip(by_name, by_file)]
-    count = len(found) - found.count(None)
-    return found, [f"{count} of {len(found)} images have a mask in {masks.name}, whose black pixels do not count"]
+    by_name, by_file = (named_files(source, masks, keys, allow_outside) for keys in (names, files))
+    result = [first or second for first, second in zip(by_name, by_file)]
+    count = len(result) - result.count(None)
+    return result, [f"{count} of {len(result)} images have a mask in {masks.name}, whose black pixels do not count"]
 
 
 def _name_inside(path: Path, folder: Path) -> str:
-    """The name of a path in a folder, or its last part if it leads elsewhere."""
+    """Returns a path relative to a folder, or its file name if it lies outside the folder."""
     name = os.path.relpath(path, folder)
     return path.name if name.startswith("..") else name
 
 
 def points_seen(image: ColmapImage, model: ColmapModel) -> Array:
-    """The points of the model that an image sees, float64 [s, 3]."""
-    at = np.searchsorted(model.numbers, image.points)
-    known = at < len(model.numbers)
-    return np.asarray(model.points[at[known][model.numbers[at[known]] == image.points[known]]])
+    """Returns the points of the model that an image sees, float64 [s, 3]."""
+    places = np.searchsorted(model.numbers, image.points)
+    in_range = places < len(model.numbers)
+    return np.asarray(model.points[places[in_range][model.numbers[places[in_range]] == image.points[in_range]]])
 
 
 def depth_bounds(image: ColmapImage, points: Array) -> tuple[float, float] | None:
-    """The depths between which the points [s, 3] of an image lie, but for outliers; None if they are too few."""
-    apart = points - image.pose[:3, 3]
-    around = image.camera.lens.model == EQUIRECTANGULAR  # which has no axis along which depths are measured
-    depth = np.linalg.norm(apart, axis=1) if around else -apart @ image.pose[:3, 2]
+    """Returns the depths between which an image's points [s, 3] lie, without outliers; None for too few points."""
+    offsets = points - image.pose[:3, 3]
+    panorama = image.camera.lens.model == EQUIRECTANGULAR  # without an optical axis, distances replace depths
+    depth = np.linalg.norm(offsets, axis=1) if panorama else -offsets @ image.pose[:3, 2]
     depth = depth[depth > 0]
     if len(depth) < LEAST_POINTS:
         return None

@@ -2,4 +2,4 @@
 
 
 class SceneError(ValueError):
-    """The data of a scene cannot be used. The message is one line and names the file."""
+    """An unusable scene; the message is one line and names the file."""

@@ -1,4 +1,4 @@
-"""The image files of COLMAP's and LLFF's folders: `images`, or `images_N`, which are smaller by N."""
+"""Image files of COLMAP and LLFF folders: in `images`, or reduced by a factor N in `images_N`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from voronerf.app.scenes.photographs import least_factor
 log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
-#: Images of phones, and all images of which `voronerf process` makes JPEG or PNG.
+#: Suffixes of phones' images, and of all images that `voronerf process` converts to JPEG or PNG.
 HEIF = (".heic", ".heif")
 CONVERTED = (".tif", ".tiff", ".bmp", ".webp", *HEIF)
 
@@ -29,9 +29,9 @@ class ImageFolder(NamedTuple):
 
     Attributes:
         path: the folder.
-        full: the folder of the same images in full size, if that is another one.
-        masks: the folder of their masks.
-        factor: by how much the images are still to be reduced; None leaves it to their size.
+        full: the folder of the same images in full size, or None if ``path`` is this folder.
+        masks: the folder of their masks, or None.
+        factor: the remaining downscale factor; None to choose it by the size of the images.
         notes: lines for the user.
     """
 
@@ -42,26 +42,26 @@ class ImageFolder(NamedTuple):
     notes: tuple[str, ...]
 
     def reduction(self, headers: Sequence[Header]) -> int:
-        """By how much images with these headers are to be reduced."""
+        """Returns the remaining downscale factor for images with these headers."""
         return self.factor or least_factor(max(max(header.size) for header in headers))
 
 
 def image_folders(folder: Path, images: str = "images") -> dict[int, Path]:
-    """The folders `images` and `images_N` of a scene, in any case, by N; `images` is a path in the scene's folder."""
-    around, name = (folder / images).parent, Path(images).name
+    """Returns the folders `images` (N = 1) and `images_N` by N, in any case; `images` is a path in ``folder``."""
+    parent, name = (folder / images).parent, Path(images).name
     matches = [
         (re.fullmatch(rf"{name}(?:_([1-9]\d{{0,3}}))?", path.name, re.IGNORECASE), path)
-        for path in sorted(around.iterdir() if around.is_dir() else ())
+        for path in sorted(parent.iterdir() if parent.is_dir() else ())
     ]
     return {int(match[1] or 1): path for match, path in matches if match and path.is_dir()}
 
 
 def choose_images(folder: Path, downscale: int | None, images: str = "images") -> ImageFolder:
-    """The folder of images that needs the least reduction.
+    """Returns the image folder that needs the least further reduction.
 
-    With `downscale` N, `images_N` is read as it is, else `images`, whose files are reduced by N, whatever size the
-    cameras are for. Where there is no `images`, the largest `images_N` is read, which a `downscale` of 1 takes as it
-    is. None reduces the images as far as `least_factor` says. `images` is a path in the scene's folder.
+    With `downscale` N, this is `images_N`; if it is missing, `images`, whose files are reduced by N. Without `images`,
+    it is the `images_N` with the largest images, which `downscale` 1 leaves in their size. `downscale` None reduces the
+    images by `least_factor`. `images` is a path in the scene's folder.
     """
     sizes = image_folders(folder, images)
     if not sizes:
@@ -81,9 +81,9 @@ def choose_images(folder: Path, downscale: int | None, images: str = "images") -
 
 
 def stay_inside(path: Path, folder: Path, allow_outside: bool, name: str = "") -> None:
-    """Raises SceneError for a path that leads out of the scene's folder by `..` or a link, unless that is allowed.
+    """Raises SceneError for a path that leads out of the scene's folder by `..` or a link, unless this is allowed.
 
-    The error calls it by a name, or by itself.
+    The error message begins with ``name``, or else with the path.
     """
     if not allow_outside and leads_outside(path, folder):
         raise SceneError(f"{name or path}: must lie in the folder of the scene; --allow-outside reads others")
@@ -92,10 +92,12 @@ def stay_inside(path: Path, folder: Path, allow_outside: bool, name: str = "") -
 def named_images(
     source: Path, images: ImageFolder, names: Sequence[str], allow_outside: bool
 ) -> tuple[list[Path | None], tuple[str, ...]]:
-    """Finds the files of names in a folder of images, as `named_files` does; else by their order if all are there.
+    """Finds the image files of names by `named_files`, or, if none fits, by order where there are as many files.
+
+    Warns of missing files.
 
     Returns:
-        (the file of each name, None for those that are missing, with a warning that says how many; lines for the user).
+        (the file of each name, None if it is missing; lines for the user).
     """
     files = named_files(source, images.path, names, allow_outside)
     notes: tuple[str, ...] = ()
@@ -111,10 +113,11 @@ def named_images(
 
 
 def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
-    """Finds the files of names in a folder and the folders in it; None for those that are missing.
+    """Finds the files of names in a folder and its subfolders; None for missing files.
 
-    A name is that of a file as it is; else without the suffix of either, else in another case. Where no name is found
-    so, and the last parts of the names differ from each other, the last parts are compared in the same way.
+    A name is compared with a file's path: exactly, then without the file's suffix, then without both suffixes, and at
+    last in the same ways without regard to case. If no name fits, and the names' last parts are unique, these last
+    parts are compared in the same ways.
     """
     names = [posixpath.normpath(name.replace("\\", "/")) for name in names]
     found = {
@@ -128,7 +131,7 @@ def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside:
         if not found and len(set(map(posixpath.basename, names))) == len(set(names)):
             _compare(source, folder, set(names), files, found, posixpath.basename)
     for name in names:
-        if name in found or not posixpath.isabs(name):  # of another machine
+        if name in found or not posixpath.isabs(name):  # an absolute path may be of another machine
             stay_inside(found.get(name, folder / name), folder.parent, allow_outside)
     return [found.get(name) for name in names]
 
@@ -136,19 +139,19 @@ def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside:
 def _compare(
     source: Path, folder: Path, names: set[str], files: list[Path], found: dict[str, Path], part: Callable[[str], str]
 ) -> None:
-    """Adds what is found of names by comparing a part of the paths; nothing that two names or two files share."""
+    """Adds the files of names to ``found``, by comparing a part of the paths; ambiguous matches are left out."""
     for fold in (str, str.casefold):
         for cut, cut_file in ((str, str), (str, _without_suffix), (_without_suffix, _without_suffix)):
-            fitting = defaultdict(list)
+            by_key = defaultdict(list)
             for path in files:
-                fitting[fold(cut_file(part(path.relative_to(folder).as_posix())))].append(path)
+                by_key[fold(cut_file(part(path.relative_to(folder).as_posix())))].append(path)
             keys = {name: fold(cut(part(name))) for name in names}
             counts, taken = Counter(keys.values()), set(found.values())
             for name in sorted(names - found.keys()):
-                paths = fitting.get(keys[name], [])
+                paths = by_key.get(keys[name], [])
                 if len(paths) > 1 and part is str:
-                    both = " or ".join(path.relative_to(folder).as_posix() for path in paths[:2])
-                    raise SceneError(f"{source}: {name} may be {both} in {folder}: leave one of them there")
+                    candidates = " or ".join(path.relative_to(folder).as_posix() for path in paths[:2])
+                    raise SceneError(f"{source}: {name} may be {candidates} in {folder}: leave one of them there")
                 if len(paths) == counts[keys[name]] == 1 and paths[0] not in taken:
                     found[name] = paths[0]
 
@@ -158,14 +161,14 @@ def _without_suffix(name: str) -> str:
 
 
 def _files_in_order(source: Path, images: ImageFolder, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
-    """The files of names by the order of the names; or, of reduced images, by that of the images in full size.
+    """Matches files with names by their order; for reduced images, the order of the images in full size counts.
 
-    None are found where the order of the characters is not that of the numbers in names, as of 10.jpg and 9.jpg: others
-    may have counted on.
+    It finds none if sorting by characters and by numbers differ, as for 10.jpg and 9.jpg: the other program may have
+    used either order.
     """
     files = image_files(images.path)
     ordered: list[Any] = sorted(set(names)) if images.full is None else image_files(images.full)
-    if len(ordered) != len(files) or not (_counts_on(ordered) and _counts_on(files)):
+    if len(ordered) != len(files) or not (_in_numeric_order(ordered) and _in_numeric_order(files)):
         return [None] * len(names)
     places = dict(zip(ordered, files))
     if images.full is None:
@@ -173,24 +176,24 @@ def _files_in_order(source: Path, images: ImageFolder, names: Sequence[str], all
     return [path and places.get(path) for path in named_files(source, images.full, names, allow_outside)]
 
 
-def _counts_on(paths: Sequence[Path | str]) -> bool:
-    """Whether the numbers in sorted paths are in order, too."""
+def _in_numeric_order(paths: Sequence[Path | str]) -> bool:
+    """Returns whether the numbers in sorted paths are in ascending order, too."""
     parts = [re.split(r"(\d+)", str(path)) for path in paths]
-    keys = [[int(part) if part.isdecimal() else part for part in each] for each in parts]
+    keys = [[int(part) if part.isdecimal() else part for part in pieces] for pieces in parts]
     return keys == sorted(keys)
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The image files of a folder and the folders in it, in the order of their paths."""
+    """Returns the image files of a folder and its subfolders, sorted by path."""
     files = (path for path in folder.rglob("*") if _is_image(path))
     return sorted(files, key=lambda path: path.relative_to(folder).as_posix())
 
 
 def listed_images(folder: Path) -> list[Path]:
-    """The image files of a folder in the order of their names."""
+    """Returns the image files of a folder, sorted by name."""
     return sorted(path for path in folder.iterdir() if _is_image(path))
 
 
 def _is_image(path: Path) -> bool:
-    """Whether a path is that of an image file; macOS puts others beside them, as ._a.jpg."""
+    """Returns whether a path is an image file; macOS adds other files, such as ._a.jpg, which do not count."""
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()

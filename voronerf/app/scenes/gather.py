@@ -1,4 +1,4 @@
-"""Gathers the images of a video or of somebody's folder as COLMAP reads them: PNG and JPEG, each once."""
+"""Gathers images of a folder or frames of a video for COLMAP, as PNG and JPEG files without duplicates."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ from voronerf.app.scenes.folders import CONVERTED, HEIF, SUFFIXES, listed_images
 from voronerf.app.scenes.images import UNREADABLE, drawn, read_header, read_image
 from voronerf.app.scenes.soundness import some_of
 
-#: Formats of a video. A playlist would name other files.
+#: Container formats of videos. Playlists are excluded, since they name other files.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
-#: Formats of images, decided by the content of a file, and those that are copied. MPO is JPEG with a second picture.
+#: Image formats, recognised by the content of a file, and the formats that are copied. MPO is JPEG with two pictures.
 FORMATS = ("PNG", "JPEG", "WebP", "TIFF", "BMP")
 COPIED = ("PNG", "JPEG", "MPO")
-#: The tags of EXIF by which COLMAP knows a focal length.
+#: The EXIF tags from which COLMAP gets a focal length.
 CAMERA = (ExifTags.Base.Make, ExifTags.Base.Model)
 LENS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
-#: Suffixes of images. Of files that differ in these alone the first is taken, as of a photograph and its cut-out.
+#: Image suffixes in order of preference. Of files that differ in suffix alone, such as a photograph and its cut-out,
+#: the first is taken.
 KINDS = (*reversed(SUFFIXES), *CONVERTED)
-#: Files and folders of systems that are no captures, beside hidden ones.
+#: Files and folders of operating systems, which are ignored like hidden ones.
 IGNORED = ("thumbs.db", "desktop.ini", "__macosx", "@eadir")
-#: Folders of masks, depths and smaller copies, which programs keep beside photographs.
+#: Folders of masks, depths and smaller copies that programs keep beside photographs.
 BESIDE = re.compile(r"(?i)masks?|depths?|images_\d+")
 LEAST_IMAGES = 3
 
@@ -41,15 +42,15 @@ Progress = Callable[[str, int, int], None]
 def gather(
     source: Path, images: Path, masks: Path, frames: int, *, say: Callable[[str], None], progress: Progress
 ) -> None:
-    """Copies the images of a folder and their masks, or takes frames of a video.
+    """Copies the images of a folder and their masks, or extracts frames of a video.
 
     Args:
-        source: a video, or a folder, as of :func:`voronerf.app.scenes.process.process`.
-        images: the folder to fill, which is empty.
-        masks: the folder to make if there are masks.
-        frames: of a video.
-        say: takes a line about what is left out.
-        progress: takes the name "images", how many are done and how many there are.
+        source: a video, or a folder, as in :func:`voronerf.app.scenes.process.process`.
+        images: the empty folder for the images.
+        masks: the folder for the masks, made if there are any.
+        frames: the number of frames of a video.
+        say: called with a line for the user, such as about files that are left out.
+        progress: called with the name "images", the number of copied images, and the number of all.
     """
     folder, files = _list_images(source, say) if source.is_dir() else (source, [])
     progress("images", 0, len(files))
@@ -65,16 +66,17 @@ def gather(
 
 
 def emptied(folder: Path) -> Path:
-    """A new folder in the place of what an earlier process left."""
+    """Makes a new folder in place of an existing one, and returns it."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """The files of a folder and of the folders in it.
+    """Yields the files of a folder and its subfolders.
 
-    Hidden ones are left out, what programs keep beside photographs, and scenes of :func:`process`.
+    It skips hidden files, system files, folders of masks, depths and smaller copies, and scenes made by
+    :func:`process`.
     """
 
     def counts(path: Path) -> bool:
@@ -87,9 +89,9 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _list_images(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[Path]]:
-    """Returns the folder of the images and their files, and says what is left out.
+    """Returns the folder of the images and the image files, and reports the files that are left out.
 
-    They are those of the folder or, if it has none, of its folder `images` or of all its folders.
+    The images are in ``folder`` itself or, if it has none, in its subfolder `images`, or in all its subfolders.
     """
     files = sorted(_files(folder))
     images = [path for path in files if path.suffix.lower() in KINDS]
@@ -98,10 +100,10 @@ def _list_images(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[P
         if deeper:
             say(f"{folder}: {len(deeper)} images in its folders are left out, since it has images itself")
         files, images = ([path for path in paths if path.parent == folder] for paths in (files, images))
-    elif own := next((path for path in folder.iterdir() if path.is_dir() and path.name.lower() == "images"), None):
-        if more := sum(own not in path.parents for path in images):
-            say(f"{folder}: {more} images in other folders than {own.name} are left out")
-        return _list_images(own, say)
+    elif inner := next((path for path in folder.iterdir() if path.is_dir() and path.name.lower() == "images"), None):
+        if skipped := sum(inner not in path.parents for path in images):
+            say(f"{folder}: {skipped} images in other folders than {inner.name} are left out")
+        return _list_images(inner, say)
     elif len(places := Counter(str(path.parent.relative_to(folder)) for path in deeper)) > 1:
         say(f"{folder}: the images are those of {some_of([f'{name} ({count})' for name, count in places.items()])}")
     if others := Counter(path.suffix.lower() or path.name for path in files if path.suffix.lower() not in KINDS):
@@ -113,17 +115,17 @@ def _list_images(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[P
         images = [path for path in images if path.suffix.lower() not in HEIF]
     images.sort(key=lambda path: KINDS.index(path.suffix.lower()))
     first = {path.with_suffix(""): path for path in reversed(images)}
-    if same := [str(path.relative_to(folder)) for path in images if first[path.with_suffix("")] != path]:
-        say(f"{folder}: {len(same)} images are left out that are there in another format, too: {some_of(same)}")
+    if repeats := [str(path.relative_to(folder)) for path in images if first[path.with_suffix("")] != path]:
+        say(f"{folder}: {len(repeats)} images are left out that are there in another format, too: {some_of(repeats)}")
     return folder, sorted(first.values())
 
 
 def _copy_images(
     folder: Path, files: Sequence[Path], part: Path, say: Callable[[str], None], progress: Progress
 ) -> dict[Path, Path]:
-    """Copies images to a folder, and returns them by their copies.
+    """Copies images to a folder, and returns the original of each copy.
 
-    COLMAP's lists of pairs separate names by spaces: names have `_` in their place, and in that of `/`.
+    In the copies' names, `_` replaces `/` and spaces, since COLMAP's lists of pairs separate names by spaces.
     """
     copied: dict[Path, Path] = {}
     deep = []
@@ -140,40 +142,40 @@ def _copy_images(
 
 
 def _opened(path: Path) -> Image.Image:
-    """Opens an image of any of the formats that are read."""
+    """Opens an image of any supported format."""
     if path.suffix.lower() not in HEIF:
         return Image.open(path, formats=FORMATS)
     import pillow_heif
 
-    image: Image.Image = pillow_heif.open_heif(path).to_pillow()  # upright, and says so
+    image: Image.Image = pillow_heif.open_heif(path).to_pillow()  # upright, with its tag
     return image
 
 
 def _copy_image(path: Path, copy: Path) -> tuple[Path, bool]:
-    """Copies a PNG or JPEG image; writes another one upright, with what it says of its lens.
+    """Copies a PNG or JPEG image; converts other images, upright and with the EXIF tags of their camera and lens.
 
-    HEIC and lossy WebP become JPEG, unless they are transparent, and others PNG.
+    HEIC and lossy WebP become JPEG unless they are transparent; other images become PNG.
 
     Returns:
-        the copy, whose suffix may be another one, and whether the image has 16 bits a channel, of which 8 are kept.
+        The path of the copy, whose suffix may differ, and whether 16 bits a channel were reduced to 8.
     """
     try:
         with _opened(path) as image:
             deep = re.search(r";16[BLN]", str(getattr(image, "tile", ""))) is not None
             if image.format in COPIED and not deep:
-                read_image(path, min(8, *read_header(path).size))  # COLMAP would take one that is cut off
+                read_image(path, min(8, *read_header(path).size))  # refuses truncated files, which COLMAP accepts
                 shutil.copyfile(path, copy)
                 return copy, deep
             if image.mode[0] in "IF":
                 raise SceneError(f"{path}: has grey values of more than 8 bits; write it with 8 bits a channel")
             lossy = image.format is None or (image.format == "WEBP" and b"VP8L" not in path.read_bytes())
             copy = copy.with_suffix(".jpg" if lossy and not image.has_transparency_data else ".png")
-            said = image.getexif()
-            lens, written = said.get_ifd(ExifTags.IFD.Exif), Image.Exif()
+            exif = image.getexif()
+            lens, written = exif.get_ifd(ExifTags.IFD.Exif), Image.Exif()
             written[ExifTags.IFD.Exif] = {tag: lens[tag] for tag in LENS if tag in lens}
-            written.update({tag: said[tag] for tag in CAMERA if tag in said})
-            shown = ImageOps.exif_transpose(image).convert("RGBA" if image.has_transparency_data else "RGB")
-            shown.save(copy, quality=95, compress_level=1, exif=written)
+            written.update({tag: exif[tag] for tag in CAMERA if tag in exif})
+            upright = ImageOps.exif_transpose(image).convert("RGBA" if image.has_transparency_data else "RGB")
+            upright.save(copy, quality=95, compress_level=1, exif=written)
     except SceneError:
         raise
     except Image.UnidentifiedImageError:
@@ -184,9 +186,9 @@ def _copy_image(path: Path, copy: Path) -> tuple[Path, bool]:
 
 
 def _remove_repeats(folder: Path) -> list[str]:
-    """Removes images that repeat others to the byte, such as `a (1).jpg` beside `a.jpg`, and returns their names.
+    """Removes byte-identical copies of images, such as `a (1).jpg` beside `a.jpg`, and returns their names.
 
-    One of them might be trained, and the other one held out. The shortest name stays.
+    Otherwise one copy might be trained and another one held out. The image with the shortest name stays.
     """
     seen: set[bytes] = set()
     repeats = []
@@ -200,14 +202,14 @@ def _remove_repeats(folder: Path) -> list[str]:
 
 
 def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callable[[str], None]) -> None:
-    """Writes the masks of images, which lie in `masks` in or beside their folder, by COLMAP's names of their copies."""
+    """Writes the masks of images, found in `masks` in or beside their folder, by COLMAP's names for the copies."""
     places = [place for place in (folder / "masks", folder / ".." / "masks") if place.is_dir()]
-    found = 0
+    count = 0
     for copy, path in copied.items():
         name, header = path.relative_to(folder), read_header(copy)
         size = header.size
-        named = [place / each for place in places for each in (f"{name}.png", name.with_suffix(".png"))]
-        named += [path.parent / "masks" / each for each in (f"{path.name}.png", f"{path.stem}.png")]
+        named = [place / end for place in places for end in (f"{name}.png", name.with_suffix(".png"))]
+        named += [path.parent / "masks" / end for end in (f"{path.name}.png", f"{path.stem}.png")]
         mask = next((file for file in named if file.is_file()), None)
         if mask is None:
             continue
@@ -221,42 +223,42 @@ def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callab
             raise SceneError(f"{mask}: is {wide} x {high} pixels, {path.name} is {size[0]} x {size[1]}")
         masks.mkdir(exist_ok=True)
         Image.fromarray(kept).save(masks / f"{copy.name}.png")
-        found += 1
-    if found:
-        say(f"{found} of {len(copied)} images have a mask: nothing is learnt where it is black")
+        count += 1
+    if count:
+        say(f"{count} of {len(copied)} images have a mask: nothing is learnt where it is black")
     elif places and copied:
         say(f"{places[0]}: has no mask of an image; that of 0.jpg is 0.jpg.png or 0.png")
 
 
 def _take_frames(video: Path, folder: Path, count: int, say: Callable[[str], None]) -> None:
-    """Writes frames of a video as JPEG, evenly spread, each once; ffmpeg turns those of a phone upright.
+    """Writes evenly spaced frames of a video as JPEG without repeats; ffmpeg turns frames of phones upright.
 
-    Packets are counted first, which takes no time, since durations may be missing or wrong. A video that was cut
-    without encoding has more of them than frames, and is read again.
+    Packets are counted first, which is fast, since durations may be missing or wrong. A video that was cut without
+    encoding has more packets than frames, and is read a second time.
     """
     import imageio_ffmpeg
 
-    # Filters that are made again where the size of the frames changes would count from 0.
+    # Without this, ffmpeg would restart the filters, and their frame count, where the frame size changes.
     read = ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS, "-reinit_filter", "0"]
     read += ["-i", f"file:{video}"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", *read]
-    each = ["-fps_mode", "passthrough"]
+    passed = ["-fps_mode", "passthrough"]
 
     def run(options: Sequence[str]) -> subprocess.CompletedProcess[str]:
         return subprocess.run([*command, *options], capture_output=True, text=True, errors="replace")
 
     def take(total: int) -> int:
-        """Writes the frames of a video that is said to have `total`, and returns how many it has."""
+        """Writes frames of a video, supposing `total` frames, and returns the actual number of its frames."""
         rate = f"{min(count, total)}/{total}"
         chosen = f"select='gt(floor((n+1)*{rate}+0.5),floor(n*{rate}+0.5))'"
-        # By frames' numbers, since times that stand still or go back end ffmpeg.
+        # Frame numbers replace time stamps, since ffmpeg stops at repeated or decreasing ones.
         graph = f"[0:V:0]settb=1,setpts=N,split[all][each];[each]{chosen},scale[chosen]"
-        counted = ["-map", "[all]", *each, "-progress", "-", "-f", "null", "-"]
-        written = ["-map", "[chosen]", *each, "-enc_time_base", "1", "-q:v", "2", str(emptied(folder) / "%05d.jpg")]
-        made = run(["-filter_complex", graph, *counted, *written])
-        frames = re.findall(r"^frame=(\d+)$", made.stdout, re.MULTILINE)
-        if made.returncode or not frames:
-            reason = (made.stderr.strip().splitlines() or ["no reason"])[-1]
+        counted = ["-map", "[all]", *passed, "-progress", "-", "-f", "null", "-"]
+        written = ["-map", "[chosen]", *passed, "-enc_time_base", "1", "-q:v", "2", str(emptied(folder) / "%05d.jpg")]
+        done = run(["-filter_complex", graph, *counted, *written])
+        frames = re.findall(r"^frame=(\d+)$", done.stdout, re.MULTILINE)
+        if done.returncode or not frames:
+            reason = (done.stderr.strip().splitlines() or ["no reason"])[-1]
             raise SceneError(f"{video}: ffmpeg cannot read it: {reason:.200}")
         return int(frames[-1])
 

@@ -1,4 +1,4 @@
-"""Reads image files as uint8 tensors and reduces them on the way, in little more memory than the scene will take."""
+"""Reads image files as uint8 tensors and reduces them, in little more memory than the resulting tensor takes."""
 
 from __future__ import annotations
 
@@ -23,28 +23,29 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.store import stored
 from voronerf.ops._core.checks import available_memory
 
-#: Decided by the content of a file. Pillow would read others too, some of them by starting another program.
+#: The image formats that are read, recognised by a file's content. Pillow reads further formats, some by starting
+#: another program.
 FORMATS = ("PNG", "JPEG")
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
-#: Quarters anticlockwise that make an image upright, by its orientation tag. Mirrors are no turns, and stay.
+#: Quarter turns anticlockwise that make an image upright, by its orientation tag. Mirrored images stay mirrored.
 TURNS = {3: 2, 6: 3, 8: 1}
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_DEPTH = 24  # offset of the bits a channel
-#: Alpha from which a pixel counts where alpha is a mask; less is a border, and what lies behind shows.
+PNG_DEPTH = 24  # byte offset of the number of bits per channel
+#: Alpha from which a pixel counts where alpha is a mask; pixels below mix with the background.
 OPAQUE = 250
-#: Share of the free memory that a scene may need; the rest is for the networks.
+#: The largest share of the free memory for a scene; the rest is for the networks.
 SHARE = 0.75
-#: Bytes for each pixel while a view is rendered and scored, most of them for SSIM.
+#: Bytes per pixel for rendering and scoring a view, most of them for SSIM.
 VIEW = 550
-#: Images are decoded by up to four threads while those in hand take at most this many bytes.
+#: The most decoding threads, and the most bytes of the images that they decode at a time.
 THREADS, IN_HAND = 4, 2**26
-#: Pixels that are converted and averaged at a time.
+#: The number of pixels that are converted and averaged at a time.
 BAND = 2**20
 
 
 class Header(NamedTuple):
-    """The header of an image file: (width, height), an alpha channel, bytes of a decoded pixel, whether
-    it is JPEG, and by how many quarters its orientation tag turns it anticlockwise."""
+    """The header of an image file: (width, height), whether it has alpha, bytes of a decoded pixel, whether it is
+    JPEG, and the quarter turns anticlockwise by its orientation tag."""
 
     size: tuple[int, int]
     alpha: bool
@@ -53,16 +54,16 @@ class Header(NamedTuple):
     turns: int
 
     def decoded(self, factor: int) -> int:
-        """Bytes of memory to decode it."""
+        """Returns the memory for decoding the image, in bytes."""
         width, height = (-(-side // _reduction(self.jpeg, factor)) for side in self.size)
         return width * height * self.depth
 
 
 def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Averages blocks of `factor` x `factor` pixels; columns and rows that fill no block are dropped.
+    """Averages blocks of `factor` x `factor` pixels; columns and rows of incomplete blocks are dropped.
 
     With alpha, premultiplied colours are averaged, which equals averaging the image composited on any background. The
-    result is straight colour and alpha. Rounding both to 8 bits changes the composited colour by at most one level.
+    result has straight alpha. Rounding to 8 bits changes the composited colour by at most one level.
 
     Args:
         image: [h, w, 3] or [h, w, 4].
@@ -87,8 +88,8 @@ def read_header(path: Path) -> Header:
     """Reads the header of an image file, without its pixels."""
     with _opened(path) as file:
         jpeg, turns = isinstance(file, JpegImageFile), 0
-        if jpeg:  # of PNG, Pillow would decode the pixels
-            with contextlib.suppress(*UNREADABLE):  # a broken tag is none
+        if jpeg:  # for a PNG, Pillow would decode the pixels
+            with contextlib.suppress(*UNREADABLE):  # a broken tag counts as missing
                 turns = TURNS.get(file.getexif().get(ExifTags.Base.Orientation, 1), 0)
         # Pillow keeps colours in four bytes a pixel.
         return Header(file.size, _has_alpha(file), 1 if len(file.getbands()) == 1 else 4, jpeg, turns)
@@ -97,8 +98,8 @@ def read_header(path: Path) -> Header:
 def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
     """Decodes one image file.
 
-    As it is stored, whatever its orientation tag: so do poses and intrinsics have it. JPEG files are reduced by up to 8
-    while they are decoded, from the low frequencies of each block of 8 x 8 pixels, which saves time and memory.
+    The orientation tag is ignored, since poses and intrinsics refer to the image as stored. JPEG files are reduced by
+    up to 8 during decoding, from the low frequencies of each block of 8 x 8 pixels, which saves time and memory.
 
     Returns:
         [h, w, 3], or [h, w, 4] with an alpha channel.
@@ -120,11 +121,11 @@ class Decoded(NamedTuple):
     """The result of `read_images`.
 
     Attributes:
-        images: uint8 [c, h, w, 3], or [c, h, w, 4] where any image has an alpha channel, with the smaller ones in the
-            upper left corner and zeros around them.
+        images: uint8 [c, h, w, 3], or [c, h, w, 4] if any image has an alpha channel. Smaller images lie in the upper
+            left corner, padded with zeros.
         sizes: int64 [c, 2], (width, height) of the files.
-        on_disk: the images are mapped from a file of the cache, and must not be written to.
-        turns: by how many quarters each image was turned anticlockwise.
+        on_disk: whether the images are mapped from a file of the cache, and read-only.
+        turns: number of quarter turns anticlockwise of each image.
     """
 
     images: Tensor
@@ -147,24 +148,24 @@ def read_images(
 
     Args:
         paths: at least one file.
-        headers: of those that were looked at already, with None for others.
-        factor: of the reduction, >= 1.
-        keep: in "memory"; on "disk", see `voronerf.app.scenes.store`; or "auto": on disk what does not fit into memory.
-        name: of the scene.
-        most_channels: 3 leaves alpha out.
-        upright: turn images by their orientation tags.
+        headers: the headers of the files that were read before, with None for other files.
+        factor: downscale factor, >= 1.
+        keep: "memory"; "disk", see `voronerf.app.scenes.store`; or "auto": on disk if they do not fit into memory.
+        name: the name of the scene.
+        most_channels: the most channels; 3 drops alpha.
+        upright: turn images upright by their orientation tags.
     """
-    seen = [header or read_header(path) for path, header in itertools.zip_longest(paths, headers)]
-    for path, header in zip(paths, seen):
+    found_headers = [header or read_header(path) for path, header in itertools.zip_longest(paths, headers)]
+    for path, header in zip(paths, found_headers):
         if factor > min(header.size):
             raise SceneError(f"{path}: downscaling by {factor} leaves no pixel of {header.size[0]} x {header.size[1]}")
-    sizes = torch.tensor([header.size for header in seen])
-    turns = [header.turns if upright else 0 for header in seen]
+    sizes = torch.tensor([header.size for header in found_headers])
+    turns = [header.turns if upright else 0 for header in found_headers]
     size = torch.where((torch.tensor(turns) % 2 == 1)[:, None], sizes.flip(1), sizes).amax(0).tolist()
     differ = bool((sizes != sizes[:1]).any())
-    channels = min(4 if any(header.alpha for header in seen) else 3, most_channels)
+    channels = min(4 if any(header.alpha for header in found_headers) else 3, most_channels)
     shape = (len(paths), size[1] // factor, size[0] // factor, channels)
-    decoded = max(header.decoded(factor) for header in seen)
+    decoded = max(header.decoded(factor) for header in found_headers)
     threads = max(1, min(THREADS, IN_HAND // decoded))
     pixels = shape[1] * shape[2]
     needed, free = len(paths) * pixels * channels + max(decoded, pixels * VIEW), available_memory()
@@ -199,7 +200,7 @@ def read_images(
 
 
 def _times(paths: Sequence[Path | None]) -> list[tuple[int, int, int] | None]:
-    """Size and times of each file: that of its content, which can be set, and that of its last change in any way."""
+    """Returns (size, mtime, ctime) of each file; programs can set mtime, but not ctime."""
     stats = [None if path is None else path.stat() for path in paths]
     return [None if stat is None else (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for stat in stats]
 
@@ -213,19 +214,19 @@ def read_masks(
     name: str = "images",
     alpha: bool = False,
 ) -> Tensor | None:
-    """Decodes the masks of images: black pixels do not count, nor does a block that has one.
+    """Decodes the masks of images. A reduced pixel counts if no pixel of its block is black.
 
     Args:
         masks: the mask file of each image, or None if the whole image counts.
-        paths: of the images.
-        images: of the sizes of their masks or reduced from these, and turned as the masks will be; where they are on
-            disk, so are the masks.
-        factor: of the reduction.
-        name: of the scene.
-        alpha: transparent pixels do not count either.
+        paths: the image files.
+        images: the decoded images, which have the size of their masks or a smaller one. Masks get the same turns, and
+            are on disk if the images are.
+        factor: downscale factor.
+        name: the name of the scene.
+        alpha: exclude transparent pixels, too.
 
     Returns:
-        bool [c, h, w], False around smaller images; None if no image has a mask and ``alpha`` is False.
+        bool [c, h, w], False in the padding of smaller images; None if no image has a mask and ``alpha`` is False.
     """
     if not any(masks) and not alpha:
         return None
@@ -239,21 +240,21 @@ def read_masks(
             with _opened(mask) as file:
                 kept = drawn(file, size, turns[index])
             high, wide = kept.shape
-            scale = wide / size[0]  # above 1 the mask is that of the image before it was reduced
+            scale = wide / size[0]  # above 1, the image was reduced after the mask was made
             if scale < 1 or abs(high - scale * size[1]) >= scale:
                 raise SceneError(f"{mask}: is {wide} x {high} pixels, {path.name} is {size[0]} x {size[1]}")
             if scale > 1:
-                whole = Image.fromarray(kept.astype(np.uint8) * 255)
-                kept = np.asarray(whole.resize(size, Image.Resampling.BOX)) == 255
+                mask_image = Image.fromarray(kept.astype(np.uint8) * 255)
+                kept = np.asarray(mask_image.resize(size, Image.Resampling.BOX)) == 255
             kept = kept[: height * factor, : width * factor]
             kept = kept.reshape(height, factor, width, factor).all(axis=(1, 3))
         kept = np.rot90(kept, turns[index])
         if alpha:
             kept = kept & (images.images[index, : kept.shape[0], : kept.shape[1], 3].numpy() >= OPAQUE)
         if not kept.any():
-            what = f"{mask}: must" if mask else f"{path}: its alpha must"
+            rule = f"{mask}: must" if mask else f"{path}: its alpha must"
             raise SceneError(
-                f"{what} leave a pixel that counts, or with --downscale a block of pixels; else take the image away"
+                f"{rule} leave a pixel that counts, or with --downscale a block of pixels; else take the image away"
             )
         place = np.zeros(shape[1:], dtype=np.uint8)
         place[: kept.shape[0], : kept.shape[1]] = kept
@@ -267,15 +268,15 @@ def read_masks(
 
 
 def drawn(mask: Image.Image, size: Sequence[int], turns: int) -> NDArray[np.bool_]:
-    """The pixels of a mask that count, bool [h, w] of the image as it is stored: neither black nor transparent.
+    """Returns bool [h, w], in the orientation of the stored image: pixels of a mask neither black nor transparent.
 
-    A mask may have been drawn on the upright image, which a tag makes of the stored one by quarter turns. Of a JPEG,
-    which blurs borders, what is darker than grey is black.
+    A mask may have been drawn on the upright image. JPEG blurs borders, so that its pixels darker than grey count as
+    black.
 
     Args:
-        mask: its file, opened.
-        size: (width, height) of the image as it is stored, or in proportion.
-        turns: quarters anticlockwise, of the image's tag.
+        mask: the opened mask file.
+        size: (width, height) of the image as stored, or proportional to it.
+        turns: quarter turns anticlockwise that make the image upright.
     """
     kept = np.asarray(mask.convert("L")) > (127 if isinstance(mask, JpegImageFile) else 0)
     if mask.has_transparency_data:
@@ -286,12 +287,12 @@ def drawn(mask: Image.Image, size: Sequence[int], turns: int) -> NDArray[np.bool
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """An image file whose pixels are not decoded yet."""
+    """Opens an image file without decoding its pixels."""
     try:
         with open(path, "rb") as stream:
             start = stream.read(PNG_DEPTH + 1)
             stream.seek(0)
-            # Pillow rounds most of these to 8 bits without a word.
+            # Pillow rounds most 16-bit images to 8 bits without a warning.
             if start.startswith(PNG_SIGNATURE) and start[PNG_DEPTH:] == b"\x10":
                 raise SceneError(f"{path}: has more than 8 bits a channel, which is not supported")
             with Image.open(stream, formats=FORMATS) as file:
@@ -309,9 +310,9 @@ def _has_alpha(file: Image.Image) -> bool:
 
 
 def _reduce_while_decoding(file: Image.Image, factor: int) -> int:
-    """Lets a JPEG file be decoded in a part of its size; returns the factor that is left.
+    """Makes Pillow reduce a JPEG file during decoding, and returns the remaining downscale factor.
 
-    Files with a second picture, which Pillow calls MPO, are JPEG, too.
+    JPEG includes files with a second picture, which Pillow calls MPO.
     """
     size, step = file.size, _reduction(isinstance(file, JpegImageFile), factor)
     if step > 1:
@@ -320,5 +321,5 @@ def _reduce_while_decoding(file: Image.Image, factor: int) -> int:
 
 
 def _reduction(jpeg: bool, factor: int) -> int:
-    """By how much a file can be reduced while it is decoded."""
+    """Returns the factor by which a file can be reduced during decoding."""
     return math.gcd(factor, 8) if jpeg else 1

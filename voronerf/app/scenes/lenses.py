@@ -1,4 +1,4 @@
-"""Lenses by the names of COLMAP's camera models, and whether a lens gives a position a ray.
+"""Lenses by the names of COLMAP's camera models, and a check which pixels of a lens have rays.
 
 Source: COLMAP, "Camera Models", and `src/colmap/sensor/models.h`.
 """
@@ -17,15 +17,15 @@ from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, unp
 
 
 class Lens(NamedTuple):
-    """Intrinsics (fx, fy, cx, cy) in pixels, the coefficients of `Cameras.distortion`, and of `Cameras.models` one."""
+    """A lens: intrinsics (fx, fy, cx, cy) in pixels, a row of `Cameras.distortion`, an entry of `Cameras.models`."""
 
     intrinsics: tuple[float, ...]
     coefficients: tuple[float, ...]
     model: int
 
 
-#: COLMAP's number of each model, its name and what its parameters are. f stands for fx and fy, w and h for the size of
-#: the picture.
+#: The name and the parameters of each camera model, by COLMAP's numbers. f stands for fx and fy, w and h for the
+#: picture's size.
 MODELS: dict[int, tuple[str, str]] = {
     0: ("SIMPLE_PINHOLE", "f cx cy"),
     1: ("PINHOLE", "fx fy cx cy"),
@@ -42,7 +42,7 @@ MODELS: dict[int, tuple[str, str]] = {
     15: ("FISHEYE", "fx fy cx cy"),
     17: ("EQUIRECTANGULAR", "w h"),
 }
-#: The numbers and names of the models that are not read: no lens of `Cameras` is equal to one of them.
+#: The numbers and names of unsupported models, for which `Cameras` has no equivalent lens.
 OTHER_MODELS = {11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION", 16: "EUCM"}
 #: The names of the coefficients in `Cameras.distortion`.
 COEFFICIENTS = {
@@ -54,7 +54,7 @@ COEFFICIENTS = {
 
 
 def colmap_lens(model: str, parameters: Sequence[float]) -> Lens:
-    """The lens of a camera model of COLMAP, with its parameters in COLMAP's order."""
+    """Returns the lens of a COLMAP camera model, given its parameters in COLMAP's order."""
     names = {name: text.split() for name, text in MODELS.values()}
     if model not in names:
         raise ValueError(
@@ -74,9 +74,9 @@ def colmap_lens(model: str, parameters: Sequence[float]) -> Lens:
 
 
 def have_rays(cameras: Cameras, index: int, x: Tensor, y: Tensor) -> Tensor:
-    """Which of the positions [n] in an image its lens gives a ray to, bool [n].
+    """Returns bool [n]: whether the lens has a ray for each position [n] of an image.
 
-    A model that folds over inside the image leaves out its corners.
+    Corners have no ray if the distortion model folds over inside the image.
     """
     if cameras.distortion is None:
         return torch.ones_like(x, dtype=torch.bool)

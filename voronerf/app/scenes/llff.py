@@ -1,7 +1,8 @@
-"""Captures as LLFF's `poses_bounds.npy` (Mildenhall et al. 2019), with `images` or `images_N` beside it.
+"""Captures with LLFF's `poses_bounds.npy` (Mildenhall et al. 2019), and `images` or `images_N` beside it.
 
-A row for each image in the order of their names: a pose of 3 x 5, whose columns are the axes down, right and backwards,
-the position, and height, width and focal length in pixels of `images`; then the depths between which its points lie.
+The file has a row for each image, in the order of their names. It begins with a 3 x 5 matrix, whose columns are the
+axes down, right and backwards, the position, and height, width and focal length in pixels of `images`. Then follow the
+least and the largest depth of its points.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from voronerf.app.scenes.transforms import LARGEST, ORTHONORMAL
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17
-#: Rows that a file may have; each is an image.
+#: The most rows, one for each image, of a file.
 MOST = 1_000_000
 
 
@@ -46,8 +47,8 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
         if np.abs(turn.T @ turn - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(turn) < 0:
             raise SceneError(f"{path}: row {number} is not a pose, its axes are no rotation")
         if not (min(height, width, focal) >= 1 and 0 < near < far):
-            came = ", ".join(f"{value:g}" for value in row[[4, 9, 14, 15, 16]])
-            raise SceneError(f"{path}: row {number} must have a size, a focal length and 0 < near < far, got {came}")
+            actual = ", ".join(f"{value:g}" for value in row[[4, 9, 14, 15, 16]])
+            raise SceneError(f"{path}: row {number} must have a size, a focal length and 0 < near < far, got {actual}")
         lens = Lens((focal, focal, width / 2, height / 2), (0.0,) * 8, PERSPECTIVE)
         headers.append(read_header(file))
         views.append(View(file, torch.from_numpy(pose), lens, (width, height), bounds=(near, far), header=headers[-1]))
@@ -59,7 +60,7 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
 def _read(path: Path) -> np.ndarray:
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # a header is a line of Python, with whatever shape
+    except Exception as error:  # the header is Python syntax, which may fail in any way
         raise SceneError(f"{path}: is no array of NumPy that can be read: {error!s:.80}") from None
     if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and 0 < len(rows) <= MOST):
         raise SceneError(

@@ -1,8 +1,8 @@
-"""From photographs with known cameras to a scene: which kind it is, where it lies, and how near and far it reaches.
+"""Makes a scene of photographs with known cameras: its kind, its frame, and its near and far bounds.
 
-c images, n sparse points. A scene is moved, turned and scaled so that the networks meet the same numbers whatever the
-units of its files: what the cameras look at becomes the origin, their mean up direction the z axis, and the farthest
-camera is at distance 1.
+c images, n sparse points. A scene is moved, turned and scaled so that the networks' inputs do not depend on the units
+of its files: the point that the cameras look at becomes the origin, their mean up direction becomes the z axis, and the
+farthest camera is at distance 1.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from voronerf.nerf.cameras import Cameras, focus_point, shared_focus
 from voronerf.nerf.contraction import Contraction, Perspective
 
 HOLD_OUT = 8
-# To which images are reduced where nobody says by how much: about what minutes of training can learn.
+# The longest side of images by default: about the resolution that can be learnt in minutes.
 LONGEST_SIDE = 512
-# Near bound without bounds of the views, as a share of the distance from the focus to the nearest camera; closer things
-# are rarely in focus.
+# The near bound of scenes without sparse points, as a share of the distance from the focus to the nearest camera.
+# Closer objects are rarely in focus.
 NEAR = 0.35
-# Smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
+# The smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
 NEAREST = 0.05
 FAR = 4.0
-# Points nearer than this are taken for noise if only this share of the views has any: half of the samples lie before
-# twice the near bound.
+# Points nearer than `LEAST_NEAR` count as noise if at most the share `NOISY` of the views has such points. A smaller
+# near bound costs samples: half of them lie before twice the near bound.
 LEAST_NEAR, NOISY = 0.02, 0.1
-# Of the bounds of the views: things may be a little nearer than the nearest point, and farther than the farthest.
+# Factors of the views' bounds: surfaces may be a little nearer than the nearest point, and farther than the farthest.
 NEARER, FARTHER = 0.75, 1.5
-# Mean of the viewing directions, a unit vector each, from which on they count as one direction.
+# The length of the mean of the viewing directions above which a scene is forward facing.
 PARALLEL = 0.95
-# A picture of an object on white: so much of it is transparent, and so much of its border. Masks of people, edges after
-# straightening and single pixels are less of one of both.
+# The least transparent shares of all pixels and of border pixels in a picture of a cut-out object. Masks of people,
+# edges after undistortion and single pixels stay below one of them.
 CLEAR, CLEAR_BORDER = 0.25, 0.5
-# Positions along each side of an image whose rays say how far it sees, where its corners have none.
+# The number of positions along each side of an image that give its field of view if its corners have no rays.
 ACROSS = 65
-# Share of the pixels of an image to which its lens must give a ray.
+# The least share of an image's pixels that have a ray.
 LEAST_RAYS = 0.25
-# By how many pixels a reduced image may have another shape than the one before: sizes are whole numbers, and exporters
-# that scale images may write fractions.
+# The tolerance in pixels for the aspect ratio of a reduced image: sizes are integers, and exporters that scale images
+# may write fractions.
 ROUNDED = 2
 KIND_LINES = {
     "object": "an object on white, from the images' alpha",
@@ -62,9 +62,11 @@ KIND_LINES = {
 
 
 class View(NamedTuple):
-    """A photograph: its file, its pose float64 [4, 4], camera to world, its lens and the (width, height) that this is
-    for; and where known its mask, the depths between which its points lie, these points float64 [s, 3], the header of
-    the file, and the radius of the circle around its middle outside of which nothing counts, in pixels of ``size``."""
+    """A photograph: its file, its pose float64 [4, 4] (camera to world), its lens, and the lens's (width, height).
+
+    The optional fields are the mask's file, the least and largest depth of its points, these points float64 [s, 3], the
+    file's header, and the radius of a fisheye's image circle in pixels of ``size``; pixels outside of it are masked.
+    """
 
     path: Path
     pose: Tensor
@@ -79,7 +81,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """How a folder is read, the options of `load_scene`."""
+    """The options of `load_scene` for reading a folder."""
 
     downscale: int | None = None
     allow_outside: bool = False
@@ -90,15 +92,15 @@ class Reading:
 
 
 def least_factor(longest: float) -> int:
-    """The factor that leaves a side of so many pixels at most `LONGEST_SIDE`."""
+    """Returns the smallest downscale factor that leaves at most `LONGEST_SIDE` of ``longest`` pixels."""
     return max(math.ceil(longest / LONGEST_SIDE), 1)
 
 
 def distinct_names(paths: list[Path], folder: Path) -> list[str]:
-    """A unique name for each image, under which pictures of it are stored.
+    """Returns a unique name for each image, used for files of rendered pictures.
 
-    The names are the stems of the files if these differ; otherwise the paths inside the folder of the scene, such as
-    a_00 for a/00.png; and if some of these are the same, the paths behind the number of the image.
+    The names are the stems of the files if these are unique; otherwise the paths inside the scene's folder, such as
+    a_00 for a/00.png; and if some paths are equal, the image's number and its path.
     """
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
@@ -124,13 +126,13 @@ def photograph_scene(
 
     Args:
         source: the file to name in errors.
-        folder: of the scene.
-        views: in the order of their names.
-        held_out: bool [c], the test views; None for every 8th, from the first.
-        reading: how the folder is read.
-        factor: by which the files are still to be reduced.
-        notes: what the loader has to say.
-        transform: float64 [4, 4], from the original coordinates to those of the poses.
+        folder: the scene's folder.
+        views: the c views, sorted by name.
+        held_out: bool [c], True for test views; None for every 8th view, from the first.
+        reading: the options for reading the folder.
+        factor: the remaining downscale factor of the files.
+        notes: the loader's lines for the user.
+        transform: float64 [4, 4], transform from the original coordinates to the coordinates of the poses.
     """
     views, held_out, repeats = _listed_once(views, held_out)
     places = torch.stack([view.pose[:3, 3] for view in views])
@@ -148,13 +150,13 @@ def photograph_scene(
     frame = find_frame(upright, kind, bounds if len(bounds) else None, normalise=reading.normalise)
     cameras = _cameras(frame.poses(poses), views, pictures.sizes, source)
     contraction = _contraction(kind, frame, cameras)
-    # Last, since the rows and columns that a reduction drops are those of the files.
+    # The turn follows the reduction, which drops rows and columns of the files as stored.
     cameras = _turned(cameras.downscaled(factor), pictures.turns)
     try:
         _ = cameras.lenses
     except ValueError as error:
         raise SceneError(f"{source}: {error}") from None
-    masks, shown = _masked_by_lenses(cameras, masks, source, views, factor, pictures.turns)
+    masks, lines = _masked_by_lenses(cameras, masks, source, views, factor, pictures.turns)
     box = None
     if kind == "object":
         box = carve_box(cameras[:count], pictures.images[:count, ..., 3], frame.near, frame.far)
@@ -168,7 +170,7 @@ def photograph_scene(
         for part in (slice(count), slice(count, None))
     )
     faults = camera_faults(places, bounds, ((view.lens, view.size[0]) for view in views))
-    notes = [*notes, *masked, *shown, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
+    notes = [*notes, *masked, *lines, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
     if reading.downscale is None and factor > 1:
         size = f"{cameras.width} x {cameras.height}"
         notes.append(f"images are reduced by {factor}, to {size} (--downscale 1 keeps their size)")
@@ -190,7 +192,7 @@ def photograph_scene(
 def _listed_once(
     views: Sequence[View], held_out: Tensor | None
 ) -> tuple[Sequence[View], Tensor | None, tuple[str, ...]]:
-    """Views of different files, and which are held out: one file could be trained and tested. A line names repeats."""
+    """Returns the views without repeated files, ``held_out``, and notes: no file may be both trained and tested."""
     first: dict[Path, int] = {}
     for index, view in enumerate(views):
         first.setdefault(view.path.resolve(), index)
@@ -203,7 +205,7 @@ def _listed_once(
 
 
 def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path) -> tuple[list[View], int]:
-    """The training views and then the others, so that the images of both are slices and no copies; how many train."""
+    """Returns the views, training views first so that both splits are slices, and the number of training views."""
     if held_out is None:
         held_out = torch.arange(len(views)) % HOLD_OUT == 0
     order = held_out.int().argsort(stable=True).tolist()
@@ -216,10 +218,10 @@ def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path
 def _read_pictures(
     views: Sequence[View], poses: Tensor, factor: int, reading: Reading, source: Path, name: str
 ) -> tuple[Decoded, Tensor | None, str, tuple[str, ...]]:
-    """Reads images and masks of views, and tells the kind of scene and whether alpha was a mask.
+    """Reads images and masks of views; returns them, the kind of scene, and a note if alpha was used as a mask.
 
-    An object keeps its alpha. Elsewhere transparent pixels are masked: people who walk through, and what straightening
-    has left without colour.
+    An object keeps its alpha. In other scenes transparent pixels are masked, such as passers-by, or pixels without
+    colour after undistortion.
     """
     paths, headers = [view.path for view in views], [view.header for view in views]
     read = functools.partial(read_images, paths, factor, headers=headers, name=name, upright=True)
@@ -231,7 +233,7 @@ def _read_pictures(
     alphas = _alphas(pictures, factor) if has_alpha else []
     models = {view.lens.model for view in views}
     with_alpha = sum(bool((alpha < OPAQUE).any()) for alpha in alphas)
-    # Of a fisheye, what surrounds its circle may be transparent.
+    # Around the image circle of a fisheye, pixels may be transparent.
     cut_out = not models & {EQUIRECTANGULAR, FISHEYE} and sum(map(_is_cut_out, alphas)) > len(alphas) / 2
     kind = _kind(poses, with_alpha > 0, cut_out, EQUIRECTANGULAR in models, reading, source)
     as_mask = with_alpha > 0 and kind != "object"
@@ -240,14 +242,14 @@ def _read_pictures(
         some = f"{with_alpha} of {len(views)} images"
         notes = (f"transparent pixels, in {some}, are masked (--kind object puts them on white)",)
     if kind != "object" and has_alpha:
-        # On disk they are stored again: a part of each pixel cannot be drawn from a mapped file without a copy.
+        # On disk, images are stored again without alpha: slicing the channels of a mapped file would need a copy.
         again = read(keep="disk", most_channels=3) if pictures.on_disk else None
         pictures = again or pictures._replace(images=pictures.images[..., :3].contiguous())
     return pictures, masks, kind, notes
 
 
 def _alphas(pictures: Decoded, factor: int) -> list[Tensor]:
-    """The alpha [h, w] of each image, without what lies around smaller ones."""
+    """Returns the alpha [h, w] of each image, without the padding of smaller images."""
     alphas = []
     for image, size, turns in zip(pictures.images, pictures.sizes, pictures.turns):
         width, height = ((size.flip(0) if turns % 2 else size) // factor).tolist()
@@ -256,22 +258,22 @@ def _alphas(pictures: Decoded, factor: int) -> list[Tensor]:
 
 
 def _is_cut_out(alpha: Tensor) -> bool:
-    """Whether an image with this alpha [h, w] shows an object before nothing."""
+    """Returns whether an image with this alpha [h, w] shows a cut-out object on a transparent background."""
     clear = alpha < 128
     border = torch.cat((clear[0], clear[-1], clear[:, 0], clear[:, -1]))
     return float(clear.float().mean()) >= CLEAR and float(border.float().mean()) >= CLEAR_BORDER
 
 
 def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
-    """A line about the views whose cameras lie far from the others, bool [c]: one would give the scene its scale."""
-    names = [view.path.name for view, apart in zip(views, far.tolist()) if apart]
-    which = f"{len(names)} of {len(views)} cameras lie far from the others"
-    done = "and are kept, as asked" if kept else "and are left out (--keep-far keeps them)"
-    return [f"{which} {done}: {some_of(names)}"] if names else []
+    """Returns a note on the views with ``far`` True, bool [c]: one such camera would determine the scene's scale."""
+    names = [view.path.name for view, is_far in zip(views, far.tolist()) if is_far]
+    start = f"{len(names)} of {len(views)} cameras lie far from the others"
+    treatment = "and are kept, as asked" if kept else "and are left out (--keep-far keeps them)"
+    return [f"{start} {treatment}: {some_of(names)}"] if names else []
 
 
 def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:
-    """The pixels in which views of a split see their points, inside the image and the mask."""
+    """Returns the pixels, inside image and mask, in which a split's views see their points; None if there are none."""
     pixels, distances = [], []
     for index, view in enumerate(views):
         if view.points is None:
@@ -291,16 +293,16 @@ def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDept
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of a scene: a similarity, and bounds that are measured after it.
+    """The frame of a scene: a similarity transform, and bounds in the transformed coordinates.
 
     Attributes:
-        matrix: float64 [4, 4], from the coordinates of the files to those of the scene.
+        matrix: float64 [4, 4], transform from the files' coordinates to the scene's.
         near: distance along a ray at which the scene begins.
-        far: distance along a ray at which it ends.
-        centre: float64 [3], the middle of the foreground.
-        radius: of the foreground.
-        axes: float64 [3, 3], its rows are the directions right, up and ahead.
-        measured: near and far come from the points.
+        far: distance along a ray at which the scene ends.
+        centre: float64 [3], the centre of the foreground.
+        radius: the radius of the foreground.
+        axes: float64 [3, 3], whose rows are the directions right, up and ahead.
+        measured: whether near and far come from sparse points.
     """
 
     matrix: Tensor
@@ -313,11 +315,11 @@ class Frame:
 
     @property
     def scale(self) -> float:
-        """Lengths in the scene over those in the files."""
+        """The ratio of lengths in the scene to lengths in the files."""
         return float(torch.linalg.det(self.matrix[:3, :3])) ** (1 / 3)
 
     def poses(self, poses: Tensor) -> Tensor:
-        """Poses float64 [c, 4, 4] in the scene, rigid as before."""
+        """Returns poses float64 [c, 4, 4] in the scene's coordinates, still with orthonormal axes."""
         moved = self.matrix @ poses
         moved[:, :3, :3] /= self.scale
         return moved
@@ -326,32 +328,33 @@ class Frame:
 def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normalise: bool = True) -> Frame:
     """Finds the coordinates of a scene.
 
-    The cameras' focus becomes the origin, or their middle where they have none in common; their mean up direction
-    becomes z, and for a forward-facing scene their mean direction becomes y. The farthest camera is at distance 1; with
-    bounds, the nearest near bound of a forward-facing scene. In one that is seen from within 1 is no nearer than the
-    median near bound, since cameras may only turn, and no farther than the median far bound.
+    The cameras' common focus, or else their mean position, becomes the origin. Their mean up direction becomes z, and
+    for a forward-facing scene their mean viewing direction becomes y. The farthest camera is at distance 1.
+
+    With bounds, the unit of a forward-facing scene is the smallest near bound. The unit of an inside-out scene is
+    limited to the range from the median near bound to the median far bound, since its cameras may share one place.
 
     Args:
         poses: float64 [c, 4, 4].
-        kind: of the scene.
+        kind: the kind of the scene.
         bounds: float64 [m, 2], the least and the largest depth of the points of m views.
-        normalise: False for the same space in the coordinates of the files.
+        normalise: False to keep the coordinates of the files.
     """
     cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
     outward = kind in ("forward", "inside-out")
     centre = None if outward else focus_point(cameras)
     if centre is None:
         centre = cameras.origins.mean(0)
-    turn = _upright(poses[:, :3, 1].mean(0), cameras.forward.mean(0) if kind == "forward" else None)
+    rotation = _upright(poses[:, :3, 1].mean(0), cameras.forward.mean(0) if kind == "forward" else None)
     distances = (cameras.origins - centre).norm(dim=-1)
     length = float(distances.max())
     if outward and bounds is not None:
-        least, most = bounds.median(0).values.tolist()  # cells as far as views reach would be too few for near things
-        length = float(bounds[:, 0].min()) if kind == "forward" else min(max(length, least), most)
+        low, high = bounds.median(0).values.tolist()  # a longer unit would leave too few cells for near objects
+        length = float(bounds[:, 0].min()) if kind == "forward" else min(max(length, low), high)
     length = length if length > 0 else 1.0
     matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3] = turn / length
-    matrix[:3, 3] = -turn @ centre / length
+    matrix[:3, :3] = rotation / length
+    matrix[:3, 3] = -rotation @ centre / length
     nearest = float(distances.min()) / length
     near, far, measured = max(NEAR * nearest, NEAREST), FAR, False
     if kind == "object":
@@ -364,26 +367,26 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
     axes = torch.eye(3, dtype=torch.float64)[[0, 2, 1]]
     if normalise:
         return Frame(matrix, near, far, torch.zeros(3, dtype=torch.float64), 1.0, axes, measured)
-    same = torch.eye(4, dtype=torch.float64)
-    return Frame(same, near * length, far * length, centre.double(), length, axes @ turn, measured)
+    identity = torch.eye(4, dtype=torch.float64)
+    return Frame(identity, near * length, far * length, centre.double(), length, axes @ rotation, measured)
 
 
 def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Perspective | None:
-    """The contraction of a scene without a box: a cube around all that forward-facing cameras see, or a ball."""
+    """Returns the contraction of a scene without a box: NDC for perspective forward-facing cameras, or a sphere."""
     centre = frame.centre.float()
     if kind == "object":
         return None
-    if kind != "forward" or cameras.models is not None:  # a fisheye may see to the side, or behind
+    if kind != "forward" or cameras.models is not None:  # a fisheye may see sideways or backwards
         return Contraction(centre, frame.radius)
     slopes = torch.zeros(2)
     axes = frame.axes.float()
     for index in range(len(cameras)):
         width, height = cameras.size(index)
         x, y = torch.cartesian_prod(torch.tensor([0.0, width]), torch.tensor([0.0, height])).T
-        if not (there := have_rays(cameras, index, x, y)).all():  # corners of a wide lens
+        if not (valid := have_rays(cameras, index, x, y)).all():  # corners of a wide lens may have no ray
             x, y = torch.cartesian_prod(torch.linspace(0, width, ACROSS), torch.linspace(0, height, ACROSS)).T
-            there = have_rays(cameras, index, x, y)
-        rays = cameras.rays(index, x[there], y[there])
+            valid = have_rays(cameras, index, x, y)
+        rays = cameras.rays(index, x[valid], y[valid])
         for distance in (frame.near, frame.far):
             local = (rays.origins + distance * rays.directions - centre) @ axes.T
             slopes = torch.maximum(slopes, (local[:, :2].abs() / local[:, 2:].clamp_min(frame.near / 2)).amax(0))
@@ -391,7 +394,7 @@ def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Per
 
 
 def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
-    """A rotation [3, 3] that turns `up` to z, and `forward`, if given, to y; leaves a direction of no length alone."""
+    """Returns a rotation [3, 3] of `up` to z and of `forward` to y; ignores a direction that is None or nearly zero."""
     if forward is not None and forward.norm() > 0.1:
         y = torch.nn.functional.normalize(forward, dim=0)
         x = torch.linalg.cross(y, up)
@@ -401,15 +404,15 @@ def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
     if up.norm() <= 0.1:
         return torch.eye(3, dtype=up.dtype)
     z = up / up.norm()
-    spare = torch.eye(3, dtype=up.dtype)[int(z.abs().argmin())]
-    x = torch.nn.functional.normalize(torch.linalg.cross(spare, z), dim=0)
+    axis = torch.eye(3, dtype=up.dtype)[int(z.abs().argmin())]
+    x = torch.nn.functional.normalize(torch.linalg.cross(axis, z), dim=0)
     return torch.stack((x, torch.linalg.cross(z, x), z))
 
 
-def _kind(poses: Tensor, transparent: bool, cut_out: bool, around: bool, reading: Reading, source: Path) -> str:
-    """The kind that was asked for, or the one that pictures and cameras show.
+def _kind(poses: Tensor, transparent: bool, cut_out: bool, panoramic: bool, reading: Reading, source: Path) -> str:
+    """Returns the requested kind of scene, or else the kind by images and cameras.
 
-    Pixels may be transparent, most pictures cut out, and some cameras may see all around.
+    The flags tell whether images have transparent pixels, most images show a cut-out, and any camera is a panorama.
     """
     if reading.kind == "object" and not transparent:
         raise SceneError(f"{source}: --kind object needs images with transparent pixels, these are opaque")
@@ -417,46 +420,46 @@ def _kind(poses: Tensor, transparent: bool, cut_out: bool, around: bool, reading
         return reading.kind
     if cut_out:
         return "object"
-    if around:
+    if panoramic:
         return "inside-out"
     return kind_of(Cameras(poses, torch.ones(len(poses), 4), 1, 1))
 
 
 def kind_of(cameras: Cameras) -> str:
-    """Returns the kind of scene that the directions of cameras show, without their images."""
+    """Returns the kind of scene by the viewing directions of the cameras alone."""
     if float(cameras.forward.mean(0).norm()) > PARALLEL:
         return "forward"
     return "inside-out" if shared_focus(cameras) is None else "unbounded"
 
 
 def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) -> Cameras:
-    """Cameras of the image files, whose size may be another one of the same shape than the lens is for."""
+    """Returns the cameras of image files, with intrinsics scaled from the lens's size to the file's."""
     intrinsics = []
     for view, (width, height) in zip(views, sizes.tolist()):
-        across, down = width / view.size[0], height / view.size[1]
-        if abs(across - down) * max(view.size) > ROUNDED * max(across, 1):
+        scale_x, scale_y = width / view.size[0], height / view.size[1]
+        if abs(scale_x - scale_y) * max(view.size) > ROUNDED * max(scale_x, 1):
             raise SceneError(
                 f"{view.path}: is {width} x {height} pixels as stored, but {source} says {view.size[0]:g} x "
                 f"{view.size[1]:g}"
             )
         fx, fy, cx, cy = view.lens.intrinsics
-        intrinsics.append((fx * across, fy * down, cx * across, cy * down))
-    bent = torch.tensor([view.lens.coefficients for view in views])
+        intrinsics.append((fx * scale_x, fy * scale_y, cx * scale_x, cy * scale_y))
+    coefficients = torch.tensor([view.lens.coefficients for view in views])
     models = torch.tensor([view.lens.model for view in views], dtype=torch.int32)
     others = models if bool((models != PERSPECTIVE).any()) else None
-    distortion = bent if others is not None or bool(bent.any()) else None
+    distortion = coefficients if others is not None or bool(coefficients.any()) else None
     return Cameras.of_images(poses.float(), torch.tensor(intrinsics), sizes, distortion, others)
 
 
 def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
-    """Cameras of images that are turned anticlockwise by so many quarters each: of the same rays, in another order.
+    """Returns cameras of images turned anticlockwise by ``turns`` quarters; the turned pixels keep their rays.
 
-    A quarter brings what is at (x, y) to (y, width - x), so that u becomes v, and v becomes -u.
+    A quarter turn moves the pixel at (x, y) to (y, width - x), so that u becomes v, and v becomes -u.
     """
     if not any(turns):
         return cameras
-    poses, intrinsics, bent = cameras.poses.clone(), cameras.intrinsics.clone(), cameras.distortion
-    bent = torch.zeros(len(cameras), 8) if bent is None else bent.clone()
+    poses, intrinsics, coefficients = cameras.poses.clone(), cameras.intrinsics.clone(), cameras.distortion
+    coefficients = torch.zeros(len(cameras), 8) if coefficients is None else coefficients.clone()
     prism = torch.zeros(len(cameras), dtype=torch.bool) if cameras.models is None else cameras.models == FISHEYE
     sizes = torch.tensor([cameras.size(index) for index in range(len(cameras))])
     for step in range(3):
@@ -465,48 +468,48 @@ def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
         poses[turning, :3, :2] = torch.stack((-up, right), -1)
         fx, fy, cx, cy = intrinsics[turning].unbind(-1)
         intrinsics[turning] = torch.stack((fy, fx, cy, sizes[turning, 0] - cx), -1)
-        bent[turning, 2:4] = torch.stack((-bent[turning, 3], bent[turning, 2]), -1)  # p1 and p2
-        both = turning & prism
-        bent[both, 6:8] = torch.stack((bent[both, 7], -bent[both, 6]), -1)  # s1 and s2
+        coefficients[turning, 2:4] = torch.stack((-coefficients[turning, 3], coefficients[turning, 2]), -1)  # p1 and p2
+        rows = turning & prism
+        coefficients[rows, 6:8] = torch.stack((coefficients[rows, 7], -coefficients[rows, 6]), -1)  # s1 and s2
         sizes[turning] = sizes[turning].flip(1)
-    distortion = None if cameras.distortion is None else bent
+    distortion = None if cameras.distortion is None else coefficients
     return Cameras.of_images(poses, intrinsics, sizes, distortion, cameras.models)
 
 
 def _masked_by_lenses(
     cameras: Cameras, masks: Tensor | None, source: Path, views: Sequence[View], factor: int, turns: Sequence[int]
 ) -> tuple[Tensor | None, tuple[str, ...]]:
-    """The masks without the pixels that have no ray of a lens or lie outside of a fisheye's circle, and a line."""
-    shown: dict[int, Tensor] = {}
+    """Masks the pixels without a ray or outside a fisheye's image circle; returns the masks and a note."""
+    seen: dict[int, Tensor] = {}
     for index, view in enumerate(views):
-        there = cameras.has_ray(index)
-        share = 1.0 if there is None else float(there.float().mean())
-        if share < LEAST_RAYS:
+        valid = cameras.has_ray(index)
+        ray_share = 1.0 if valid is None else float(valid.float().mean())
+        if ray_share < LEAST_RAYS:
             raise SceneError(
-                f"{source}: the lens of {view.path.name} gives a ray to {share:.0%} of its pixels, at least "
+                f"{source}: the lens of {view.path.name} gives a ray to {ray_share:.0%} of its pixels, at least "
                 f"{LEAST_RAYS:.0%} must have one; check its focal length and distortion"
             )
         if view.circle is not None:
             circle = _circle(view, factor).rot90(turns[index])
-            there = circle if there is None else there & circle
-        if there is not None and not there.all():
-            shown[index] = there
-    if not shown:
+            valid = circle if valid is None else valid & circle
+        if valid is not None and not valid.all():
+            seen[index] = valid
+    if not seen:
         return masks, ()
     if masks is None:
         masks = torch.ones(len(cameras), cameras.height, cameras.width, dtype=torch.bool)
-    masks = masks.clone()  # it may be mapped from a file
-    for index, there in shown.items():
-        height, width = there.shape
-        masks[index, :height, :width] &= there
+    masks = masks.clone()  # the tensor may be mapped from a file, read-only
+    for index, valid in seen.items():
+        height, width = valid.shape
+        masks[index, :height, :width] &= valid
         if not masks[index].any():
             raise SceneError(f"{views[index].path}: its mask and its lens must leave a pixel")
-    dark = 1 - sum(map(torch.sum, shown.values())) / sum(map(torch.numel, shown.values()))
-    return masks, (f"{dark:.0%} of the pixels of {len(shown)} images are none that their lens shows, and are masked",)
+    share = 1 - sum(map(torch.sum, seen.values())) / sum(map(torch.numel, seen.values()))
+    return masks, (f"{share:.0%} of the pixels of {len(seen)} images are none that their lens shows, and are masked",)
 
 
 def _circle(view: View, factor: int) -> Tensor:
-    """The pixels of a reduced image within the circle of its fisheye, bool [h, w] as it is stored."""
+    """Returns bool [h, w] in the stored orientation: whether pixels of a reduced image lie in the fisheye's circle."""
     assert view.header is not None and view.circle is not None
     width, height = view.header.size
     y, x = torch.meshgrid(

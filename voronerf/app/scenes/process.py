@@ -1,16 +1,17 @@
-"""From a video or a folder of images to a scene: COLMAP finds the cameras, by pycolmap.
+"""Makes a scene of a video or a folder of images: COLMAP, by pycolmap, finds the cameras.
 
-Its stages leave what they found in `OUT/colmap`, where a stopped process goes on and COLMAP's own program can look:
+The stages keep their results in `OUT/colmap`. A stopped process continues from them, and COLMAP's own program can open
+them:
 
-    features   `database.db`: the features of each image; `masks`: where images are not transparent, nor masked
-    pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: those that share some
-    matches    `database.db`: matches of those pairs
-    cameras    `global` and, if that model has faults or loses cameras, `incremental`. Each is made again, by
-               `trusted.db`, if it contradicts pairs of images (:mod:`voronerf.app.scenes.folds`). The best becomes
-               `OUT/sparse/0`, without cameras that few points hold or that lie far from the others
+    features   `database.db`: the features of each image; `masks`: pixels that are neither transparent nor masked
+    pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: the pairs to match
+    matches    `database.db`: the matches of these pairs
+    cameras    `global` and, if this model has faults or loses cameras, `incremental`. A mapper runs again, on
+               `trusted.db`, if its model contradicts pairs of images (:mod:`voronerf.app.scenes.folds`). The best model
+               becomes `OUT/sparse/0`, without cameras that see few points or lie far from the others
 
 Matching the largest features first is the preemptive matching of Wu 2013, "Towards Linear-time Incremental Structure
-from Motion", section 4; the global mapper is that of Pan et al. 2024, "Global Structure-from-Motion Revisited".
+from Motion", section 4. The global mapper is by Pan et al. 2024, "Global Structure-from-Motion Revisited".
 """
 
 from __future__ import annotations
@@ -58,37 +59,40 @@ from voronerf.app.wording import did_you_mean
 
 MATCHINGS = ("auto", "exhaustive", "sequential")
 MAPPERS = ("auto", "global", "incremental")
-#: Of transparent images, the alpha from which features count.
+#: The least alpha of pixels with features.
 OPAQUE = 128
-#: "auto" matches at most so many images all with all.
+#: The most images for which "auto" matches all pairs.
 FEW_IMAGES = 40
-#: Of the largest features of an image that choose its pairs; with how many images it is matched, and how many matches
-#: of the largest features make a pair. Images are also matched with this many that follow by name.
+#: Selection of pairs: the number of an image's largest features, the most partners of an image, the fewest matches of
+#: these features in a pair, and the number of next images by name that are always partners.
 LARGEST_FEATURES, NEIGHBOURS, LEAST_MATCHES, FOLLOWING = 800, 20, 10, 2
-#: Pairs are matched in parts of so many, between blocks of so many images, so that a part reads few images' features.
+#: The number of pairs in a part, and of images in a block. Pairs are sorted by blocks, so that a part reads the
+#: features of few images.
 PART, BLOCK = 256, 16
-#: Of so many images the pixels are tried as they are. Where these give less than a quarter of the features that are
-#: asked for, all images are enlarged to twice their sides, as SIFT does it, which takes four times as long.
+#: The number of images on which features are tried without upsampling. If they give less than a quarter of the
+#: requested features, all images are enlarged to twice their sides, as in the original SIFT, which takes four times as
+#: long.
 TRIED = 4
-#: "sequential" matches an image with so many that follow, and with as many at distances of powers of two.
+#: "sequential" matches an image with this number of next images, and with as many at distances of powers of two.
 SEQUENTIAL = 10
-#: Shares of the images with a camera: below the first a model is refused, below the second other mappers are tried.
+#: Shares of the images with a camera: below the first, a model is refused; below the second, other mappers are tried.
 LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
-#: A camera is held by so many points that at least three images see. COLMAP asks for as many matches of two images.
+#: The fewest points, seen by at least three images, of a camera that is not lost. COLMAP requires as many matches of
+#: two images.
 LEAST_HELD = 15
-#: Mean error of the points of a sound model: pixels, and, of larger images, the share of the longer side. A phone's
-#: images of 4,032 pixels have 2.04, and fields are as good as with 1.39.
+#: The largest mean reprojection error of a sound model: in pixels, and as a share of the longer side, whichever is
+#: larger. A phone's images of 4,032 pixels have an error of 2.04, and fields are as good as with 1.39.
 LARGEST_ERROR, ERROR_SHARE = 2.0, 1 / 800
-#: The global mapper places cameras by the longest tracks, until each image has so many; triangulation adds the others.
+#: The tracks of an image that the global mapper uses for placing cameras, longest first; triangulation adds the rest.
 TRACKS = 200
-#: The name of the mapper's thread, which cannot be stopped.
+#: The name of the mapper's thread, which cannot be interrupted.
 MAPPER = "mapper"
-#: The name of the stages' folder until its settings are written.
+#: The temporary name of the stages' folder, until its settings are written.
 BEGUN = ".colmap"
-#: Reduced images are written while their longer side has so many pixels.
+#: The least longer side of reduced images that are written, in pixels.
 LEAST_SIDE = 256
 
-#: The start of the names of COLMAP's logs, and what they say when a stage of the global mapper begins.
+#: The prefix of COLMAP's log files, and the pattern of a log line at the start of a stage of the global mapper.
 LOG, BEGINS = "log.", re.compile(r"=== Running (?:iterative )?(.+) ===")
 
 Size = tuple[int, int]
@@ -96,7 +100,7 @@ Item = TypeVar("Item")
 
 
 class Settings(NamedTuple):
-    """The settings of all stages; a folder that was begun with others is refused."""
+    """The settings of all stages; a folder with results of other settings is refused."""
 
     source: str
     frames: int
@@ -108,19 +112,29 @@ class Settings(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """The model that a mapper made."""
+    """A mapper's model.
 
-    folder: Path  # of its files
-    images: list[ColmapImage]  # that have a sound camera, in the order of their names
-    lost: dict[str, str]  # names of the other images, and what is wrong with their cameras
-    error: float  # mean distance of the points from where they were seen, in pixels
-    faults: list[str]  # what is wrong with it, as parts of a line
-    contradicted: int = 0  # pairs of images that match well over much of both, and that its cameras contradict
-    strong: int = 0  # pairs that match well over much of both
+    Attributes:
+        folder: the folder of its files.
+        images: the images with a sound camera, sorted by name.
+        lost: the names of the other images, and the faults of their cameras.
+        error: the mean reprojection error in pixels.
+        faults: the model's faults, as parts of a line.
+        contradicted: the number of strong pairs that its cameras contradict.
+        strong: the number of strong pairs of its images (:mod:`voronerf.app.scenes.folds`).
+    """
+
+    folder: Path
+    images: list[ColmapImage]
+    lost: dict[str, str]
+    error: float
+    faults: list[str]
+    contradicted: int = 0
+    strong: int = 0
 
     @property
     def folded(self) -> bool:
-        """Whether something that looks alike from several sides has misled the mapper."""
+        """Returns whether an object that looks alike from several sides has misled the mapper."""
         return is_folded(self.contradicted, self.strong)
 
 
@@ -140,38 +154,39 @@ def process(
 ) -> None:
     """Makes a scene: `out/images`, reduced copies, a COLMAP model in `out/sparse/0` and `out/transforms.json`.
 
-    Images of one size share a camera. `out/colmap` keeps what each stage found, and a process with the same settings
-    goes on there. `out/sparse/0` appears when all is done.
+    Images of one size share a camera. `out/colmap` keeps the results of each stage, from which a process with the same
+    settings continues. `out/sparse/0` is written last.
 
     Args:
-        source: a video, or a folder of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC images; if it has none,
-            those of its folder `images`, or of all its folders, are taken. Transparent parts have no features: the
-            surroundings of an object on a turntable, which stand still, must be so. Nor have parts that are black in
-            the mask of an image `0.jpg`: `0.jpg.png` or `0.png` in a folder `masks` in or beside that of the images.
-            Masks go along to `out/masks`.
-        out: the folder to make. It must not exist, be empty, or be that of a process that was stopped.
-        frames: of a video, evenly spread; all of a video that has fewer.
-        matching: which images are matched: "exhaustive", all with all; "sequential", with those next to them by name;
-            "auto", those whose largest features match, and the next two by name.
-        camera_model: COLMAP's name of the model of the lens.
-        mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults or loses
-            cameras. A model that contradicts pairs of images is made again, without pairs that may mislead.
-        max_features: of an image.
-        size: of an image's longer side in pixels, to which it is reduced where features are searched. With 3,200, which
-            is COLMAP's default, phones' images take twice the time, and fields are no better.
-        verbose: show what COLMAP says.
-        say: takes a line about each step.
-        progress: takes the name of a stage, how much of it is done and how much there is; 0 where that is not known.
+        source: a video, or a folder of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC images. Without images of
+            its own, its subfolder `images` is read, or all its subfolders. Features are found neither in transparent
+            parts nor in parts that a mask shows black. The mask of `0.jpg` is `0.jpg.png` or `0.png` in a folder
+            `masks`, in or beside the images' folder, and is copied to `out/masks`. The static surroundings of an object
+            on a turntable must be transparent or masked.
+        out: the folder to make. It must not exist, or must be empty or the folder of a stopped process.
+        frames: the number of evenly spaced frames of a video, or all if it has fewer.
+        matching: selection of image pairs: "exhaustive", all pairs; "sequential", neighbours by name; "auto", images
+            whose largest features match, and the next two by name.
+        camera_model: COLMAP's name of the lens model.
+        mapper: "global", "incremental", or "auto": global, and also incremental if the global model has faults or loses
+            cameras. If a model contradicts pairs of images, its mapper runs again on trusted pairs alone.
+        max_features: the most features of an image.
+        size: the longer side in pixels to which images are reduced for finding features. COLMAP's default, 3,200,
+            doubles the time for phones' images, and fields are no better.
+        verbose: show COLMAP's log.
+        say: called with a line about each step.
+        progress: called with the name of a stage, the number of finished items, and the number of all items, 0 if
+            unknown.
     """
     names = [name for name, _ in MODELS.values() if name != "EQUIRECTANGULAR"]
-    for argument, value, known in (
+    for argument, value, choices in (
         ("matching", matching, MATCHINGS),
         ("mapper", mapper, MAPPERS),
         ("camera_model", camera_model, names),
     ):
-        if value not in known:
-            end = did_you_mean(value, known)
-            raise ValueError(f"process: {argument} must be one of {', '.join(known)}, got {value!r:.60}{end}")
+        if value not in choices:
+            hint = did_you_mean(value, choices)
+            raise ValueError(f"process: {argument} must be one of {', '.join(choices)}, got {value!r:.60}{hint}")
     if max_features < 100:
         raise ValueError(f"process: max_features must be at least 100, got {max_features}")
     if size < 64:
@@ -182,19 +197,19 @@ def process(
     work = _begin(out, settings)
     if not (images := out / "images").is_dir():
         _begin_images(source, out, frames, say, progress)
-    os.environ.setdefault("GLOG_logbuflevel", "-1")  # COLMAP reads it when it is loaded: its log is not held back
+    os.environ.setdefault("GLOG_logbuflevel", "-1")  # read when COLMAP is loaded: turns off log buffering
     stopping = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError:
         raise ImportError("voronerf process needs pycolmap: pip install 'voronerf[colmap]'") from None
-    with contextlib.suppress(ValueError):  # in another thread than the main one
-        signal.signal(signal.SIGTERM, stopping)  # importing pycolmap installs glog's handler, which prints a stack
+    with contextlib.suppress(ValueError):  # outside the main thread
+        signal.signal(signal.SIGTERM, stopping)  # replaces glog's handler, which prints a stack trace
     log, level = pycolmap.logging, pycolmap.logging.Level
     log.minloglevel, log.logtostderr, log.alsologtostderr = level.INFO.value, False, verbose
     log.stderrthreshold = level.FATAL.value
     log.set_log_destination(level.INFO, work / LOG)
-    for other in (level.WARNING, level.ERROR):  # which are in that log, too
+    for other in (level.WARNING, level.ERROR):  # the INFO log has these lines, too
         log.set_log_destination(other, "")
     files, masks = listed_images(images), out / "masks"
     sizes = {path.name: read_header(path).size for path in files}
@@ -225,19 +240,19 @@ def process(
         )
     for factor in (2, 4):
         _write_reduced(files, out / f"images_{factor}", factor)
-    shown = [
+    shots = [
         Shot(
-            f"images/{each.name}",
-            torch.from_numpy(each.pose),
-            each.camera.lens,
-            each.camera.width,
-            each.camera.height,
-            f"masks/{each.name}.png" if (masks / f"{each.name}.png").is_file() else "",
+            f"images/{image.name}",
+            torch.from_numpy(image.pose),
+            image.camera.lens,
+            image.camera.width,
+            image.camera.height,
+            f"masks/{image.name}.png" if (masks / f"{image.name}.png").is_file() else "",
         )
-        for each in best.images
+        for image in best.images
     ]
-    with contextlib.suppress(SceneError):  # for a lens that only COLMAP has
-        write_transforms(out / "transforms.json", shown)
+    with contextlib.suppress(SceneError):  # transforms.json cannot describe all of COLMAP's lenses
+        write_transforms(out / "transforms.json", shots)
     _write_sound(pycolmap, best, out / "sparse" / "0")
     if best.folded:
         say(f"check the cameras: the model {_contradiction(best)}")
@@ -245,38 +260,38 @@ def process(
 
 
 def _begin(out: Path, settings: Settings) -> Path:
-    """The folder of the stages, new or that of a process with the same settings that was stopped."""
+    """Returns the folder of the stages: a new one, or the folder of a stopped process with the same settings."""
     work = out / "colmap"
-    noted = work / "settings.json"
-    if noted.is_file():
-        before, asked = json.loads(noted.read_text()), settings._asdict()
-        if other := [name for name, value in asked.items() if before.get(name) != value]:
-            name = other[0]
+    record = work / "settings.json"
+    if record.is_file():
+        stored, wanted = json.loads(record.read_text()), settings._asdict()
+        if changed := [name for name, value in wanted.items() if stored.get(name) != value]:
+            name = changed[0]
             raise SceneError(
-                f"{work}: was begun with --{name.replace('_', '-')} {before.get(name)}, not {asked[name]}; give the "
+                f"{work}: was begun with --{name.replace('_', '-')} {stored.get(name)}, not {wanted[name]}; give the "
                 "same, or another folder"
             )
         if (out / "sparse" / "0").exists():
             raise SceneError(f"{out}: is a scene already")
         return work
-    part = out / BEGUN
-    if out.exists() and (not out.is_dir() or any(path != part for path in out.iterdir())):
+    partial = out / BEGUN
+    if out.exists() and (not out.is_dir() or any(path != partial for path in out.iterdir())):
         raise SceneError(f"{out}: must not exist yet, be an empty folder, or be that of a process that was stopped")
-    write_text(emptied(part) / noted.name, json.dumps(settings._asdict(), indent=1))
-    os.replace(part, work)
+    write_text(emptied(partial) / record.name, json.dumps(settings._asdict(), indent=1))
+    os.replace(partial, work)
     return work
 
 
 def _begin_images(source: Path, out: Path, frames: int, say: Callable[[str], None], progress: Progress) -> None:
-    """Makes `out/images` and, where there are masks, `out/masks`; or nothing, as if never begun."""
+    """Makes `out/images` and, if there are masks, `out/masks`; removes both and the stages' folder on failure."""
     part, masks = emptied(out / ".images"), out / "masks"
     try:
         gather(source, part, masks, frames, say=say, progress=progress)
     except BaseException:
-        for begun in (part, masks):
-            shutil.rmtree(begun, ignore_errors=True)
+        for folder in (part, masks):
+            shutil.rmtree(folder, ignore_errors=True)
         with contextlib.suppress(OSError):
-            os.replace(out / "colmap", out / BEGUN)  # a kill leaves no folder of the stages without settings
+            os.replace(out / "colmap", out / BEGUN)  # renamed first: a kill cannot leave half of it
             shutil.rmtree(out / BEGUN)
             out.rmdir()
         raise
@@ -285,24 +300,24 @@ def _begin_images(source: Path, out: Path, frames: int, say: Callable[[str], Non
 
 @dataclass(frozen=True)
 class Stages:
-    """The files and settings that all stages work on."""
+    """The files and settings of all stages."""
 
     colmap: Any  # the module pycolmap
-    work: Path  # the folder of what the stages leave
+    work: Path  # the folder of the stages' results
     images: Path  # the folder of the images
-    progress: Progress  # as of :func:`process`
+    progress: Progress  # see :func:`process`
 
     def in_parts(self, name: str, items: Sequence[Item], size: int, work: Callable[[Sequence[Item]], None]) -> None:
-        """Does the work of a stage in parts, so that it can be shown and stopped; COLMAP passes over what is done."""
+        """Runs a stage in parts, for progress and interruption; COLMAP skips the items that are finished."""
         for first in range(0, len(items), size):
             self.progress(name, first, len(items))
-            with _told(name):
+            with _named_errors(name):
                 work(items[first : first + size])
         self.progress(name, len(items), len(items))
 
 
 @contextlib.contextmanager
-def _told(stage: str) -> Iterator[None]:
+def _named_errors(stage: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError) as error:
@@ -310,7 +325,7 @@ def _told(stage: str) -> Iterator[None]:
 
 
 def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
-    """Finds the features of images, given by their names and sizes, and matches them."""
+    """Finds and matches features of images, for which ``sizes`` has the names and sizes."""
     colmap, database, names = stages.colmap, stages.work / "database.db", list(sizes)
     extraction = colmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = settings.max_features
@@ -350,7 +365,7 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
     tried.unlink(missing_ok=True)
     extraction.sift.first_octave = 0
     stages.progress("features", 0, len(names))
-    with _told("features"):
+    with _named_errors("features"):
         extract(some, tried)
     with colmap.Database.open(tried) as opened:
         if opened.num_keypoints() < len(some) * settings.max_features / 4:
@@ -359,7 +374,7 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
     stages.in_parts("features", names, 4, extract)
     with colmap.Database.open(database) as opened:
         matched = opened.num_matched_image_pairs() > 0
-    if not matched:  # SIFT gives up to twice as many as it is asked for, and matching takes their product
+    if not matched:  # SIFT returns up to twice the requested number, and the time for matching is quadratic in it
         _keep_largest(colmap, database, database, settings.max_features)
     if settings.matching == "sequential":
         steps = {*range(1, SEQUENTIAL + 1), *(2**i for i in range(SEQUENTIAL))}
@@ -377,28 +392,28 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
     match(database, "matches", pairs)
 
 
-def _keep_largest(colmap: Any, database: Path, few: Path, most: int) -> None:
-    """Copies a database with the largest features of each image alone; to itself, as well."""
-    part = _copied(database, few.with_suffix(".part"))
+def _keep_largest(colmap: Any, database: Path, target: Path, most: int) -> None:
+    """Copies a database with only the largest features of each image; both paths may be equal."""
+    part = _copied(database, target.with_suffix(".part"))
     with colmap.Database.open(part) as opened:
         kept = {}
         for image in opened.read_all_images():
-            places, described = opened.read_keypoints(image.image_id), opened.read_descriptors(image.image_id)
+            places, descriptors = opened.read_keypoints(image.image_id), opened.read_descriptors(image.image_id)
             # A feature is x, y and a scale, or x, y and an affine shape of 2 x 2.
             a, *rest = places[:, 2:].T
             area = np.abs(a * rest[2] - rest[0] * rest[1]) if len(rest) == 3 else a**2
             top = np.argsort(-area, kind="stable")[:most]
-            kept[image.image_id] = places[top], type(described)(data=described.data[top], type=described.type)
+            kept[image.image_id] = places[top], type(descriptors)(data=descriptors.data[top], type=descriptors.type)
         opened.clear_keypoints()
         opened.clear_descriptors()
-        for number, (places, described) in kept.items():
+        for number, (places, descriptors) in kept.items():
             opened.write_keypoints(number, places)
-            opened.write_descriptors(number, described)
-    os.replace(part, few)
+            opened.write_descriptors(number, descriptors)
+    os.replace(part, target)
 
 
 def _choose_pairs(colmap: Any, few: Path) -> list[Pair]:
-    """The names of the images that are worth matching with all features: each with its best, and the next by name."""
+    """Returns the pairs to match with all features: for each image its best partners, and the next by name."""
     with colmap.Database.open(few) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         numbers, matches = opened.read_two_view_geometry_num_inliers()
@@ -416,31 +431,31 @@ def _choose_pairs(colmap: Any, few: Path) -> list[Pair]:
 
 
 def _find_models(stages: Stages, matches: Matches, mapper: str, count: int, say: Callable[[str], None]) -> list[Model]:
-    """The models of a mapper or, with "auto", of as many as it takes for a good one of so many images."""
+    """Reconstructs with ``mapper``; "auto" tries the mappers in order until a model of ``count`` images is good."""
     spread = spreads(matches)
     strong, models = strong_pairs(matches, wide_pairs(matches, spread)), list[Model]()
-    for name, again in itertools.product(MAPPERS[1:], (False, True)):
+    for name, repeat in itertools.product(MAPPERS[1:], (False, True)):
         folded = bool(models) and models[-1].folded
         good = any(_sound(model, GOOD_SHARE * count) and not (model.folded or model.lost) for model in models)
-        if good or mapper not in ("auto", name) or (again and not folded):
+        if good or mapper not in ("auto", name) or (repeat and not folded):
             continue
-        database, about = stages.work / "database.db", f"{name} mapping"
-        if again:
+        database, line = stages.work / "database.db", f"{name} mapping"
+        if repeat:
             trusted = trusted_pairs(matches, spread)
             database = _keep_pairs(stages.colmap, database, trusted)
-            about += f" by {len(trusted)} pairs of {len(matches.pairs)}"
+            line += f" by {len(trusted)} pairs of {len(matches.pairs)}"
         try:
-            model = _map(stages, f"{name}_again" if again else name, database, matches, strong)
-        except SceneError as error:  # such as a model whose focal lengths are not finite
-            say(f"{about}: no model: {error}")
+            model = _map(stages, f"{name}_again" if repeat else name, database, matches, strong)
+        except SceneError as error:  # for example, a model with focal lengths that are not finite
+            say(f"{line}: no model: {error}")
             continue
-        say(f"{about}: {_described(model, count)}")
+        say(f"{line}: {_described(model, count)}")
         models += [model] if model is not None else []
     return models
 
 
 def _read_matches(stages: Stages) -> Matches:
-    """The matches that fit two cameras."""
+    """Returns the verified matches, which fit two cameras."""
     colmap, pairs = stages.colmap, {}
     with colmap.Database.open(stages.work / "database.db") as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
@@ -448,13 +463,13 @@ def _read_matches(stages: Stages) -> Matches:
         for pair, count in zip(*opened.read_two_view_geometry_num_inliers()):
             if count:
                 a, b = colmap.pair_id_to_image_pair(pair)
-                found = np.asarray(opened.read_two_view_geometry(a, b).inlier_matches)
-                pairs[names[a], names[b]] = found.astype(np.int64)
+                rows = np.asarray(opened.read_two_view_geometry(a, b).inlier_matches)
+                pairs[names[a], names[b]] = rows.astype(np.int64)
     return Matches(features, pairs)
 
 
 def _keep_pairs(colmap: Any, database: Path, pairs: Collection[Pair]) -> Path:
-    """A copy of a database, beside it, with the matches of some pairs alone; one that is there is kept."""
+    """Copies a database with only the matches of ``pairs``, and returns the copy's path; an existing copy is kept."""
     kept = database.with_name("trusted.db")
     if kept.is_file():
         return kept
@@ -470,14 +485,14 @@ def _keep_pairs(colmap: Any, database: Path, pairs: Collection[Pair]) -> Path:
 
 
 def _sound(model: Model, least: float) -> bool:
-    """Whether a model has no faults, and so many cameras."""
+    """Returns whether a model has no faults and at least ``least`` cameras."""
     return not model.faults and len(model.images) >= least
 
 
 def _best(models: Sequence[Model], count: int) -> Model:
-    """The best of models of so many images: sound, not folded, with the most cameras, few lost, and the least error.
+    """Returns the best model of ``count`` images: sound, not folded, most cameras, fewest lost, and least error.
 
-    A pair that a model contradicts weighs as much as a camera: it tells that others are wrong, too.
+    The criteria count in this order. A contradicted pair counts as a missing camera: it shows that cameras are wrong.
     """
 
     def worth(model: Model) -> tuple[float, ...]:
@@ -488,7 +503,7 @@ def _best(models: Sequence[Model], count: int) -> Model:
 
 
 def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Sequence[Pair]) -> Model | None:
-    """The largest model of a mapper, which its name begins with, or None if it finds none."""
+    """Returns the largest model of the mapper with which ``name`` begins, or None if it finds no model."""
     colmap, folder = stages.colmap, stages.work / name
     mapper, _, again = name.partition("_")
     if not folder.is_dir():
@@ -510,15 +525,15 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Se
             except Exception as error:
                 errors.append(error)
 
-        # In a thread, since Ctrl-C does not reach COLMAP.
+        # A thread keeps Ctrl-C working, which does not reach COLMAP.
         thread = threading.Thread(target=find, name=MAPPER, daemon=True)
         thread.start()
         while thread.is_alive():
             thread.join(0.5)
             logs = sorted(stages.work.glob(f"{LOG}*")) if mapper == "global" else []
-            begun = BEGINS.findall(logs[-1].read_text(errors="replace")) if logs else []
-            stages.progress(": ".join((f"{mapper} mapping {again}".rstrip(), *begun[-1:])), len(placed), 0)
-        with _told("mapping"):
+            started = BEGINS.findall(logs[-1].read_text(errors="replace")) if logs else []
+            stages.progress(": ".join((f"{mapper} mapping {again}".rstrip(), *started[-1:])), len(placed), 0)
+        with _named_errors("mapping"):
             for failure in errors:
                 raise failure
         os.replace(part, folder)
@@ -540,35 +555,35 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Se
 
 
 def _lost(model: ColmapModel) -> dict[str, str]:
-    """The images of a model whose cameras few points hold or that lie far from the others, and which of both it is."""
+    """Returns a model's images with lost cameras, and the reason: few points, or a place far from other cameras."""
     far = lost_cameras(torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images])))
     lost = {}
-    for image, apart in zip(model.images, far.tolist()):
-        held = len(points_seen(image, model))
-        if apart:
+    for image, is_far in zip(model.images, far.tolist()):
+        seen = len(points_seen(image, model))
+        if is_far:
             lost[image.name] = "far from the others"
-        elif held < LEAST_HELD:
-            lost[image.name] = f"held by {held} points"
+        elif seen < LEAST_HELD:
+            lost[image.name] = f"held by {seen} points"
     return lost
 
 
 def _described(model: Model | None, images: int) -> str:
     if model is None:
         return "no model"
-    rest = "".join(f"; {fault}" for fault in [*model.faults, *[_contradiction(model)] * model.folded])
+    remarks = "".join(f"; {fault}" for fault in [*model.faults, *[_contradiction(model)] * model.folded])
     if model.lost:
-        rest += f"; without the cameras of {some_of([f'{name} ({why})' for name, why in model.lost.items()])}"
-    return f"{len(model.images)} of {images} images, points off by {model.error:.2f} pixels{rest}"
+        remarks += f"; without the cameras of {some_of([f'{name} ({why})' for name, why in model.lost.items()])}"
+    return f"{len(model.images)} of {images} images, points off by {model.error:.2f} pixels{remarks}"
 
 
 def _contradiction(model: Model) -> str:
-    """What a folded model is wrong about, as a part of a line."""
+    """Returns the fault of a folded model, as a part of a line."""
     what = f"contradicts {model.contradicted} of {model.strong} pairs of images that match well over much of both"
     return f"{what}: something may look alike from several sides"
 
 
 def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
-    """Writes the cameras, images and points of a model, without what is lost."""
+    """Writes the cameras, images and points of a model, without its lost images."""
     reconstruction = colmap.Reconstruction(model.folder)
     for image in list(reconstruction.images.values()):
         if image.name in model.lost:
@@ -576,13 +591,13 @@ def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
     part = emptied(folder.with_name(f".{folder.name}"))
     reconstruction.write_binary(part)
     for path in part.iterdir():
-        if path.stem not in FILES:  # of rigs: each image has its pose
+        if path.stem not in FILES:  # removes files of rigs: each image has its pose
             path.unlink()
     os.replace(part, folder)
 
 
 def _write_masks(files: Sequence[Path], masks: Path, folder: Path) -> None:
-    """Writes masks as COLMAP reads them: black where an image is transparent, or masked already."""
+    """Writes masks in COLMAP's format: black where an image is transparent, or black in its mask in ``masks``."""
     if folder.is_dir():
         return
     part = emptied(folder.with_name(f".{folder.name}"))
@@ -597,7 +612,7 @@ def _write_masks(files: Sequence[Path], masks: Path, folder: Path) -> None:
 
 
 def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
-    """Writes the images reduced by area, unless they are there or would be too small."""
+    """Writes the images reduced by area averaging, unless the folder exists or they would be too small."""
     if folder.is_dir() or max(max(read_header(path).size) for path in files) // factor < LEAST_SIDE:
         return
     part = emptied(folder.with_name(f".{folder.name}"))
@@ -611,8 +626,8 @@ def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
 
 
 def _copied(database: Path, part: Path) -> Path:
-    """Copies a database over what a killed process left, whose write-ahead log SQLite would replay."""
-    for left in part.parent.glob(f"{part.name}*"):
-        left.unlink()
+    """Copies a database, and first removes leftover files, since SQLite would replay an old write-ahead log."""
+    for leftover in part.parent.glob(f"{part.name}*"):
+        leftover.unlink()
     shutil.copyfile(database, part)
     return part

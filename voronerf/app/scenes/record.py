@@ -1,6 +1,6 @@
-"""A scene without its images, as the file ``scene.json`` of a run directory: cameras and space.
+"""The file ``scene.json`` of a run directory: a scene's cameras and space, without its images.
 
-With it a run is rendered before the images are read, or where they are not. Fields as in `Scene` and `Cameras`.
+With this file, a run can be rendered without the images. Its fields are named as in `Scene` and `Cameras`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 
 CONTRACTIONS = {"sphere": Contraction, "perspective": Perspective}
-#: Values that a text of a scene may have.
+#: The choices of a scene's text fields.
 WORDS = {"background": ("white", None), "kind": KINDS}
 INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 
@@ -30,40 +30,40 @@ def write_scene(path: Path, scene: Scene) -> None:
     for name in ("box", "transform"):
         values[name] = _plain(getattr(scene, name))
     if scene.contraction is not None:
-        kind = next(name for name, its in CONTRACTIONS.items() if isinstance(scene.contraction, its))
-        values["contraction"] = {"kind": kind, **_of_fields(scene.contraction)}
+        kind = next(name for name, cls in CONTRACTIONS.items() if isinstance(scene.contraction, cls))
+        values["contraction"] = {"kind": kind, **_field_values(scene.contraction)}
     for part in ("train", "test"):
         split = getattr(scene, part)
-        values[part] = {"names": list(split.names), **_of_fields(split.cameras)}
+        values[part] = {"names": list(split.names), **_field_values(split.cameras)}
     write_text(path, json_text(values) + "\n")
 
 
-def placed(scene: Scene, known: Scene) -> Scene:
-    """The views of a scene in the space of another one of the same place.
+def placed(scene: Scene, other: Scene) -> Scene:
+    """Returns the views of ``scene`` in the space of ``other``, a scene of the same place.
 
-    Photographs are moved, turned and scaled by what the cameras of their folder say. They are moved here to where the
-    other scene's would be.
+    Each folder of photographs has its own normalisation, computed from its cameras. The cameras of ``scene`` are moved
+    into the normalised coordinates of ``other``.
     """
-    if scene.background != known.background:
-        ours, theirs = (each.background or "none" for each in (known, scene))
-        raise SceneError(f"{scene.name}: background must be that of {known.name}, {ours}, got {theirs}")
+    if scene.background != other.background:
+        ours, theirs = (each.background or "none" for each in (other, scene))
+        raise SceneError(f"{scene.name}: background must be that of {other.name}, {ours}, got {theirs}")
     train, test = scene.train, scene.test
-    if known.transform is not None and scene.transform is not None:
-        move = known.transform @ torch.linalg.inv(scene.transform)
-        if not torch.allclose(move, torch.eye(4, dtype=move.dtype), atol=1e-6):
-            scale = float(torch.linalg.det(move[:3, :3]).abs()) ** (1 / 3)
-            train, test = (replace(part, cameras=part.cameras.moved(move)) for part in (train, test))
+    if other.transform is not None and scene.transform is not None:
+        motion = other.transform @ torch.linalg.inv(scene.transform)
+        if not torch.allclose(motion, torch.eye(4, dtype=motion.dtype), atol=1e-6):
+            scale = float(torch.linalg.det(motion[:3, :3]).abs()) ** (1 / 3)
+            train, test = (replace(part, cameras=part.cameras.moved(motion)) for part in (train, test))
             if train.sparse_depth is not None:
                 seen = train.sparse_depth
                 train = replace(train, sparse_depth=seen._replace(distances=scale * seen.distances))
-    elif known.transform is not None or scene.transform is not None:
-        which = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
-        raise SceneError(f"{scene.name}: must be in the frame of {known.name}, got one that is {which} (--normalise)")
-    return replace(known, name=scene.name, notes=scene.notes, train=train, test=test)
+    elif other.transform is not None or scene.transform is not None:
+        frame = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
+        raise SceneError(f"{scene.name}: must be in the frame of {other.name}, got one that is {frame} (--normalise)")
+    return replace(other, name=scene.name, notes=scene.notes, train=train, test=test)
 
 
 def read_scene(path: Path) -> Scene:
-    """Reads what :func:`write_scene` has written: a scene whose splits have no images."""
+    """Reads the file of :func:`write_scene`; the splits of the scene have no images."""
     try:
         values = read_json(path)
         words = {name: values[name] for name in WORDS}
@@ -73,8 +73,8 @@ def read_scene(path: Path) -> Scene:
         near, far = float(values["near"]), float(values["far"])
         if not 0 <= near < far < float("inf"):
             raise ValueError(f"near and far must satisfy 0 <= near < far, got {near} and {far}")
-        kinds = values.get("contraction")
-        contraction = None if kinds is None else _made(CONTRACTIONS[kinds.pop("kind")], kinds)
+        arguments = values.get("contraction")
+        contraction = None if arguments is None else _build(CONTRACTIONS[arguments.pop("kind")], arguments)
         box = _tensor("box", values["box"])
         if box is not None and (box.shape != (2, 3) or not bool((box[0] < box[1]).all())):
             raise ValueError("box must be its lowest and highest corner")
@@ -90,13 +90,13 @@ def _split(values: dict[str, Any]) -> Split:
     names = tuple(map(str, values.pop("names")))
     if not all(isinstance(values[side], int) for side in ("width", "height")):
         raise ValueError(f"width and height must be integers, got {values['width']!r:.60}, {values['height']!r:.60}")
-    cameras = _made(Cameras, values)
+    cameras = _build(Cameras, values)
     if len(names) != len(cameras) or not names:
         raise ValueError(f"names must be as many as poses and at least one, got {len(names)} and {len(cameras)}")
     return Split(cameras, torch.empty(0, 1, 1, 3, dtype=torch.uint8), names)
 
 
-def _of_fields(value: Any) -> dict[str, Any]:
+def _field_values(value: Any) -> dict[str, Any]:
     return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
 
 
@@ -104,8 +104,8 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, Tensor) else value
 
 
-def _made(kind: type, values: dict[str, Any]) -> Any:
-    """A dataclass of tensors and numbers."""
+def _build(kind: type, values: dict[str, Any]) -> Any:
+    """Builds a dataclass of tensors and numbers from JSON values."""
     members = {name: _tensor(name, value) if isinstance(value, list) else value for name, value in values.items()}
     if "slopes" in members:
         members["slopes"] = tuple(values["slopes"])

@@ -1,4 +1,4 @@
-"""A scene: images with their cameras, and the space that it fills.
+"""A scene: images with their cameras, and its space.
 
 c images of h x w pixels. World units and axes as in `voronerf.nerf.cameras`.
 """
@@ -17,16 +17,17 @@ from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.volume import Space
 
-#: An object on white; cameras that look the same way; that look outwards; that look at one place with surroundings.
+#: An object on white; cameras that look the same way; cameras that look outwards; cameras that look at one place with
+#: surroundings.
 KINDS = ("object", "forward", "inside-out", "unbounded")
 
 
 class SparseDepth(NamedTuple):
-    """The pixels that show points of a sparse model, and the distances of these points.
+    """The pixels that show points of a sparse model, and these points' distances.
 
     Attributes:
-        pixels: int64 [s], numbered through all images: image * h * w + row * w + column.
-        distances: float32 [s], world units.
+        pixels: int64 [s], flat indices over all images: image * h * w + row * w + column.
+        distances: float32 [s], distances from the camera in world units.
     """
 
     pixels: Tensor
@@ -39,12 +40,12 @@ class Split:
 
     Attributes:
         cameras: c cameras.
-        images: uint8 [c, h, w, 3] opaque, or [c, h, w, 4] with straight (not premultiplied) alpha. Those that are
-            smaller than h x w, see `Cameras.size`, lie in the upper left corner, with zeros around them.
-        names: of the images, for tables and file names.
+        images: uint8 [c, h, w, 3] opaque, or [c, h, w, 4] with straight (not premultiplied) alpha. Images smaller than
+            h x w, see `Cameras.size`, lie in the upper left corner, padded with zeros.
+        names: names of the images, for tables and file names.
         masks: bool [c, h, w], False for pixels that are neither trained nor scored, or None.
-        on_disk: images and masks are mapped from files, since they may not fit into memory; they are not written to.
-        sparse_depth: of the points of a sparse model, or None.
+        on_disk: whether images and masks are mapped from files, since they may not fit into memory, and read-only.
+        sparse_depth: the distances of a sparse model's points, or None.
 
     Examples:
         >>> from voronerf.app.scenes import load_scene
@@ -65,7 +66,7 @@ class Split:
         return len(self.names)
 
     def truth(self, index: int, background: Tensor | None) -> Tensor:
-        """One image in 0..1 over `background` ([3]; None is black, as in rendering), float32 [h, w, 3]."""
+        """Returns one image over `background` ([3]; None is black, as in rendering), float32 [h, w, 3] in 0..1."""
         if self.on_disk:
             check_mapped()
         width, height = self.cameras.size(index)
@@ -76,7 +77,7 @@ class Split:
         return colour if background is None else colour + background.to(colour) * (1 - image[..., 3:])
 
     def mask(self, index: int) -> Tensor | None:
-        """Which pixels of one image count, bool [h, w]; None for all."""
+        """Returns bool [h, w], False for pixels of an image that are neither trained nor scored; None if all count."""
         width, height = self.cameras.size(index)
         return None if self.masks is None else self.masks[index, :height, :width]
 
@@ -86,18 +87,17 @@ class Scene:
     """Training and test views of the same space.
 
     Attributes:
-        name: short, fit for the name of a folder.
+        name: a short name that is a valid folder name.
         train: views for training.
-        test: views held out for testing.
+        test: held-out views for testing.
         near: distance along a ray at which the scene begins.
         far: distance along a ray at which the scene ends.
-        box: float32 [2, 3], lowest and highest corner of an axis-aligned box around everything, or None if unknown.
+        box: float32 [2, 3], lowest and highest corner of an axis-aligned box around the scene, or None if unknown.
         background: "white" behind transparent pixels; None for an opaque capture without a background.
         kind: one of `KINDS`.
-        contraction: what makes the space of a scene without a box finite, or None: the sphere around the origin and all
-            cameras.
-        transform: float64 [4, 4], from the coordinates of the scene's files to those of the scene, or None if it was
-            not moved.
+        contraction: the contraction that makes the space of a scene without a box finite; None for the sphere around
+            the origin and all cameras.
+        transform: float64 [4, 4], transform from the files' coordinates to the scene's, or None if it was not moved.
         notes: lines about how the files were read.
 
     Examples:
@@ -121,43 +121,42 @@ class Scene:
 
     @property
     def spacing(self) -> str:
-        """How samples are spaced along a ray: "linear" through an object, else by "disparity"."""
+        """The spacing of samples along a ray: "linear" through an object, otherwise "disparity"."""
         return "linear" if self.kind == "object" else "disparity"
 
     def background_colour(self, device: torch.device | str = "cpu") -> Tensor | None:
-        """The background as float32 [3] in 0..1, or None."""
+        """Returns the background as float32 [3] in 0..1, or None."""
         return None if self.background is None else torch.ones(3, device=device)
 
     def space(self, contraction: str = "auto", *, cones: bool = False, device: torch.device | str = "cpu") -> Space:
-        """How a field sees the scene.
+        """Returns the space in which a field is evaluated.
 
         Args:
-            contraction: "none"; "sphere", that around the scene's box, or without one the scene's own, or that around
-                the origin and all cameras; "ndc" for cameras that face forward; or "auto", which is none for a scene
-                with a box, else ndc or sphere.
-            cones: Whether the field is asked about cones.
-            device: Of the tensors of the contraction.
+            contraction: "none"; "sphere"; "ndc" for forward-facing cameras; or "auto", which is none for a scene with
+                a box, otherwise ndc or sphere. The sphere is around the scene's box; without a box, it is the sphere of
+                the scene's contraction, or else around the origin and all cameras.
+            cones: Whether the field takes cones instead of points.
+            device: The device of the contraction's tensors.
 
         Raises:
-            SceneError: For ndc without forward-facing cameras, or when all cameras are at the origin, so that there is
-                no sphere.
+            SceneError: For ndc without forward-facing cameras, or for a sphere if all cameras are at the origin.
         """
-        known, chosen = self.contraction, contraction
+        default, chosen = self.contraction, contraction
         if contraction == "auto":
-            chosen = "none" if self.box is not None else "ndc" if isinstance(known, Perspective) else "sphere"
+            chosen = "none" if self.box is not None else "ndc" if isinstance(default, Perspective) else "sphere"
         if chosen == "none":
             return Space(None, self.spacing, cones)
         if chosen == "ndc":
-            if not isinstance(known, Perspective):
+            if not isinstance(default, Perspective):
                 raise SceneError(f"{self.name}: contraction ndc needs forward-facing cameras, the scene is {self.kind}")
             return Space(
-                replace(known, centre=known.centre.to(device), axes=known.axes.to(device)), self.spacing, cones
+                replace(default, centre=default.centre.to(device), axes=default.axes.to(device)), self.spacing, cones
             )
         if self.box is not None:
             sphere = Contraction(self.box.mean(0).to(device), float((self.box[1] - self.box[0]).norm()) / 2)
-        elif known is not None:
+        elif default is not None:
             sphere = Contraction(
-                known.centre.to(device), known.near if isinstance(known, Perspective) else known.radius
+                default.centre.to(device), default.near if isinstance(default, Perspective) else default.radius
             )
         else:
             radius = float(self.train.cameras.origins.norm(dim=-1).max())
@@ -167,10 +166,10 @@ class Scene:
         return Space(sphere, self.spacing, cones, sphere.radius if self.kind == "unbounded" else None)
 
     def cube(self, space: Space) -> tuple[tuple[float, ...], ...]:
-        """The corners of the space that networks see: a cube around the box, or that of a contraction.
+        """Returns the corners of the networks' input space: a cube around the box, or the cube of the contraction.
 
-        In a box with unequal sides, the cells of a hash grid would be as much finer along the short ones, where the
-        images show nothing finer: in a city five times, at the cost of entries.
+        In a box with unequal sides, the cells of a hash grid would be finer along the short sides, in a city five
+        times. This would cost entries, although the images have no finer details there.
 
         Raises:
             SceneError: For a scene without a box that is not contracted.
@@ -185,9 +184,9 @@ class Scene:
         return tuple(tuple(round(x, 6) for x in corner) for corner in box.tolist())
 
     def pixel(self, space: Space) -> float:
-        """Width of a pixel of the training views at the middle of the scene: distance / focal length, in scene units.
+        """Returns the width of a training pixel at the scene's middle: distance / focal length, in scene units.
 
-        In normalised device coordinates it is the same at all distances.
+        In normalised device coordinates this width is the same at all distances.
         """
         cameras = self.train.cameras
         focal = float(cameras.intrinsics[:, :2].mean())
@@ -197,5 +196,5 @@ class Scene:
             return 2 / (1 / self.near + 1 / self.far) / focal
         centre = torch.zeros(3) if self.contraction is None else self.contraction.centre
         centre = centre if self.box is None else self.box.mean(0)
-        distance = float((cameras.origins - centre).norm(dim=-1).mean()) or self.near  # of a panorama from one place
+        distance = float((cameras.origins - centre).norm(dim=-1).mean()) or self.near  # 0 for panoramas from one place
         return distance / focal

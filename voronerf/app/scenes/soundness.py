@@ -1,4 +1,4 @@
-"""Checks of the cameras of photographs: signs of a reconstruction that has collapsed.
+"""Checks of reconstructed cameras: lost cameras, collapsed cameras, and implausible lenses.
 
 c cameras, in any coordinates.
 """
@@ -13,40 +13,41 @@ from torch import Tensor
 from voronerf.app.scenes.lenses import Lens
 from voronerf.nerf.lenses import EQUIRECTANGULAR
 
-#: A camera is lost if its nearest neighbour is farther than this many times the median distance between neighbours, and
-#: than this share of the distances between all cameras. The first alone would call all lost that stand beside a burst;
-#: bursts of up to 57 % of the cameras leave the second, and so do 42 % that are lost.
+#: A camera is lost if the distance to its nearest neighbour exceeds `LOST` times the median of these distances, and
+#: exceeds the share `EXTENT` of all distances between two cameras. The first condition alone would reject all cameras
+#: beside a burst. The second one holds for bursts of up to 57 % of the cameras, and for up to 42 % of lost cameras.
 LOST, EXTENT = 8.0, 1 / 3
-#: Cameras that are lost together are neighbours of each other. So lost are also those that are this many times as far
-#: from the middle of all as this share of the cameras is at the most.
+#: Cameras that are lost together are each other's neighbours. So a camera is lost, too, if its distance to the median
+#: position exceeds `APART` times the quantile `MOST` of these distances.
 APART, MOST = 10.0, 0.8
-#: Up to this share of lost cameras, or one, the others are judged alone. More may be what a collapse left.
+#: Lost cameras are ignored in the check for a collapse up to this share, or if there is one. More lost cameras may be
+#: all that a collapse left apart.
 FEW = 0.1
-#: Cameras that are drawn to measure the distances between all.
+#: The most cameras for measuring the distances between all cameras.
 MOST_CAMERAS = 1000
-#: Cameras have collapsed if their median distance to the nearest other one, times their number, is below this share of
-#: their mean distance to the middle. Cameras that are spread evenly on a circle have 6.
+#: Cameras have collapsed if their median distance to the nearest neighbour, times their number, is below this share of
+#: their mean distance to the centre. For cameras spread evenly on a circle this ratio is 6.
 COLLAPSED = 0.05
-#: The largest ratio of the depths that the cameras see.
+#: The largest plausible ratio of the largest to the least depth of points.
 DEEPEST = 1e4
-#: Focal lengths over the width of an image: fields of view of 4 to 127 degrees.
+#: The plausible range of focal lengths in image widths: fields of view of 4 to 127 degrees.
 FOCAL_LENGTHS = (0.25, 15.0)
-#: How much the focal lengths of the two axes may differ, and how large the first coefficient of a lens and those of its
-#: tilt (p1, p2) may be.
+#: The largest plausible relative difference of the two axes' focal lengths, first distortion coefficient, and
+#: tangential distortion coefficients (p1, p2).
 ASPECT, BENT, TILTED = 0.05, 1.0, 0.05
 
 
-#: Cameras that a line names.
+#: The most names in a line.
 MOST_NAMED = 8
 
 
 def lost_cameras(origins: Tensor) -> Tensor:
-    """Which cameras [c, 3] lie far away from the others, bool [c]; of two, none."""
+    """Returns bool [c]: whether cameras at ``origins`` [c, 3] lie far from the others; all False for two or fewer."""
     if len(origins) < 3:
         return torch.zeros(len(origins), dtype=torch.bool)
     nearest, some = _nearest(origins), origins[:: len(origins) // MOST_CAMERAS + 1]
-    apart = torch.pdist(some)
-    alone = (nearest > LOST * nearest.median()) & (nearest > apart.sort().values[int(EXTENT * len(apart))])
+    distances = torch.pdist(some)
+    alone = (nearest > LOST * nearest.median()) & (nearest > distances.sort().values[int(EXTENT * len(distances))])
     distance = (origins - origins.median(0).values).norm(dim=-1)
     return alone | (distance > APART * distance.sort().values[int(MOST * (len(distance) - 1))])
 
@@ -54,12 +55,12 @@ def lost_cameras(origins: Tensor) -> Tensor:
 def camera_faults(
     origins: Tensor, bounds: Tensor | None = None, lenses: Iterable[tuple[Lens, float]] = ()
 ) -> list[str]:
-    """The faults of cameras, as parts of a line; empty if they are sound.
+    """Returns the faults of cameras, as parts of a line; empty if the cameras are plausible.
 
     Args:
-        origins: [c, 3], their positions.
-        bounds: [m, 2], the least and the largest depth of what they see, outliers left out; None if it is unknown.
-        lenses: each with the width of its images in pixels.
+        origins: [c, 3], positions of the cameras.
+        bounds: [m, 2], least and largest depths of the points of m views, without outliers; None if unknown.
+        lenses: pairs of a lens and the width of its images in pixels.
     """
     faults = []
     if len(origins) >= 3:
@@ -90,13 +91,13 @@ def camera_faults(
 
 
 def some_of(names: list[str]) -> str:
-    """The first `MOST_NAMED` of some names, and how many more there are."""
+    """Returns the first `MOST_NAMED` names in a line, and the number of further names."""
     more = [f"{len(names) - MOST_NAMED} more"] * (len(names) > MOST_NAMED)
     return ", ".join(names[:MOST_NAMED] + more)
 
 
 def _nearest(origins: Tensor) -> Tensor:
-    """The distance of each camera to the nearest other one, [c]."""
+    """Returns the distance of each camera to its nearest neighbour, [c]."""
     nearest = torch.empty(len(origins), dtype=origins.dtype)
     for rows in torch.arange(len(origins)).split(1024):
         distances = torch.cdist(origins[rows], origins)

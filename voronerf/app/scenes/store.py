@@ -1,9 +1,9 @@
-"""Images on disk: decoded once into a file that is mapped into memory, so that a scene need not fit into it.
+"""Images on disk: decoded once into a memory-mapped file, so that a scene may be larger than the memory.
 
-A store is a folder of the cache with `pixels`, the bytes of all images one after another, and `store.json`, which says
-of which files they are, and the checksum of each image that is there. A build that is ended at any moment goes on where
-the record says. Where a store is opened, all of it is read and compared with the checksums: what was damaged is built
-again.
+A store is a folder of the cache with two files. `pixels` holds the bytes of all images, one after another. The record
+`store.json` holds a digest of the source files, and a checksum of each stored image. An interrupted build continues
+after the recorded images. When a store is opened, all images are compared with their checksums, and are decoded again
+from the first damaged one on.
 
 c images of h x w pixels.
 """
@@ -34,35 +34,35 @@ from voronerf.app.scenes.errors import SceneError
 
 log = logging.getLogger(__name__)
 
-VERSION = 2  # of the files
-RECORD_EVERY = 2.0  # seconds of a build
-RANDOM, WILL_NEED = 1, 3  # of madvise, on Linux and macOS
+VERSION = 2  # version of the file format
+RECORD_EVERY = 2.0  # seconds between two updates of the record
+RANDOM, WILL_NEED = 1, 3  # advice values of madvise, on Linux and macOS
 
-# from the number of an image to its pixels, [h, w, channels]
+# A function from an image's index to its pixels [h, w, channels].
 Make = Callable[[int], NDArray[np.uint8]]
 
-# The files of this process that are mapped and in use.
+# The mapped files that this process uses.
 _mapped: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
 
 def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int], make: Make, threads: int) -> Tensor:
-    """The images of a store, which is built where it is not there yet.
+    """Returns the images of a store, which is built if it does not exist.
 
     Args:
-        name: of the scene, with which that of the folder begins.
-        sources: which images they are, such as their paths; another list is another store.
-        made_of: what they were made of, such as the sizes and times of the files; where it has changed, the store is
-            built again.
-        shape: of the images, [c, h, w, channels].
-        make: decodes an image.
-        threads: that decode at the same time.
+        name: name of the scene, with which the folder's name begins.
+        sources: JSON values that identify the images, such as their paths; each list has a store of its own.
+        made_of: JSON value that changes with the images, such as the files' sizes and times; a change rebuilds the
+            store.
+        shape: shape of the images, [c, h, w, channels].
+        make: function that decodes an image.
+        threads: number of decoding threads.
 
     Returns:
-        uint8 [c, h, w, channels], which must not be written to.
+        uint8 [c, h, w, channels], read-only.
     """
     folder = cache_folder() / "images" / f"{name[:100]}-{_digest([sources, list(shape)])[:12]}"
-    each = int(np.prod(shape[1:]))
-    size = each * shape[0]
+    image_bytes = int(np.prod(shape[1:]))
+    size = image_bytes * shape[0]
     wanted = {"version": VERSION, "shape": list(shape), "made_of": _digest(made_of)}
     try:
         private_folder(folder.parent)
@@ -70,16 +70,16 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
         waits = "%s: another process makes these images, this one waits for it"
         with locked(folder, lambda: log.warning(waits, folder)):
             sums = _recorded(folder, wanted, shape[0])
-            # who has mapped a file that holds other images keeps it
+            # Other processes may have mapped the old file; they keep it after unlink.
             if not sums:
                 (folder / "store.json").unlink(missing_ok=True)
                 (folder / "pixels").unlink(missing_ok=True)
-            flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)  # of POSIX, and of Windows
+            flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)  # POSIX and Windows flags
             file = os.open(folder / "pixels", os.O_RDWR | os.O_CREAT | flags, 0o600)
             try:
                 _allocate(file, size)
                 mapped = mmap.mmap(file, size, access=mmap.ACCESS_READ)
-                sums = _undamaged(folder, mapped, sums, each, threads)
+                sums = _undamaged(folder, mapped, sums, image_bytes, threads)
                 if len(sums) < shape[0]:
                     _build(folder, file, wanted, sums, shape, make, threads)
             finally:
@@ -90,12 +90,12 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
         ) from None
     _mapped.add(mapped)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch, that the array is read-only
+        warnings.simplefilter("ignore")  # torch warns that the array is read-only
         return torch.from_numpy(np.frombuffer(mapped, np.uint8).reshape(tuple(shape)))
 
 
 def check_mapped() -> None:
-    """Raises SceneError where a mapped file has become shorter: who reads what is missing is ended by SIGBUS."""
+    """Raises SceneError if a mapped file was truncated: reading the missing part would end the process by SIGBUS."""
     for mapped in _mapped:
         if mapped.size() < len(mapped):
             raise SceneError(
@@ -104,7 +104,7 @@ def check_mapped() -> None:
 
 
 def _recorded(folder: Path, wanted: dict[str, Any], count: int) -> list[int]:
-    """The checksums of the images that a store holds already; says where it is of others."""
+    """Returns the checksums of the stored images; [] if the store holds other images, which it reports."""
     try:
         record = read_json(folder / "store.json")
     except FileNotFoundError:
@@ -119,18 +119,18 @@ def _recorded(folder: Path, wanted: dict[str, Any], count: int) -> list[int]:
 
 
 def _allocate(file: int, size: int) -> None:
-    if hasattr(os, "posix_fallocate"):  # a full disk is an error now, and none while the file is mapped
+    if hasattr(os, "posix_fallocate"):  # fails on a full disk, before the file is mapped
         os.posix_fallocate(file, 0, size)
     else:
         os.truncate(file, size)
 
 
-def _undamaged(folder: Path, mapped: mmap.mmap, sums: list[int], each: int, threads: int) -> list[int]:
-    """The checksums up to the first damaged image; says which that is."""
+def _undamaged(folder: Path, mapped: mmap.mmap, sums: list[int], image_bytes: int, threads: int) -> list[int]:
+    """Returns the checksums of the images before the first damaged one, which it reports."""
     view = memoryview(mapped)
 
     def is_damaged(number: int) -> bool:
-        return zlib.crc32(view[number * each : (number + 1) * each]) != sums[number]
+        return zlib.crc32(view[number * image_bytes : (number + 1) * image_bytes]) != sums[number]
 
     with ThreadPoolExecutor(threads) as pool:
         for number, damaged in enumerate(pool.map(is_damaged, range(len(sums)))):
@@ -143,10 +143,10 @@ def _undamaged(folder: Path, mapped: mmap.mmap, sums: list[int], each: int, thre
 def _build(
     folder: Path, file: int, wanted: dict[str, Any], sums: list[int], shape: Sequence[int], make: Make, threads: int
 ) -> None:
-    from rich import get_console  # here, since importing it takes long
+    from rich import get_console  # a slow import
     from rich.progress import Progress
 
-    each = int(np.prod(shape[1:]))
+    image_bytes = int(np.prod(shape[1:]))
     console = get_console()
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
     recorded = time.monotonic()
@@ -156,7 +156,7 @@ def _build(
             numbers = range(len(sums), min(len(sums) + 4 * threads, shape[0]))
             for number, image in zip(numbers, pool.map(make, numbers)):
                 data = np.ascontiguousarray(image).data.cast("B")
-                _write(file, data, number * each)
+                _write(file, data, number * image_bytes)
                 sums.append(zlib.crc32(data))
             bar.update(task, completed=len(sums))
             if len(sums) == shape[0] or time.monotonic() - recorded > RECORD_EVERY:
@@ -176,9 +176,10 @@ def _digest(value: Any) -> str:
 
 
 class Pages:
-    """Has the pages of a mapped tensor read before they are needed, many at a time.
+    """A prefetcher for the pages of a mapped tensor.
 
-    A page that is not in memory is read when it is touched, one after another. The disk takes many requests at once.
+    Without it, pages that are not in memory are read one by one, when they are touched. A disk serves many requests at
+    a time.
 
     Args:
         images: uint8 [c, h, w, channels], contiguous, mapped from a file.
@@ -190,11 +191,11 @@ class Pages:
         if self.advise is not None:
             self.advise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
             first = self.start // mmap.PAGESIZE * mmap.PAGESIZE
-            # without it a touched page is read with 31 neighbours, which push others out
+            # without this advice, each touched page is read with 31 neighbours, which displace other pages
             self.advise(first, self.start + images.numel() - first, RANDOM)
 
     def fetch(self, index: Tensor) -> None:
-        """Begins to read the pages of pixels [b], numbered through all images."""
+        """Starts reading the pages of pixels ``index`` [b], flat indices over all images."""
         check_mapped()
         if self.advise is None:
             return

@@ -1,6 +1,6 @@
 """Captures as `transforms.json`, with intrinsics, lens distortion and poses (instant-ngp, nerfstudio).
 
-Blender's `transforms_*.json` share its frames, poses and numbers. Poses are OpenGL's, as everywhere.
+Blender's `transforms_*.json` have the same frames, poses and numbers. Poses have OpenGL's axes, as everywhere.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ log = logging.getLogger(__name__)
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 ORTHONORMAL = 2e-3
-#: Largest number and, of positive ones, the inverse of the smallest: float32 holds even its square.
+#: The largest number, and the inverse of the smallest positive number: float32 can represent their squares.
 LARGEST = 1e9
-#: Longest focal length in sides of the image, and the inverse of the shortest: fields of view of 0.06 to 179.9 degrees.
+#: The longest focal length in image sides, and the inverse of the shortest: fields of view of 0.06 to 179.9 degrees.
 LONGEST = 1000
 SPLITS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
 MODELS = (*PERSPECTIVE_MODELS, *FISHEYE_MODELS, "EQUIRECTANGULAR")
-#: Entries of instant-ngp that change rays in ways that cameras here have not.
+#: Entries of instant-ngp that change rays in ways that `Cameras` does not support.
 OTHER_RAYS = ("orthographic", "from_mitsuba", *(f"ftheta_p{power}" for power in range(5)))
 LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "distortion_params", "camera_model", "is_fisheye")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's distortion_params
 UNSUPPORTED = ("k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
-#: Of the lens models, the distortion that is used.
+#: The supported distortion coefficients of each lens model, and the model's name in errors.
 KNOWN = {
-    # k4 of a perspective camera belongs to r^8 in nerfstudio, and to the divisor in OpenCV.
+    # In nerfstudio k4 of a perspective camera is the factor of r^8, in OpenCV it is in the divisor.
     PERSPECTIVE: (("k1", "k2", "k3", "p1", "p2"), ""),
     FISHEYE: (("k1", "k2", "k3", "k4"), " of a fisheye"),
     EQUIRECTANGULAR: ((), " of an EQUIRECTANGULAR image"),
@@ -53,8 +53,8 @@ KNOWN = {
 
 
 class ListedImage(NamedTuple):
-    """One image of a transforms file: its path, its pose float64 [4, 4], the file that lists it, the entries of that
-    file where the frame has no others, and the path of its mask."""
+    """An image of a transforms file: its path, its pose float64 [4, 4], the file that lists it, the entries of its
+    frame or else of the file, and the path of its mask."""
 
     path: Path
     pose: Tensor
@@ -68,11 +68,11 @@ def read_transforms(
 ) -> tuple[dict[str, Any], list[ListedImage]]:
     """Reads a transforms file and finds its images.
 
-    Images that are listed but missing are left out, with a warning that says how many, and an error if all are missing
-    and may not.
+    Listed images that are missing are left out, with a warning of their number. It is an error if all are missing,
+    unless ``all_may_miss`` is set.
 
     Returns:
-        (the file's entries, the frames whose image exists, in the file's order).
+        (the file's entries, the frames with an existing image, in the file's order).
     """
     try:
         entries = read_json(path)
@@ -108,11 +108,11 @@ def read_transforms(
 
 
 def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = False) -> float | None:
-    """A finite number of a transforms file; None if the entry is missing."""
+    """Returns a finite number of a transforms file; None if the entry is missing."""
     value = entries.get(key)
     if value is None:
         return None
-    # The comparisons take integers of any size; NaN fails them.
+    # The comparisons work for integers of any size, and fail for NaN.
     if not is_number(value) or not abs(value) <= LARGEST:
         raise SceneError(f"{path}: {key} must be a finite number up to {LARGEST:.0e}, got {value!r:.60}")
     if positive and not value >= 1 / LARGEST:
@@ -121,18 +121,18 @@ def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = Fa
 
 
 def is_number(value: object) -> bool:
-    """Whether a value of JSON is a number, which a boolean is to Python."""
+    """Returns whether a JSON value is a number; Python's bool, a subclass of int, is not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def focal_length(entries: dict[str, Any], key: str, side: float, path: Path) -> float | None:
-    """A focal length in pixels, from itself or from an angle of view; None if the entry is missing.
+    """Returns a focal length in pixels, from its entry or from an angle of view; None if the entry is missing.
 
     Args:
-        entries: of the file or a frame.
+        entries: entries of the file or a frame.
         key: "fl_x" or "fl_y", "camera_angle_x" or "camera_angle_y".
         side: pixels of the image along that axis.
-        path: the file, for messages.
+        path: the file, for error messages.
     """
     value = number(entries, key, path, positive=True)
     if value is None:
@@ -152,15 +152,15 @@ def focal_length(entries: dict[str, Any], key: str, side: float, path: Path) -> 
 
 
 def is_text(name: str) -> bool:
-    """Whether a name is free of lone surrogates, which JSON allows and file names do not."""
+    """Returns whether a name has no lone surrogates, which JSON allows but file names do not."""
     return not any("\ud800" <= char <= "\udfff" for char in name)
 
 
 def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Path | None:
-    """Finds an image file; Blender's files leave out the suffix, and files from Windows may have its separators."""
-    for spelt in dict.fromkeys((name, name.replace("\\", "/"))):
+    """Finds an image file; Blender's files lack the suffix, and files from Windows may have backslashes."""
+    for spelling in dict.fromkeys((name, name.replace("\\", "/"))):
         for suffix in SUFFIXES:
-            path = Path(f"{folder / spelt}{suffix}")
+            path = Path(f"{folder / spelling}{suffix}")
             stay_inside(path, folder, allow_outside, f"{where}: file_path")
             if os.path.isfile(path):
                 return path
@@ -168,7 +168,7 @@ def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Pat
 
 
 def _mask(folder: Path, name: object, allow_outside: bool, where: str) -> Path | None:
-    """The mask of a frame; None without one."""
+    """Returns the mask file of a frame; None if the frame has no mask."""
     if name is None:
         return None
     if not isinstance(name, str) or "\0" in name or not is_text(name):
@@ -181,7 +181,7 @@ def _mask(folder: Path, name: object, allow_outside: bool, where: str) -> Path |
 
 
 def pose_of(matrix: object, where: str, key: str = "transform_matrix") -> Tensor:
-    """Checks that rows of numbers are a rigid motion; float64 [4, 4]."""
+    """Returns a pose float64 [4, 4], after checking that ``matrix`` is a rigid motion, 4 x 4 or 3 x 4."""
     rows = matrix if isinstance(matrix, list) else [None]
     try:
         if not all(isinstance(row, list) and all(map(is_number, row)) for row in rows):
@@ -208,10 +208,10 @@ def pose_of(matrix: object, where: str, key: str = "transform_matrix") -> Tensor
 
 
 def load_transforms(folder: Path, reading: Reading) -> Scene:
-    """Loads a capture; every 8th image in the order of their names is held out for testing.
+    """Loads a capture; every 8th image in the order of names is held out for testing.
 
-    Where the file has nerfstudio's `train_filenames`, `test_filenames` or `val_filenames`, they decide instead.
-    Validation images are for testing if there are no others, and are else left out.
+    If the file has nerfstudio's `train_filenames`, `test_filenames` or `val_filenames`, these lists decide instead.
+    Validation images are used for testing if there are no test images; otherwise they are left out.
     """
     path = folder / "transforms.json"
     entries, frames = read_transforms(path, reading.allow_outside)
@@ -226,9 +226,9 @@ def load_transforms(folder: Path, reading: Reading) -> Scene:
 def _declared_split(
     path: Path, entries: dict[str, Any], frames: list[ListedImage]
 ) -> tuple[list[ListedImage], Tensor] | None:
-    """The frames that nerfstudio's lists of file names choose, and which are held out; None without such lists.
+    """Returns the frames in nerfstudio's lists of file names, and bool held_out; None if the file has no lists.
 
-    Where one list is missing or empty, the images of no other list take its place.
+    An empty or missing list is filled with the images that are in no other list.
     """
     lists: dict[str, set[str]] = {}
     for key in SPLITS:
@@ -236,35 +236,35 @@ def _declared_split(
         if names is not None and not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
             raise SceneError(f"{path}: {key} must be a list of file names, got {names!r:.60}")
         lists[key] = {_plain(name) for name in names or ()}
-    every = {_plain(frame["file_path"]) for frame in entries["frames"]}
+    all_names = {_plain(frame["file_path"]) for frame in entries["frames"]}
     for key, names in lists.items():
-        if unknown := sorted(names - every):
+        if unknown := sorted(names - all_names):
             raise SceneError(f"{path}: {key} has {unknown[0]}, which is no file_path of a frame")
     train, test, validation = lists.values()
     if not (train or test or validation):
         return None
     test = test or validation
-    train, test = train or every - test - validation, test or every - train
-    if both := sorted(train & test):
-        raise SceneError(f"{path}: train_filenames and the images for testing must differ, both have {both[0]}")
-    if unused := len(every - train - test - validation):
+    train, test = train or all_names - test - validation, test or all_names - train
+    if shared := sorted(train & test):
+        raise SceneError(f"{path}: train_filenames and the images for testing must differ, both have {shared[0]}")
+    if unused := len(all_names - train - test - validation):
         log.warning("%s: %d images are in none of %s and are left out", path, unused, ", ".join(SPLITS))
     names = [_plain(frame.values["file_path"]) for frame in frames]
     chosen = [(frame, name in test) for frame, name in zip(frames, names) if name in train | test]
     held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool)
-    for part, there in (("training", bool((~held_out).any())), ("testing", bool(held_out.any()))):
-        if not there:
+    for part, present in (("training", bool((~held_out).any())), ("testing", bool(held_out.any()))):
+        if not present:
             raise SceneError(f"{path}: {', '.join(SPLITS)} leave no image for {part}")
     return [frame for frame, _ in chosen], held_out
 
 
 def _plain(name: str) -> str:
-    """A file name in one spelling, so that ./images/a.png is images/a.png."""
+    """Returns a normalised file name, so that ./images/a.png equals images/a.png."""
     return posixpath.normpath(name.replace("\\", "/"))
 
 
 def has_lens(frames: Sequence[ListedImage]) -> bool:
-    """Whether a transforms file describes lenses as captures do; Blender's files give the field of view alone."""
+    """Returns whether any frame has lens entries, as captures do; Blender's files have the field of view alone."""
     flags = ("latlong", "fisheye_crop_radius", *OTHER_RAYS)
     return any(
         any(frame.values.get(key) is not None for key in LENS) or any(frame.values.get(key) for key in flags)
@@ -301,7 +301,7 @@ def capture_scene(
 
 
 def _view(frame: ListedImage, header: Header) -> View:
-    """The view of a frame, with its lens; checks that all of its model is used."""
+    """Returns the view of a frame, with its lens; raises SceneError for an unsupported lens or distortion."""
     values, path = frame.values, frame.source
     model = values.get("camera_model", "OPENCV")
     if model not in MODELS:
@@ -310,12 +310,12 @@ def _view(frame: ListedImage, header: Header) -> View:
         raise SceneError(f"{path}: {other[0]} is not supported, only lenses that are {', '.join(MODELS)}")
     kind = FISHEYE if model in FISHEYE_MODELS or bool(values.get("is_fisheye")) else PERSPECTIVE
     kind = EQUIRECTANGULAR if model == "EQUIRECTANGULAR" or values.get("latlong") else kind
-    known, whose = KNOWN[kind]
-    if used := [key for key in DISTORTION + UNSUPPORTED if key not in known and number(values, key, path)]:
-        only = f"only {', '.join(known)}{whose}" if known else f"there is none{whose}"
-        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, {only}")
+    supported, of_lens = KNOWN[kind]
+    if unsupported := [key for key in DISTORTION + UNSUPPORTED if key not in supported and number(values, key, path)]:
+        only = f"only {', '.join(supported)}{of_lens}" if supported else f"there is none{of_lens}"
+        raise SceneError(f"{path}: lens distortion {', '.join(unsupported)} is not supported, {only}")
     width, height = size = _lens_size(frame, header.size)
-    if kind == EQUIRECTANGULAR:  # whose fl_x is half of the width in nerfstudio, and says nothing
+    if kind == EQUIRECTANGULAR:  # nerfstudio writes half of the width as fl_x, which is ignored
         if width != 2 * height:
             raise SceneError(f"{frame.path}: an EQUIRECTANGULAR image must be 2 to 1, got {width} x {height} pixels")
         scale = height / math.pi
@@ -336,25 +336,25 @@ def _view(frame: ListedImage, header: Header) -> View:
 
 
 def _lens_size(frame: ListedImage, size: tuple[int, int]) -> tuple[float, float]:
-    """The (width, height) of the image that a frame's lens is for, of an image of ``size``.
+    """Returns the (width, height) to which a frame's lens refers, for an image file of ``size``.
 
-    It is ``size``, or where the image was scaled afterwards what ``w`` and ``h`` say, of the same shape.
+    It is ``size``, or ``w`` and ``h`` of the frame if the image was scaled afterwards, with the same aspect ratio.
     """
     stated = [number(frame.values, key, frame.source, positive=True) for key in ("w", "h")]
-    # Exporters that scale images may write fractions.
-    wrong = [key for key, was, now in zip("wh", stated, size) if was is not None and abs(was - now) >= 1]
+    # Exporters that scale images may write fractional sizes.
+    wrong = [key for key, want, got in zip("wh", stated, size) if want is not None and abs(want - got) >= 1]
     w, h = stated
     if not wrong:
         return size
     cropped = w is not None and abs(size[0] - w) <= ROUNDED
     if cropped or w is None or h is None or abs(size[0] / w - size[1] / h) * max(w, h) > ROUNDED:
-        says = " and ".join(f"{key} = {was:g}" for key, was in zip("wh", stated) if was is not None)
+        says = " and ".join(f"{key} = {want:g}" for key, want in zip("wh", stated) if want is not None)
         raise SceneError(f"{frame.path}: is {size[0]} x {size[1]} pixels, but {frame.source} says {says}")
     return w, h
 
 
 def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The entries with k1, k2... in the place of nerfstudio's distortion_params."""
+    """Returns the entries with nerfstudio's distortion_params, if any, as k1, k2, ..."""
     numbers = entries.get("distortion_params")
     if numbers is None or numbers == []:
         return entries
@@ -364,7 +364,7 @@ def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 class Shot(NamedTuple):
-    """One image to be written: its file, its pose [4, 4], its lens, its size, and the file of its mask, if any."""
+    """An image to write: its file, its pose [4, 4], its lens, its width and height, and its mask file, or ""."""
 
     file: str
     pose: Tensor
@@ -375,16 +375,16 @@ class Shot(NamedTuple):
 
 
 def write_transforms(path: Path, shots: Sequence[Shot]) -> None:
-    """Writes cameras as nerfstudio and instant-ngp read them."""
+    """Writes cameras in the format of nerfstudio and instant-ngp."""
     frames = []
     for shot in shots:
         (fx, fy, cx, cy), coefficients, model = shot.lens
         values = {name: value for name, value in zip(COEFFICIENTS[model], coefficients) if value}
-        known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "p1", "p2", "k3")
-        if model in (FOV, EQUIRECTANGULAR) or not values.keys() <= set(known):
+        supported = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "p1", "p2", "k3")
+        if model in (FOV, EQUIRECTANGULAR) or not values.keys() <= set(supported):
             raise SceneError(f"{path}: the lens of {shot.file} is none that transforms.json has")
         lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": shot.width, "h": shot.height}
-        lens |= {name: values.get(name, 0.0) for name in known}
+        lens |= {name: values.get(name, 0.0) for name in supported}
         kind = {"camera_model": "OPENCV_FISHEYE" if model == FISHEYE else "OPENCV"}
         mask = {"mask_path": shot.mask} if shot.mask else {}
         frames.append({"file_path": shot.file, **mask, "transform_matrix": shot.pose.tolist(), **lens, **kind})

@@ -1,4 +1,4 @@
-"""A training: settings, a state made by one function, one loop, and callbacks beside it."""
+"""A training: its settings, the state that `build` makes, the loop, and callbacks."""
 
 from voronerf.app.train.build import build
 from voronerf.app.train.callbacks import Checkpoints, Divergence, Scores, TensorBoard

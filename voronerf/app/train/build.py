@@ -1,4 +1,4 @@
-"""From settings and a scene to all that a training needs, in one state."""
+"""Builds the training state from settings and a scene."""
 
 from __future__ import annotations
 
@@ -36,18 +36,19 @@ from voronerf.router import VoronoiRouter
 
 #: Temperature of the stochastic assignment, in scene units.
 TEMPERATURE = 0.05
-#: Voxels along each axis of a grid for pictures alone, and points evaluated in each.
+#: Voxels along each axis of a grid that is used for pictures alone, and points evaluated in each voxel.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
-#: Scale of the robust loss of photographs, whose exposure and highlights differ; pictures that are computed have none.
+#: Scale of the robust loss for photographs, which differ in exposure and highlights; synthetic images have no robust
+#: loss.
 ROBUST = 0.05
-#: Factor of the loss on smooth depths of photographs from where no camera was.
+#: Factor of the smoothness loss on depths from places without a camera, for photographs.
 SMOOTH_DEPTH = 0.1
-#: Factors of the losses of rays of photographs whose light does not come from one surface. With three times the
-#: distortion even less is half transparent at silhouettes, and bonsai loses 0.3 dB.
+#: Factors of the distortion and orientation losses for photographs, which favour one surface per ray. With three times
+#: the distortion loss, even fewer silhouettes are half transparent, but bonsai loses 0.3 dB.
 DISTORTION, ORIENTATION = 0.003, 0.01
-#: At most so many rays along the longer side of a picture, one a pixel, find what its camera looks through.
+#: The most rays along the longer side of a picture for finding the voxels in front of its camera.
 LOOKS = 64
-#: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
+#: A lower bound of the bytes per sample in a step; measured are 100 (kilonerf) to 230 (hashgrid).
 SAMPLE_BYTES = 64
 
 
@@ -59,14 +60,14 @@ def build(
     on_event: Callable[[str], None] | None = None,
     speed: float = 1.0,
 ) -> State:
-    """All that a training needs, before its first step.
+    """Builds the state of a training before its first step.
 
     Args:
         config: The settings.
         scene: The scene that ``config.data`` names.
-        batches: Of rays; None for those of all training views of the scene.
+        batches: The batches of rays; None for rays of all training views of the scene.
         on_event: Called with a line of text for each split, evaluation and checkpoint.
-        speed: Of the machine, for the defaults of a training with a budget: see
+        speed: The machine's speed, for the defaults of a training with a budget: see
             :func:`voronerf.app.train.defaults.machine_speed`.
 
     Raises:
@@ -91,7 +92,7 @@ def build(
     device = torch.device(config.device)
     check_backend(config, device)
     generator = torch.Generator().manual_seed(config.seed)
-    # Random numbers are drawn on the device that uses them, so that the host need not wait.
+    # Random numbers for the device are drawn on it, without a wait for the host.
     draws = generator if device.type == "cpu" else torch.Generator(device).manual_seed(config.seed)
     routers = make_routers(config)
     for router in routers.values():
@@ -124,7 +125,7 @@ def build(
     photographs = scene.background is None
     terms: list[Term] = [SparseDepth(config.sparse_depth)] if config.sparse_depth else []
     terms.append(SmoothDepth(SMOOTH_DEPTH))
-    if photographs and isinstance(contraction, Contraction):  # forward-facing ones lose by it
+    if photographs and isinstance(contraction, Contraction):  # lowers the scores of forward-facing scenes
         terms.append(Surface(distortion=DISTORTION, orientation=ORIENTATION))
     return State(
         config=config,
@@ -146,7 +147,7 @@ def build(
 
 
 def make_batches(config: TrainConfig, scene: Scene, views: Tensor | None = None, *, unseen: float = 0.0) -> RayBatches:
-    """Batches of rays of the training views of a scene; ``views`` int64 for some, ``unseen`` as of `RayBatches`."""
+    """Returns ray batches of a scene's training views, or of ``views``, int64; for ``unseen`` see `RayBatches`."""
     train, device = scene.train, torch.device(config.device)
     images = train.images if train.on_disk else train.images.to(device)
     return RayBatches(
@@ -168,10 +169,10 @@ def make_batches(config: TrainConfig, scene: Scene, views: Tensor | None = None,
 
 
 def make_routers(config: TrainConfig, device: torch.device | str | None = None) -> dict[str, VoronoiRouter]:
-    """A router of one cell around each network, for the coarse stage; the seed alone decides its parameters."""
+    """Returns one-cell routers for the coarse stage, one for each network; the seed alone determines the parameters."""
     kind = config.field_type
     names = SAMPLERS[config.sampling].networks(kind.cones)
-    with torch.random.fork_rng():  # of GPUs as well: manual_seed reaches them
+    with torch.random.fork_rng():  # includes GPUs, which manual_seed also seeds
         torch.manual_seed(config.seed)
         networks = {name: kind.build(config.network_options) for name in names}
     return {
@@ -182,7 +183,7 @@ def make_routers(config: TrainConfig, device: torch.device | str | None = None) 
             assignment=config.assignment,
             temperature=TEMPERATURE,
             backend=config.backend,
-            way="fused",  # a run is resumed bit for bit, so nothing depends on timings
+            way="fused",  # results must not depend on timings: a run is resumed bit for bit
             **kind.router_options,
         ).to(config.device if device is None else device)
         for name, network in networks.items()
@@ -199,16 +200,16 @@ def make_renderer(
     samples: tuple[int, ...] | None = None,
     backend: str | None = None,
 ) -> Renderer:
-    """The renderer that a configuration asks for.
+    """Returns the renderer of a configuration.
 
     Args:
-        config: The settings, resolved.
-        scene: Whose space is sampled.
+        config: The resolved settings.
+        scene: The scene, for its space.
         routers: The networks by name.
-        grid: Which space is empty; None to take every sample.
-        empty: Its voxels that stay empty in a training; None for none.
-        samples: Samples per ray of each pass, in pictures too; None for those of the configuration.
-        backend: Of the operations; None for that of the configuration.
+        grid: The occupancy grid; None to take every sample.
+        empty: Voxels of the grid that stay empty in training, bool [x, y, z]; None for no such voxels.
+        samples: Samples per ray of each pass, also in pictures; None for the configuration's.
+        backend: The backend of the operations; None for the configuration's.
     """
     device, backend = next(routers["field"].parameters()).device, backend or config.backend
     space = scene.space(config.contraction, cones=config.field_type.cones, device=device)
@@ -223,10 +224,10 @@ def make_renderer(
 
 
 def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) -> Tensor:
-    """The voxels of contracted space that training views look through before their rays begin, bool [x, y, z].
+    """Returns the voxels between each training camera and its near bound, in contracted space, bool [x, y, z].
 
-    A camera stands in free space. Fog there could explain the pictures of other cameras, and would hide all else from a
-    place beside this one.
+    A camera stands in empty space. Fog in front of it could fit the images of other cameras, but would hide the scene
+    in a view from beside this camera.
     """
     device, cameras = grid.box.device, scene.train.cameras.to(grid.box.device)
     voxel = float((grid.box[1] - grid.box[0]).min()) / max(grid.occupied.shape)
@@ -234,10 +235,10 @@ def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) ->
     empty = torch.zeros(grid.occupied.numel(), dtype=torch.bool, device=device)
     for image in range(len(cameras)):
         width, height = cameras.size(image)
-        apart = max(width, height, LOOKS) / LOOKS
-        across, down = (torch.arange(0, side, apart, device=device) for side in (width, height))
-        y, x = (values.reshape(-1) for values in torch.meshgrid(down, across, indexing="ij"))
-        if (mask := scene.train.mask(image)) is not None:  # some pixels may have no ray
+        stride = max(width, height, LOOKS) / LOOKS
+        columns, rows = (torch.arange(0, side, stride, device=device) for side in (width, height))
+        y, x = (values.reshape(-1) for values in torch.meshgrid(rows, columns, indexing="ij"))
+        if (mask := scene.train.mask(image)) is not None:  # masked pixels may have no ray
             y, x = y.long(), x.long()
             seen = mask[y.cpu(), x.cpu()].to(device)
             y, x = y[seen], x[seen]
@@ -248,7 +249,7 @@ def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) ->
 
 
 def as_field(router: VoronoiRouter) -> Field:
-    """A router as the renderer asks it: with one direction for each ray, or for each sample where it takes no other."""
+    """Adapts a router to the renderer, which gives one direction per ray; some networks need one per sample."""
     takes_rays = "ray_index" in inspect.signature(router.module.forward).parameters
     return router if takes_rays else DirectionPerSample(router)
 
@@ -256,7 +257,7 @@ def as_field(router: VoronoiRouter) -> Field:
 def make_grid(
     config: TrainConfig, scene: Scene, device: torch.device | str = "cpu", resolution: int | None = None
 ) -> OccupancyGrid:
-    """A grid over the scene's box, or over the cube of its contraction, that is occupied everywhere."""
+    """Returns a fully occupied grid over the scene's box, or over the cube of its contraction."""
     contraction = scene.space(config.contraction, device=device).contraction
     if contraction is None and scene.box is None:
         raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
@@ -265,7 +266,7 @@ def make_grid(
 
 
 def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> OccupancyGrid:
-    """The occupancy grid of a field that was trained without one, made by asking the field in every voxel."""
+    """Builds the occupancy grid of a field that was trained without one, by evaluating the field in every voxel."""
     obstacle = why_no_occupancy(config)
     if obstacle is not None:
         raise ConfigError(f"--occupancy does not work with {obstacle}")
@@ -274,7 +275,7 @@ def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> 
 
 
 def ask_everywhere(grid: OccupancyGrid, field: Field, backend: str = "auto") -> OccupancyGrid:
-    """A grid after a field was asked in every voxel; the same one."""
+    """Updates a grid in place by evaluating a field in every voxel, and returns the grid."""
     generator = torch.Generator().manual_seed(0)
     for points in range(PICTURE_POINTS):
         grid.update(field, decay=float(points > 0), generator=generator, backend=backend)
@@ -282,16 +283,16 @@ def ask_everywhere(grid: OccupancyGrid, field: Field, backend: str = "auto") -> 
 
 
 def parameter_shapes(config: TrainConfig, **options: Any) -> dict[str, tuple[torch.Size, bool]]:
-    """The shape of each parameter of a network, with other options than those of the settings where they are given,
-    and whether all cells share it; takes no memory for any of them."""
+    """Returns (shape, whether all cells share it) for each parameter of a network, without allocating the parameters;
+    ``options`` override the settings' options."""
     kind = config.field_type
     make, share = functools.partial(kind.build, {**config.network_options, **options}), kind.router_options
     network: nn.Module
     try:
         with torch.device("meta"):
             network = make()
-    except RuntimeError:  # a field that computes numbers where it is made
-        with torch.random.fork_rng(devices=[]):  # draws nothing from the caller's random numbers
+    except RuntimeError:  # some fields compute values in their constructor
+        with torch.random.fork_rng(devices=[]):  # keeps the caller's random state
             network = make()
     return {
         key: (parameter.shape, any(fnmatch.fnmatchcase(key, pattern) for pattern in share.get("share", ())))
@@ -300,14 +301,14 @@ def parameter_shapes(config: TrainConfig, **options: Any) -> dict[str, tuple[tor
 
 
 def count_parameters(config: TrainConfig, **options: Any) -> int:
-    """Parameters of all networks of all final cells; options as for `parameter_shapes`."""
+    """Returns the number of parameters of all networks of all final cells; options as in `parameter_shapes`."""
     shapes, cells = parameter_shapes(config, **options).values(), config.final_cells
-    each = sum((1 if shared else cells) * shape.numel() for shape, shared in shapes)
-    return each * len(SAMPLERS[config.sampling].networks(config.field_type.cones))
+    per_network = sum((1 if shared else cells) * shape.numel() for shape, shared in shapes)
+    return per_network * len(SAMPLERS[config.sampling].networks(config.field_type.cones))
 
 
 def solve_width(config: TrainConfig, total: int) -> int:
-    """The largest width with which all networks of all final cells have at most ``total`` parameters together."""
+    """Returns the largest width with which all networks of all final cells have at most ``total`` parameters."""
     if "width" not in config.field_type.options:
         raise ConfigError(f"--parameters needs a field with an option width, {config.field} has none")
     _check_fits(config, f"--parameters {total}", _parameter_bytes(config) * total)
@@ -323,7 +324,7 @@ def solve_width(config: TrainConfig, total: int) -> int:
 
 
 def check_backend(config: TrainConfig, device: torch.device) -> None:
-    """Looks up every op of a step: a backend that cannot train should say so before anything is written."""
+    """Looks up every op of a step, so that a backend that cannot train fails before any file is written."""
     ops = ["pixel_rays", "nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", "adam"]
     if config.occupancy:
         ops += ["march_rays", "observe_occupancy", "forward_with_tape", "render_loss_gradient"]
@@ -335,7 +336,7 @@ def check_backend(config: TrainConfig, device: torch.device) -> None:
 
 
 def check_memory(config: TrainConfig) -> None:
-    """Raises ConfigError, with the sizes, for what does not fit into the machine."""
+    """Raises ConfigError, with the sizes, if rays or networks do not fit into the machine's memory."""
     rays, samples = int(config.rays or 0), sum(config.samples or ())
     _check_fits(config, f"--rays {rays} with {samples} samples", SAMPLE_BYTES * rays * samples)
     width = "" if config.width is None else f" of --width {config.width}"
@@ -344,29 +345,29 @@ def check_memory(config: TrainConfig) -> None:
 
 
 def _parameter_bytes(config: TrainConfig) -> int:
-    """Bytes for a parameter, its gradient, Adam's two moments and its average."""
+    """Returns the bytes for a parameter, its gradient, Adam's two moments and, if used, its average."""
     return 20 if config.average else 16
 
 
 def _check_fits(config: TrainConfig, name: str, needed: int) -> None:
     device = torch.device(config.device)
-    there = torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else physical_memory()
-    if needed > there:
-        needed = min(needed, 2**100)  # which a float holds
-        raise ConfigError(f"{name} needs {needed / 2**30:.1f} GiB of memory or more, there are {there / 2**30:.1f}")
+    available = torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else physical_memory()
+    if needed > available:
+        needed = min(needed, 2**100)  # prevents a float overflow
+        raise ConfigError(f"{name} needs {needed / 2**30:.1f} GiB of memory or more, there are {available / 2**30:.1f}")
 
 
 def present_device(name: str) -> str:
-    """A torch device that is present; for "auto" a GPU that has kernels of this package, else the CPU.
+    """Returns the name of a device that is present; for "auto" a GPU with kernels of this package, else the CPU.
 
     Raises:
-        ConfigError: For another device.
+        ConfigError: For a device that is not present, or is no CPU or GPU.
     """
     if name == "auto":
-        there = torch.cuda.is_available()
+        has_gpu = torch.cuda.is_available()
         return (
             "cuda"
-            if there and backends.chosen("routed_mlp", torch.device("cuda"), torch.float32) != "reference"
+            if has_gpu and backends.chosen("routed_mlp", torch.device("cuda"), torch.float32) != "reference"
             else "cpu"
         )
     try:
@@ -376,6 +377,6 @@ def present_device(name: str) -> str:
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         device = device_of(name)
         reason = str(error).splitlines()[0].partition(": ")[0]
-        end = f": {reason}; leave it out for the CPU" if device == name else f"; did you mean {device or 'auto'}?"
-        raise ConfigError(f"--device must be auto, cpu or a GPU that is present, got {name!r}{end}") from None
+        hint = f": {reason}; leave it out for the CPU" if device == name else f"; did you mean {device or 'auto'}?"
+        raise ConfigError(f"--device must be auto, cpu or a GPU that is present, got {name!r}{hint}") from None
     return name

@@ -29,28 +29,28 @@ from voronerf.app.train.state import State
 from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.split import MIN_SAMPLES, SplitDone
 
-#: Seconds of training between checkpoints, and how many are kept.
+#: Seconds of training between checkpoints, and the number of kept checkpoints.
 CHECKPOINT_EVERY, KEPT = 30.0, 3
-#: Share of the budget for evaluations, half of it for the final one; and the most views of one on the way.
+#: Share of the budget for evaluations, half of it for the final evaluation; the most views of an intermediate one.
 SHARE, VIEWS = 0.1, 20
-#: About the pixels that are rendered to learn what a view takes, and the least side of a part of one, for LPIPS.
+#: Approximate number of pixels rendered to time a view, and the least side of a view's middle.
 PROBE, PROBE_SIDE = 1024, 31
-#: The most views whose middle is scored where time is short for one.
+#: The most views of which the middle is scored, if there is too little time for a whole view.
 PARTS = 8
-#: Side of the corner of a view that tells what LPIPS takes.
+#: Side of the corner of a view on which LPIPS is timed.
 LPIPS_PROBE = 128
-#: Entries of the last evaluation that summary.json repeats.
+#: The entries of the last evaluation that are repeated in summary.json.
 FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views", "part")
-#: Skipped steps in a row after which waiting is of no use.
+#: Number of consecutive skipped steps after which a training has diverged.
 PATIENCE = 10
-#: Decibels below the best evaluation so far that are a collapse.
+#: Drop of the PSNR from its best value, in dB, that counts as a collapse.
 COLLAPSE = 5.0
-#: A run is compared with pictures of one colour from its middle on, and from this step.
+#: Step from which, after the middle of a run, its PSNR is compared with the PSNR of a single colour.
 SETTLED = 100
 
 
 class Checkpoints(Callback):
-    """Writes a checkpoint now and then, beside the training, and at the end; and the samples of each split.
+    """Writes checkpoints at regular times, in a thread, and at the end; also writes the samples of each split.
 
     Args:
         out: The run directory.
@@ -65,14 +65,14 @@ class Checkpoints(Callback):
         self.saved_at, self.described = 0.0, False
 
     def on_start(self, state: State) -> None:
-        """Counts from the state's time on."""
+        """Starts the timer at the state's training time."""
         self.saved_at = state.seconds
 
     def after_split(self, state: State, done: SplitDone) -> None:
-        """Writes the samples that decided a split, and says what it made."""
-        kept, stage = io.BytesIO(), state.stages[-1]  # benchmarks/paper/balance.py reads them
-        np.savez(kept, points=done.points.cpu().numpy(), importance=done.importance.cpu().numpy())
-        write_bytes(self.out / "samples" / f"level-{state.strategy.splits}.npz", kept.getvalue())
+        """Writes the samples on which a split is based, and reports the new cells."""
+        buffer, stage = io.BytesIO(), state.stages[-1]  # benchmarks/paper/balance.py reads the samples
+        np.savez(buffer, points=done.points.cpu().numpy(), importance=done.importance.cpu().numpy())
+        write_bytes(self.out / "samples" / f"level-{state.strategy.splits}.npz", buffer.getvalue())
         when = f"at {state.seconds:.0f} s, step {state.step}"
         if stage.split_cells:
             balance = f", imbalance of their importance {stage.balance_before:.3f} -> {stage.balance_after:.4f}"
@@ -83,25 +83,25 @@ class Checkpoints(Callback):
             state.report(f"no cell split {when}: none holds {MIN_SAMPLES} of the {len(done.points)} samples kept")
 
     def after_step(self, state: State) -> None:
-        """Begins to write a checkpoint when it is time, unless one is being written."""
+        """Starts writing a checkpoint when it is due, unless another one is being written."""
         if state.seconds - self.saved_at >= self.every and not self.writer.busy:
             self.save(state)
 
     def on_end(self, state: State) -> None:
-        """Writes the last checkpoint, and waits for it."""
+        """Writes the last checkpoint, and waits until it is written."""
         self.save(state)
         self.writer.wait()
 
     def save(self, state: State) -> None:
-        """Begins to write a checkpoint, after the one before.
+        """Starts writing a checkpoint, after the previous checkpoint is written.
 
         Raises:
-            TrainingError: When parameters or moments are not finite; the last checkpoint stays as it was.
-            OSError: When the one before could not be written.
+            TrainingError: When parameters or moments are not finite; the last checkpoint stays unchanged.
+            OSError: When the previous checkpoint could not be written.
         """
         if not all_finite(state.optimizer):
             raise diverged(self.out, "parameters or moments of Adam not finite", state.step)
-        if not self.described:  # not earlier: a run whose first step fails leaves nothing
+        if not self.described:  # not earlier, so that a run whose first step fails leaves no files
             write_text(self.out / "config.json", state.config.to_json())
             write_scene(self.out / "scene.json", state.scene)
             self.described = True
@@ -110,10 +110,10 @@ class Checkpoints(Callback):
 
 
 class Divergence(Callback):
-    """Ends a training whose gradients stop being finite.
+    """Ends a training with an error if its gradients become infinite or NaN.
 
     Args:
-        out: The run directory, for the message.
+        out: The run directory, for the error message.
     """
 
     group = GROUP
@@ -122,40 +122,41 @@ class Divergence(Callback):
         self.out = out
 
     def after_step(self, state: State) -> None:
-        """Raises TrainingError after `PATIENCE` steps that were left out in a row."""
+        """Raises TrainingError after `PATIENCE` consecutive skipped steps."""
         if state.skipped_in_a_row >= PATIENCE:
             raise diverged(self.out, f"gradients of {state.skipped_in_a_row} steps in a row not finite", state.step)
 
 
 def diverged(out: Path, reason: str, step: int) -> TrainingError:
-    """The error of a training that cannot continue."""
-    kept = "the last checkpoint is unchanged" if checkpoint_paths(out) else "there is no checkpoint"
-    return TrainingError(f"{out}: {reason} at step {step}, try a smaller --lr; {kept}")
+    """Returns the error of a training that cannot continue."""
+    remark = "the last checkpoint is unchanged" if checkpoint_paths(out) else "there is no checkpoint"
+    return TrainingError(f"{out}: {reason} at step {step}, try a smaller --lr; {remark}")
 
 
 def all_finite(optimizer: torch.optim.Optimizer) -> bool:
-    """Whether all parameters of an optimiser and its moments are finite; reads all of them."""
+    """Returns whether all parameters and moments of an optimiser are finite."""
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     moments = [entry for state in optimizer.state.values() for entry in state.values() if isinstance(entry, Tensor)]
     return bool(get_total_norm([tensor.detach() for tensor in (*parameters, *moments)], math.inf).isfinite())
 
 
 class Scores(Callback):
-    """Scores test views at even times and at the end, into ``metrics.jsonl``, and writes ``summary.json``.
+    """Scores test views at regular intervals and at the end, into ``metrics.jsonl``, and writes ``summary.json``.
 
-    With ``config.budget`` and without ``config.eval_views``, evaluations on the way take at most a twentieth of the
-    time so far: fewer views are scored where that is too short, or none. All evaluations take at most a tenth of the
-    budget. Where that is too short for one view at the end, the middle of it is scored.
+    With ``config.budget`` and without ``config.eval_views``, the time of evaluations is limited. Intermediate
+    evaluations take at most a twentieth of the elapsed time, and score fewer views, or none, if necessary. All
+    evaluations together take at most a tenth of the budget. If the final one has too little time for a view, the middle
+    of a view is scored.
 
     Args:
-        out: The run directory; None to write nothing.
-        lpips: For the final evaluation; None for none.
-        track: Shows progress: yields the items of a sequence, and is given its name.
-        clock: Counts seconds.
+        out: The run directory; None to write no files.
+        lpips: The LPIPS network for the final evaluation, or None.
+        track: Function that shows progress: it yields the items of a sequence, and takes the sequence's name.
+        clock: Function that returns the time in seconds.
 
     Attributes:
         metrics: All evaluations, in order.
-        summary: What ``summary.json`` holds, after the end.
+        summary: The contents of ``summary.json``, after the end of the training.
     """
 
     group = GROUP
@@ -174,17 +175,17 @@ class Scores(Callback):
         self.done, self.view_seconds, self.probe_seconds, self.one_colour = 0, 0.0, 0.0, math.nan
 
     def on_start(self, state: State) -> None:
-        """Goes on after the evaluations that a resumed run has made."""
+        """Loads the evaluations of a resumed run."""
         if self.out is not None:
             self.metrics = [line for line in read_metrics(self.out) if line["step"] <= state.step]
         self.done = min(len(self.metrics), self._due(state))
-        self.after_step(state)  # of one that was stopped
+        self.after_step(state)  # scores an evaluation that was interrupted
 
     def _due(self, state: State) -> int:
         return int(state.fraction * state.config.evaluations + 1e-9)
 
     def after_step(self, state: State) -> None:
-        """Scores test views when it is time."""
+        """Scores test views when an evaluation is due."""
         if self._due(state) > self.done and state.fraction < 1:
             self.done = self._due(state)
             self._evaluate(state, last=False)
@@ -193,12 +194,12 @@ class Scores(Callback):
         """Scores the test views of a finished training, and writes the summary."""
         if state.fraction >= 1:
             state.clear_stop()
-            if left := state.strategy.left:
-                state.report(f"Run ended before {left} of {state.strategy.splits + left} planned splits.")
+            if remaining := state.strategy.left:
+                state.report(f"Run ended before {remaining} of {state.strategy.splits + remaining} planned splits.")
             self._evaluate(state, last=True)
-        now = self.metrics[-1] if self.metrics else {}
+        last = self.metrics[-1] if self.metrics else {}
         self.summary = {
-            **{key: now.get(key) for key in FIGURES},
+            **{key: last.get(key) for key in FIGURES},
             "complete": state.fraction >= 1 and not state.stopped,
             "seconds": state.seconds,
             "steps": state.step,
@@ -214,46 +215,46 @@ class Scores(Callback):
             write_text(self.out / "summary.json", json_text(self.summary, indent=2) + "\n")
 
     def _evaluate(self, state: State, *, last: bool) -> None:
-        """Scores test views; where a stop is asked for meanwhile, not all of them, and without a trace."""
-        config, lpips, every = state.config, self.lpips if last else None, len(state.scene.test)
-        views, middle = min(every, config.eval_views or (every if last else VIEWS)), 1
-        left, started, budget = math.inf, self.clock(), None if config.eval_views else config.budget
+        """Scores test views; discards the scores if a stop is requested meanwhile."""
+        config, lpips, all_views = state.config, self.lpips if last else None, len(state.scene.test)
+        views, middle = min(all_views, config.eval_views or (all_views if last else VIEWS)), 1
+        remaining, started, budget = math.inf, self.clock(), None if config.eval_views else config.budget
         if budget is not None:
-            left = (SHARE * budget if last else SHARE / 2 * state.seconds) - state.evaluation_seconds
-            most = max(1, min(state.scene.test.cameras.smallest) // PROBE_SIDE)
-            if not 0 < self.view_seconds <= left and 4 * self.probe_seconds <= left:
-                self._probe(state, most)
-            each = self.view_seconds + (0.0 if lpips is None else self._seconds_of(lpips, state))
-            left -= self.clock() - started
-            views = min(views, int(max(left, 0) / max(each, 1e-9)))
+            remaining = (SHARE * budget if last else SHARE / 2 * state.seconds) - state.evaluation_seconds
+            most_parts = max(1, min(state.scene.test.cameras.smallest) // PROBE_SIDE)
+            if not 0 < self.view_seconds <= remaining and 4 * self.probe_seconds <= remaining:
+                self._probe(state, most_parts)
+            per_view = self.view_seconds + (0.0 if lpips is None else self._seconds_of(lpips, state))
+            remaining -= self.clock() - started
+            views = min(views, int(max(remaining, 0) / max(per_view, 1e-9)))
             if last and views < 1:
-                afford = max(left, 1e-9) / max(each, 1e-9)  # views, of which this is less than one
-                views = max(1, min(every, PARTS, int(afford * most**2)))
-                middle = min(most, math.ceil(math.sqrt(views / afford)))
+                affordable = max(remaining, 1e-9) / max(per_view, 1e-9)  # number of views, below 1
+                views = max(1, min(all_views, PARTS, int(affordable * most_parts**2)))
+                middle = min(most_parts, math.ceil(math.sqrt(views / affordable)))
         if views:
-            begun = self.clock()
-            stop = lambda: state.stopped or self.clock() - begun > left  # noqa: E731
+            begin = self.clock()
+            stop = lambda: state.stopped or self.clock() - begin > remaining  # noqa: E731
             scores = self._score(state, views, lpips, middle, stop=stop, track=self.track)
             if middle == 1:
-                self.view_seconds = (self.clock() - begun) / len(scores)
+                self.view_seconds = (self.clock() - begin) / len(scores)
             if not state.stopped:
                 self._record(state, scores, middle)
         if budget is not None and not last:
-            state.count_evaluation(self.clock() - started, min(self.view_seconds * every, SHARE / 2 * budget))
+            state.count_evaluation(self.clock() - started, min(self.view_seconds * all_views, SHARE / 2 * budget))
 
     def affordable(self, budget: float | None, most: int) -> int:
-        """How many views a tenth of a budget in seconds allows, by what one took last; at least one."""
+        """Returns how many views, 1 to ``most``, fit into a tenth of a budget in seconds, by the last view's time."""
         return most if budget is None else max(1, min(most, int(SHARE * budget / max(self.view_seconds, 1e-9))))
 
     def _seconds_of(self, lpips: Lpips, state: State) -> float:
-        """The seconds of LPIPS for a view, measured on a corner of it."""
+        """Estimates the seconds of LPIPS for a view, by timing it on a corner of the view."""
         truth = state.scene.test.truth(0, state.scene.background_colour()).to(state.device)
         corner, started = truth[:LPIPS_PROBE, :LPIPS_PROBE], self.clock()
         float(lpips(corner, corner))
         return (self.clock() - started) * truth.numel() / corner.numel()
 
     def _probe(self, state: State, most: int) -> None:
-        """Learns what a view takes from its middle, which is at most so many times narrower."""
+        """Estimates the seconds for a view by scoring its middle, which is at most ``most`` times narrower."""
         width, height = state.scene.test.cameras.size(0)
         factor, started = min(most, max(1, round(math.sqrt(width * height / PROBE)))), self.clock()
         self._score(state, 1, None, factor)
@@ -265,8 +266,8 @@ class Scores(Callback):
             return evaluate(state.renderer, state.scene, views=views, lpips=lpips, middle=middle, **options)
 
     def _record(self, state: State, scores: list[ViewScore], middle: int) -> None:
-        """Adds an evaluation to ``metrics.jsonl`` and says it, with what makes it poor."""
-        now = {
+        """Adds an evaluation to ``metrics.jsonl``, and reports it and any fault."""
+        entry = {
             "step": state.step,
             "seconds": round(state.seconds, 3),
             "cells": state.router.num_cells,
@@ -275,23 +276,23 @@ class Scores(Callback):
             "part": 1 / middle**2,
             **mean_scores(scores),
         }
-        self.metrics = [line for line in self.metrics if line["step"] < state.step] + [now]
+        self.metrics = [line for line in self.metrics if line["step"] < state.step] + [entry]
         if self.out is not None:
             write_text(self.out / "metrics.jsonl", "".join(json_text(line) + "\n" for line in self.metrics))
         state.report(
-            f"{state.seconds:7.1f} s  step {state.step:6d}  {now['cells']:4d} cell{'s' * (now['cells'] != 1)}  "
-            f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({views_of(now)})"
+            f"{state.seconds:7.1f} s  step {state.step:6d}  {entry['cells']:4d} cell{'s' * (entry['cells'] != 1)}  "
+            f"psnr {entry['psnr']:6.2f}  ssim {entry['ssim']:.4f}  ({views_of(entry)})"
         )
         if math.isnan(self.one_colour):
             self.one_colour = one_colour_psnr(state.scene)
         settled = state.step >= SETTLED and state.fraction >= 0.5
-        poor = why_scores_are_poor(self.metrics, state.config, self.one_colour, settled=settled)
-        if poor is not None:
-            state.report(poor)
+        fault = why_scores_are_poor(self.metrics, state.config, self.one_colour, settled=settled)
+        if fault is not None:
+            state.report(fault)
 
 
 def views_of(scores: Mapping[str, Any]) -> str:
-    """The views behind scores, such as "3 views" or "the middle 6% of 1 view"; empty if unknown."""
+    """Describes the scored views, such as "3 views" or "the middle 6% of 1 view"; empty if unknown."""
     views, part = scores.get("views"), scores.get("part", 1)
     if not isinstance(views, int) or not isinstance(part, int | float):
         return ""
@@ -299,12 +300,12 @@ def views_of(scores: Mapping[str, Any]) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """A number of things, such as "1 cell" or "16 cells"."""
+    """Returns a number with its noun, such as "1 cell" or "16 cells"."""
     return f"{count:,} {noun}{'s' * (count != 1)}"
 
 
 def one_colour_psnr(scene: Scene) -> float:
-    """PSNR in dB of test views that are painted in their mean colour."""
+    """Returns the PSNR in dB of a prediction that paints test views in their mean colour."""
     background = scene.background_colour()
     pixels = torch.cat([scene.test.truth(i, background).reshape(-1, 3) for i in view_numbers(len(scene.test), 5)])
     return -10 * math.log10(max(float(pixels.var(0, correction=0).mean()), 1e-10))
@@ -313,17 +314,17 @@ def one_colour_psnr(scene: Scene) -> float:
 def why_scores_are_poor(
     metrics: Sequence[Mapping[str, Any]], config: TrainConfig, one_colour: float, *, settled: bool
 ) -> str | None:
-    """The fault of the last evaluation of a run and its probable cause, in a line; None if it is good.
+    """Returns the fault of a run's last evaluation and its probable cause, in a line; None if there is no fault.
 
     Args:
         metrics: All evaluations.
         config: The settings of the run.
-        one_colour: See :func:`one_colour_psnr`.
-        settled: Whether the run is so far that it must have learnt something.
+        one_colour: The PSNR of a single colour, see :func:`one_colour_psnr`.
+        settled: Whether the run is long enough for scores above a single colour's.
     """
     if metrics[-1].get("part", 1) < 1:
-        return None  # the middle of views has scores of its own
-    *earlier, now = (math.nan if m["psnr"] is None else m["psnr"] for m in metrics if m.get("part", 1) == 1)
+        return None  # scores of the views' middle are not comparable
+    *earlier, now = (math.nan if line["psnr"] is None else line["psnr"] for line in metrics if line.get("part", 1) == 1)
     best = max((psnr for psnr in earlier if math.isfinite(psnr)), default=-math.inf)
     assert config.lr is not None
     usual = config.field_type.learning_rate(config.network_options)
@@ -331,16 +332,16 @@ def why_scores_are_poor(
     if best - now > COLLAPSE:
         return f"psnr fell from {best:.2f} to {now:.2f} dB: the learning rate is probably too high, try --lr {rate:.2g}"
     if settled and not now > one_colour:
-        other = "" if config.lr > usual else ", or cameras, near and far do not fit the images"
+        other_causes = "" if config.lr > usual else ", or cameras, near and far do not fit the images"
         return (
             f"nothing is learnt: psnr is {now:.2f} dB, where a single colour gives {one_colour:.2f}; the learning rate "
-            f"is probably too high, try --lr {rate:.2g}{other}"
+            f"is probably too high, try --lr {rate:.2g}{other_causes}"
         )
     return None
 
 
 def tensorboard_writer() -> Any:
-    """The class that writes files of TensorBoard; raises ImportError where it is not installed."""
+    """Returns TensorBoard's writer class; raises ImportError if TensorBoard is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
@@ -352,11 +353,11 @@ class TensorBoard(Callback):
     """Writes loss, speed, cells and scores for TensorBoard.
 
     Args:
-        folder: Of the event files.
-        scores: Whose evaluations are written; comes before this one among the callbacks.
+        folder: The folder of the event files.
+        scores: The callback whose evaluations are written; it must precede this callback.
 
     Raises:
-        ImportError: TensorBoard is not installed.
+        ImportError: If TensorBoard is not installed.
 
     Examples:
         >>> import tempfile
@@ -374,11 +375,11 @@ class TensorBoard(Callback):
         self.writer: Any = None
 
     def on_start(self, state: State) -> None:
-        """Opens the file; what an earlier part of the run has written of later steps is hidden."""
+        """Opens the event file; on a resume, TensorBoard hides earlier entries of later steps."""
         self.writer, self.written = self._make(str(self.folder), purge_step=state.step + 1), len(self.scores.metrics)
 
     def after_step(self, state: State) -> None:
-        """Writes the state after a step, and the evaluations since the step before."""
+        """Writes the state after a step, and new evaluations."""
         if state.step % GROUP == 0:
             speed = state.rays_done / max(state.seconds, 1e-9)
             for name, value in (("loss", state.loss), ("rays_per_second", speed), ("cells", state.router.num_cells)):
@@ -386,7 +387,7 @@ class TensorBoard(Callback):
         self._write_scores()
 
     def on_end(self, state: State) -> None:
-        """Writes the last evaluations, and ends the file."""
+        """Writes the last evaluations, and closes the file."""
         self._write_scores()
         self.writer.close()
 

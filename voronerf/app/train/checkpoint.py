@@ -1,8 +1,8 @@
-"""Checkpoints: safetensors files, written atomically, read without pickle, and refused where a bit of them changed.
+"""Checkpoints: safetensors files, written atomically, read without pickle, and verified by checksums.
 
-The tensors are those of the routers with their diagrams, of the optimiser, of the sample reservoir and of the random
-generators. Everything else (configuration, counters, stages) is JSON in the metadata of the file, beside a checksum for
-each tensor and one for the JSON.
+The tensors belong to the routers with their diagrams, the optimiser, the sample reservoir and the random generators.
+All other values (configuration, counters, stages) are JSON in the file's metadata, with a checksum for each tensor and
+a checksum for the JSON.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from voronerf.app.files import parse_json, rename, write_bytes
 from voronerf.app.wording import similar_path
 
 FORMAT = "voronerf-checkpoint-2"
-#: The name of the checksum of the JSON, beside those of the tensors.
+#: The key of the JSON's checksum among the tensors' checksums.
 _VALUES = "values"
 
 
@@ -36,35 +36,35 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The contents of a checkpoint: tensors by name, everything else as JSON values, and the file that errors name."""
+    """The contents of a checkpoint: tensors by name, all other values as JSON values, and the file name for errors."""
 
     tensors: dict[str, Tensor]
     values: dict[str, Any]
     source: str = "checkpoint"
 
     def group(self, prefix: str) -> dict[str, Tensor]:
-        """The tensors below ``prefix.``, without it."""
+        """Returns the tensors whose names begin with ``prefix.``, under their names without it."""
         return {name[len(prefix) + 1 :]: t for name, t in self.tensors.items() if name.startswith(prefix + ".")}
 
 
 def checkpoint_path(run: Path) -> Path:
-    """Where a run directory keeps its last checkpoint."""
+    """Returns the path of the last checkpoint in a run directory."""
     return run / "checkpoints" / "last.safetensors"
 
 
 def checkpoint_paths(run: Path) -> list[Path]:
-    """The checkpoints that a run directory has, the last first: last, last-1, last-2..."""
+    """Returns the checkpoints in a run directory, the latest first: last, last-1, last-2, ..."""
     last = checkpoint_path(run)
     earlier = [p for p in last.parent.glob("last-*.safetensors") if p.stem[5:].isdecimal()]
     return [last] * last.is_file() + sorted(earlier, key=lambda path: int(path.stem[5:]))
 
 
 def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
-    """Writes the last checkpoint of a run; the one before becomes ``last-1``; ``keep`` stay, on failure all."""
+    """Writes the last checkpoint, renames older ones to ``last-1``, ... and keeps ``keep``; on failure, all stay."""
     last = checkpoint_path(run)
     written = last.with_name("new.safetensors")
     save_checkpoint(written, checkpoint)
-    # From the oldest on, so that a crash at any moment leaves a gap in the numbers and no fewer checkpoints.
+    # The oldest one first, so that a crash leaves a gap in the numbers but loses no checkpoint.
     for number, path in reversed(list(enumerate(checkpoint_paths(run), 1))):
         if number < keep:
             rename(path, last.with_name(f"last-{number}.safetensors"))
@@ -74,7 +74,7 @@ def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
 
 
 class CheckpointWriter:
-    """Writes the checkpoints of a run one after the other, beside what the caller does."""
+    """Writes the checkpoints of a run one after another, in a background thread."""
 
     def __init__(self, run: Path, keep: int) -> None:
         self.run, self.keep = run, keep
@@ -83,13 +83,13 @@ class CheckpointWriter:
 
     @property
     def busy(self) -> bool:
-        """Whether a checkpoint is being written."""
+        """Returns whether a checkpoint is being written."""
         return self._thread is not None and self._thread.is_alive()
 
     def write(self, checkpoint: Checkpoint) -> None:
-        """Begins to write a checkpoint, after the one before; its tensors must not change."""
+        """Starts writing a checkpoint, after the previous one is written; its tensors must not change meanwhile."""
         self.wait()
-        self._error = MemoryError("no memory for the thread that writes a checkpoint")  # until that has done so
+        self._error = MemoryError("no memory for the thread that writes a checkpoint")  # the thread clears it
 
         def run() -> None:
             try:
@@ -99,12 +99,12 @@ class CheckpointWriter:
             else:
                 self._error = None
 
-        # The end of the process does not wait for it: a second Ctrl-C is to end it at once.
+        # A daemon thread, since a second Ctrl-C must end the process at once.
         self._thread = threading.Thread(target=run, daemon=True)
         self._thread.start()
 
     def wait(self) -> None:
-        """Returns when the checkpoint is written."""
+        """Waits until the checkpoint is written, and raises the error of its thread, if any."""
         if self._thread is not None:
             self._thread.join()
             self._thread = None
@@ -118,19 +118,19 @@ def _all(name: str) -> bool:
 
 
 def is_shown(name: str) -> bool:
-    """Whether a tensor is for pictures, and not for training alone."""
+    """Returns whether rendering needs a tensor, by its name; the other tensors are for training alone."""
     return name.startswith(("router", "part-", "occupancy.")) or name.endswith(".average")
 
 
 def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
-    """The last checkpoint of a run that can be read; a warning tells of those passed over.
+    """Returns the last readable checkpoint of a run, and warns if it skips unreadable ones.
 
     Args:
         run: The run directory.
         keep: See :func:`load_checkpoint`.
 
     Raises:
-        CheckpointError: When there is none.
+        CheckpointError: If there is no readable checkpoint.
     """
     paths = checkpoint_paths(run)
     if not paths:
@@ -149,7 +149,7 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Writes a checkpoint atomically: on failure an older one at ``path`` is untouched."""
+    """Writes a checkpoint atomically: on failure, an older file at ``path`` stays unchanged."""
     values = json.dumps(checkpoint.values)
     sums = {name: _checksum(tensor) for name, tensor in checkpoint.tensors.items()}
     sums[_VALUES] = zlib.crc32(values.encode())
@@ -158,24 +158,26 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def no_run(path: Path, file: str) -> str:
-    """The message for a path without a run, whose folder lacks a file; names a run that the path lies in, holds, or is
-    like."""
+    """Returns the error message for a path without a run, in which ``file`` is missing.
+
+    It suggests a run that contains the path, lies in it, or has a similar name.
+    """
     reason = f"there is no {file} in it" if path.is_dir() else "it is a file" if path.is_file() else None
-    around = [folder for folder in path.parents if (folder / "config.json").is_file()]
-    near = around[:1] or sorted(config.parent for config in path.glob("*/config.json"))[:1]
+    parents = [folder for folder in path.parents if (folder / "config.json").is_file()]
+    candidates = parents[:1] or sorted(config.parent for config in path.glob("*/config.json"))[:1]
     similar = [config.parent for config in path.parent.glob("*/config.json")]
-    end = f"; did you mean {near[0]}?" if near else similar_path(path, similar)
-    return f"no run at {path}: {reason or 'there is no such folder'}{end}"
+    hint = f"; did you mean {candidates[0]}?" if candidates else similar_path(path, similar)
+    return f"no run at {path}: {reason or 'there is no such folder'}{hint}"
 
 
 def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
     """Reads a checkpoint onto the CPU.
 
-    Its tensors are pages of the file: the system drops what is not in use.
+    Its tensors are mapped from the file, so that the system can drop unused pages.
 
     Args:
         path: The file.
-        keep: Which tensors, by their names, are read and checked. None of the others may be missing.
+        keep: Function of a tensor's name that returns whether to read and verify it. Other tensors must exist, too.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint")
@@ -204,19 +206,19 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
 
 
 def _checksum(tensor: Tensor) -> int:
-    """The checksum of elements, shape and dtype."""
+    """Returns the checksum of a tensor's elements, shape and dtype."""
     kind = zlib.crc32(f"{tensor.dtype} {list(tensor.shape)}".encode())
     return zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, kind)
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """The optimiser's per-parameter state as tensors named ``INDEX.KEY`` (all of Adam's state is tensors)."""
+    """Returns the optimiser's per-parameter state as tensors named ``INDEX.KEY`` (Adam's state is tensors alone)."""
     state = optimizer.state_dict()["state"]
     return {f"{index}.{key}": torch.as_tensor(value) for index, s in state.items() for key, value in s.items()}
 
 
 def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """The inverse of :func:`optimizer_tensors`; groups and learning rates stay the optimiser's own."""
+    """Restores the tensors of :func:`optimizer_tensors`; parameter groups and learning rates stay unchanged."""
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
@@ -227,7 +229,7 @@ def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, 
     for number, entries in state.items():
         for key in ("exp_avg", "exp_avg_sq", *entries):
             wanted = [] if key == "step" else list(parameters[number].shape)
-            came = list(entries[key].shape) if key in entries else None
-            if came != wanted:
-                raise ValueError(f"optimizer.{number}.{key} must have shape {wanted}, got {came or 'nothing'}")
+            actual = list(entries[key].shape) if key in entries else None
+            if actual != wanted:
+                raise ValueError(f"optimizer.{number}.{key} must have shape {wanted}, got {actual or 'nothing'}")
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

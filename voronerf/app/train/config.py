@@ -1,5 +1,7 @@
-"""The settings of a training: checked once, stored beside the results as JSON. Defaults that depend on the scene are
-filled in by :mod:`voronerf.app.train.defaults`."""
+"""The settings of a training: checked once, and stored beside the results as JSON.
+
+:mod:`voronerf.app.train.defaults` fills in the defaults that depend on the scene.
+"""
 
 from __future__ import annotations
 
@@ -20,45 +22,45 @@ from voronerf.nerf.samplers import SAMPLERS
 from voronerf.nerf.split import RESERVOIR, PlannedSplit, final_cells, plan_splits
 from voronerf.ops._core.backends import BACKENDS
 
-#: Settings that are options of a field where its class has an option of that name.
+#: Settings that are passed to the field if its class has an option of the same name.
 NETWORK_SETTINGS = ("width", "depth")
 
 
 class ConfigError(Exception):
-    """A setting that cannot be used. The message names the setting, the rule and the value.
+    """An unusable setting; the message names the setting, the rule and the value.
 
-    It is not a ValueError, because the parser of the command line would catch that and print a long explanation.
+    It is not a ValueError, which the command-line parser would catch to print a long explanation.
     """
 
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """The scene that is learnt."""
+    """The scene."""
 
     data: str = "builtin"
-    """Scene folder (--format says which there are), that of one of its COLMAP models, or a built-in scene: "builtin",
-    "builtin:400" of so many pixels, or "builtin-city:4x4", a city of so many blocks."""
+    """Scene folder in a format of --format, the folder of a COLMAP model in it, or a built-in scene: "builtin",
+    "builtin:400" with 400 pixels a side, or "builtin-city:4x4", a city of 16 blocks."""
     format: Literal["auto", "blender", "colmap", "transforms", "llff"] = "auto"
-    """What is read of a scene folder; auto is the first of them that it holds, in this order, but
-    transforms before a model in colmap/sparse (nerfstudio's), distorted/sparse or dense/sparse."""
+    """Format of the scene folder; auto is the first that the folder has, in this order, but transforms before a COLMAP
+    model in colmap/sparse (nerfstudio's), distorted/sparse or dense/sparse."""
     kind: Literal["auto", "object", "forward", "inside-out", "unbounded"] = "auto"
-    """Kind of scene: an object on white; cameras that look the same way; that look outwards; or that look at one place
-    with surroundings. auto tells it by transparent pixels and by the cameras."""
+    """Kind of scene: an object on white; cameras that look the same way; cameras that look outwards; or cameras that
+    look at one place with surroundings. auto decides by transparent pixels and by the cameras."""
     normalise: bool = True
     """Move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera at distance
-    1; the coordinates of the files are kept otherwise."""
+    1; otherwise the coordinates of the files are kept."""
     downscale: int | None = None
-    """Factor by which the images are made smaller when they are loaded; default 1, and for photographs the least that
-    leaves at most 512 pixels a side."""
+    """Factor by which the images are reduced; default 1, and for photographs the smallest factor that leaves at most
+    512 pixels a side."""
     images: Literal["auto", "memory", "disk"] = "auto"
     """Keep the images of a scene folder or city in memory, or on disk: decoded once into a file of the cache
-    (VORONERF_CACHE, or voronerf in the user's caches), from which the pixels of each step are read. auto is on disk for
-    what does not fit into memory."""
+    (VORONERF_CACHE, or voronerf in the user's caches), from which the pixels of each step are read. auto is disk if
+    they do not fit into memory."""
     allow_outside: bool = False
     """Also read images that lie outside of the scene folder, which it may name by .., an absolute path or a link."""
     keep_far: bool = False
-    """Keep photographs whose cameras lie far from the others. They are left out otherwise: one lost camera would give
-    the scene its scale."""
+    """Keep photographs whose cameras lie far from the others. By default they are left out, since one lost camera would
+    determine the scale of the scene."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class RunSettings:
     budget: float | None = None
     """Time in seconds for training and evaluation; default 480, unless --steps is given."""
     steps: int | None = None
-    """Number of training steps, instead of a time."""
+    """Number of training steps, instead of a budget."""
 
 
 @dataclass(frozen=True)
@@ -85,19 +87,19 @@ class FieldSettings:
     """The network of a cell."""
 
     field: str = "hashgrid"
-    """Kind of network: hashgrid (small networks on a hash grid that the cells share), nerf (as published), mipnerf
+    """Kind of network: hashgrid (small networks on a hash grid shared by the cells), nerf (as published), mipnerf
     (cones instead of rays), kilonerf (nerf in the size of KiloNeRF's networks), or another name in
     `voronerf.nerf.fields.FIELDS`."""
     field_options: tuple[str, ...] = ()
     """Further options of the field, each as NAME=VALUE, such as density_scale=20, skips=(4,) or view_directions=False.
-    position_octaves is by default such that the finest wave spans two pixels of the training views, and two more for
-    mipnerf, whose cones leave nothing of finer ones (published: 16)."""
+    By default, the finest wave of position_octaves spans two pixels of the training views; mipnerf has two more
+    octaves, since its cones filter finer waves out (published: 16)."""
     width: int | None = None
     """Channels of the networks' hidden layers; default 32, nerf and mipnerf 64."""
     depth: int | None = None
     """Hidden layers before the heads; default 1, nerf and mipnerf 4, kilonerf 2."""
     parameters: int | None = None
-    """Upper limit for the number of parameters of all final cells together; --width becomes the largest that fits."""
+    """Limit of the number of parameters of all final cells together; --width becomes the largest that fits."""
 
 
 @dataclass(frozen=True)
@@ -105,73 +107,73 @@ class CellSettings:
     """The Voronoi diagram."""
 
     cells: tuple[int, ...] = (16,)
-    """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, no number is one network."""
+    """Cells per level: `16` is 16 cells, `16 16` splits each of the 16 cells into 16, no number is one network."""
     split_at: tuple[float, ...] | None = None
-    """When to split, one time for each level: below 1 a fraction of the run, from 1 on a number of steps; default: 0.2,
-    or evenly spaced from 0.15 to 0.5. With --max-cells those of the first and of the last split."""
+    """Time of the split of each level: below 1 a fraction of the run, from 1 on a number of steps; default: 0.2, or
+    evenly spaced from 0.15 to 0.5. With --max-cells, the times of the first and of the last split."""
     max_cells: int | None = None
-    """Below the first level, split the cell with the largest accumulated error alone, again and again until there are
-    this many cells. The first split makes the first number of --cells, each later one divides a cell into the last."""
+    """Final number of cells when, below the first level, each split divides only the cell with the largest accumulated
+    error. The first number of --cells is for the first split, the last number for each later split."""
     centres: Literal["balanced", "random", "uniform", "centroidal"] = "centroidal"
-    """Centres of the new cells: balanced by importance (as published), drawn from the samples, a regular grid, or
-    centroids of their cells, which makes cells compact."""
+    """Centres of the new cells: balanced by importance (as published), random samples, a uniform grid, or centroids of
+    the cells (centroidal), which makes cells compact."""
     init: Literal["inherit", "random"] = "inherit"
-    """New cells start as copies of their parent, or from random parameters."""
+    """New cells start from the parameters of their parent, or from random ones."""
     assignment: Literal["nearest", "stochastic"] = "nearest"
-    """A sample goes to the nearest cell, or, while training, to one drawn by its distances to the centres."""
+    """Cell of a sample: the nearest one, or, in training, a random one by the distances to the centres."""
 
 
 @dataclass(frozen=True)
 class SamplingSettings:
-    """Rays and where they are sampled."""
+    """Rays and their samples."""
 
     rays: int | None = None
-    """Rays per training step; default 512, on a hash grid in a box more for a long --budget. Where empty space is
-    skipped, of the first steps: hashgrid takes up to eight times as many when few samples of a ray are left."""
+    """Rays per training step; default 512, and more on a hash grid in a box for a long --budget. With --occupancy, this
+    number is for the first steps: hashgrid takes up to eight times as many when few samples of a ray remain."""
     sampling: str = "stratified"
-    """Samples along a ray: stratified in one pass, or hierarchical, with a second pass where the first found something
-    (nerf: a coarse and a fine network)."""
+    """Samples along a ray: stratified in one pass, or hierarchical, with a second pass concentrated where the first
+    pass has large weights (nerf: a coarse and a fine network)."""
     samples: tuple[int, ...] | None = None
-    """Samples per ray of each pass; default 32 and 32 for two passes, for one 64. Where empty space is skipped 128, or
-    256 in a training of at least 25 seconds, or 384 in one of 90; for an object more for larger images: 64 at 100
-    pixels across it, 128 at 400, and on a hash grid twice as many, at most 256, in a training of at least 40 or 160
-    seconds. A CPU that is measured to be faster than two cores of an AMD EPYC (Zen 5) needs less of --budget for it;
-    --steps count the same everywhere."""
+    """Samples per ray of each pass; default 32 and 32 for two passes, 64 for one pass. With --occupancy,
+    contracted space has 128, or 256 in a training of at least 25 seconds, or 384 in one of 90 seconds. An object has 64
+    at 100 pixels across it and 128 at 400; on a hash grid twice as many, at most 256, in a training of at least 40 or
+    160 seconds. These times are for two cores of an AMD EPYC (Zen 5), and shorter for a CPU that is measured to be
+    faster; with --steps, the machine has no effect."""
     sparse_depth: float | None = None
-    """Factor of a loss on light that does not come from where the points of a sparse model are (Deng et al. 2022,
+    """Factor of a loss on light that does not come from the points of a sparse model (Deng et al. 2022,
     "Depth-supervised NeRF"); default 0.0015 for COLMAP's models, and 0, which is off, without points."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
-    """Space as the networks see it: unchanged; with all points outside a sphere mapped into a shell of twice its
-    radius; or in normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for
-    fields without a grid, else ndc where the cameras face forward and the sphere elsewhere."""
+    """Input space of the networks: unchanged; with all points outside a sphere mapped into a shell of twice its radius;
+    or normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for fields
+    without a grid, otherwise ndc for forward-facing cameras and sphere for other cameras."""
     occupancy: bool = True
-    """Skip samples in empty space, in training and in pictures, wherever that works: for points in a single pass, in a
-    scene with a box or with a contraction."""
+    """Skip samples in empty space, in training and in pictures. This works for points in a single pass, in a scene with
+    a box or with a contraction; it is off otherwise."""
 
 
 @dataclass(frozen=True)
 class OptimiserSettings:
-    """How the networks learn."""
+    """The optimiser and its precision."""
 
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
-    """Products of the networks while training: float32, bfloat16, or float16 with a scaled loss. Sums, parameters and
-    moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""
+    """Precision of the networks' matrix products in training: float32, bfloat16, or float16 with a scaled loss. Sums,
+    parameters and moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""
     lr: float | None = None
-    """Learning rate of Adam at the start; default: 0.02 up to width 64, in inverse proportion to the width beyond."""
+    """Initial learning rate of Adam; default: 0.02 up to width 64, inversely proportional to larger widths."""
     average: float = 0.98
-    """Decay per step of the averaged weights, which evaluations and pictures use; 0 is off. It is smaller in the first
-    steps. Training goes on with the weights themselves."""
+    """Decay per step of the averaged weights, which evaluations and pictures use; 0 is off. The decay is smaller in the
+    first steps. Training itself uses the weights without averaging."""
 
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """Evaluations on the way."""
+    """Evaluations during the run."""
 
     evaluations: int = 8
     """Evaluations during the run, evenly spaced; the last one is at the end."""
     eval_views: int | None = None
-    """Test views of every evaluation, evenly spread, in time of their own beside --budget; default: at most 20 on the
-    way and all at the end, as many as a twentieth of the time so far and a tenth of the budget allow."""
+    """Test views of every evaluation, evenly spaced; evaluations then do not count for --budget. Default: at most 20
+    during the run, and all at the end, as far as a twentieth of the elapsed time and a tenth of the budget allow."""
     lpips: Path | None = None
     """LPIPS weights for the final evaluation, a file or folder, or "off"; default: VORONERF_LPIPS, the folder lpips of
     VORONERF_DATA or beside the scene, the installed lpips package."""
@@ -184,7 +186,7 @@ class TrainConfig(
     """All settings of a training.
 
     Raises:
-        ConfigError: For a setting that is out of range; names it, the rule and the value.
+        ConfigError: For a setting that is out of range; the message names the setting, the rule and the value.
 
     Examples:
         >>> from voronerf.app.train import TrainConfig
@@ -202,7 +204,7 @@ class TrainConfig(
 
     @property
     def field_type(self) -> FieldType:
-        """The field's row in the table of fields."""
+        """The field's entry in `FIELDS`."""
         return FIELDS[self.field]
 
     @property
@@ -212,7 +214,7 @@ class TrainConfig(
 
     @property
     def network_options(self) -> dict[str, Any]:
-        """The arguments of the field: settings that it has options for, and ``field_options``."""
+        """The options of the field: the settings that the field accepts, and ``field_options``."""
         settings = {name: getattr(self, name) for name in NETWORK_SETTINGS if name in self.field_type.options}
         chosen = {name: value for name, value in settings.items() if value is not None}
         return chosen | dict(parse_option(text) for text in self.field_options)
@@ -224,25 +226,25 @@ class TrainConfig(
 
     @property
     def final_cells(self) -> int:
-        """Cells at the end, where every cell holds enough samples to be split."""
+        """The number of cells at the end, if every cell has enough samples for its split."""
         return final_cells(self.plan)
 
     def to_values(self) -> dict[str, Any]:
-        """The settings as values of JSON."""
+        """Returns the settings as JSON values."""
         values = dataclasses.asdict(self)
         values |= {name: None if values[name] is None else str(values[name]) for name in PATHS}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def to_json(self) -> str:
-        """The settings as the text of a JSON file."""
+        """Returns the settings as the text of a JSON file."""
         return json.dumps(self.to_values(), indent=2) + "\n"
 
     @staticmethod
     def from_values(values: Any, source: str = "config.json") -> TrainConfig:
-        """Reads what :meth:`to_values` gave, from JSON.
+        """Builds the settings from the values of :meth:`to_values`.
 
         Raises:
-            ConfigError: For values that are not a configuration, or one of another version; names ``source``.
+            ConfigError: For values that are no configuration, or another version's; the message names ``source``.
         """
         try:
             if isinstance(values, dict):
@@ -257,11 +259,11 @@ class TrainConfig(
             raise ConfigError(f"{source}: not a configuration of this version: {error}") from None
 
 
-#: Settings that take one of a few words, with these words.
+#: The choices of the settings that take one of several words.
 CHOICES: dict[str, tuple[str, ...]] = {
     name: get_args(kind) for name, kind in get_type_hints(TrainConfig).items() if get_origin(kind) is Literal
 }
-#: Settings that are text in JSON.
+#: Path settings, which are strings in JSON.
 PATHS = ("out", "lpips")
 #: Settings that may differ between a run and its continuation.
 RESUMABLE = frozenset(
@@ -273,7 +275,7 @@ RESUMABLE = frozenset(
 
 
 def differences(a: TrainConfig, b: TrainConfig) -> list[str]:
-    """The settings in which ``b`` must not differ to continue ``a``: "--width 64 -> 128" and so on."""
+    """Returns the differences that prevent ``b`` from continuing ``a``, such as "--width 64 -> 128"."""
     return [
         f"--{f.name.replace('_', '-')} {getattr(a, f.name)} -> {getattr(b, f.name)}"
         for f in dataclasses.fields(TrainConfig)
@@ -282,7 +284,7 @@ def differences(a: TrainConfig, b: TrainConfig) -> list[str]:
 
 
 def parse_option(text: str) -> tuple[str, Any]:
-    """Splits ``name=value`` into a name and a Python value; a value that is no Python literal is a string."""
+    """Splits ``name=value`` into a name and a Python literal, or a string if the value is no literal."""
     name, _, value = text.partition("=")
     try:
         return name, ast.literal_eval(value)
@@ -291,22 +293,22 @@ def parse_option(text: str) -> tuple[str, Any]:
 
 
 def check_backend_name(name: str) -> None:
-    """Raises ConfigError for a name that is no backend's, such as that of a device."""
+    """Raises ConfigError for a name that is not a backend, such as the name of a device."""
     names = ("auto", *BACKENDS)
     if name not in names:
         device = device_of(name)
-        end = f"; did you mean --device {device}?" if device else did_you_mean(name, names)
-        raise ConfigError(f"--backend must be {either(names)}, got {name!r}{end}")
+        hint = f"; did you mean --device {device}?" if device else did_you_mean(name, names)
+        raise ConfigError(f"--backend must be {either(names)}, got {name!r}{hint}")
 
 
 def check_config(config: TrainConfig) -> None:
-    """Raises ConfigError for the first setting that is out of range, or that the field or the sampler does not have."""
+    """Raises ConfigError for the first setting that is out of range, or that the field or the sampler lacks."""
 
     def need(ok: bool, name: str, rule: str, words: Iterable[str] = ()) -> None:
         if not ok:
             value = getattr(config, name)
-            end = did_you_mean(value, words)
-            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {as_typed(value)}{end}")
+            hint = did_you_mean(value, words)
+            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {as_typed(value)}{hint}")
 
     need(config.sampling in SAMPLERS, "sampling", f"be {either(list(SAMPLERS))}", SAMPLERS)
     more = "voronerf.nerf.fields.register_field adds others"
@@ -342,12 +344,12 @@ def check_config(config: TrainConfig) -> None:
         rising = all(a < b for a, b in itertools.pairwise(config.split_at))
         fractions = all(0 < at < 1 for at in config.split_at)
         steps = all(1 <= at < (config.steps or float("inf")) for at in config.split_at)
-        end = "" if config.steps is None else f" below --steps {config.steps}"
-        need(rising and (fractions or steps), "split_at", f"be rising fractions of the run, or numbers of steps{end}")
+        hint = "" if config.steps is None else f" below --steps {config.steps}"
+        need(rising and (fractions or steps), "split_at", f"be rising fractions of the run, or numbers of steps{hint}")
 
 
 def check_samples(config: TrainConfig) -> None:
-    """Raises ConfigError for samples that are not one number for each pass of the sampler."""
+    """Raises ConfigError unless there is one number of samples for each pass of the sampler."""
     passes = SAMPLERS[config.sampling].passes
     if config.samples is not None and (len(config.samples) != passes or min(config.samples) < 1):
         count = "one number" if passes == 1 else f"{passes} numbers, one for each pass,"
@@ -360,15 +362,15 @@ def _check_field_options(config: TrainConfig) -> None:
         setting = getattr(config, name)
         if name not in options and setting is not None:
             raise ConfigError(f"--{name.replace('_', '-')} must not come with --field {config.field}, got {setting!r}")
-    known = [name for name in options if name not in NETWORK_SETTINGS]
+    allowed = [name for name in options if name not in NETWORK_SETTINGS]
     for text in config.field_options:
         if "=" not in text:
             raise ConfigError(f"--field-options must be NAME=VALUE, got {text!r}")
         name, value = parse_option(text)
         if name in NETWORK_SETTINGS:
             raise ConfigError(f"--field-options must not hold {name}, use --{name.replace('_', '-')}; got {text!r}")
-        if name not in known:
-            raise ConfigError(f"--field-options of {config.field} are {', '.join(known) or 'none'}; got {text!r}")
+        if name not in allowed:
+            raise ConfigError(f"--field-options of {config.field} are {', '.join(allowed) or 'none'}; got {text!r}")
         is_number = isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
         if isinstance(options[name], (int, float)) and not (is_number or value is None):
             raise ConfigError(f"--field-options must give {name} a finite number, got {text!r:.60}")

@@ -1,4 +1,4 @@
-"""The loop of a training, and the interface of what goes on beside it."""
+"""The training loop, and the interface of its callbacks."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from voronerf.nerf.split import SplitDone
 from voronerf.nerf.step import StepOutput
 from voronerf.ops._core import backends
 
-#: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
+#: On a GPU, number of steps between two reads of the loss, for which the host waits for the device.
 READ_EVERY = 3 * GROUP
-#: Seconds after which a training answers, such as to Ctrl-C, if its steps are not longer.
+#: Target duration of a group of steps in seconds, so that a training reacts quickly, for example to Ctrl-C.
 ANSWER = 0.3
 
 
 class TrainingError(RuntimeError):
-    """Training cannot continue; the message gives the reason and what is left on disk."""
+    """A training cannot continue; the message gives the reason, and the state of the last checkpoint."""
 
 
 class Callback:
-    """What goes on beside a training: scores, checkpoints, progress. It keeps its own state.
+    """A callback of a training, such as for scores, checkpoints or progress. It keeps its own state.
 
-    Its time is not training time, except in :meth:`after_split`.
+    The time of a callback is not training time, except in :meth:`after_split`.
 
     Attributes:
-        group: How many steps may lie between two calls of :meth:`after_step`. Up to 16 of them are made in one call,
-            which is faster. Results do not depend on it.
+        group: The most steps between two calls of :meth:`after_step`. Up to 16 steps are made in one call, which is
+            faster. Results do not depend on ``group``.
 
     Examples:
         >>> from voronerf.app.train import Callback
@@ -48,13 +48,13 @@ class Callback:
         """Called before the first step of this process."""
 
     def after_split(self, state: State, done: SplitDone) -> None:
-        """Called after cells were split, before the step that follows."""
+        """Called after a split of cells, before the next step."""
 
     def after_step(self, state: State) -> None:
-        """Called after each step, or after up to ``group`` of them."""
+        """Called after each group of at most ``group`` steps."""
 
     def on_end(self, state: State) -> None:
-        """Called when the training has ended, or was stopped."""
+        """Called when the training has ended or was stopped."""
 
 
 def train(
@@ -66,32 +66,32 @@ def train(
 ) -> None:
     """Trains until ``until`` training seconds, the end of the training, or ``state.stop()``, whichever comes first.
 
-    Calls in turns let several trainings share a machine, so that its noise affects all of them alike.
+    Alternating calls for several trainings on one machine expose all of them to the same timing noise.
 
     Args:
-        state: What :func:`voronerf.app.train.build` made.
-        callbacks: Called in their order.
-        until: Training seconds.
-        clock: Counts seconds.
+        state: The state of the training, from :func:`voronerf.app.train.build`.
+        callbacks: The callbacks, called in their order.
+        until: Training seconds at which to return.
+        clock: Function that returns the time in seconds.
     """
-    before, one_thread = state.step, backends.torch_on_one_thread if state.thread_deterministic else nullcontext
-    quick = GROUP
+    first_step, one_thread = state.step, backends.torch_on_one_thread if state.thread_deterministic else nullcontext
+    quick_steps = GROUP
     state.training_step.run_within(one_thread)
     while state.fraction < 1 and state.seconds < until and not state.stopped:
         started = clock()
         with one_thread():
             prepare(state, callbacks)
         group = min((callback.group for callback in callbacks), default=GROUP)
-        steps = min(state.steps_alike(), steps_to_judgement(state), group, quick)
-        made = state.training_step(state.rays, steps, at=state.step - state.began)
-        count(state, steps, made)
-        judge_start(state, made)
-        taken = clock() - started
-        state.add_seconds(taken)
-        quick = max(1, int(steps * ANSWER / max(taken, 1e-9)))
+        steps = min(state.steps_alike(), steps_to_judgement(state), group, quick_steps)
+        output = state.training_step(state.rays, steps, at=state.step - state.began)
+        count(state, steps, output)
+        judge_start(state, output)
+        elapsed = clock() - started
+        state.add_seconds(elapsed)
+        quick_steps = max(1, int(steps * ANSWER / max(elapsed, 1e-9)))
         for callback in callbacks:
             callback.after_step(state)
-    if state.fraction >= 1 and state.step > before:  # once, however often this is called
+    if state.fraction >= 1 and state.step > first_step:  # only once, in the call that ends the training
         started = clock()
         with state.averaged():
             state.sampler.finish(state.renderer.field, state.config.seed)
@@ -99,44 +99,44 @@ def train(
 
 
 def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool = False) -> None:
-    """What comes before steps: a split that is due, the learning rate.
+    """Prepares the next steps: makes a split that is due, and sets the learning rate.
 
     Args:
-        state: Between two steps.
-        callbacks: Told of a split.
-        patient: Whether a split waits for samples that it lacks, which is an error else.
+        state: The state between two steps.
+        callbacks: The callbacks to call after a split.
+        patient: Whether a split without enough samples waits; otherwise it is an error.
     """
     strategy, optimizer = state.strategy, state.optimizer
     if strategy.is_due(state.fraction, state.step) and (not patient or strategy.has_samples()):
         done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
         if done is not None:
             state.begin_stage(done)
-            if not strategy.inherit:  # the averages are of networks that are no more
+            if not strategy.inherit:  # the averages belong to the replaced networks
                 optimizer.drop_averages()
             for callback in callbacks:
                 callback.after_split(state, done)
     optimizer.set_learning_rate(state.learning_rate())
-    group = state.step - (state.step - state.began) % GROUP  # its first step: the clock may cut a group anywhere
+    group = state.step - (state.step - state.began) % GROUP  # first step of the group, which may be cut
     if state.batches.unseen and state.fraction_at(group) >= state.unseen_share:
         state.batches.end_unseen()
     if not state.router.training:
         state.renderer.train()
 
 
-def count(state: State, steps: int, made: StepOutput) -> None:
-    """Counts steps, and reads what the last of them has found."""
-    state.count_steps(steps, made.rays)
+def count(state: State, steps: int, output: StepOutput) -> None:
+    """Counts steps, and reads the output of the last step, on a GPU only every `READ_EVERY` steps."""
+    state.count_steps(steps, output.rays)
     if state.device.type == "cpu" or state.step % READ_EVERY == 0:
-        state.read_output(made)
+        state.read_output(output)
 
 
 def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[], float] = time.perf_counter) -> None:
-    """Trains to the end, from where a state is; calls ``on_start`` before and ``on_end`` after it.
+    """Trains from a state to the end; calls ``on_start`` before and ``on_end`` after the training.
 
     Args:
-        state: What :func:`voronerf.app.train.build` made, and ``load`` may have moved on.
-        callbacks: Called in their order.
-        clock: Counts seconds.
+        state: The state of the training, from :func:`voronerf.app.train.build`, and perhaps restored by ``load``.
+        callbacks: The callbacks, called in their order.
+        clock: Function that returns the time in seconds.
 
     Examples:
         >>> import tempfile

@@ -1,4 +1,4 @@
-"""A training as a checkpoint: taken of a state, and loaded into a state of the same settings."""
+"""Conversion of a training state to a checkpoint and back."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from voronerf.nerf.adam import parameter_groups
 from voronerf.nerf.samplers import SAMPLERS
 from voronerf.router import VoronoiRouter
 
-#: What is counted, by the names of a state and of a checkpoint.
+#: The names of the counters, in a state and in a checkpoint.
 COUNTERS = ("step", "seconds", "evaluation_seconds", "reserved_seconds", "rays", "rays_done", "skipped")
 
 
 @dataclass(frozen=True)
 class Stored:
-    """The values of a checkpoint beside its tensors, by the names of a state."""
+    """The values of a checkpoint except its tensors, named as in a state."""
 
     config: dict[str, Any]
     step: int
@@ -40,7 +40,7 @@ class Stored:
 
 
 def snapshot(state: State) -> Checkpoint:
-    """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
+    """Returns a checkpoint for a bit-exact resume: parameters, moments, samples, random generators and counters."""
     values = {name: getattr(state, name) for name in COUNTERS}
     values |= {"config": state.config.to_values(), "threads": _threads(state)}
     values |= {"stages": [asdict(stage) for stage in state.stages]}
@@ -52,7 +52,7 @@ def snapshot(state: State) -> Checkpoint:
     if state.scaler.is_enabled():
         groups["scaler"] = state.scaler.state_dict()
     tensors = {
-        f"{prefix}.{name}": torch.as_tensor(value).detach().to("cpu", copy=True).contiguous()  # training goes on
+        f"{prefix}.{name}": torch.as_tensor(value).detach().to("cpu", copy=True).contiguous()  # copied
         for prefix, entries in groups.items()
         for name, value in entries.items()
     }
@@ -60,14 +60,14 @@ def snapshot(state: State) -> Checkpoint:
 
 
 def load(state: State, checkpoint: Checkpoint) -> None:
-    """Puts a state where the training was that wrote a checkpoint of its settings.
+    """Restores a training from a checkpoint into a new state.
 
     Args:
-        state: As :func:`voronerf.app.train.build` made it.
-        checkpoint: Of a training with the same settings, but for those that may differ.
+        state: The new state, from :func:`voronerf.app.train.build`.
+        checkpoint: A checkpoint of a training with the same settings, except those that may differ.
 
     Raises:
-        CheckpointError: When it is of another configuration, or something is missing or does not fit.
+        CheckpointError: If the checkpoint has another configuration, or its contents are incomplete or do not fit.
 
     Examples:
         >>> from voronerf.app.scenes import builtin_scene
@@ -96,25 +96,25 @@ def load(state: State, checkpoint: Checkpoint) -> None:
         state.strategy.load_state_dict(checkpoint.group("strategy"))
         generators = checkpoint.group("generator")
         state.generator.set_state(generators["state"])
-        drawn = generators["draws"]
-        if state.draws is not state.generator and drawn.shape == state.draws.get_state().shape:
-            state.draws.set_state(drawn)  # else the run began on another kind of device
+        draws = generators["draws"]
+        if state.draws is not state.generator and draws.shape == state.draws.get_state().shape:
+            state.draws.set_state(draws)  # otherwise the run began on another kind of device
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
     counts = stored.threads, _threads(state)
-    before, now = (f"torch on {n} thread{'s' * (n > 1)}" if n else "native operations" for n in counts)
-    if before != now and state.device.type == "cpu":
-        state.report(f"not bit for bit: {checkpoint.source} was computed by {before}, what follows by {now}")
+    earlier, current = (f"torch on {n} thread{'s' * (n > 1)}" if n else "native operations" for n in counts)
+    if earlier != current and state.device.type == "cpu":
+        state.report(f"not bit for bit: {checkpoint.source} was computed by {earlier}, what follows by {current}")
     state.restore(**{name: getattr(stored, name) for name in (*COUNTERS, "stages")})
 
 
 def _threads(state: State) -> int:
-    """The threads of torch, on which its sums depend; 0 where native operations compute the networks."""
+    """Returns the number of torch's threads, on which its sums depend; 0 if native operations compute the networks."""
     return 0 if state.thread_deterministic else torch.get_num_threads()
 
 
 def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
-    """The settings of a checkpoint's training, and how far it is."""
+    """Returns the settings and the values of a checkpoint, after checking them."""
     source, values = checkpoint.source, dict(checkpoint.values)
     if "step" not in values:
         raise CheckpointError(f"{source}: must be the checkpoint of one training, as voronerf train writes it")
@@ -127,8 +127,8 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
         stored = Stored(**values)
         times = [stored.seconds, stored.evaluation_seconds, stored.reserved_seconds]
         if not (stored.step >= 0 and all(0 <= each < math.inf for each in times) and stored.stages):
-            came = f"got {stored.step}, {times} and {len(stored.stages)}"
-            raise ValueError(f"{source}: step, times and stages must be counts, {came}")
+            actual = f"got {stored.step}, {times} and {len(stored.stages)}"
+            raise ValueError(f"{source}: step, times and stages must be counts, {actual}")
     except ValueError as error:
         raise CheckpointError(str(error)) from None
     config = TrainConfig.from_values(stored.config, source)
@@ -140,7 +140,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
 
 
 def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
-    """Compares networks with those in a checkpoint, float32 as Adam takes them, before memory is taken for either."""
+    """Checks that a checkpoint's parameters are float32 and have the networks' shapes, before memory is allocated."""
     for name in SAMPLERS[config.sampling].networks(config.field_type.cones):
         tensors = checkpoint.group(group(name))
         try:
@@ -151,17 +151,17 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
             wanted = [*([] if shared else [diagram.num_cells]), *shape]
             tensor = tensors.get(f"module.{key}")
             if tensor is None or list(tensor.shape) != wanted or tensor.dtype != torch.float32:
-                came = (
+                actual = (
                     "nothing" if tensor is None else f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
                 )
                 raise CheckpointError(
                     f"{checkpoint.source}: the checkpoint is of another architecture: {group(name)}.module.{key} "
-                    f"must be float32 {wanted}, got {came}"
+                    f"must be float32 {wanted}, got {actual}"
                 )
 
 
 def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint, *, assign: bool = False) -> None:
-    """Loads the cells of a checkpoint, whose number may differ; ``assign`` takes its tensors in place of copies."""
+    """Loads a checkpoint's cells, whose number may differ; ``assign`` uses the checkpoint's tensors without copies."""
     for name, router in routers.items():
         try:
             router.load_state_dict(checkpoint.group(group(name)), assign=assign)
@@ -173,7 +173,7 @@ def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint
 def open_routers(
     config: TrainConfig, checkpoint: Checkpoint, device: torch.device | str, backend: str
 ) -> dict[str, VoronoiRouter]:
-    """The routers of a checkpoint with averaged weights, in evaluation mode; on the CPU they are pages of its file."""
+    """Returns a checkpoint's routers with averaged weights, in eval mode; on the CPU they are mapped from its file."""
     check_shapes(config, checkpoint)
     routers = make_routers(config, device)
     restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
@@ -184,8 +184,8 @@ def open_routers(
         if average is None:
             continue
         if average.shape != parameter.shape:
-            wanted, came = list(parameter.shape), list(average.shape)
-            raise CheckpointError(f"{checkpoint.source}: {name} must have shape {wanted}, got {came}")
+            wanted, actual = list(parameter.shape), list(average.shape)
+            raise CheckpointError(f"{checkpoint.source}: {name} must have shape {wanted}, got {actual}")
         parameter.data = average.to(parameter)
     for router in routers.values():
         router.backend = backend
@@ -194,5 +194,5 @@ def open_routers(
 
 
 def group(name: str) -> str:
-    """The first word of the tensors of a network in a checkpoint."""
+    """Returns the prefix of the names of a network's tensors in a checkpoint."""
     return "router" if name == "field" else f"router-{name}"

@@ -1,4 +1,4 @@
-"""Run directories: the choice of one, a lock on it, and the files in it."""
+"""Run directories: their choice, lock and files."""
 
 from __future__ import annotations
 
@@ -26,41 +26,41 @@ from voronerf.app.scenes import Scene, is_builtin
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
 
-#: The folders of a run, in which files are written.
+#: The subfolders of a run directory to which files are written.
 FOLDERS = ("camera_paths", "checkpoints", "images", "plots", "samples", "tensorboard")
 
 
 def check_folders(run: Path) -> None:
-    """Refuses a run with a folder that leads out of it, where files that are none of the run would be replaced."""
+    """Raises ConfigError if a subfolder of a run is a link out of it, since a write could then replace other files."""
     for name in FOLDERS:
         if leads_outside(run / name, run):
             raise ConfigError(f"{run}: {name} must be in the run directory, got a link to {(run / name).resolve()}")
 
 
 def is_outside(run: Path, path: str | Path) -> bool:
-    """Whether the user has chosen neither a path nor a folder that it is in: the run's, the working directory,
+    """Returns whether a path was never named by the user and lies outside the run directory, the working directory and
     ``VORONERF_DATA``."""
     data = os.environ.get("VORONERF_DATA")
     folders = (run, Path.cwd(), *([Path(data)] if data else []))
     with contextlib.suppress(OSError):
-        if _note_of(path).exists():
+        if _marker_of(path).exists():
             return False
     return all(leads_outside(Path(path), folder) for folder in folders)
 
 
 def remember_choice(path: str | Path) -> None:
-    """Notes that the user of this machine has named a path, so that a run may name it from now on."""
-    with contextlib.suppress(OSError):  # it must then be named again
-        _note_of(path).touch()
+    """Remembers that the user of this machine has named a path, so that settings of runs may name it, too."""
+    with contextlib.suppress(OSError):  # on failure, the user must name it again
+        _marker_of(path).touch()
 
 
-def _note_of(path: str | Path) -> Path:
+def _marker_of(path: str | Path) -> Path:
     name = hashlib.sha256(os.path.realpath(path).encode(errors="surrogateescape")).hexdigest()
     return private_folder(cache_folder() / "chosen") / name
 
 
 def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None = None) -> None:
-    """Refuses paths of a run's settings outside of what the user chose, since the run may be another person's."""
+    """Raises ConfigError for a path in a run's settings that `is_outside`, since the run may be another person's."""
     paths = {"data": None if is_builtin(data) else data, "lpips": None if str(lpips) == OFF else lpips}
     for option, path in paths.items():
         if path is not None and is_outside(run, path):
@@ -71,13 +71,13 @@ def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None
 
 
 def choose_directory(config: TrainConfig, scene: Scene, *, resume: bool = False) -> TrainConfig:
-    """The configuration with ``out`` filled in and checked."""
+    """Returns the configuration with ``out`` filled in and checked; makes a new folder if ``out`` is None."""
     out = config.out
     if out is None:
         if resume:
             raise ConfigError("--resume needs --out, the run directory to continue")
         names = (scene.name, *(f"{scene.name}-{i}" for i in range(2, 10_000)))
-        out = next(folder for name in names if _made(folder := Path("runs") / name))
+        out = next(folder for name in names if _make_folder(folder := Path("runs") / name))
     elif out.is_file():
         raise ConfigError(f"--out must be a folder, got the file {out}")
     elif not resume and checkpoint_paths(out):
@@ -87,8 +87,8 @@ def choose_directory(config: TrainConfig, scene: Scene, *, resume: bool = False)
     return replace(config, out=out)
 
 
-def _made(folder: Path) -> bool:
-    """Makes a folder; False if it exists, which may be since another run began."""
+def _make_folder(folder: Path) -> bool:
+    """Makes a folder, and returns whether it is new; another run may have made it meanwhile."""
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
@@ -98,9 +98,9 @@ def _made(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Locks a run directory, so that two processes cannot write it; without effect on file systems without locks."""
+    """Locks a run directory against other processes; has no effect on file systems without locks."""
     check_folders(folder)
-    made = _made(folder)
+    is_new = _make_folder(folder)
 
     def refuse() -> None:
         raise ConfigError(f"--out must not be in use by another run, got {folder}")
@@ -111,30 +111,30 @@ def held(folder: Path) -> Iterator[None]:
             yield
         finally:
             with contextlib.suppress(OSError):
-                if made:
-                    folder.rmdir()  # fails if something was written, and is then not needed
+                if is_new:
+                    folder.rmdir()  # removes an empty folder; fails, as intended, if it has files
 
 
 def stored_config(run: Path) -> TrainConfig | None:
-    """The settings of the run in a directory, for its continuation; None if it holds no run.
+    """Returns the settings for continuing the run in a directory; None if there is no run.
 
-    ``allow_outside`` is not among them: whoever made the run may be another than who continues it.
+    ``allow_outside`` is reset, since the run may be another person's.
     """
     path = run / "config.json"
     return replace(read_config(path), out=run) if path.is_file() else None
 
 
 def read_config(path: Path) -> TrainConfig:
-    """The settings in a file, for a training of another person; without directory and --allow-outside."""
+    """Reads settings from a file, perhaps another person's; resets ``out`` and ``allow_outside``."""
     config = TrainConfig.from_values(read_json(path), str(path))
-    for name, value in vars(config).items():  # they are defaults, which the help prints
+    for name, value in vars(config).items():  # as defaults of options, they are printed by the help
         if not "".join(map(str, value if isinstance(value, tuple) else (value,))).isprintable():
             raise ConfigError(f"{path}: {name} must be printable text, got {value!r:.60}")
     return replace(config, out=None, allow_outside=False)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """The evaluations of a run, in order."""
+    """Returns the evaluations of a run, in order."""
     path = run / "metrics.jsonl"
     metrics = read_json_lines(path)
     for number, line in enumerate(metrics, 1):
@@ -148,7 +148,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
 
 
 def read_curve(run: Path) -> list[tuple[float, float]]:
-    """Training seconds and PSNR of the evaluations of a run, of whole views and where the PSNR is finite."""
+    """Returns (training seconds, PSNR in dB) of a run's evaluations on whole views with a finite PSNR."""
     points = [(line.get("seconds"), line.get("psnr")) for line in read_metrics(run) if line.get("part", 1) == 1]
     return [(x, y) for x, y in points if isinstance(x, (int, float)) and isinstance(y, (int, float))]
 

@@ -1,4 +1,4 @@
-"""The types of values that were read from JSON, by the annotations of the dataclass that they are for."""
+"""Type checks of JSON values, by the annotations of a dataclass."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ def check_types(source: str, kind: type, values: object, *, optional: bool = Fal
     """Checks that values fit the fields of a dataclass.
 
     Args:
-        source: The file, and the place in it, that an error names.
+        source: The file, and the place in it, for errors.
         kind: The dataclass.
-        values: By name, with tuples for the lists of JSON.
-        optional: Fields may be missing.
+        values: The values by name, with tuples in place of JSON lists.
+        optional: Whether fields may be missing.
     """
     if not isinstance(values, Mapping):
         raise ValueError(f"{source}: must be an object, got {_short(values)}")
     hints = get_type_hints(kind)
     if unknown := sorted(values.keys() - hints.keys()):
-        near = ", ".join(filter(None, (nearest(str(name), hints) for name in unknown)))
-        raise ValueError(f"{source}: unknown {', '.join(unknown)}" + (f"; did you mean {near}?" if near else ""))
+        similar = ", ".join(filter(None, (nearest(str(name), hints) for name in unknown)))
+        raise ValueError(f"{source}: unknown {', '.join(unknown)}" + (f"; did you mean {similar}?" if similar else ""))
     if not optional and (missing := sorted(hints.keys() - values.keys())):
         raise ValueError(f"{source}: {', '.join(missing)} missing")
     for name, value in values.items():
         if not _fits(value, hints[name]):
-            words = get_args(hints[name]) if get_origin(hints[name]) is Literal else ()
-            end = did_you_mean(value, words)
-            raise ValueError(f"{source}: {name} must be {_named(hints[name])}, got {_short(value)}{end}")
+            choices = get_args(hints[name]) if get_origin(hints[name]) is Literal else ()
+            hint = did_you_mean(value, choices)
+            raise ValueError(f"{source}: {name} must be {_named(hints[name])}, got {_short(value)}{hint}")
 
 
 def _fits(value: object, hint: Any) -> bool:
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        return any(_fits(value, one) for one in inner)
+        return any(_fits(value, alternative) for alternative in inner)
     if origin is Literal:
         return value in inner
     if origin is tuple:
         return isinstance(value, tuple) and all(_fits(entry, inner[0]) for entry in value)
-    if isinstance(value, bool):  # which is an int to Python
+    if isinstance(value, bool):  # bool is a subclass of int
         return hint is bool
     return isinstance(value, (int, float)) if hint is float else isinstance(value, origin or hint)
 
 
 def _named(hint: Any) -> str:
-    """A type in words."""
+    """Describes a type in words."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        return " or ".join(_named(one) for one in inner)
+        return " or ".join(_named(alternative) for alternative in inner)
     if origin is Literal:
         return f"one of {', '.join(map(str, inner))}"
     if origin is tuple:

@@ -1,6 +1,6 @@
-"""A training whose coarse stage learns nothing begins it again from another draw, by one rule, the same on resume.
+"""Restart of a coarse stage that has learnt nothing, from another random draw; a resumed run decides the same.
 
-r rays of a batch.
+A batch has r rays.
 """
 
 from __future__ import annotations
@@ -15,32 +15,33 @@ from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.step import StepOutput
 from voronerf.nerf.volume import Batch, RenderOutput
 
-#: Steps after the grid has settled after which a start is judged, and how often a training begins again at most.
+#: Steps from the settling of the grid to the check of a start, and the most restarts of a training.
 JUDGED, DRAWS = 100, 3
-#: From draw to draw, the seed of the networks grows by this.
+#: The increment of the networks' seed with each restart.
 STRIDE = 1_000_003
-#: A start has failed if the rays that differ from the background by more than `DIFFERS` meet less than `EMPTY` of
-#: opacity on average; or if the own colours of rays deviate by less than `ONE_COLOUR`, and what they should show by
-#: more than `COLOURED`.
+#: A start has failed if the rays whose target differs from the background by more than `DIFFERS` have a mean opacity
+#: below `EMPTY`. It has also failed if the standard deviation of the rays' colours is below `ONE_COLOUR`, and of their
+#: targets above `COLOURED`.
 DIFFERS, EMPTY, ONE_COLOUR, COLOURED = 0.1, 0.02, 1e-3, 0.05
 
 
-def judge_start(state: State, made: StepOutput) -> None:
-    """Begins the coarse stage again if its start has failed, once it is so far; says so.
+def judge_start(state: State, last: StepOutput) -> None:
+    """Restarts the coarse stage with a new seed if nothing has been learnt by step `judged_at`, and reports it.
 
-    Only trainings with an occupancy grid are judged, which can empty itself. At most `DRAWS` further draws are tried.
+    Only trainings with an occupancy grid are judged, since the grid can become empty. There are at most `DRAWS`
+    restarts.
 
     Args:
-        state: After a step.
-        made: That step.
+        state: The state after a step.
+        last: The output of this step.
     """
     if state.step != judged_at(state):
         return
     draw = sum(stage.cells == 1 for stage in state.stages)
     if state.router.num_cells > 1 or draw > DRAWS:
         return
-    why = why_nothing_is_learnt(made.batch, made.output)
-    if why is None:
+    fault = why_nothing_is_learnt(last.batch, last.output)
+    if fault is None:
         return
     config = state.config
     for name, router in make_routers(replace(config, seed=config.seed + STRIDE * draw)).items():
@@ -51,33 +52,33 @@ def judge_start(state: State, made: StepOutput) -> None:
     state.optimizer.state.clear()
     state.strategy.forget()
     state.begin_again()
-    state.report(f"nothing is learnt by step {state.step}: {why}; begins again from another draw, {draw} of {DRAWS}")
+    state.report(f"nothing is learnt by step {state.step}: {fault}; begins again from another draw, {draw} of {DRAWS}")
 
 
 def steps_to_judgement(state: State) -> int:
-    """How many steps can be made before :func:`judge_start` may judge; `GROUP` where it will not."""
-    left = judged_at(state) - state.step
-    return left if left > 0 else GROUP
+    """Returns the number of steps until :func:`judge_start` judges; `GROUP` if it will not."""
+    remaining = judged_at(state) - state.step
+    return remaining if remaining > 0 else GROUP
 
 
 def judged_at(state: State) -> int:
-    """After which step a start is judged; 0 for none."""
+    """Returns the step after which a start is judged; 0 if it is not judged."""
     return 0 if state.sampler.grid is None else state.began + state.sampler.settling_steps + JUDGED
 
 
 def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
-    """The fault of a start, from the r rays of one of its steps; None if it is good. Waits for the device."""
+    """Returns the fault of a start, by the r rays of a step; None if there is no fault. Waits for the device."""
     background = torch.zeros(3) if batch.background is None else batch.background
     background = background.to(batch.target)
-    light = output.error.new_zeros(len(batch.rays)).index_add(
+    opacity = output.error.new_zeros(len(batch.rays)).index_add(
         0, output.samples.ray_index.long(), output.weights.float()
     )
     differs = (batch.target - background).abs().amax(-1) > DIFFERS
-    if bool(differs.any()) and not bool(light[differs].mean() >= EMPTY):
+    if bool(differs.any()) and not bool(opacity[differs].mean() >= EMPTY):
         return "all space is empty"
-    seen = light > 0.5
-    if int(seen.sum()) > 1:
-        colour = (output.colour - (1 - light)[:, None] * background)[seen] / light[seen, None]
-        if bool((colour.std(0) < ONE_COLOUR).all()) and bool((batch.target[seen].std(0) > COLOURED).any()):
+    opaque = opacity > 0.5
+    if int(opaque.sum()) > 1:
+        colour = (output.colour - (1 - opacity)[:, None] * background)[opaque] / opacity[opaque, None]
+        if bool((colour.std(0) < ONE_COLOUR).all()) and bool((batch.target[opaque].std(0) > COLOURED).any()):
             return "all has one colour"
     return None

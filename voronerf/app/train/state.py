@@ -1,4 +1,4 @@
-"""A training between two steps."""
+"""The state of a training between two steps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from voronerf.ops import Guard
 from voronerf.ops._core import backends
 from voronerf.router import VoronoiRouter
 
-#: The dtype of autocast for each precision but float32.
+#: The dtype of autocast for each precision except float32.
 HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
@@ -36,8 +36,8 @@ HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 class Stage:
     """A period of training on one diagram.
 
-    ``balance_before`` and ``balance_after`` are std(W / max W) over the new cells of a parent, and of these the median
-    over the parents that were split; None for the coarse stage.
+    ``balance_before`` and ``balance_after`` are medians over the split cells of std(W / max W), where W are the
+    importances of a split cell's new cells. They are None for the coarse stage.
     """
 
     cells: int
@@ -50,36 +50,37 @@ class Stage:
 
 @dataclass
 class State:
-    """A training between two steps.
+    """The state of a training between two steps.
 
-    :func:`voronerf.app.train.build` makes it, :func:`voronerf.app.train.train` moves it on.
+    :func:`voronerf.app.train.build` builds it, and :func:`voronerf.app.train.train` advances it.
 
     Attributes:
         config: The settings, with every default filled in.
         scene: The scene.
         routers: The networks by name; "field" gives the colours.
         renderer: Networks and sampler.
-        ray_loss: From a batch of rays to a loss.
-        optimizer: Of all networks.
-        strategy: When and how cells split.
-        batches: Of rays.
-        generator: Of random choices on the host.
-        draws: Of random choices on the device; the same on a CPU.
-        scaler: Of the loss in float16.
-        guard: Of steps whose loss or gradients are not finite.
-        on_event: Called with a line of text for what happens; None for no calls.
-        step: Steps done.
-        seconds: Training time.
-        evaluation_seconds: Of evaluations so far that count towards the budget.
-        reserved_seconds: Of the budget, for the last evaluation.
-        rays: Of the next step.
-        unseen_share: The part of the training in which batches have rays that no picture shows.
-        rays_done: Of all steps.
-        loss: Of the last step that the host has read.
-        skipped_in_a_row: Steps that the guard has left out since the last good one.
-        stages: Periods of training: one more than splits, and one for each new start of the coarse stage.
-        stopped: Whether somebody asked to end the training.
-        training_step: Of these objects.
+        ray_loss: The loss of a batch of rays.
+        optimizer: The optimiser of all networks.
+        strategy: The strategy for splits of cells.
+        batches: The source of ray batches.
+        generator: The random generator of the host.
+        draws: The random generator of the device; on a CPU the host's generator.
+        scaler: The loss scaler for float16.
+        guard: The NaN guard, which skips steps whose loss or gradients are not finite.
+        on_event: Function that is called with a line of text for each event; None for no calls.
+        step: The number of finished steps.
+        seconds: The training time in seconds.
+        evaluation_seconds: The time in seconds of evaluations that count for the budget.
+        reserved_seconds: The seconds of the budget that are reserved for the last evaluation.
+        rays: The number of rays of the next step.
+        unseen_share: The fraction of the training in which batches have unseen rays.
+        rays_done: The number of rays of all finished steps.
+        loss: The loss of the last step that the host has read.
+        skipped_in_a_row: The number of consecutive steps that the guard has skipped last.
+        stages: The periods of training: the first one, one after each split, and one for each restart of the coarse
+            stage.
+        stopped: Whether a stop of the training is requested.
+        training_step: The training step with the objects of this state.
     """
 
     config: TrainConfig
@@ -132,16 +133,16 @@ class State:
 
     @property
     def sampler(self) -> Sampler:
-        """Where along rays the networks are asked."""
+        """The sampler, which places samples along rays."""
         return self.renderer.sampler
 
     @property
     def fraction(self) -> float:
-        """How much of the training is done, 0..1."""
+        """The finished fraction of the training, 0..1."""
         return self.fraction_at(self.step)
 
     def fraction_at(self, step: int) -> float:
-        """How much of the training is done after so many steps, if they are made by now."""
+        """Returns the finished fraction, 0..1, at a step; a training with a budget takes the current time for it."""
         if self.config.steps is not None:
             return min(1.0, step / self.config.steps)
         training = float(self.config.budget or 1.0) - self.evaluation_seconds - self.reserved_seconds
@@ -149,36 +150,36 @@ class State:
 
     @property
     def skipped(self) -> int:
-        """Steps that were left out, since a loss or gradients were not finite; waits for the device."""
+        """The number of steps that the guard has skipped; waits for the device."""
         return int(self.guard.skipped)
 
     @property
     def parameter_count(self) -> int:
-        """Parameters of all networks of all cells."""
+        """The number of parameters of all networks of all cells."""
         return sum(p.numel() for router in self.routers.values() for p in router.parameters())
 
     @property
     def thread_deterministic(self) -> bool:
-        """Whether native ops compute all networks: then steps are the same bits on any number of threads."""
+        """Returns whether native ops compute all networks, so that results do not depend on the number of threads."""
         chosen = backends.chosen("routed_mlp", self.device, torch.float32, backend=self.config.backend)
         native = self.device.type == "cpu" and chosen == "native"
         return native and all(map(self._is_one_program, self.routers.values()))
 
     def _is_one_program(self, router: VoronoiRouter) -> bool:
-        """Whether all that a router computes is one program, whatever its timings."""
-        if router.fuse and router.way != "fused":  # timings may decide for another way
+        """Returns whether a router always runs as one fused program, whatever its timings."""
+        if router.fuse and router.way != "fused":  # timings may select another implementation
             return False
         return not isinstance(router.program(*_samples(6 if self.renderer.cones else 3), trace=True), str)
 
     def learning_rate(self) -> float:
-        """The learning rate of the next step: that of the middle of its group."""
+        """Returns the learning rate of the next step, which is computed at the middle of its group of steps."""
         group = schedule.GROUP
         middle = self.step - (self.step - self.began) % group + group // 2
         highest, hold = float(self.config.lr or 0), self.config.field_type.lr_hold
         return learning_rate(highest, self.fraction_at(middle), middle, hold=hold, began=self.began)
 
     def steps_alike(self) -> int:
-        """How many of the next steps can be made in one call: nothing changes between them."""
+        """Returns the number of next steps that can be made in one call, because no setting changes between them."""
         if any(in_python(self.strategy, hook) for hook in ("is_due", "step_pre_backward")):
             return 1
         age = self.step - self.began
@@ -190,20 +191,20 @@ class State:
 
     @property
     def began(self) -> int:
-        """The step at which the coarse stage began, for the last time: see `voronerf.app.train.start`."""
+        """The step of the last start of the coarse stage, see `voronerf.app.train.start`."""
         return max((stage.started_at_step for stage in self.stages if stage.cells == 1), default=0)
 
     def averaged(self) -> AbstractContextManager[None]:
-        """A context in which the networks have their averaged weights, for pictures; not for training."""
+        """Returns a context in which the networks have their averaged weights, for pictures but not for training."""
         return self.optimizer.averaged()
 
-    def read_output(self, made: StepOutput) -> None:
-        """Reads loss, guard and number of samples of a step, which waits for the device; finds the rays of the next."""
-        self.loss, self.skipped_in_a_row = float(made.loss), int(self.guard.in_a_row)
+    def read_output(self, output: StepOutput) -> None:
+        """Reads a step's loss, guard and sample count, which waits for the device; updates the number of rays."""
+        self.loss, self.skipped_in_a_row = float(output.loss), int(self.guard.in_a_row)
         if self.sampler.grid is not None and (self.step - self.began) % schedule.GROUP == 0:
             self.rays = next_rays(
                 self.rays,
-                made.samples,
+                output.samples,
                 rays=int(self.config.rays or 0),
                 samples=self.sampler.strata,
                 growth=self.config.field_type.ray_growth,
@@ -211,11 +212,11 @@ class State:
             )
 
     def count_evaluation(self, seconds: float, reserved: float) -> None:
-        """Takes seconds of an evaluation from the budget, and reserves some of it for the last one."""
+        """Subtracts an evaluation's seconds from the budget, and sets the seconds reserved for the last evaluation."""
         self.evaluation_seconds, self.reserved_seconds = self.evaluation_seconds + seconds, reserved
 
     def begin_stage(self, done: SplitDone) -> None:
-        """Counts a split, after which a new stage of training begins."""
+        """Adds the stage of training that begins after a split."""
         balances = list(done.split.balances.values())
         before, after = (
             float(torch.tensor([getattr(balance, name) for balance in balances]).median()) if balances else None
@@ -224,32 +225,32 @@ class State:
         self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
 
     def begin_again(self) -> None:
-        """Counts a new start of the coarse stage."""
+        """Adds a stage for a restart of the coarse stage, and resets the number of rays."""
         self.rays = int(self.config.rays or 0)
         self.stages.append(Stage(1, self.seconds, self.step, None, None, 0))
 
     def count_steps(self, count: int, rays: int) -> None:
-        """Counts steps with so many rays each."""
+        """Counts ``count`` steps with ``rays`` rays each."""
         self.step += count
         self.rays_done += count * rays
 
     def add_seconds(self, seconds: float) -> None:
-        """Counts seconds of training."""
+        """Adds seconds of training time."""
         self.seconds += seconds
 
     def restore(self, skipped: int, stages: Sequence[Mapping[str, Any]], **counters: float) -> None:
-        """Takes the counters of a checkpoint, by their names here."""
+        """Restores the counters of a checkpoint, which have the names of these attributes."""
         self.guard.begin(skipped)
         self.stages[:] = (Stage(**stage) for stage in stages)
         for name, value in counters.items():
             setattr(self, name, value)
 
     def clear_stop(self) -> None:
-        """Forgets a request to stop that came during the last step."""
+        """Clears a request to stop that came during the last step."""
         self.stopped = False
 
     def stop(self) -> None:
-        """Ends the training after the step or the view in hand, with a checkpoint, as Ctrl-C does."""
+        """Ends the training after the current step or view, with a checkpoint, like Ctrl-C."""
         self.stopped = True
 
     def report(self, line: str) -> None:
@@ -260,6 +261,6 @@ class State:
 
 @functools.cache
 def _samples(columns: int) -> tuple[Tensor, Tensor]:
-    """Some on which networks can be traced: positions or Gaussians [16, columns], and directions."""
+    """Returns inputs for tracing networks: positions or Gaussians [16, columns], and directions [16, 3]."""
     points = torch.linspace(-1, 1, 16 * columns).reshape(16, columns)
     return points, torch.nn.functional.normalize(points[:, :3], dim=-1)

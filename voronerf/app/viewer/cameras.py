@@ -1,6 +1,6 @@
-"""Cameras of a browser as cameras of the renderer.
+"""Converts between a browser's cameras and the renderer's cameras.
 
-A browser's camera has OpenCV's axes (x right, y down, z forward), its canvas square pixels, and `fov` is vertical.
+A browser's camera has OpenCV's axes (x right, y down, z forward), square pixels, and a vertical `fov`.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from viser.transforms import SO3
 from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras, shared_focus
 
-#: From OpenCV's axes to OpenGL's, and back.
+#: The matrix that converts OpenCV's axes to OpenGL's, and back.
 FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def make_camera(
     rotation: NDArray[np.floating], position: NDArray[np.floating], fov: float, aspect: float, longest: int
 ) -> Cameras:
-    """One camera that fills a canvas.
+    """Returns one camera whose picture fills a canvas.
 
     Args:
         rotation: [3, 3], camera to world, in OpenCV's axes.
         position: [3], in scene units.
-        fov: Vertical, in radians.
+        fov: The vertical angle of view in radians.
         aspect: Width over height of the canvas.
-        longest: Pixels along the longer side.
+        longest: Pixels along the longer side of the picture.
 
     Examples:
         >>> import numpy as np
@@ -44,7 +44,7 @@ def make_camera(
     height = longest if aspect < 1 else max(1, round(longest / aspect))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation @ FLIP, position
-    # Whole pixels change the aspect a little; the picture is stretched over the canvas again.
+    # Rounding to whole pixels changes the aspect a little; stretching the picture over the canvas undoes that.
     down = height / 2 / math.tan(fov / 2)
     across = down * width / (height * aspect)
     intrinsics = torch.tensor([[across, down, width / 2, height / 2]])
@@ -52,7 +52,7 @@ def make_camera(
 
 
 def frustum(cameras: Cameras, number: int) -> dict[str, Any]:
-    """The arguments of viser's ``add_camera_frustum`` for one of several cameras."""
+    """Returns the arguments of viser's ``add_camera_frustum`` for one of several cameras."""
     cameras, number = cameras[[number]].perspective(), 0
     pose, (width, height) = cameras.poses[number].double().numpy(), cameras.size(number)
     fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[number, 1]))
@@ -61,13 +61,13 @@ def frustum(cameras: Cameras, number: int) -> dict[str, Any]:
 
 
 def angle_of_view(cameras: Cameras, number: int, aspect: float) -> float:
-    """The vertical angle in radians at which a canvas of an aspect shows all that one of several cameras sees."""
-    of = frustum(cameras, number)
-    return 2 * math.atan(math.tan(of["fov"] / 2) * max(1.0, of["aspect"] / aspect))
+    """Returns the vertical angle in radians at which a canvas shows the whole picture of one of several cameras."""
+    view = frustum(cameras, number)
+    return 2 * math.atan(math.tan(view["fov"] / 2) * max(1.0, view["aspect"] / aspect))
 
 
 def axial_depth(camera: Cameras, depth: Tensor) -> Tensor:
-    """Distances along rays [h, w] as distances along the optical axis."""
+    """Converts distances along rays [h, w] to distances along the optical axis."""
     fx, fy, cx, cy = camera.intrinsics[0].to(depth).unbind()
     u = (torch.arange(camera.width).to(depth) + 0.5 - cx) / fx
     v = (torch.arange(camera.height).to(depth) + 0.5 - cy) / fy
@@ -75,7 +75,7 @@ def axial_depth(camera: Cameras, depth: Tensor) -> Tensor:
 
 
 def scene_bounds(scene: Scene) -> Tensor:
-    """The scene's box [2, 3], or without one a box around the cameras and what is before them."""
+    """Returns the scene's box [2, 3], or without one a box around the cameras and points in front of them."""
     if scene.box is not None:
         return scene.box.cpu()
     cameras = scene.train.cameras
@@ -86,7 +86,7 @@ def scene_bounds(scene: Scene) -> Tensor:
 
 
 def look_point(scene: Scene, cameras: Cameras, index: int) -> Tensor:
-    """What one of several cameras looks at, as the point [3] to turn around: on its axis, beside the scene's focus."""
+    """Returns the point [3] around which a camera turns: on its axis, nearest to the scene's focus."""
     focus = shared_focus(scene.train.cameras)
     centre = scene_bounds(scene).mean(0) if focus is None else focus
     origin, forward = cameras.origins[index], cameras.forward[index]

@@ -1,4 +1,4 @@
-"""One browser: its camera, the pictures it needs, and its panel."""
+"""A browser that is connected to the viewer: its camera, the pictures it needs, and its panel."""
 
 from __future__ import annotations
 
@@ -27,51 +27,51 @@ from voronerf.nerf.cameras import Cameras
 if TYPE_CHECKING:
     from voronerf.app.viewer.viewer import Viewer
 
-#: Pixels along the longer side of the sharp picture: at first those of the window, in this range; and at most.
+#: Pixels along the longer side of the sharp picture: the range for following the window's size, and the maximum.
 SHARP, FULL, LARGEST = 512, 1536, 2048
-#: Training views that are drawn at most, evenly spread, and the longer side of their pictures.
+#: Greatest number of training views that are drawn, and pixels along the longer side of their pictures.
 MOST_VIEWS, THUMBNAIL = 200, 96
-#: Vertical angles of view in degrees that can be chosen.
+#: Range of the vertical angle of view in degrees.
 NARROWEST, WIDEST = 5, 120
 NO_CELL = "Click or tap a cell."
 MOUSE = "Drag: turn. Right drag or two fingers: move. Scroll or pinch: zoom. Click or tap: name the cell."
-#: Seconds without a movement after which pictures are counted anew, and between two changes of the count that is shown.
+#: Seconds without a movement after which the frame rate is measured anew; seconds between updates of its display.
 PAUSE, SAY = 0.5, 0.25
 OWN_GPU = "[Draw it in this browser](/scene.html), by WebGPU: a movement then waits for no picture."
-#: Pixels around the curve: above, right, below, left. Without them its labels are cut off.
+#: Padding of the curve in pixels: top, right, bottom, left. Without it the labels are cut off.
 PADDING = (14, 14, 0, 0)
 
 
 def shown_angle(fov: float) -> int:
-    """The angle of view in degrees that the panel shows for one in radians."""
+    """Converts an angle of view in radians to the degrees that the panel shows."""
     return min(max(round(math.degrees(fov)), NARROWEST), WIDEST)
 
 
 class Client:
-    """A browser that has connected.
+    """A browser that is connected to the viewer.
 
     Attributes:
-        camera: Its camera, with so many pixels along the longer side.
-        aspect: Width over height of its canvas.
-        fov: Its vertical angle of view in radians.
-        look: What it shows.
-        longest: Pixels along the longer side of its sharp picture.
-        follows: Whether these are still those of the window.
-        opened: Whether an angle of view has been chosen for its canvas.
+        camera: Returns the browser's camera, for a number of pixels along the longer side.
+        aspect: Width over height of the canvas.
+        fov: The vertical angle of view in radians.
+        look: The choices in the panel.
+        longest: Pixels along the longer side of the sharp picture.
+        follows: Whether `longest` follows the window's size (False once the user has set it).
+        opened: Whether an angle of view has been chosen for the canvas.
         degrees: The angle of view that the panel shows.
-        version: Counts what changes its picture.
-        moved_at: When that was last.
-        wants_coarse: Whether it needs a coarse picture now.
-        wants_sharp: Whether it needs a sharp one when the camera rests.
-        drawn_at: When the last sharp picture was done.
-        cost: Seconds that it took.
-        state: The line about the picture.
+        version: The number of changes of the picture.
+        moved_at: The time of the last change.
+        wants_coarse: Whether the browser needs a coarse picture.
+        wants_sharp: Whether the browser needs a sharp picture once the camera rests.
+        drawn_at: The time when the last sharp picture was done.
+        cost: Seconds that the last sharp picture took.
+        state: The line about the picture in the panel.
     """
 
     def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:
         self.handle, self.viewer = handle, viewer
         self.longest, self.follows, self.opened = SHARP, True, False
-        self.times: deque[float] = deque(maxlen=20)  # when the last coarse pictures were drawn
+        self.times: deque[float] = deque(maxlen=20)  # times of the last coarse pictures
         self.said_at = 0.0
         self.version, self.moved_at, self.drawn_at, self.cost = 0, 0.0, 0.0, 0.0
         self.wants_coarse = self.wants_sharp = True
@@ -105,11 +105,11 @@ class Client:
         """Shows a note for some seconds."""
         self.handle.add_notification(title, body, auto_close_seconds=15.0)
 
-    # --- what it sees ----------------------------------------------------------------------------------------------
+    # --- camera ----------------------------------------------------------------------------------------------------
 
     @property
     def shows_nodes(self) -> bool:
-        """Whether something is drawn into the scene."""
+        """True if centres, cameras, a crop box or keyframes are drawn into the scene."""
         return any(self.nodes.values())
 
     async def _moved(self, _: object) -> None:
@@ -117,21 +117,21 @@ class Client:
         self.change()
 
     def _follow(self) -> None:
-        """Takes the browser's camera, and opens a new browser at all of the first view.
+        """Reads the browser's camera; sets the angle of view of a new browser to show the whole first test view.
 
-        A slow page tells viser's own angle of view first and takes the server's later. A page that has been connected
-        before keeps its angle.
+        A slow page first reports viser's default angle of view, and takes the server's later. A reconnected page keeps
+        its angle.
         """
-        there = self._look_around()
-        if there and not self.opened and math.isclose(self.fov, self.viewer.server.initial_camera.fov, rel_tol=1e-3):
+        is_valid = self._look_around()
+        if is_valid and not self.opened and math.isclose(self.fov, self.viewer.server.initial_camera.fov, rel_tol=1e-3):
             self._open(angle_of_view(self.viewer.subject.scene.test.cameras, 0, self.aspect))
 
     def _look_around(self) -> bool:
-        """Takes the browser's camera unless its canvas is empty or a number not finite; returns whether it did."""
+        """Reads the browser's camera; returns False and keeps the old one if the canvas is empty or numbers invalid."""
         now = self.handle.camera
         numbers = (*now.wxyz, *now.position, now.fov)
-        there = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)
-        if not there or not np.isfinite(numbers).all() or not 0 < now.fov < math.pi:
+        is_shown = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)
+        if not is_shown or not np.isfinite(numbers).all() or not 0 < now.fov < math.pi:
             return False
         self.aspect, self.fov = now.aspect, now.fov
         if self.follows:
@@ -140,7 +140,7 @@ class Client:
         return True
 
     def change(self, **look: Any) -> None:
-        """Asks for new pictures, with other values of its `Look`."""
+        """Requests new pictures, with the given fields of the `Look` changed."""
         self.look = replace(self.look, **look)
         self.version += 1
         if time.perf_counter() - self.moved_at > PAUSE:
@@ -150,7 +150,7 @@ class Client:
         self.viewer.wake.set()
 
     def on_diagram(self) -> None:
-        """Follows a split: cells have other numbers now."""
+        """Resets the level and the choice of cells after a split, which renumbers the cells."""
         depth = self.viewer.subject.diagram.depth
         self.level.max, self.level.visible = max(depth, 2), depth > 1
         self.level.value = depth  # type: ignore[misc]
@@ -160,31 +160,31 @@ class Client:
         self.change(level=depth, hidden=frozenset(), picked=None)
 
     def stand(self, cameras: Cameras, view: int) -> None:
-        """Moves to one of several cameras."""
-        of = frustum(cameras, view)
+        """Moves the browser's camera to one of several cameras."""
+        target = frustum(cameras, view)
         with self.handle.atomic():
-            self.handle.camera.position = of["position"]
+            self.handle.camera.position = target["position"]
             self.handle.camera.look_at = look_point(self.viewer.subject.scene, cameras, view).numpy()
             self.handle.camera.up_direction = cameras.poses[view, :3, 1].double().numpy()
             self._open(angle_of_view(cameras, view, self.aspect))
 
     def _open(self, fov: float) -> None:
-        """Takes another vertical angle of view, in radians, and shows it in the panel."""
+        """Sets the vertical angle of view, in radians, and shows it in the panel."""
         self.opened = True
         self.handle.camera.fov = fov
         self.degrees = shown_angle(fov)
         self.angle.value = self.degrees  # type: ignore[misc]
 
     def _choose_angle(self, degrees: int) -> None:
-        if degrees != self.degrees:  # else `_open` has set both
+        if degrees != self.degrees:  # equal after `_open`, which has set both
             self.opened, self.degrees = True, degrees
             self.handle.camera.fov = math.radians(degrees)
         self._look_around()
         self.change()
 
     def count_picture(self, camera: Cameras) -> None:
-        """Says how many pictures a second are drawn while the camera moves, after one more of a camera."""
-        times, now = self.times, time.perf_counter()  # another thread begins a new list
+        """Counts a coarse picture, and shows the frame rate while the camera moves."""
+        times, now = self.times, time.perf_counter()  # another thread may replace `self.times`
         times.append(now)
         if len(times) > 1 and now - self.said_at > SAY:
             rate = (len(times) - 1) / (now - times[0])
@@ -238,7 +238,7 @@ class Client:
         )
 
     def on(self, register: Callable[[Callable[[Any], None]], object], work: Callable[[], object]) -> None:
-        """Calls ``work`` when a part of the panel is used; disconnects the client if that fails."""
+        """Registers ``work`` as the callback of a panel element; if it fails, the client is disconnected."""
         register(lambda _: self.viewer.serve_client(self, work))
 
     def _resize(self, longest: int) -> None:
@@ -251,25 +251,25 @@ class Client:
         self.viewer.do(lambda: self.viewer.serve_client(self, lambda: self.pick(*event.screen_pos)))
 
     def pick(self, x: float, y: float) -> None:
-        """Describes the cell at a position in the picture, 0..1 from the left and from the top."""
+        """Picks and describes the cell at a position in the picture, 0..1 from the left and from the top."""
         subject = self.viewer.subject
         cell = cell_at(subject, self.camera(self.longest), self.look, x, y)
         self.change(picked=cell)
         self.info.content = NO_CELL if cell is None else describe_cell(subject.diagram, cell, self.look.level)
 
-    def _hide(self, what: str) -> None:
-        if what == "show all":
+    def _hide(self, action: str) -> None:
+        if action == "show all":
             self.change(hidden=frozenset())
         elif (picked := self.look.picked) is not None:
             groups = groups_of(self.viewer.subject.diagram, self.look.level)
             inside = groups == groups[picked]
-            cells = frozenset((inside if what == "hide" else ~inside).nonzero()[:, 0].tolist())
-            self.change(hidden=self.look.hidden | cells if what == "hide" else cells)
+            cells = frozenset((inside if action == "hide" else ~inside).nonzero()[:, 0].tolist())
+            self.change(hidden=self.look.hidden | cells if action == "hide" else cells)
 
-    # --- what is drawn into the scene ------------------------------------------------------------------------------
+    # --- objects in the scene --------------------------------------------------------------------------------------
 
     def clear(self, kind: str) -> None:
-        """Removes what is drawn of one kind."""
+        """Removes the objects of one kind from the scene."""
         for node in self.nodes[kind]:
             node.remove()
         self.nodes[kind] = []
@@ -296,7 +296,7 @@ class Client:
         if show:
             scene = self.viewer.subject.scene
             cameras, count = scene.train.cameras, min(len(scene.train), MOST_VIEWS)
-            apart = float((cameras.origins - cameras.origins.mean(0)).norm(dim=-1).mean())
+            spread = float((cameras.origins - cameras.origins.mean(0)).norm(dim=-1).mean())
             with self.handle.atomic():
                 for view in (number * len(scene.train) // count for number in range(count)):
                     picture = None
@@ -306,7 +306,7 @@ class Client:
                         picture = (truth[::step, ::step] * 255).to(torch.uint8).numpy()
                     node: Any = self.handle.scene.add_camera_frustum(
                         f"/cameras/{view}",
-                        scale=0.06 * max(apart, 1e-3),
+                        scale=0.06 * max(spread, 1e-3),
                         thickness=1.5,
                         thickness_units="screen",
                         image=picture,

@@ -1,4 +1,4 @@
-"""The box that one browser crops a scene by: two corners that are dragged."""
+"""The crop box of one browser, with two corners that the user drags."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from voronerf.app.viewer.cameras import scene_bounds
 if TYPE_CHECKING:
     from voronerf.app.viewer.client import Client
 
-#: Share of the box's diagonal that its sides keep, and size of a corner's arrows.
+#: The least side of the box and the size of a corner's arrows, as shares of the scene's diagonal.
 LEAST, ARROWS = 0.01, 0.12
 
 
 class CropBox:
-    """Renders only what is inside a box, and draws the box."""
+    """A crop box, outside of which nothing is rendered; it is drawn into the scene."""
 
     def __init__(self, client: Client) -> None:
         self.client, subject = client, client.viewer.subject
@@ -59,10 +59,10 @@ class CropBox:
         self.update()
 
     def drag(self, number: int, place: Any) -> None:
-        """Moves the lowest corner, number 0, or the highest.
+        """Moves the lowest corner, number 0, or the highest corner, number 1.
 
         Raises:
-            ValueError: A page of the viewer cannot have sent the place.
+            ValueError: The place is no valid position; a page of the viewer never sends one.
         """
         place = np.asarray(place, dtype=np.float64)
         if place.shape != (3,) or not (np.abs(place) < 1e9).all():
@@ -74,7 +74,7 @@ class CropBox:
         self.update()
 
     def update(self) -> None:
-        """Redraws the box, and the picture inside it."""
+        """Redraws the box and requests a new picture."""
         if self.shown.value:
             self.box.position = self.corners.mean(0)
             self.box.dimensions = tuple(self.corners[1] - self.corners[0])

@@ -1,7 +1,7 @@
-"""Who may connect to the viewer, and what a page may send: a browser lets each of its pages open a websocket to it.
+"""Access control of the viewer: checks of connections and messages.
 
-viser does not check where a request comes from, and trusts what it is sent. Its server is that of the package
-websockets, to which it passes its functions; the functions here are called first.
+A browser lets the pages of any site open a websocket to the viewer. viser does not check the origin of a request, and
+trusts all messages. It passes its handlers to the server of the package websockets; the functions here wrap them.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from websockets.http11 import Request, Response
 
 log = logging.getLogger(__name__)
 
-#: Bytes of a message; the page sends some hundred.
+#: Greatest number of bytes of a message; viser's page sends some hundred.
 LARGEST = 2**16
 
-#: Of websockets: says only what ends the server, and not that somebody connected without a request.
+#: The logger for websockets: only critical errors, so that connections without a request are not logged.
 QUIET = log.getChild("websockets")
 QUIET.setLevel(logging.CRITICAL)
 
-#: Kinds of messages that the viewer takes; the wish for a public address is none of them.
+#: Kinds of messages that the viewer accepts; a request for a public share link is not among them.
 KINDS = (
     *("ViewerCameraMessage", "GuiUpdateMessage", "ScenePointerMessage", "SceneNodeClickMessage"),
     *(f"TransformControls{what}Message" for what in ("DragStart", "Update", "DragEnd")),
@@ -39,10 +39,10 @@ KINDS = (
 
 
 def chosen(part: Any) -> Any:
-    """The value of a slider or a list, where it is one that can be chosen.
+    """Returns the value of a slider or a list after a check that it is a possible choice.
 
     Raises:
-        ValueError: a page of the viewer cannot have sent it.
+        ValueError: the value is no possible choice; a page of the viewer never sends one.
     """
     value = part.value
     if not (value in part.options if hasattr(part, "options") else part.min <= value <= part.max):
@@ -52,18 +52,18 @@ def chosen(part: Any) -> Any:
 
 @contextlib.contextmanager
 def guarded(host: str, pages: Mapping[str, Callable[[], Awaitable[bytes]]]) -> Iterator[None]:
-    """A viser server that is made in this context, to listen at `host`, refuses requests of pages of other sites.
+    """A context in which a viser server is made that refuses requests from pages of other sites.
 
-    It passes over messages that the viewer has no use for, and disconnects whoever sends what is none. It also serves
-    ``pages``, HTML by their paths.
+    The server, which listens at `host`, ignores messages that the viewer does not use, and disconnects a browser whose
+    message cannot be decoded. It also serves ``pages``, HTML by path.
     """
-    serve, made = server.serve, []
+    serve, guarded_hosts = server.serve, []
 
     def guarded_serve(
         handler: Callable[..., Any], *arguments: Any, process_request: Callable[..., Any], **options: Any
     ) -> server.serve:
         async def handle(connection: server.ServerConnection) -> None:
-            asyncio.get_running_loop().set_exception_handler(_say)
+            asyncio.get_running_loop().set_exception_handler(_log_error)
             receive = connection.recv
 
             async def recv() -> Any:
@@ -88,7 +88,7 @@ def guarded(host: str, pages: Mapping[str, Callable[[], Awaitable[bytes]]]) -> I
             page = pages.get(request.path)
             return process_request(connection, request) if page is None else _answer(await page())
 
-        made.append(host)
+        guarded_hosts.append(host)
         return serve(handle, *arguments, process_request=check, **options | {"max_size": LARGEST, "logger": QUIET})
 
     server.serve = guarded_serve  # type: ignore[assignment, misc]
@@ -96,7 +96,7 @@ def guarded(host: str, pages: Mapping[str, Callable[[], Awaitable[bytes]]]) -> I
         yield
     finally:
         server.serve = serve  # type: ignore[misc]
-    if not made:
+    if not guarded_hosts:
         warnings.warn(f"pages of other sites can reach the viewer with viser {viser.__version__}", stacklevel=2)
 
 
@@ -105,21 +105,21 @@ def _answer(page: bytes) -> Response:
     return Response(200, "OK", Headers({**headers, "Cache-Control": "no-store"}), page)
 
 
-def _say(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Logs a message that viser could not use, such as text in place of a number."""
+def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Logs a message that viser could not handle, such as text in place of a number."""
     log.warning("a message of a browser is passed over: %.200s", context.get("exception", context["message"]))
 
 
 def why_refused(headers: Mapping[str, str], host: str) -> str | None:
-    """The reason why a request to a server at `host` is refused; None if it is not.
+    """Returns the reason why a request to a server at `host` is refused, or None if it is accepted.
 
-    A page must come from where it connects to, as for Jupyter. And it must ask by an address, or by a name that is
-    known to be this machine's: the owner of any other name can have it lead here after the page is loaded (DNS
-    rebinding). Programs that are no browser send no `Origin`, and are let in.
+    As in Jupyter, a page must come from the host to which it connects. This host must be an IP address or a name of
+    this machine: the owner of any other name could redirect it to this machine after the page is loaded (DNS
+    rebinding). Programs other than browsers send no `Origin`, and are accepted.
 
     Args:
-        headers: of the request.
-        host: address or name of this machine that the viewer listens at.
+        headers: the headers of the request.
+        host: the address or name of this machine at which the viewer listens.
 
     Examples:
         >>> from voronerf.app.viewer.door import why_refused
@@ -130,16 +130,16 @@ def why_refused(headers: Mapping[str, str], host: str) -> str | None:
         'the viewer must be opened by an address or as localhost, not as example.org; --host example.org allows it'
     """
     try:
-        asked, origin = headers.get("Host", ""), headers.get("Origin")
-        name = urlsplit(f"//{asked}").hostname or ""
+        requested, origin = headers.get("Host", ""), headers.get("Origin")
+        name = urlsplit(f"//{requested}").hostname or ""
         site = None if origin is None else urlsplit(origin).netloc
-    except (ValueError, LookupError):  # an address that is none, or a header twice
+    except (ValueError, LookupError):  # an invalid address, or a duplicate header
         return "its headers cannot be read"
     machine = socket.gethostname().lower()
     if not (name in ("localhost", machine, f"{machine}.local", host.lower()) or _is_address(name)):
         return f"the viewer must be opened by an address or as localhost, not as {name}; --host {name} allows it"
-    if site is not None and site != asked:
-        return f"a page of {origin} must not use the viewer at {asked}"
+    if site is not None and site != requested:
+        return f"a page of {origin} must not use the viewer at {requested}"
     return None
 
 

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from voronerf.app.viewer.client import Client
 
 FPS = 24
-#: Keyframes of one browser at the most.
+#: Greatest number of keyframes of one browser.
 MOST = 500
-#: Size of a keyframe as a share of the scene's diagonal, and points of the line through all.
+#: Size of a drawn keyframe as a share of the scene's diagonal; number of points of the line through the keyframes.
 SIZE, POINTS = 0.04, 200
 
 
@@ -44,12 +44,12 @@ class Keyframes:
         self.button = gui.add_button("Save path", disabled=True)
         client.on(self.button.on_click, self.save)
 
-    def edit(self, what: str) -> None:
-        """Adds the present camera ("add"), or takes the last keyframe ("undo") or all of them ("clear") away."""
-        if what == "add":
+    def edit(self, action: str) -> None:
+        """Adds the current camera ("add"), or removes the last keyframe ("undo") or all keyframes ("clear")."""
+        if action == "add":
             self.cameras = [*self.cameras, self.client.camera(self.client.longest)][:MOST]
         else:
-            self.cameras = self.cameras[:-1] if what == "undo" else []
+            self.cameras = self.cameras[:-1] if action == "undo" else []
         self.draw()
 
     def draw(self) -> None:
@@ -63,7 +63,7 @@ class Keyframes:
         with client.handle.atomic():
             for number, camera in enumerate(self.cameras):
                 name, size = f"/keyframes/{number}", SIZE * float((high - low).norm())
-                # In units of the scene the lines around the camera itself would cover the picture.
+                # Lines of a thickness in scene units would cover the picture when the camera is at the keyframe.
                 node = scene.add_camera_frustum(
                     name,
                     scale=size,
@@ -85,13 +85,13 @@ class Keyframes:
         client.change()
 
     def frames(self) -> CameraPath:
-        """The smooth path, in the size of the sharp picture."""
+        """Returns the smooth path, with frames of the sharp picture's size."""
         keyframes, closed = same_size(self.cameras), bool(self.closed.value)
         count = round(chosen(self.seconds) * FPS)
         return CameraPath(smooth_path(keyframes, count, closed=closed), FPS, keyframes, closed)
 
     def preview(self) -> None:
-        """Flies along the path in the time that it takes; other browsers are served meanwhile."""
+        """Moves the camera along the path in real time; serves other browsers meanwhile."""
         if not self.cameras:
             return
         viewer, frames, started = self.client.viewer, self.frames().frames, time.perf_counter()
@@ -119,7 +119,7 @@ class Keyframes:
 
 
 def same_size(cameras: list[Cameras]) -> Cameras:
-    """Cameras in the size of the last one, made even for a video, each with its vertical angle of view."""
+    """Resizes cameras to the last one's size, rounded down to even numbers for a video; keeps vertical angles."""
     width, height = (max(2, side // 2 * 2) for side in (cameras[-1].width, cameras[-1].height))
     focal = torch.stack([camera.intrinsics[0, 1] * (height / camera.height) for camera in cameras])
     middle = torch.tensor((width / 2, height / 2)).repeat(len(cameras), 1)

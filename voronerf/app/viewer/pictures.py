@@ -1,4 +1,4 @@
-"""The pictures of a viewer: the panes of a rendered camera, hidden cells, the cell behind a pixel.
+"""The pictures of a viewer: colour, depth, opacity and cells of a camera, hidden cells, the cell behind a pixel.
 
 h x w pixels, k cells. Pictures are uint8 [h, w, 3].
 """
@@ -24,11 +24,11 @@ from voronerf.nerf.field import Field
 from voronerf.nerf.renderer import RenderedImage, Renderer
 
 PANES = ("colour", "depth", "opacity", "cells")
-#: Grey values of what is behind a scene.
+#: Grey values of the backgrounds.
 BACKGROUNDS = {"white": 1.0, "grey": 0.5, "black": 0.0}
 
 
-#: Colour of the outline around the picked cell, of no cell in the palette.
+#: Colour of the outline around the picked cell; the palette does not have it.
 OUTLINE = (255, 0, 255)
 
 
@@ -39,10 +39,10 @@ class Look:
     Attributes:
         pane: One of `PANES`.
         background: One of `BACKGROUNDS`, behind the colours.
-        level: Of a nested diagram, whose cells are shown; 1 is the coarsest.
-        hidden: Leaves that are not rendered.
-        crop: Lowest and highest corner of the box that is rendered, or None for the scene's.
-        picked: A leaf that was clicked on, whose cell has an outline, or None.
+        level: The level of a nested diagram whose cells are shown; 1 is the coarsest.
+        hidden: The leaves that are not rendered.
+        crop: Lowest and highest corner of the rendered box, or None for the scene's box.
+        picked: The leaf that was clicked on, whose cell gets an outline, or None.
     """
 
     pane: str = "colour"
@@ -58,12 +58,12 @@ class Subject:
     """A run in a viewer, trained or in training.
 
     Attributes:
-        name: For titles.
+        name: The name in titles.
         folder: The run directory.
-        scene: Cameras, and images if they are read.
-        router: Has the diagram of the cells, and says which cell a position belongs to.
-        renderer: How rays become colours.
-        weights: A context in which the networks have the weights to show.
+        scene: The cameras, and the images if they are loaded.
+        router: The diagram of the cells, and the assignment of positions to cells.
+        renderer: The renderer of the run.
+        weights: Returns a context in which the networks have the weights to show.
     """
 
     name: str
@@ -75,31 +75,34 @@ class Subject:
 
     @classmethod
     def of(cls, run: Run) -> Subject:
-        """A trained run."""
+        """Returns the subject of a trained run."""
         return cls(run.path.resolve().name, run.path, run.scene, run.router, run.renderer)
 
     @property
     def diagram(self) -> VoronoiDiagram:
-        """The cells, which a split replaces."""
+        """The current diagram; a split replaces it."""
         return self.router.diagram
 
 
 class VisibleCells(nn.Module):
-    """A field without the density of hidden cells, bool [k]."""
+    """A field that sets the density in hidden cells, bool [k], to 0."""
 
     def __init__(self, field: Field, router: HasCells, hidden: Tensor) -> None:
         super().__init__()
         self.field, self.router, self.hidden = field, router, hidden
 
     def forward(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`voronerf.nerf.Field`."""
+        """Evaluates the field; see :class:`voronerf.nerf.Field`."""
         colour, density = self.field(positions, directions, ray_index)
         cells = self.router.assign(positions[:, :3].contiguous())
         return colour, density.masked_fill(self.hidden[cells.long()], 0)
 
 
 def groups_of(diagram: VoronoiDiagram, level: int) -> Tensor:
-    """int64 [k]: the cell of a level, 1 being the coarsest, that each leaf lies in; numbered in the order of leaves."""
+    """Returns int64 [k], the number of each leaf's cell on a level; 1 is the coarsest level.
+
+    The cells of a level are numbered in the order of their leaves.
+    """
     paths = diagram.paths()[:, : max(1, level)].cpu()
     starts = torch.ones(len(paths), dtype=torch.bool)
     starts[1:] = (paths[1:] != paths[:-1]).any(1)
@@ -107,16 +110,16 @@ def groups_of(diagram: VoronoiDiagram, level: int) -> Tensor:
 
 
 def space_from(scene: Scene, camera: Cameras) -> Scene:
-    """A scene for a camera that may be anywhere: its box, where it has one, is seen from outside and from inside."""
+    """Returns a scene whose near and far suit a camera anywhere; with a box, the camera sees it from inside too."""
     if scene.box is None:
         return scene
     diagonal = float((scene.box[1] - scene.box[0]).norm())
-    away = float((camera.origins[0] - scene.box.mean(0)).norm())
-    return replace(scene, near=0.01 * diagonal, far=away + diagonal)
+    distance = float((camera.origins[0] - scene.box.mean(0)).norm())
+    return replace(scene, near=0.01 * diagonal, far=distance + diagonal)
 
 
 def render_bands(subject: Subject, camera: Cameras, look: Look, rows: int) -> Iterator[RenderedImage]:
-    """Renders a camera in bands of `rows` rows from top to bottom, with what a look hides and crops."""
+    """Renders a camera in bands of `rows` rows from top to bottom, with the hidden cells and the crop of a look."""
     renderer, scene = subject.renderer, space_from(subject.scene, camera)
     if look.hidden:
         hidden = torch.zeros(subject.diagram.num_cells, dtype=torch.bool)
@@ -134,23 +137,23 @@ def render_bands(subject: Subject, camera: Cameras, look: Look, rows: int) -> It
 
 
 def stack_bands(bands: list[RenderedImage]) -> RenderedImage:
-    """The image that bands make, on the CPU."""
+    """Joins bands into an image on the CPU."""
     return RenderedImage(*(torch.cat(parts).cpu() for parts in zip(*bands)))
 
 
 def render_look(subject: Subject, camera: Cameras, look: Look) -> RenderedImage:
-    """Renders a camera at once; see :func:`render_bands`."""
+    """Renders a camera in one band; see :func:`render_bands`."""
     return stack_bands(list(render_bands(subject, camera, look, camera.height)))
 
 
 def cells_of(subject: Subject, places: Tensor) -> Tensor:
-    """The leaves int64 [...] of places [..., 3], as `RenderedImage.heaviest` has them."""
+    """Returns the leaves, int64 [...], of places [..., 3] such as `RenderedImage.heaviest`."""
     where = places.to(subject.renderer.device).reshape(-1, 3)
     return subject.router.assign(where).reshape(places.shape[:-1]).cpu().long()
 
 
 def picture_of(subject: Subject, image: RenderedImage, look: Look) -> Tensor:
-    """The picture of a look's pane, with an outline around the cell that was picked."""
+    """Draws the pane of a look, with an outline around the picked cell."""
     picture = _picture_of_pane(subject, image, look)
     if look.picked is None:
         return picture
@@ -175,12 +178,12 @@ def _picture_of_pane(subject: Subject, image: RenderedImage, look: Look) -> Tens
 
 
 def cell_at(subject: Subject, camera: Cameras, look: Look, x: float, y: float) -> int | None:
-    """The leaf that a pixel shows, or None if it shows nothing.
+    """Returns the leaf that a pixel shows, or None if it shows nothing.
 
     Args:
-        subject: What is viewed.
-        camera: Of the whole picture.
-        look: Hidden cells are not found.
+        subject: The viewed run.
+        camera: The camera of the whole picture.
+        look: The hidden cells and the crop.
         x: Position from the left, 0..1.
         y: Position from the top, 0..1.
     """
@@ -191,7 +194,7 @@ def cell_at(subject: Subject, camera: Cameras, look: Look, x: float, y: float) -
 
 
 def describe_cell(diagram: VoronoiDiagram, leaf: int, level: int) -> str:
-    """The number, path and centre of a cell of a level, which has a leaf; as Markdown."""
+    """Describes a leaf's cell on a level, by number, path and centre, as Markdown."""
     groups = groups_of(diagram, level)
     number, count = int(groups[leaf]), int((groups == groups[leaf]).sum())
     path = " / ".join(str(step) for step in diagram.paths()[leaf].tolist()[:level] if step >= 0)

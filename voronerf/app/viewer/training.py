@@ -1,4 +1,4 @@
-"""A training in a viewer: pictures between its steps, its curve, pause and stop."""
+"""The viewer of a training: pictures between the steps, the PSNR curve, pause and stop."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from voronerf.app.viewer.pictures import Subject
 from voronerf.app.viewer.viewer import Viewer
 from voronerf.nerf.schedule import GROUP
 
-#: Seconds between two changes of the lines and the curve that tell of the training.
+#: Seconds between updates of the lines and the curve of the training.
 TELL = 1.0
 
 
 def watch(state: State, scores: Scores, *, host: str = "127.0.0.1", port: int = 8080) -> Training:
-    """A viewer of a training, to be one of its callbacks.
+    """Returns a callback that shows a training in a viewer.
 
     Args:
-        state: What is viewed.
-        scores: Whose curve is shown.
+        state: The viewed training.
+        scores: The scores whose curve is shown.
         host: Address to listen at.
-        port: To listen at; 0 is any that is free.
+        port: Port to listen at; 0 is any free port.
 
     Raises:
         ConfigError: The address cannot be listened at.
@@ -32,21 +32,21 @@ def watch(state: State, scores: Scores, *, host: str = "127.0.0.1", port: int = 
 
 
 def subject_of(state: State, scores: Scores) -> Subject:
-    """The run in training, shown with its averaged weights."""
+    """Returns the subject of a training, which is shown with its averaged weights."""
     out = scores.out or Path()
     return Subject(out.name, out, state.scene, state.router, state.renderer, state.averaged)
 
 
 class Training(Callback):
-    """Shows a training in a viewer.
+    """A callback that shows a training in a viewer.
 
-    Nothing is rendered while there is no browser, and the results of training are the same bit for bit with and without
+    Without a connected browser nothing is rendered. The results of training are the same bit for bit with and without
     a viewer.
 
     Args:
-        viewer: Shows it from now on.
-        state: What is viewed.
-        scores: Whose curve is shown.
+        viewer: The viewer, which is switched to the training.
+        state: The viewed training.
+        scores: The scores whose curve is shown.
     """
 
     def __init__(self, viewer: Viewer, state: State, scores: Scores) -> None:
@@ -64,7 +64,7 @@ class Training(Callback):
 
     @property
     def group(self) -> int:  # type: ignore[override]
-        """Each step is followed by a picture while somebody looks."""
+        """The number of steps between pictures: 1 while a browser is connected."""
         return 1 if self.viewer.clients else GROUP
 
     def pause(self, paused: bool) -> None:
@@ -79,7 +79,7 @@ class Training(Callback):
         self.viewer.wake.set()
 
     def after_step(self, state: State) -> None:
-        """Shows the state after a step; returns when training may continue."""
+        """Renders pictures after a step; during a pause, returns when the training continues."""
         viewer, cells = self.viewer, state.router.num_cells
         if not viewer.clients and not self.paused:
             return

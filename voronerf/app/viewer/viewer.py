@@ -1,7 +1,8 @@
-"""The viewer: a server, its clients, and which picture is rendered next.
+"""The viewer: a server, its clients, and the order in which pictures are rendered.
 
-One thread renders everything, that which calls :meth:`Viewer.render_next` or :meth:`Viewer.serve`: in a training it is
-the thread of the steps, so that a picture is never of half a step. The threads of the server only set flags.
+One thread renders everything: the one that calls :meth:`Viewer.render_next` or :meth:`Viewer.serve`. In a training it
+is the thread of the steps, so that a picture never shows a half-finished step. The threads of the server only set
+flags.
 """
 
 from __future__ import annotations
@@ -37,31 +38,31 @@ log = logging.getLogger(__name__)
 
 #: Seconds without a movement after which the sharp picture is begun.
 REST = 0.15
-#: Seconds that a picture may take while the camera moves, and a band of the sharp one, after which others have a turn.
+#: Target time in seconds of a coarse picture, and of a band of the sharp picture, after which other clients are served.
 COARSE, BAND = 0.06, 0.1
-#: Pixels along the longer side of a coarse picture, at least.
+#: Least number of pixels along the longer side of a coarse picture.
 SMALLEST = 96
-#: Share of a training's time that goes into new pictures while nobody moves.
+#: Share of the training time that is spent on new sharp pictures while no camera moves.
 REFRESH = 0.05
-#: Hosts that stand for all addresses of this machine.
+#: Hosts that mean all addresses of this machine.
 EVERYWHERE = ("0.0.0.0", "::", "")
 #: Path of the page that draws the scene in the browser itself.
 PAGE = "/scene.html"
-#: Depth of empty pixels in scene units, the largest that viser takes.
+#: Depth of empty pixels in scene units, the largest depth that viser can send.
 NOWHERE = 160.0
 
 
 class Viewer:
-    """Shows a subject to any number of browsers.
+    """A server that shows a subject to any number of browsers.
 
     Args:
-        subject: What is viewed.
+        subject: The viewed run or training.
         host: Address to listen at.
-        port: To listen at; 0 is any that is free.
-        page: Makes the page that draws the subject in the browser itself, served at `PAGE`; None for none.
+        port: Port to listen at; 0 is any free port.
+        page: Returns the page that draws the subject in the browser itself, served at `PAGE`; None for no page.
 
     Raises:
-        ConfigError: The address cannot be listened at.
+        ConfigError: The server cannot listen at the address.
     """
 
     def __init__(
@@ -73,16 +74,16 @@ class Viewer:
         page: Callable[[], bytes] | None = None,
     ) -> None:
         check_address(host, port)
-        # A tab is closed at any time; what is on its way to it then is lost.
+        # Messages to a browser tab that has just been closed are lost, which is no error.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         self.subject = subject
         self.clients: dict[int, Client] = {}
         self.tasks: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.wake = threading.Event()
         self.rate = 100_000.0  # pixels a second
-        # viser draws a box around its address
         self.page = page
         pages = {} if page is None else {PAGE: self._make_page}
+        # stdout is redirected, since viser prints its address in a box.
         with contextlib.redirect_stdout(io.StringIO()), guarded(host, pages):
             self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
         self.host, self.port = host, self.server.get_port()
@@ -94,21 +95,21 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
+        """The URL of the viewer."""
         host = socket.gethostname() if self.host in EVERYWHERE else self.host
         return f"http://[{host}]:{self.port}" if ":" in host else f"http://{host}:{self.port}"
 
     @property
     def audience(self) -> str:
-        """A line about where the viewer is, and for whom."""
-        others = self.host in EVERYWHERE
-        return f"open {self.address} in a browser" + "; whoever can reach this machine can use the viewer" * others
+        """A line with the URL of the viewer and who can reach it."""
+        is_public = self.host in EVERYWHERE
+        return f"open {self.address} in a browser" + "; whoever can reach this machine can use the viewer" * is_public
 
     def _stand(self) -> None:
-        """Starts new browsers at the first test view."""
+        """Sets the initial camera of new browsers to the first test view."""
         start, scene = self.server.initial_camera, self.subject.scene
-        seen = frustum(scene.test.cameras, 0)
-        start.position, start.fov = seen["position"], seen["fov"]
+        view = frustum(scene.test.cameras, 0)
+        start.position, start.fov = view["position"], view["fov"]
         start.look_at = look_point(scene, scene.test.cameras, 0).numpy()
 
     def show(self, subject: Subject, points: Sequence[tuple[float, float]] = ()) -> None:
@@ -124,34 +125,34 @@ class Viewer:
         """Draws PSNR in dB over training seconds, from the second evaluation on.
 
         Args:
-            points: seconds and PSNR of each evaluation.
+            points: (seconds, PSNR) of each evaluation.
         """
         self.points = list(points)
         for client in self.list_clients():
             self.serve_client(client, client.draw_curve)
 
     async def _make_page(self) -> bytes:
-        """The page, made on the thread that renders."""
-        made: concurrent.futures.Future[bytes] = concurrent.futures.Future()
+        """Returns the page, which is made on the rendering thread."""
+        future: concurrent.futures.Future[bytes] = concurrent.futures.Future()
 
         def make() -> None:
             assert self.page is not None
             try:
-                made.set_result(self.page())
+                future.set_result(self.page())
             except Exception as error:
-                made.set_exception(error)
+                future.set_exception(error)
 
         self.do(make)
-        return await asyncio.wrap_future(made)
+        return await asyncio.wrap_future(future)
 
     def close(self) -> None:
-        """Ends the server; its clients see that it is gone."""
+        """Stops the server and disconnects its clients."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
     def _enter(self, handle: viser.ClientHandle) -> None:
         self.clients[handle.client_id] = Client(handle, self)
-        if handle.client_id not in self.server.get_clients():  # it has left meanwhile
+        if handle.client_id not in self.server.get_clients():  # it has disconnected meanwhile
             del self.clients[handle.client_id]
         self.wake.set()
 
@@ -159,16 +160,16 @@ class Viewer:
         self.clients.pop(handle.client_id, None)
 
     def do(self, task: Callable[[], None]) -> None:
-        """Runs a task on the thread that renders."""
+        """Queues a task for the rendering thread."""
         self.tasks.put(task)
         self.wake.set()
 
     def serve_client(self, client: Client, work: Callable[[], object]) -> None:
-        """Does what a client asked for; if that fails, disconnects the client and logs a line."""
+        """Runs ``work`` for a client; if it fails, disconnects the client and logs a line."""
         try:
             work()
-        except Exception as error:  # whatever it asked for, the others and the training go on
-            if self.clients.pop(client.handle.client_id, None) is None:  # as other threads have found
+        except Exception as error:  # an error of one client must not end the viewer or the training
+            if self.clients.pop(client.handle.client_id, None) is None:  # another thread has removed it
                 return
             log.warning("a browser is disconnected: %s: %.200s", type(error).__name__, error)
             connections = getattr(self.server._websock_server, "_live_connections", {})
@@ -178,26 +179,26 @@ class Viewer:
     # --- rendering -------------------------------------------------------------------------------------------------
 
     def serve(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Renders what clients need, until ``until()`` is true or Ctrl-C."""
+        """Renders the pictures that clients need, until ``until()`` is true or Ctrl-C."""
         while not until():
             if not self.render_next():
-                # A picture may wait for its camera to rest; without one there is nothing to look at.
+                # A sharp picture waits for its camera to rest, hence the short timeout.
                 waiting = any(client.wants_sharp for client in self.list_clients())
                 self.wake.wait(REST / 3 if waiting else 1.0)
                 self.wake.clear()
 
     def warm_up(self) -> None:
-        """Renders something small, since the first call of the operations loads much of torch."""
+        """Renders a small picture, since the first call of the operations loads much of torch."""
         cameras = self.subject.scene.train.cameras
         camera = Cameras(cameras.poses[:1], cameras.intrinsics[:1] * (SMALLEST / cameras.width), SMALLEST, SMALLEST)
         render_look(self.subject, camera, Look())
 
     def list_clients(self) -> list[Client]:
-        """The clients that are connected now."""
+        """Returns the connected clients, as a copy that is safe to iterate over."""
         return list(self.clients.values())
 
     def render_next(self) -> bool:
-        """Does the most urgent task or picture; returns whether there was one."""
+        """Runs the next task or renders the most urgent picture; returns False if there was neither."""
         with contextlib.suppress(queue.Empty):
             self.tasks.get_nowait()()
             return True
@@ -213,7 +214,7 @@ class Viewer:
         return False
 
     def refresh(self) -> None:
-        """Renders pictures at rest again, since the weights have changed, as often as `REFRESH` allows."""
+        """Requests new sharp pictures, since the weights have changed, as often as `REFRESH` allows."""
         now = time.perf_counter()
         for client in self.list_clients():
             if now - client.drawn_at > client.cost / REFRESH:
@@ -230,7 +231,7 @@ class Viewer:
         client.count_picture(camera)
 
     def _draw_sharp(self, client: Client) -> None:
-        """Renders in bands; a movement ends it, and other clients get their coarse pictures in between."""
+        """Renders in bands; a movement stops it, and other clients get their coarse pictures between bands."""
         version, look, camera = client.version, client.look, client.camera(client.longest)
         started, bands = time.perf_counter(), []
         rows = max(1, int(self.rate * BAND / camera.width))
@@ -252,7 +253,7 @@ class Viewer:
     def _send(self, client: Client, camera: Cameras, image: RenderedImage, look: Look, *, quality: int) -> None:
         picture = picture_of(self.subject, image, look)
         depth = None
-        if client.shows_nodes:  # so that what is drawn into the scene vanishes behind it
+        if client.shows_nodes:  # hides objects of the scene that lie behind surfaces
             solid = image.opacity > 0.5
             depth = torch.where(solid, axial_depth(camera, image.depth), NOWHERE).clamp(max=NOWHERE).numpy()
         client.handle.scene.set_background_image(picture.numpy(), format="jpeg", jpeg_quality=quality, depth=depth)
@@ -263,7 +264,7 @@ class Viewer:
 
 
 def check_address(host: str, port: int) -> None:
-    """Raises ConfigError for an address that cannot be listened at."""
+    """Raises ConfigError if a server cannot listen at the address."""
     if not 0 <= port <= 65535:
         raise ConfigError(f"--port must be 0 to 65535, got {port}")
     try:
@@ -276,15 +277,15 @@ def check_address(host: str, port: int) -> None:
 
 
 def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
-    """The viewer of a trained run; `Viewer.serve` renders for it.
+    """Returns a viewer of a trained run; call `Viewer.serve` to render.
 
     Args:
-        run: As `voronerf.app.open_run` opens it.
+        run: The run from `voronerf.app.open_run`.
         host: Address to listen at.
-        port: To listen at; 0 is any that is free.
+        port: Port to listen at; 0 is any free port.
 
     Raises:
-        ConfigError: The address cannot be listened at.
+        ConfigError: The server cannot listen at the address.
     """
     try:
         packed: Packed | None = pack(run)

@@ -1,4 +1,4 @@
-"""A trained run as a page that draws it in any browser with WebGPU."""
+"""Exports a trained run as a page that draws it in any browser with WebGPU."""
 
 from voronerf.app.web.packing import Packed, pack
 from voronerf.app.web.page import export_web, page_of, turntable

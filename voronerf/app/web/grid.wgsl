@@ -1,7 +1,7 @@
 
 struct Level { scale: f32, shift: f32, side: u32, entries: u32, offset: u32, hashed: bool, half: u32 }
 
-// The entry of a corner within its level; the last corners of an axis may stand one past its stride.
+// Returns the entry of a corner within its level. The last corner of an axis may lie one beyond its stride.
 fn corner_of(level: Level, corner: vec3u) -> u32 {
   if (level.hashed) {
     return (corner.x ^ (corner.y * 2654435761u) ^ (corner.z * 805459861u)) & (level.entries - 1u);
@@ -10,7 +10,7 @@ fn corner_of(level: Level, corner: vec3u) -> u32 {
   return select(entry - level.entries, entry, entry < level.entries);
 }
 
-// Features of a level between its corners, at a place in 0..1.
+// Interpolates the features of a level at a position in 0..1.
 fn features_of(first: u32, inside: vec3f, level: Level) -> Features {
   let at = inside * level.scale + level.shift;
   let corner = vec3u(at);

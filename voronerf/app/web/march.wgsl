@@ -1,26 +1,26 @@
-// Rays through the occupied voxels of a grid, up to the first surface: as voronerf.ops.render_opaque. The constants
-// above, and `evaluate` below, are those of the run.
+// Marches rays through the occupied voxels of a grid up to the first surface, as voronerf.ops.render_opaque does. The
+// constants above and `evaluate` below are generated from the run.
 
 struct View {
-  right: vec4f, up: vec4f, back: vec4f, origin: vec4f,  // the camera's axes and its place
-  lens: vec4f,   // focal lengths and principal point, pixels
-  size: vec4u,   // width and height of the picture, the first row to draw, and one past the last
-  cut: vec4f,    // axis (3: none), and the place from which on nothing is shown
+  right: vec4f, up: vec4f, back: vec4f, origin: vec4f,  // axes and position of the camera
+  lens: vec4f,   // focal lengths and principal point in pixels
+  size: vec4u,   // width and height of the picture, first row to draw, one past the last row
+  cut: vec4f,    // axis of the cut (3: none), and its coordinate, beyond which nothing is shown
 }
 
 @group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> parameters: array<vec4u>;  // of one cell after another, float16
-@group(0) @binding(2) var<storage, read> table: array<u32>;         // of the hash grid, float16
-@group(0) @binding(3) var<storage, read> occupied: array<u32>;      // a bit for each voxel
-@group(0) @binding(4) var<storage, read> centres: array<vec4f>;     // and the diagram in the cell, or -1 - leaf
-@group(0) @binding(5) var<storage, read> diagrams: array<u32>;      // the first centre of each, and the end
-@group(0) @binding(6) var<storage, read> hidden: array<u32>;        // a bit for each cell
-// Colour times opacity, and opacity, float16; the cell that is seen and one, or 0; depth.
+@group(0) @binding(1) var<storage, read> parameters: array<vec4u>;  // float16, cell after cell
+@group(0) @binding(2) var<storage, read> table: array<u32>;         // float16, the hash grid
+@group(0) @binding(3) var<storage, read> occupied: array<u32>;      // a bit per voxel
+@group(0) @binding(4) var<storage, read> centres: array<vec4f>;     // centre; bits of the inner diagram, or -1 - leaf
+@group(0) @binding(5) var<storage, read> diagrams: array<u32>;      // first centre of each diagram, and the end
+@group(0) @binding(6) var<storage, read> hidden: array<u32>;        // a bit per cell
+// Per pixel: float16 colour times opacity, and opacity; 1 + the cell that is seen, or 0; float depth.
 @group(0) @binding(7) var<storage, read_write> pixels: array<vec4u>;
 
 const NOTHING = 1e-20;
 
-// Four outputs of four inputs.
+// Reads a block of a matrix: four outputs by four inputs.
 fn block(at: u32) -> mat4x4f {
   let a = parameters[at];
   let b = parameters[at + 1u];
@@ -37,19 +37,19 @@ fn bias(first: u32, four: u32) -> vec4f {
 
 fn sigmoid(x: vec4f) -> vec4f { return 1.0 / (1.0 + exp(-clamp(x, vec4f(-60), vec4f(60)))); }
 fn softplus(x: vec4f) -> vec4f { return max(x, vec4f()) + log(1.0 + exp(-abs(x))); }
-// The same angle within a half turn, where sine and cosine are exact enough on every GPU.
+// Reduces an angle to half a turn around 0, where sine and cosine are exact enough on every GPU.
 fn turned(angle: vec4f) -> vec4f {
   let turns = round(angle * 0.15915494309189535);
   return (angle - turns * 6.28125) - turns * 0.0019353071795864769;
 }
 
-// Where a ray is at a share of its way, in equal steps of distance or of 1 / distance.
+// Returns the distance at a share of the ray, in equal steps of distance or of 1 / distance.
 fn depth_of(near: f32, far: f32, share: f32) -> f32 {
   if (SPACING == 0u) { return near + (far - near) * share; }
   return near * far / max(far * (1.0 - share) + near * share, 1.17549435e-38);
 }
 
-// Into the space of the grid and of the networks (voronerf.nerf.contraction).
+// Maps a point into the space of the grid and the networks (voronerf.nerf.contraction).
 fn contracted(point: vec3f) -> vec3f {
   if (CONTRACTION == 1u) {
     let offset = (point - SPHERE_CENTRE) * (1.0 / SPHERE_RADIUS);
@@ -72,7 +72,7 @@ fn is_occupied(place: vec3f) -> bool {
   return ((occupied[number / 32u] >> (number % 32u)) & 1u) == 1u;
 }
 
-// The nearest centre; in the tree of diagrams the nearest of each level.
+// Returns the cell of a position: descends the tree of diagrams to the nearest centre of each level.
 fn cell_of(place: vec3f) -> u32 {
   var diagram = 0i;
   for (var level = 0u; level < LEVELS && diagram >= 0i; level++) {
@@ -91,7 +91,7 @@ fn cell_of(place: vec3f) -> u32 {
 
 fn is_hidden(cell: u32) -> bool { return ((hidden[cell / 32u] >> (cell % 32u)) & 1u) == 1u; }
 
-// Where a ray is in the scene's box: from x to y, none if these are equal.
+// Returns the distances at which a ray enters and leaves the scene's box; they are equal if the ray misses it.
 fn way_of(origin: vec3f, direction: vec3f) -> vec2f {
   if (!BOXED) { return vec2f(NEAR, FAR); }
   let along = select(direction, vec3f(NOTHING), abs(direction) < vec3f(NOTHING));
@@ -103,7 +103,7 @@ fn way_of(origin: vec3f, direction: vec3f) -> vec2f {
   return vec2f(enter, max(enter, clamp(min(last.x, min(last.y, last.z)), NEAR, FAR)));
 }
 
-// What a cut shows: how dense it is there, dark to bright.
+// Returns the colour of a cut surface, dark to bright by its density.
 fn density_colour(opacity: f32) -> vec3f {
   return mix(vec3f(0.16, 0.07, 0.36), vec3f(0.98, 0.86, 0.30), opacity);
 }
@@ -127,7 +127,7 @@ fn draw(@builtin(global_invocation_id) id: vec3u) {
   var most = 0.0;
   var seen = 0u;
 
-  // The part of the ray that is shown: what lies beyond the place on an axis is cut away.
+  // The shown part of the ray: space beyond the coordinate on the axis is cut away.
   var shown = vec2f(near, far);
   let axis = u32(view.cut.x);
   if (axis < 3u && far > near) {
@@ -153,10 +153,10 @@ fn draw(@builtin(global_invocation_id) id: vec3u) {
   }
 
   var stratum = select(STRATA, 0u, far > near);
-  var first = near;  // where the stratum begins
+  var first = near;  // the start of the stratum
   var samples = 0u;
   loop {
-    // The next stratum whose middle is in an occupied voxel.
+    // Finds the next stratum whose middle is in an occupied voxel.
     var last = first;
     var at = 0.0;
     var place = vec3f();
@@ -186,7 +186,7 @@ fn draw(@builtin(global_invocation_id) id: vec3u) {
     if (samples % WAVE == 0u && exp(-front) <= OPAQUE) { break; }
   }
   depth = select(far, depth / opacity, opacity > 0.0);
-  if (exp(-front) <= OPAQUE) {  // what is behind counts as of the colour before it
+  if (exp(-front) <= OPAQUE) {  // the remaining light counts as the same colour
     colour /= opacity;
     opacity = 1.0;
   }

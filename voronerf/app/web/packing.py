@@ -1,13 +1,13 @@
-"""The contents of a page: bytes in the order in which the shader reads them, and a description in JSON.
+"""Packs the contents of a page: bytes in the layout that the shader reads, and a description in JSON.
 
-The parts, one after another, each from a multiple of 16 bytes on:
+The bytes have these parts in this order, each aligned to 16 bytes:
 
-    parameters  float16, of one cell after another as `Layout` says: blocks of matrices, and biases
+    parameters  float16, cell after cell in the order of `Layout`: blocks of matrices, and biases
     table       float16 [e, f], or [k, e, f], of a hash grid
-    occupied    a bit for each voxel, 32 to a word, the lowest first
-    centres     float32 [m, 4]: a centre, and as int32 the diagram in its cell, or -1 - its number if it is a leaf
-    diagrams    uint32 [g + 1]: the first centre of each diagram, and the end
-    colours     uint8 [k, 4] of the cells in pictures
+    occupied    a bit per voxel, 32 to a word, least significant bit first
+    centres     float32 [m, 4]: a centre, and as int32 bits the diagram in its cell, or -1 - (cell number) for a leaf
+    diagrams    uint32 [g + 1]: the first centre of each diagram, and m
+    colours     uint8 [k, 4]: the colours of the cells in pictures
 
 k cells, m centres of g diagrams, e entries of f features.
 """
@@ -32,11 +32,11 @@ from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.nerf.samplers import FINE_WAVE, OPAQUE, Occupancy
 from voronerf.ops.formulas import SPACINGS
 
-#: Bytes of a part: WebGPU lets every shader read so many at once.
+#: Greatest number of bytes of a part, WebGPU's guaranteed size of a storage binding.
 LARGEST = 2**27
-#: Training cameras that a page has, evenly spread.
+#: Greatest number of training cameras in a page.
 MOST_CAMERAS = 240
-#: Points on which a module that was not is traced.
+#: Number of sample points with which a module is traced.
 TRACED = 16
 #: Largest float16.
 GREATEST = 65504.0
@@ -44,12 +44,12 @@ GREATEST = 65504.0
 
 @dataclass(frozen=True)
 class Packed:
-    """A run as a page has it.
+    """The contents of a page.
 
     Attributes:
-        scene: The description: numbers, and one text, the name.
-        data: The parts, one after another.
-        shader: WGSL.
+        scene: The description, as JSON values.
+        data: The concatenated parts.
+        shader: The source of the shader in WGSL.
     """
 
     scene: dict[str, Any]
@@ -58,7 +58,7 @@ class Packed:
 
     @property
     def summary(self) -> str:
-        """Describes the contents of the page in a line."""
+        """A line about the contents of the page."""
         sizes = {name: size for name, (_, size) in self.scene["parts"].items()}
         table = f"a table of {sizes['table'] / 1e6:.2f} MB, " if sizes["table"] > 16 else ""
         networks = f"networks of {sizes['parameters'] / 1e6:.2f} MB, "
@@ -66,17 +66,17 @@ class Packed:
 
 
 def pack(run: Run) -> Packed:
-    """The parts of a run, its description and its shader.
+    """Packs the parts of a run, its description and its shader.
 
     Raises:
-        CannotDraw: A run that a page cannot draw; in a line.
+        CannotDraw: A page cannot draw the run; the message is one line.
     """
-    known, sampler = _networks(run), run.renderer.sampler
+    radiance, sampler = _networks(run), run.renderer.sampler
     assert isinstance(sampler, Occupancy)
     grid, k, diagram = sampler.grid, run.diagram.num_cells, run.diagram
     layout = Layout()
-    networks = networks_text(known.networks, layout)
-    parameters, tables = known.cells.parameters, known.networks.program.tables
+    networks = networks_text(radiance.networks, layout)
+    parameters, tables = radiance.cells.parameters, radiance.networks.program.tables
     if len(tables) > 1:
         raise CannotDraw(f"its networks read {len(tables)} tables of hash grids")
     table = parameters[tables[0]] if tables else None
@@ -90,7 +90,7 @@ def pack(run: Run) -> Packed:
         if size > LARGEST:
             raise CannotDraw(f"its part {name} takes {size / 2**20:,.1f} MiB, of {LARGEST / 2**20:g} at most")
     parts: dict[str, NDArray[Any]] = {
-        "parameters": _parameters(parameters, known.networks.program.parameters, layout, k),
+        "parameters": _parameters(parameters, radiance.networks.program.parameters, layout, k),
         "table": _half(np.zeros(8, np.float32) if table is None else table.detach().float().cpu().numpy()),
         "occupied": np.packbits(grid.occupied.cpu().numpy().reshape(-1), bitorder="little"),
         "centres": _centres(diagram),
@@ -99,10 +99,10 @@ def pack(run: Run) -> Packed:
     }
     data, places = bytearray(), {}
     for name, part in parts.items():
-        piece = part.tobytes()
-        piece += bytes(-len(piece) % 16)
-        places[name] = [len(data), len(piece)]
-        data += piece
+        padded = part.tobytes()
+        padded += bytes(-len(padded) % 16)
+        places[name] = [len(data), len(padded)]
+        data += padded
     per_cell = table is not None and table.dim() == 3 and table.shape[0] == k and k > 1
     constants = _constants(run, sampler, diagram.depth, table.shape[-2] if per_cell and table is not None else 0)
     scene = {
@@ -118,7 +118,7 @@ def pack(run: Run) -> Packed:
 
 
 def _networks(run: Run) -> Radiance:
-    """The networks of a run that a page can draw."""
+    """Returns the networks of a run; raises CannotDraw if a page cannot draw them."""
     renderer = run.renderer
     if renderer.cones:
         raise CannotDraw("its field is asked about cones, a page asks about points")
@@ -126,12 +126,12 @@ def _networks(run: Run) -> Radiance:
         raise CannotDraw("it has no grid of empty space: --occupancy makes one")
     directions = torch.nn.functional.normalize(torch.linspace(-1, 1, 3 * TRACED).view(-1, 3), dim=-1)
     samples = torch.linspace(-1, 1, 3 * TRACED).view(-1, 3), directions
-    known = radiance_of(renderer.field, (samples[0].to(renderer.device), samples[1].to(renderer.device)))
-    if isinstance(known, str):
-        raise CannotDraw(f"its field is no single network for each cell ({known})")
-    if "cells" in known.router.places(samples[0].to(renderer.device)):
+    radiance = radiance_of(renderer.field, (samples[0].to(renderer.device), samples[1].to(renderer.device)))
+    if isinstance(radiance, str):
+        raise CannotDraw(f"its field is no single network for each cell ({radiance})")
+    if "cells" in radiance.router.places(samples[0].to(renderer.device)):
         raise CannotDraw("its cells are not those of the nearest centres")
-    return known
+    return radiance
 
 
 def _half(values: NDArray[np.float32]) -> NDArray[np.float16]:
@@ -143,7 +143,7 @@ def _half(values: NDArray[np.float32]) -> NDArray[np.float16]:
 def _parameters(
     parameters: list[Tensor], shapes: tuple[tuple[int, ...], ...], layout: Layout, k: int
 ) -> NDArray[np.float16]:
-    """[k, size], the blocks and biases of every cell."""
+    """Returns [k, size], the matrix blocks and biases of every cell."""
     rows = np.zeros((k, layout.size), "<f2")
 
     def of_cells(number: int) -> NDArray[np.float16]:
@@ -153,7 +153,7 @@ def _parameters(
     for number, start, o, i, place in layout.matrices:
         padded = np.zeros((k, 4 * fours(o), 4 * fours(i)), "<f2")
         padded[:, :o, :i] = of_cells(number)[:, :, start : start + i]
-        # [k, o / 4, i / 4, of four inputs, four outputs]: the columns of a mat4x4f.
+        # [k, o / 4, i / 4, 4 inputs, 4 outputs]: a block is a mat4x4f, column by column.
         blocks = padded.reshape(k, fours(o), 4, fours(i), 4).transpose(0, 1, 3, 4, 2)
         rows[:, place : place + fours(o) * fours(i) * BLOCK] = blocks.reshape(k, -1)
     for number, start, width, place in layout.vectors:
@@ -162,7 +162,7 @@ def _parameters(
 
 
 def _centres(diagram: Any) -> NDArray[np.float32]:
-    """[m, 4]; see the module."""
+    """Returns the part `centres`, [m, 4]; see the module."""
     centres = diagram.centres.detach().float().cpu().numpy()
     if not np.isfinite(centres).all():
         raise CannotDraw("its centres are not finite")
@@ -173,7 +173,7 @@ def _centres(diagram: Any) -> NDArray[np.float32]:
 
 
 def _constants(run: Run, sampler: Occupancy, levels: int, table: int) -> dict[str, Any]:
-    """Of march.wgsl."""
+    """Returns the constants of march.wgsl by name."""
     scene, grid, contraction = run.scene, sampler.grid, sampler.space.contraction
     low, high = grid.box.double().tolist()
     size = grid.occupied.shape
@@ -223,7 +223,7 @@ def _check_finite(value: Any) -> None:
 
 
 def _views(run: Run) -> dict[str, Any]:
-    """The training cameras, where the first view stands, and what is cut."""
+    """Returns the training cameras, the first view, the target to turn around, and the bounds for cuts."""
     scene, cameras = run.scene, run.scene.train.cameras.perspective()
     chosen = np.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS)).round().astype(int)
     chosen = chosen[_tour(cameras.origins[chosen].numpy())]
@@ -252,17 +252,17 @@ def _views(run: Run) -> dict[str, Any]:
 
 
 def _tour(places: NDArray[np.float32]) -> list[int]:
-    """The order in which to visit places [c, 3]: the nearest that is left comes next."""
-    left, order = np.arange(1, len(places)), [0]
-    while len(left):
-        nearest = int(np.square(places[left] - places[order[-1]]).sum(1).argmin())
-        order.append(int(left[nearest]))
-        left = np.delete(left, nearest)
+    """Orders places [c, 3] into a tour from the first; the nearest remaining place is always next."""
+    remaining, order = np.arange(1, len(places)), [0]
+    while len(remaining):
+        nearest = int(np.square(places[remaining] - places[order[-1]]).sum(1).argmin())
+        order.append(int(remaining[nearest]))
+        remaining = np.delete(remaining, nearest)
     return order
 
 
 def _camera(cameras: Cameras, number: int) -> list[float]:
-    """Three rows of the pose, and the focal length and the size in pixels: 15 numbers."""
+    """Returns a camera as 15 numbers: three rows of the pose, then focal length, width and height in pixels."""
     width, height = cameras.size(number)
     focal = float(cameras.intrinsics[number, :2].mean())
     if not focal > 0:

@@ -1,11 +1,11 @@
-// The page: its camera, and what mouse, touch, keys and the panel do with it.
+// The page: its camera, and the controls by mouse, touch, keys and panel.
 "use strict";
 
 const REST = 150; // milliseconds without a movement after which the sharp picture is drawn
 const SMOOTH = 33; // milliseconds that a picture may take while the camera moves
 const SEGMENT = 1000; // milliseconds from one camera of the path to the next
 const FARTHEST = 1e6;
-const NEW_DEVICES = 2; // within a minute, for devices that the browser has taken away
+const NEW_DEVICES = 2; // most replacements of lost GPU devices within a minute
 
 const element = (id) => document.getElementById(id);
 const text = (id) => element(id).textContent;
@@ -20,8 +20,8 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const unit = (a) => a.map((x) => x / (Math.hypot(...a) || 1));
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
-// --- the camera: what it turns around, from where, and how wide it sees ------------------------------------------------
-// {target, yaw, pitch, roll, distance, wide: [width, height of what is seen at distance 1]}; the world's z is up.
+// --- the camera ------------------------------------------------------------------------------------------------------
+// A view is {target, yaw, pitch, roll, distance, wide: [width, height of the visible area at distance 1]}; z is up.
 
 function axesOf(view) {
   const { yaw, pitch, roll } = view;
@@ -44,7 +44,7 @@ function viewOf(camera) {
   return { target: add(origin, back, -distance), yaw, pitch, roll, distance, wide: [width / focal, height / focal] };
 }
 
-// For a picture of so many pixels, which shows all that `wide` says.
+// Returns the camera of a view for a picture of a size in pixels; the picture shows at least the area of `wide`.
 function cameraOf(view, width, height) {
   const { right, up, back } = axesOf(view);
   const origin = add(view.target, back, view.distance);
@@ -64,7 +64,7 @@ const state = {
   playing: false,
 };
 
-// --- a view in the address -------------------------------------------------------------------------------------------
+// --- the view in the page's address ----------------------------------------------------------------------------------
 
 function addressOf() {
   const { target, yaw, pitch, roll, distance, wide } = state.view;
@@ -97,11 +97,11 @@ function readAddress() {
 // --- drawing ---------------------------------------------------------------------------------------------------------
 
 let renderer = null;
-let version = 1; // of what is drawn
+let version = 1; // number of changes of the view or the panel
 let drawn = 0; // the version of the sharp picture on the screen
 let movedAt = 0;
 let changed = () => {};
-const times = []; // of the last pictures while the camera moved
+const times = []; // milliseconds of the last coarse pictures
 
 function change() {
   version++;
@@ -126,7 +126,7 @@ function sizes() {
   return [Math.max(1, Math.round(innerWidth * ratio)), Math.max(1, Math.round(innerHeight * ratio))];
 }
 
-// Draws every change until another renderer is in use.
+// Draws every change until another renderer replaces this one.
 async function drawAlways(current) {
   for (;;) {
     if (drawn === version) await new Promise((done) => { changed = done; });
@@ -135,7 +135,7 @@ async function drawAlways(current) {
     const mine = version;
     const [width, height] = sizes();
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    // While the camera moves, all pixels where these take no longer than a smooth movement allows, else fewer.
+    // While the camera moves, the resolution is reduced as far as `SMOOTH` requires.
     const share = [1, 2, 4, 8].find((s) => (width * height) / (s * s) < SMOOTH * renderer.pixelsPerMs) ?? 8;
     const began = performance.now();
     renderer.resize(renderer.rough, Math.ceil(width / share), Math.ceil(height / share));
@@ -164,7 +164,7 @@ function showSpeed(ms) {
   element("speed").value = `${(1000 / mean).toFixed(mean > 100 ? 1 : 0)} frames/s`;
 }
 
-// A picture by a camera {pose: 12 numbers, focal, centre, width, height}, with what the panel says, as bytes RGBA.
+// Draws a picture of a camera {pose: 12 numbers, focal, centre, width, height}, with the panel's settings, as RGBA bytes.
 let waiting = Promise.resolve();
 function picture(camera) {
   const draw = async () => {
@@ -267,7 +267,7 @@ async function play(playing) {
     await new Promise(requestAnimationFrame);
     const now = performance.now();
     const end = scene.cameras.length - 1;
-    // A slow GPU gets as many views as it can draw.
+    // A slow GPU skips views.
     if (end > 0 && state.playing) goTo((state.path + Math.min(now - before, 250) / SEGMENT) % end);
     else state.playing = false;
     before = now;
@@ -294,7 +294,7 @@ async function click(x, y) {
   }
 }
 
-// Turns around what is seen at a point from now on.
+// Sets the point to turn around to the surface at a pixel.
 async function lookAt(x, y) {
   const { cell, depth } = await pick(x, y);
   if (cell < 0) return;
@@ -481,15 +481,15 @@ async function open(data) {
   Promise.race([lost, failed]).then((reason) => reopen(data, reason)).catch(fail);
 }
 
-// Browsers take devices away: from a page in the background, after a crash of the driver, or when memory is short.
-const losses = []; // their times in milliseconds
+// A browser may take the GPU device away: from a page in the background, after a driver crash, or for lack of memory.
+const losses = []; // times of the losses in milliseconds
 async function reopen(data, reason) {
   losses.push(performance.now());
   if (losses.at(-1) - losses.at(-1 - NEW_DEVICES) < 60_000) {
     throw new Error(`The browser took the GPU away ${NEW_DEVICES + 1} times in a minute. Reload the page to try again.`);
   }
   console.warn(`A new GPU device replaces one that is lost: ${reason}`);
-  await sleep(500); // a browser may have to start its GPU process again
+  await sleep(500); // the browser may have to restart its GPU process
   await open(data);
 }
 

@@ -1,4 +1,4 @@
-"""A run as one page: HTML that holds its networks, the shader that draws them, and a turntable for browsers without."""
+"""Writes a run as one HTML page: its networks, the shader that draws them, and a turntable without WebGPU."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from voronerf.app.run import Run
 from voronerf.app.web.packing import Packed, pack
 
 SUFFIXES = (".html",)
-#: The turntable: frames, milliseconds of each, and pixels along its longer side.
+#: The turntable: number of frames, milliseconds per frame, and pixels along the longer side.
 FRAMES, FRAME, SIDE = 24, 125, 240
 
 
@@ -29,15 +29,15 @@ def export_web(run: Run, path: Path | str) -> tuple[Packed, int]:
     """Writes a run as a page that draws it in a browser with WebGPU; one file, which loads nothing from elsewhere.
 
     Args:
-        run: The run. Its field is one network for each cell, and it has a grid of empty space.
+        run: The run. It must have one network per cell and an occupancy grid.
         path: File to write, .html.
 
     Returns:
-        What the page holds, and the bytes of the file.
+        The contents of the page, and the size of the file in bytes.
 
     Raises:
         ConfigError: A page cannot draw the run.
-        ValueError: Another suffix.
+        ValueError: The suffix is not .html.
         OSError: The file cannot be written.
 
     Examples:
@@ -55,16 +55,16 @@ def export_web(run: Run, path: Path | str) -> tuple[Packed, int]:
 
 
 def check_page(path: Path) -> None:
-    """Makes the folder of a page; ValueError for another suffix."""
+    """Raises ValueError for a suffix other than .html; makes the folder of the page."""
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{path}: the file must end in {' or '.join(SUFFIXES)}")
     path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def page_of(packed: Packed, still: bytes) -> str:
-    """The page; `still` is a picture in WebP."""
+    """Returns the HTML of the page; `still` is the turntable, a WebP picture."""
     style, script = _file("page.css"), _file("renderer.js") + "\n" + _file("page.js")
-    # Nothing but this script and this style is executed, whatever a run is called.
+    # The browser runs only this script and style, even if the name of a run contains HTML.
     policy = (
         f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; img-src data:; "
         "base-uri 'none'; form-action 'none'"
@@ -74,18 +74,18 @@ def page_of(packed: Packed, still: bytes) -> str:
         "title": html.escape(packed.scene["name"]),
         "style": style,
         "still": "data:image/webp;base64," + base64.b64encode(still).decode(),
-        "scene": json.dumps(packed.scene).replace("<", "\\u003c"),  # no name ends the block
+        "scene": json.dumps(packed.scene).replace("<", "\\u003c"),  # a name cannot end the script element
         "march": packed.shader,
         "screen": _file("screen.wgsl"),
         "data": base64.b64encode(zlib.compress(packed.data)).decode(),
         "script": script,
     }
-    # In one pass, so that no part is looked for in another.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _file("page.html"))
+    # One pass over the template, so that placeholders in an inserted part are not replaced.
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))
 
 
 def turntable(run: Run, frames: int = FRAMES) -> bytes:
-    """The scene, turning, as an animated picture in WebP; it may take a second for a frame."""
+    """Renders a turntable of the scene as an animated WebP picture; a frame may take a second."""
     scene = run.scene
     cameras = scene.train.cameras
     around = capture_path(cameras, frames, near=scene.near, far=scene.far)

@@ -1,7 +1,7 @@
-// Draws the scene by WebGPU: into a buffer of pixels, by march.wgsl, and from there to a canvas, by screen.wgsl.
+// Draws the scene by WebGPU: march.wgsl renders into a buffer of pixels, screen.wgsl draws the buffer on a canvas.
 //
-// A picture is drawn in strips of rows, each in a submission of its own whose end is waited for. So a slow GPU is never
-// held for long, and a picture can be given up between two strips.
+// A picture is drawn in strips of rows. Each strip is a submission of its own, and the next one waits for its end. So a
+// slow GPU is never blocked for long, and drawing can be cancelled between two strips.
 "use strict";
 
 const STRIP = 30; // milliseconds that a strip may take
@@ -10,7 +10,7 @@ const PIXEL = 16; // bytes
 const ELSEWHERE = "Current versions of Chrome, Edge, Safari and Firefox have it on most devices.";
 
 class Renderer {
-  // Throws an Error whose message is a sentence for the reader.
+  // Creates a renderer. Throws an Error whose message is a sentence for the user.
   static async create(scene, data, shaders) {
     if (!navigator.gpu) {
       throw new Error(
@@ -34,7 +34,7 @@ class Renderer {
     this.device = device;
     this.scene = scene;
     this.mostPixels = mostPixels;
-    this.rows = TILE; // of a strip; follows the time that strips take
+    this.rows = TILE; // rows per strip, adapted to the measured time of strips
     this.pixelsPerMs = 10;
     this.hiddenCells = new Uint32Array(Math.ceil(scene.cells / 32));
     this.rough = { width: 1, height: 1, buffer: null };
@@ -98,7 +98,7 @@ class Renderer {
     return ((this.hiddenCells[cell >>> 5] >>> (cell & 31)) & 1) === 1;
   }
 
-  // A picture's pixels; kept as long as its size stays.
+  // Sets the size of a picture; allocates a new buffer only if the old one is too small.
   resize(target, width, height) {
     const size = PIXEL * width * height;
     if (!target.buffer || target.buffer.size < size) {
@@ -109,8 +109,9 @@ class Renderer {
     target.height = height;
   }
 
-  // Draws rows of a picture until it is whole or `stop()`; `step(rows)` is called with how many are ready.
-  // camera: {pose: 12 numbers, focal: [x, y], centre: [x, y]}, in pixels of the picture; cut: [axis, place].
+  // Draws a picture in strips; calls `step(rows)` with the number of finished rows after each strip. Returns false if
+  // `stop()` cancelled it, else true.
+  // camera: {pose: 12 numbers, focal: [x, y], centre: [x, y]}, in pixels of the picture; cut: [axis, coordinate].
   async draw(target, camera, cut, step = () => {}, stop = () => false) {
     const { device } = this;
     const { width, height } = target;
@@ -151,7 +152,7 @@ class Renderer {
     return true;
   }
 
-  // Shows what is drawn: `ready` rows of the sharp picture, the rough one in the place of the others.
+  // Shows the first `ready` rows of the sharp picture, and the coarse picture below them.
   present(look, ready) {
     const view = this.context.getCurrentTexture().createView();
     this.paint(look, ready, this.rough, this.fine, view, this.onScreen, [this.canvas.width, this.canvas.height]);
@@ -183,7 +184,7 @@ class Renderer {
     device.queue.submit([encoder.finish()]);
   }
 
-  // A picture that is drawn, as bytes RGBA.
+  // Returns a drawn picture as RGBA bytes.
   async bytesOf(target, look) {
     const { device } = this;
     const { width, height } = target;
@@ -204,7 +205,7 @@ class Renderer {
     return bytes;
   }
 
-  // The cell that a pixel of a picture shows, or -1, and how far away it is.
+  // Returns the cell that a pixel of a picture shows, or -1, and its depth.
   async pick(target, x, y) {
     const at = PIXEL * (y * target.width + x);
     const bytes = await this.read(PIXEL, (encoder, buffer) =>

@@ -1,12 +1,12 @@
-// What was drawn, on the screen: colour over a background, or the cells.
+// Shows a drawn picture on the screen: colour over a background, or the cells.
 
 struct Screen {
-  size: vec2f,         // of the screen, pixels
-  rough: vec2u,        // of the picture that was drawn while the camera moved
-  fine: vec2u,         // of the sharp one
-  ready: u32,          // rows of the sharp one that are drawn
-  cells: u32,          // 1: in the colours of the cells
-  background: vec4f,   // w 0: a chessboard
+  size: vec2f,         // size of the screen in pixels
+  rough: vec2u,        // size of the coarse picture, drawn while the camera moved
+  fine: vec2u,         // size of the sharp picture
+  ready: u32,          // number of finished rows of the sharp picture
+  cells: u32,          // 1: show the colours of the cells
+  background: vec4f,   // colour; w = 0: a chessboard
 }
 
 @group(0) @binding(0) var<uniform> screen: Screen;
@@ -43,7 +43,7 @@ fn show(@builtin(position) position: vec4f) -> @location(0) vec4f {
     let column = u32(at.x * f32(screen.fine.x));
     return vec4f(shown(fine[row * screen.fine.x + column], position.xy), 1);
   }
-  // Between the four pixels around.
+  // Bilinear interpolation of the coarse picture.
   let place = clamp(at * vec2f(screen.rough) - 0.5, vec2f(), vec2f(screen.rough - 1u));
   let first = vec2u(place);
   let last = min(first + 1u, screen.rough - 1u);

@@ -1,9 +1,9 @@
-"""The WGSL of a run: constants, the networks step by step, and march.wgsl around them.
+"""Generates the WGSL shader of a run: constants, march.wgsl, and the networks step by step.
 
-A field is a program (`voronerf.ops._core.program`). Each of its values becomes an array of vec4f, four columns each;
-the lanes behind the last column are finite, and the weights that meet them are 0. A matrix becomes blocks of four
-outputs and four inputs, since a product of a mat4x4f and a vec4f needs no sums across lanes. `Layout` says where the
-blocks and biases of a cell lie; `voronerf.app.web.packing` puts them there.
+A field is a program (`voronerf.ops._core.program`). Each value of it becomes an array of vec4f with four columns each;
+padding lanes are finite, and their weights are 0. A matrix becomes blocks of four outputs and four inputs, since a
+product of a mat4x4f and a vec4f needs no sums across lanes. `Layout` has the offsets of a cell's blocks and biases;
+`voronerf.app.web.packing` writes them.
 
 o outputs and i inputs of a matrix, w columns.
 """
@@ -21,7 +21,7 @@ from voronerf.ops._core.encodings import harmonics
 from voronerf.ops._core.grids import GridLevel, HashGrid
 from voronerf.ops._core.program import HASH, PARAMETER, VALUE, Columns, Program, Step
 
-#: Functions of one value x with numbers a and b; finite for every finite x.
+#: WGSL of the functions of one value x with numbers a and b; finite for every finite x.
 FUNCTIONS = {
     "copy": "x",
     "affine": "{a} * x + {b}",
@@ -36,19 +36,19 @@ FUNCTIONS = {
     "sine": "sin(turned({a} * x + {b}))",
 }
 BINARY = {"add": "+", "sub": "-", "mul": "*"}
-#: Numbers that a sample may need: WGSL allows a function 8,192 bytes of variables.
+#: Greatest number of floats of a sample: WGSL allows a function 8,192 bytes of variables.
 MOST_NUMBERS = 2000
-#: Stands for infinity, which WGSL has not.
+#: Replaces infinity, which WGSL lacks.
 GREATEST = 3.4e38
-#: Numbers of float16 in a vec4u, in which the parameters are read, and in a block of a matrix.
+#: Number of float16 in a vec4u, the unit in which parameters are read, and in a block of a matrix.
 WORD, BLOCK = 8, 16
 
 
 class CannotDraw(ConfigError):
-    """A run that a page cannot draw.
+    """An error for a run that a page cannot draw.
 
     Args:
-        reason: A clause about the run.
+        reason: The reason, as a clause about the run.
     """
 
     def __init__(self, reason: str) -> None:
@@ -57,12 +57,12 @@ class CannotDraw(ConfigError):
 
 @dataclass
 class Layout:
-    """Where the parameters of a cell lie, in numbers from the first of its own.
+    """The offsets of a cell's parameters, in numbers from the cell's first parameter.
 
     Attributes:
-        matrices: (parameter, start column, rows o, columns i, place) of each step that reads a matrix.
-        vectors: (parameter, start, width, place) of each one that is added.
-        size: Of a cell.
+        matrices: (parameter, start column, rows o, columns i, offset) of each step that reads a matrix.
+        vectors: (parameter, start, width, offset) of each bias.
+        size: Number of parameters of a cell, including padding.
     """
 
     matrices: list[tuple[int, int, int, int, int]] = field(default_factory=list)
@@ -70,43 +70,43 @@ class Layout:
     size: int = 0
 
     def place(self, count: int) -> int:
-        """Room for so many numbers, from a whole word on."""
-        at = self.size
+        """Reserves space for ``count`` numbers, aligned to words; returns its offset."""
+        offset = self.size
         self.size += -(-count // WORD) * WORD
-        return at
+        return offset
 
 
 def fours(width: int) -> int:
-    """How many vec4f hold so many columns."""
+    """Returns the number of vec4f that hold ``width`` columns."""
     return -(-width // 4)
 
 
 def networks_text(networks: Networks, layout: Layout) -> str:
-    """The function ``evaluate`` of WGSL: colour and density at a place; fills the layout of a cell's parameters.
+    """Returns the WGSL function ``evaluate``, colour and density at a place; fills the layout of a cell's parameters.
 
     Raises:
-        CannotDraw: A step that has no counterpart, or more numbers than a shader may keep.
+        CannotDraw: A step has no counterpart in WGSL, or a sample needs more than `MOST_NUMBERS`.
     """
     program = networks.program
     numbers = sum(4 * fours(step.width) for step in program.steps)
     if numbers > MOST_NUMBERS:
         raise CannotDraw(f"its networks keep {numbers:,} numbers of a sample, a page at most {MOST_NUMBERS:,}")
     grids = [HashGrid.parse(text) for text in program.grids]
-    lines, made = [], {step.out: step for step in program.steps}
+    lines, steps = [], {step.out: step for step in program.steps}
     readers = [columns.index for step in program.steps for columns in step.operands if columns.of == VALUE]
     readers += [columns.index for columns in program.outputs]
-    done: set[int] = set()
+    fused: set[int] = set()
     for number, step in enumerate(program.steps):
-        if number in done:
+        if number in fused:
             continue
-        # A ReLU that alone reads a layer is done with it.
+        # A ReLU is fused into its layer if it is the only reader.
         after, name = program.steps[number + 1] if number + 1 < len(program.steps) else None, step.name
         if step.op == "linear" and after is not None and _is_relu_of(after, step) and readers.count(step.out) == 1:
-            done.add(number + 1)
+            fused.add(number + 1)
             step, name = step._replace(out=after.out), "relu"
-        lines += _step(program, step, name, layout, grids, made)
+        lines += _step(program, step, name, layout, grids, steps)
     (out,) = program.outputs
-    raw = ", ".join(_column(out, made, number) for number in range(4))
+    raw = ", ".join(_column(out, steps, number) for number in range(4))
     lines.append(f"let raw = vec4f({raw});")
     if networks.density_scale is None:
         lines.append("return raw;")
@@ -121,17 +121,17 @@ def networks_text(networks: Networks, layout: Layout) -> str:
 
 
 def _is_relu_of(after: Step, step: Step) -> bool:
-    whole = Columns(VALUE, step.out, 0, step.width)
-    return after.op == "function" and after.name == "relu" and after.operands == (whole,) and after.numbers[0] == 0
+    output = Columns(VALUE, step.out, 0, step.width)
+    return after.op == "function" and after.name == "relu" and after.operands == (output,) and after.numbers[0] == 0
 
 
 def _step(
-    program: Program, step: Step, name: str, layout: Layout, grids: list[HashGrid], made: dict[int, Step]
+    program: Program, step: Step, name: str, layout: Layout, grids: list[HashGrid], steps: dict[int, Step]
 ) -> list[str]:
-    """The lines of a step."""
+    """Returns the WGSL lines of a step."""
     out, wide = f"v{step.out}", fours(step.width)
     declare = f"var {out}: array<vec4f, {wide}>;"
-    every = f"for (var o = 0u; o < {wide}u; o++)"
+    loop = f"for (var o = 0u; o < {wide}u; o++)"
     if step.op == "input":
         return [declare, f"{out}[0] = vec4f({'direction' if step.numbers[0] in program.rays else 'place'}, 0);"]
     if step.op == "encode":
@@ -149,37 +149,37 @@ def _step(
             "}",
         ]
     if step.op == "linear":
-        return [declare, *_linear(program, step, name, layout, made)]
+        return [declare, *_linear(program, step, name, layout, steps)]
     if step.op == "function" and step.numbers[0] == 0 and name in FUNCTIONS:
-        before, operand = _whole(step.operands[0], made, f"{out}_of")
+        setup, operand = _whole(step.operands[0], steps, f"{out}_of")
         a, b = (_number(value) for value in step.numbers[1:])
         value = f"({FUNCTIONS[name].format(a=a, b=b)})"
         for factor in step.operands[1:]:
-            more, by = _whole(factor, made, f"{out}_by")
-            before, value = [*before, *more], f"{value} * {by}[o]"
-        return [*before, declare, f"{every} {{ let x = {operand}[o]; {out}[o] = {value}; }}  // {name}"]
+            extra, name_of_factor = _whole(factor, steps, f"{out}_by")
+            setup, value = [*setup, *extra], f"{value} * {name_of_factor}[o]"
+        return [*setup, declare, f"{loop} {{ let x = {operand}[o]; {out}[o] = {value}; }}  // {name}"]
     if step.op == "binary" and name in BINARY:
-        (before, left), (also, right) = (_whole(columns, made, f"{out}_{n}") for n, columns in enumerate(step.operands))
-        return [*before, *also, declare, f"{every} {{ {out}[o] = {left}[o] {BINARY[name]} {right}[o]; }}"]
+        (setup, left), (more, right) = (_whole(columns, steps, f"{out}_{n}") for n, columns in enumerate(step.operands))
+        return [*setup, *more, declare, f"{loop} {{ {out}[o] = {left}[o] {BINARY[name]} {right}[o]; }}"]
     if step.op == "move":
         lines = [declare]
-        for columns, at in zip(step.operands, step.numbers):
+        for columns, first in zip(step.operands, step.numbers):
             if columns.of != VALUE:
                 raise CannotDraw("its networks put out parameters as they are")
             for number in range(columns.width):
-                to = int(at) + number
-                lines.append(f"{out}[{to // 4}].{'xyzw'[to % 4]} += {_column(columns, made, number)};")
+                column = int(first) + number
+                lines.append(f"{out}[{column // 4}].{'xyzw'[column % 4]} += {_column(columns, steps, number)};")
         return lines
     raise CannotDraw(f"its networks have a step {step.op} {name}".rstrip())
 
 
-def _linear(program: Program, step: Step, name: str, layout: Layout, made: dict[int, Step]) -> list[str]:
-    """Blocks of four outputs and four inputs, and what is added."""
+def _linear(program: Program, step: Step, name: str, layout: Layout, steps: dict[int, Step]) -> list[str]:
+    """Returns the WGSL lines of a linear step, block by block, with its bias."""
     matrix, start, transposed = map(int, step.numbers)
     if transposed or name not in ("", "relu"):
         raise CannotDraw("its networks have a transposed product")
     x, *added = step.operands
-    before, source = _whole(x, made, f"v{step.out}_of")
+    setup, source = _whole(x, steps, f"v{step.out}_of")
     o, i, out = step.width, x.width, f"v{step.out}"
     place = layout.place(fours(o) * fours(i) * BLOCK)
     layout.matrices.append((matrix, start, o, i, place))
@@ -189,11 +189,11 @@ def _linear(program: Program, step: Step, name: str, layout: Layout, made: dict[
         layout.vectors.append((added[0].index, added[0].start, o, bias))
         first = f"bias(own + {bias // WORD}u, o)"
     elif added:
-        more, value = _whole(added[0], made, f"v{step.out}_plus")
-        before, first = [*before, *more], f"{value}[o]"
+        extra, value = _whole(added[0], steps, f"v{step.out}_plus")
+        setup, first = [*setup, *extra], f"{value}[o]"
     last = "max(sum, vec4f())" if name == "relu" else "sum"
     return [
-        *before,
+        *setup,
         f"for (var o = 0u; o < {fours(o)}u; o++) {{  // linear, {i} to {o}{', relu' if name else ''}",
         f"  var sum = {first};",
         f"  let row = own + {place // WORD}u + o * {fours(i) * BLOCK // WORD}u;",
@@ -224,7 +224,7 @@ def _level(level: GridLevel, half: int) -> str:
 
 
 def _grid_text(grid: HashGrid) -> str:
-    """What reads an entry of the table."""
+    """Returns the WGSL of a hash grid: its constants, and the functions that read and interpolate the table."""
     low, high = grid.box
     inverse = [1 / (b - a) for a, b in zip(low, high)]
     kind = "f32" if grid.features == 1 else f"vec{min(grid.features, 4)}f"
@@ -258,7 +258,7 @@ def _frequency(out: str, octaves: int) -> list[str]:
 
 
 class _Term(str):
-    """A number of WGSL in a formula of Python."""
+    """A WGSL expression that Python formulas can compute with."""
 
     def __mul__(self, other: object) -> _Term:
         return _Term(f"{self} * {other}")
@@ -279,22 +279,22 @@ def _spherical(out: str, degree: int) -> list[str]:
 
 
 ENCODINGS: dict[str, Callable[[str, int], list[str]]] = {"frequency": _frequency, "spherical": _spherical}
-"""The lines that encode a vec3f s, by the value that they fill and the encoding's size."""
+"""Functions that return the WGSL lines of an encoding of a vec3f s, from the output's name and the encoding's size."""
 
 
-def _whole(columns: Columns, made: dict[int, Step], name: str) -> tuple[list[str], str]:
-    """Lines before, and an array that begins with the columns and ends with them."""
+def _whole(columns: Columns, steps: dict[int, Step], name: str) -> tuple[list[str], str]:
+    """Returns WGSL lines that make an array of exactly these columns, and its name."""
     if columns.of != VALUE:
         raise CannotDraw("its networks compute with parameters other than weights and biases")
-    if not columns.spread and columns.start == 0 and columns.width == made[columns.index].width:
+    if not columns.spread and columns.start == 0 and columns.width == steps[columns.index].width:
         return [], f"v{columns.index}"
     lines = [f"var {name}: array<vec4f, {fours(columns.width)}>;"]
     for number in range(columns.width):
-        lines.append(f"{name}[{number // 4}].{'xyzw'[number % 4]} = {_column(columns, made, number)};")
+        lines.append(f"{name}[{number // 4}].{'xyzw'[number % 4]} = {_column(columns, steps, number)};")
     return lines, name
 
 
-def _column(columns: Columns, made: dict[int, Step], number: int) -> str:
+def _column(columns: Columns, steps: dict[int, Step], number: int) -> str:
     if columns.of != VALUE:
         raise CannotDraw("its networks put out parameters as they are")
     at = columns.start + (0 if columns.spread else number)
@@ -302,7 +302,7 @@ def _column(columns: Columns, made: dict[int, Step], number: int) -> str:
 
 
 def _number(value: Any) -> str:
-    """A float of WGSL, in parentheses if negative."""
+    """Formats a number as a WGSL float, in parentheses if negative."""
     text = repr(min(max(float(value), -GREATEST), GREATEST))
     text = text if any(mark in text for mark in ".e") else f"{text}.0"
     return f"({text})" if text.startswith("-") else text
@@ -314,11 +314,11 @@ def _vector(values: Any) -> str:
 
 
 def shader_text(networks: str, constants: dict[str, Any]) -> str:
-    """The whole shader.
+    """Returns the source of the whole shader.
 
     Args:
-        networks: From `networks_text`.
-        constants: By their names in march.wgsl: booleans, int, float, or lists of three.
+        networks: The text from `networks_text`.
+        constants: Booleans, ints, floats or lists of three, by their names in march.wgsl.
     """
     lines = []
     for name, value in constants.items():

@@ -13,49 +13,49 @@ from voronerf.ops._core.checks import physical_memory
 from voronerf.ops._core.grids import UNIT_CUBE, HashGrid
 from voronerf.ops._core.layers import MLP, Layer
 
-#: Bias of the hidden layers at the start. The features are near zero then, so that with a bias of zero every unit would
-#: be at the kink of its ReLU, and the first steps could switch off a whole layer: one seed in seven lost its colours.
+#: The initial bias of the hidden layers. The features are near zero at first, so with a bias of zero each unit would be
+#: at the kink of its ReLU, and the first steps could switch off a whole layer: one seed in seven lost its colours.
 HIDDEN_BIAS = 0.3
 
-#: The logarithm of the entries of a level in contracted space, and that of a training of at least so many seconds: a
-#: larger table takes longer to read and to learn, and shows more from half a minute on.
+#: The base-2 logarithms of the entries of a level in contracted space, for a short training and for a training of at
+#: least `LONG` seconds. A larger table takes longer to read and to learn; it pays from half a minute on.
 CONTRACTED_ENTRIES, LONG_ENTRIES, LONG = 17, 19, 25.0
 
 #: The density scale in contracted space.
 CONTRACTED_DENSITY = 40.0
 
-#: The density scale and the density of the untrained field in a box, times its longest side. A field that begins
-#: thinner learns more slowly: of a dark object, all colours may become one while it lets most of the light through.
+#: The density scale and the initial density in a box, both times the longest side of the box. A thinner initial field
+#: learns more slowly: a dark object may get a single colour while the field lets most of the light through.
 BOX_DENSITY, BOX_INITIAL = 200.0, 2.0
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 class HashGridField(RadianceField):
-    """A hash grid with a small network behind it (Müller et al. 2022, section 5.4).
+    """A hash grid followed by a small network (Müller et al. 2022, section 5.4).
 
     A layer of ``width`` channels reads the features of the position. A linear head gives the density. A second layer,
     which also sees the view direction, gives the colour through a linear head.
 
-    In :class:`voronerf.VoronoiRouter` the cells share the grid (``share=["features"]``), and each has its own network:
-    the cell tells apart what has the same entry of the table. Without ``share``, each cell has a table of its own.
+    In :class:`voronerf.VoronoiRouter` the cells share the grid (``share=["features"]``), and each cell has its own
+    network, which resolves hash collisions between cells. Without ``share``, each cell has its own table.
 
     Args:
         width: Channels of the hidden layers, at least 2.
         depth: Hidden layers before the heads, at least 1.
         levels: Resolutions of the grid, 1 to 24.
         level_features: Features of a level: 1, 2, 4 or 8.
-        log2_entries: The logarithm of the most entries of a level, 10 to 24.
+        log2_entries: The base-2 logarithm of the most entries of a level, 10 to 24.
         base: The coarsest resolution.
         finest: The finest resolution.
-        box: The space that the grid covers, two corners; None is the unit cube.
+        box: The lowest and the highest corner of the grid; None is the unit cube.
         direction_octaves: Octaves of the encoding of the view direction.
         view_directions: Whether colour depends on the view direction.
         density_scale: Factor on the density, per scene unit, > 0.
-        initial_density: Of the untrained field, per scene unit, > 0.
+        initial_density: The density of the untrained field, per scene unit, > 0.
 
     Raises:
-        ValueError: For a size out of range, or a table that does not fit into memory.
+        ValueError: A size is out of range, or the table does not fit into memory.
 
     Examples:
         >>> import torch
@@ -125,19 +125,20 @@ class HashGridField(RadianceField):
 
     @staticmethod
     def learning_rate(**_: object) -> float:
-        """Adam's rate at the start: twice the published one, which learnt more slowly on every scene tried."""
+        """Returns Adam's initial learning rate: twice the published rate, which was slower on all tested scenes."""
         return 0.02
 
     @staticmethod
     def scene_options(pixel: float, box: Box, contracted: bool, seconds: float) -> dict[str, Any]:
-        """The grid covers the space, and has finer cells and more entries for larger images.
+        """Returns options for a scene: the grid covers the box, with finer cells and more entries for larger images.
 
-        Half a pixel is the width of the finest cells. A surface meets as many cells as the square of the resolution;
-        the entries grow more slowly, since larger tables take longer to read and to learn: 2^15 for an object of 88
-        pixels, 2^18 for 353. In contracted space, most of what is seen is farther away than the middle, by which a
-        pixel is measured: the finest cells are as wide as that pixel, and there are 2^17 entries, or 2^19 in a training
-        of at least 25 seconds. Surfaces there are thinner beside all of space, so the density has a larger scale. In a
-        box the density goes with its size, whatever the units of the scene are.
+        In a box, the finest cells are half a pixel wide. The number of cells on a surface grows with the square of the
+        resolution, but the entries grow more slowly, since larger tables take longer to read and to learn: 2^15 for an
+        object of 88 pixels, 2^18 for 353 pixels. The density scale is inverse to the size of the box.
+
+        In contracted space, most surfaces are farther away than the middle of the scene, where the pixel width is
+        measured. So the finest cells are one pixel wide, with 2^17 entries, or 2^19 in a training of at least 25
+        seconds. Surfaces are thinner relative to the whole space, so the density scale is larger.
         """
         side = max(high - low for low, high in zip(*box))
         pixels = side / pixel
@@ -153,13 +154,13 @@ class HashGridField(RadianceField):
         return {**options, "density_scale": BOX_DENSITY / side, "initial_density": BOX_INITIAL / side}
 
     def reset_parameters(self) -> None:
-        """Features near zero, as published; the layers as in :func:`voronerf.nerf.fields.radiance.reset_layers`."""
+        """Initialises features near zero, as published, and layers by `voronerf.nerf.fields.radiance.reset_layers`."""
         nn.init.uniform_(self.features, -1e-4, 1e-4)
         reset_layers(self.linears(), [self.density, self.colour], self.density_scale, self.initial_density)
         for layer in (*self.linears()[:-3], self.view):
             nn.init.constant_(layer.bias, HIDDEN_BIAS)
 
     def linears(self) -> list[nn.Linear]:
-        """The linear layers in the order of ``layers``."""
+        """Returns the linear layers in the order of ``layers``."""
         trunk = [layer for layer in self.trunk if isinstance(layer, nn.Linear)]
         return [*trunk, self.density, self.view, self.colour]

@@ -1,4 +1,4 @@
-"""NeRF, an MLP from a point and a view direction to a colour and a density; mip-NeRF; and KiloNeRF's size of it.
+"""NeRF, an MLP from a point and a view direction to a colour and a density; mip-NeRF; and KiloNeRF.
 
 Letters: n samples, r rays. Positions are in scene units, directions are unit vectors, densities are per scene unit.
 """
@@ -12,32 +12,32 @@ from torch import nn
 from voronerf.nerf.fields.radiance import RadianceField, reset_layers
 from voronerf.ops._core.layers import MLP, Layer
 
-#: Octaves of mip-NeRF's encoding, as published; the encoding fades out waves that a Gaussian cannot resolve.
+#: The octaves of mip-NeRF's encoding, as published; the encoding fades out waves that a Gaussian cannot resolve.
 MIP_OCTAVES = 16
 
 
 class NeRF(RadianceField):
-    """The architecture of NeRF (Mildenhall et al. 2020, figure 7), of any width and depth.
+    """The architecture of NeRF (Mildenhall et al. 2020, figure 7) with any width and depth.
 
     The trunk is ``depth`` ReLU layers on the encoded position, which is concatenated again after each layer listed in
     ``skips``. A linear head gives the density. A linear feature layer, followed by one ReLU layer of half the width
     that also sees the encoded view direction, gives the colour. Without view directions, the colour is a linear head on
     the trunk.
 
-    The density is ``density_scale * softplus(raw)``, where the paper has a ReLU. If the input of a ReLU becomes
-    negative everywhere, it has no gradient: a NeRF on a white background can collapse to a white image within its first
-    hundred steps. Softplus always has a gradient (mip-NeRF, section 3.1, made the same choice). The bias of the head is
-    such that the untrained density is ``INITIAL_DENSITY``. Surfaces need densities near 100 per scene unit;
-    ``density_scale`` lets network outputs of order one reach them sooner.
+    The density is ``density_scale * softplus(raw)``, where the paper has a ReLU. A ReLU has no gradient if its input
+    becomes negative everywhere: a NeRF on a white background can collapse to a white image within its first hundred
+    steps. Softplus always has a gradient, as in mip-NeRF, section 3.1. The bias of the head sets the untrained density
+    to ``INITIAL_DENSITY``. Surfaces need densities near 100 per scene unit, which network outputs of order one reach
+    sooner with ``density_scale``.
 
-    ``layers`` (a table, see :class:`voronerf.ops._core.layers.MLP`) and :meth:`linears`, in its order, describe
-    the network. :class:`voronerf.VoronoiRouter` uses them to evaluate the copies of all cells in one pass.
+    The layer table ``layers`` (see :class:`voronerf.ops._core.layers.MLP`) and :meth:`linears` describe the network.
+    :class:`voronerf.VoronoiRouter` uses them to evaluate the copies of all cells in one pass.
 
     Args:
         width: Channels of the hidden layers, at least 2.
         depth: Hidden layers before the heads, at least 1.
-        skips: Indices of trunk layers whose output is concatenated with the encoded position; None is 4, as published,
-            if the trunk has more than five layers, else no layer.
+        skips: The indices of trunk layers whose output is concatenated with the encoded position. None is layer 4, as
+            published, if the trunk has more than five layers, else no layer.
         position_octaves: Octaves of the positional encoding; 0 uses the position itself.
         direction_octaves: Octaves of the encoding of the view direction.
         view_directions: Whether colour depends on the view direction.
@@ -46,7 +46,7 @@ class NeRF(RadianceField):
         position_encoding: "frequency", or "integrated" for Gaussians [n, 6] instead of positions (mip-NeRF).
 
     Raises:
-        ValueError: A width, depth, skip or scale out of range.
+        ValueError: A width, depth, skip or scale is out of range.
 
     Examples:
         >>> import torch
@@ -116,15 +116,15 @@ class NeRF(RadianceField):
 
     @staticmethod
     def learning_rate(width: int, **_: object) -> float:
-        """Adam's rate at the start, in inverse proportion to a large width (Yang et al. 2021, table 3)."""
+        """Returns Adam's initial learning rate, inverse to the width above 64 (Yang et al. 2021, table 3)."""
         return 0.02 * 64 / max(width, 64)
 
     def reset_parameters(self) -> None:
-        """See :func:`voronerf.nerf.fields.radiance.reset_layers`."""
+        """Initialises the parameters; see :func:`voronerf.nerf.fields.radiance.reset_layers`."""
         reset_layers(self.linears(), [self.density, self.colour], self.density_scale)
 
     def linears(self) -> list[nn.Linear]:
-        """The linear layers in the order of ``layers``."""
+        """Returns the linear layers in the order of ``layers``."""
         linears = [*self.trunk, self.density, self.feature, self.view, self.colour]
         return [layer for layer in linears if isinstance(layer, nn.Linear)]
 
@@ -132,8 +132,8 @@ class NeRF(RadianceField):
 class MipNeRF(NeRF):
     """The architecture of NeRF with the integrated encoding (Barron et al. 2021, "Mip-NeRF", section 3.1).
 
-    Its input is Gaussians [n, 6], mean and diagonal variance, instead of positions;
-    `voronerf.nerf.cones.frustum_gaussians` makes them from cones.
+    Its inputs are Gaussians [n, 6], mean and diagonal variance, instead of positions;
+    `voronerf.nerf.cones.frustum_gaussians` computes them from cones.
 
     Args:
         width: Channels of the hidden layers.
@@ -161,19 +161,21 @@ class MipNeRF(NeRF):
 
     @staticmethod
     def octaves(finest: int) -> int:
-        """Two beyond the finest that the images show, where a pixel's cone leaves a thousandth of the wave.
+        """Returns the octaves of the encoding: two more than the images show, at most 16.
 
-        Of the next it leaves 1e-11: the published 16 would feed zeros to the network.
+        The cone of a pixel damps the wave of the second additional octave to a thousandth, and the next wave to 1e-11:
+        the published 16 octaves would feed zeros to the network.
         """
         return min(finest + 2, MIP_OCTAVES)
 
 
 class KiloNeRF(NeRF):
-    """The network of one cell in KiloNeRF (Reiser et al. 2021, figure 3): two trunk layers of 32 channels, a feature
-    layer, and a layer of the same 32 channels that also sees the view direction.
+    """The network of one cell in KiloNeRF (Reiser et al. 2021, figure 3).
+
+    It has two trunk layers of 32 channels, a feature layer, and a layer of 32 channels that sees the view direction.
 
     Args:
-        width: Channels of every hidden layer.
+        width: Channels of each hidden layer.
         depth: Trunk layers.
         **options: The further arguments of :class:`NeRF`.
 

@@ -1,4 +1,4 @@
-"""What radiance fields on a layer table have in common."""
+"""The base class and shared functions of radiance fields that are described by a layer table."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from voronerf.ops._core.layers import MLP
 from voronerf.ops.grouped_mlp import grouped_mlp
 from voronerf.router import CellProgram, layered_program
 
-#: Density of the untrained field, per scene unit. A scene of diameter 2 then starts with an opacity of about 0.2:
-#: translucent enough that every sample of a ray receives a gradient, opaque enough that the colours do as well.
+#: The density of the untrained field, per scene unit. A scene of diameter 2 then starts with an opacity of about 0.2.
+#: It is translucent enough for a gradient at every sample of a ray, and opaque enough for gradients of the colours.
 INITIAL_DENSITY = 0.1
 
 
 def activate_radiance(self: Any, raw: Tensor) -> tuple[Tensor, Tensor]:
-    """Turns the network's outputs into what a renderer needs.
+    """Applies the activations: turns raw network outputs into colours and densities.
 
-    A training through an occupancy grid reads them off its steps, and goes from outputs to the loss in one operation
+    A training with an occupancy grid recognises these activations in the traced program, and fuses them with the loss
     (``voronerf.ops.render_loss``).
 
     Args:
@@ -33,8 +33,8 @@ def activate_radiance(self: Any, raw: Tensor) -> tuple[Tensor, Tensor]:
         (colour [n, 3] in 0..1, density [n] >= 0 per scene unit), float32 or wider.
     """
     raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
-    # `split`, because its gradient is one concatenation, and that of two slices two padded arrays and their sum.
-    # `contiguous`, because torch vectorises activations for contiguous values only. Together a third of the time.
+    # The gradient of `split` is one concatenation; two slices would need two padded arrays and their sum. Torch
+    # vectorises activations only for contiguous values. Both together take a third of the time.
     colour, density = (part.contiguous() for part in raw.split([3, 1], dim=-1))
     return torch.sigmoid(colour), F.softplus(density.squeeze(-1)) * self.density_scale
 
@@ -45,20 +45,20 @@ def reset_layers(
     density_scale: float,
     initial_density: float = INITIAL_DENSITY,
 ) -> None:
-    """He initialisation of ReLU layers (He et al. 2015), small heads, and a density that can grow.
+    """Initialises ReLU layers (He et al. 2015), small heads, and the density of the untrained field.
 
     Args:
-        layers: all layers, the heads too.
-        heads: those without an activation; the first gives the density.
-        density_scale: factor on the softplus of the density.
-        initial_density: of the untrained field, per scene unit.
+        layers: All layers, including the heads.
+        heads: The layers without an activation; the first head gives the density.
+        density_scale: The factor on the softplus of the density.
+        initial_density: The density of the untrained field, per scene unit.
     """
     for layer in layers:
         nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
         nn.init.zeros_(layer.bias)
     for head in heads:
         nn.init.xavier_uniform_(head.weight, gain=0.1)
-    # The inverse of softplus, so that the untrained density is that wherever the head's weights say 0.
+    # The inverse of softplus: the density is `initial_density` where the head's product is 0.
     nn.init.constant_(heads[0].bias, math.log(math.expm1(initial_density / density_scale)))
 
 
@@ -70,7 +70,7 @@ def run_network(
     ray_index: Tensor | None = None,
     features: Tensor | None = None,
 ) -> Tensor:
-    """The raw outputs [n, layers.out_features] of one network that a layer table describes."""
+    """Returns the raw outputs [n, layers.out_features] of one network that a layer table describes."""
     offsets = torch.tensor([0, positions.shape[0]], dtype=torch.int32, device=positions.device)
     return grouped_mlp(
         positions,
@@ -85,10 +85,10 @@ def run_network(
 
 
 class RadianceField(nn.Module):
-    """A layer table with colour and density as its outputs; the base of ``NeRF`` and ``HashGridField``.
+    """The base class of ``NeRF`` and ``HashGridField``: a field with a layer table for colour and density.
 
-    A subclass sets ``layers``, ``view_directions`` and ``density_scale``, and ``features`` where the table has a hash
-    grid, and defines :meth:`linears`.
+    A subclass sets ``layers``, ``view_directions`` and ``density_scale``, and ``features`` if the table has a hash
+    grid. It also defines :meth:`linears`.
     """
 
     layers: MLP
@@ -98,11 +98,11 @@ class RadianceField(nn.Module):
     activate = activate_radiance
 
     def linears(self) -> list[nn.Linear]:
-        """The linear layers in the order of ``layers``."""
+        """Returns the linear layers in the order of ``layers``."""
         raise NotImplementedError
 
     def program(self) -> CellProgram:
-        """All that ``forward`` computes, as a router runs it for all cells at once."""
+        """Returns the program of ``forward``, which a router runs for all cells at once."""
         return layered_program(self.layers, self.linears(), self.activate, getattr(self, "features", None))
 
     def forward(
@@ -111,10 +111,10 @@ class RadianceField(nn.Module):
         """Evaluates the field.
 
         Args:
-            positions: [n, 3] in scene units; with the integrated encoding Gaussians [n, 6]. Outside of the box of a
-                hash grid, the features are those of the nearest point inside.
-            directions: Unit vectors [n, 3], or [r, 3] together with ``ray_index``; not needed without view directions.
-            ray_index: int32 [n], the row of ``directions`` that belongs to each sample.
+            positions: [n, 3] in scene units, or Gaussians [n, 6] with the integrated encoding. Outside the box of a
+                hash grid, the features of the nearest point inside are used.
+            directions: [n, 3], unit vectors, or [r, 3] with ``ray_index``; not needed without view directions.
+            ray_index: int32 [n], the row of ``directions`` for each sample.
 
         Returns:
             (colour [n, 3] in 0..1, density [n] per scene unit).

@@ -1,32 +1,32 @@
-"""The table of fields: the networks that can be trained by name, and their properties.
+"""The table of fields, which lists the networks that can be trained by name, and their properties.
 
 A field is any ``nn.Module`` that maps positions [n, 3] and unit directions [n, 3] to a colour [n, 3] in 0..1 and a
-density [n] >= 0 per scene unit. Its class, or a function that makes it, is entered by :func:`register_field`. It may
-have these attributes, all of which are optional:
+density [n] >= 0 per scene unit. :func:`register_field` enters its class, or a function that returns a field. The class
+may have these optional attributes:
 
     inputs                   "points" (the default), or "gaussians": positions are [n, 6], means and variances
-    training_defaults        options that differ in training from the defaults of the constructor
-    learning_rate(**options) static method: Adam's rate at the start of a training; default ``LEARNING_RATE``
+    training_defaults        options whose training defaults differ from the defaults of the constructor
+    learning_rate(**options) static method: Adam's initial learning rate; default ``LEARNING_RATE``
     router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
-    sparse_parameters        names of tables, as patterns, of which a step of training reads few entries. Their
-                             entries without a gradient do not move, see ``voronerf.ops.adam``, but for the
-                             weight decay that tables have
-    ray_growth               the most rays of a training step, as a multiple of ``--rays``, where space is empty:
-                             more than 1, the default, for a field whose samples cost little beside the rest of a step
-    lr_hold                  fraction of a training for which the learning rate stays before it falls; default 0
+    sparse_parameters        name patterns of tables of which a training step reads few entries. Entries without a
+                             gradient change only by the weight decay of tables; see ``voronerf.ops.adam``
+    ray_growth               the most rays of a training step, as a multiple of ``--rays``, if space is empty; default
+                             1, more for a field whose samples are cheap relative to the rest of a step
+    lr_hold                  fraction of a training for which the learning rate stays constant; default 0
     scene_options(pixel, box, contracted, seconds)
-                             static method: options from the width of a pixel at the middle of the scene and the
-                             corners of the space that the field sees, both in scene units, whether all of space was
-                             contracted into it, and how long the training is; for those not given
-    octaves(finest)          static method: position_octaves for images that show ``finest`` octaves; default all
+                             static method: defaults of options, from the width of a pixel at the middle of the scene,
+                             the corners of the field's space (both in scene units), whether space is contracted, and
+                             the training time in seconds
+    octaves(finest)          static method: ``position_octaves`` for images that show ``finest`` octaves; default
+                             ``finest``
 
-Its options are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is called with
-the directions [r, 3] of the rays, and with the row of them that belongs to each sample.
+The options of a field are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is
+called with the directions [r, 3] of the rays, and with the row of each sample's direction.
 
-A class with a method ``program()`` says what it computes, as :class:`voronerf.nerf.fields.NeRF` does by a layer table
-(:func:`voronerf.router.layered_program`): a router runs that for all cells in one operation and does not call
-``forward``. Any other module runs its own ``forward``, which ``router_options = {"fuse": True}`` traces to a program.
-Where all of a field is one operation, its colours, the loss and the gradients are part of it, whatever its activations
+A class may describe its computation by a method ``program()``, as :class:`voronerf.nerf.fields.NeRF` does by a layer
+table (:func:`voronerf.router.layered_program`). A router then runs the program for all cells in one op and does not
+call ``forward``. Any other module runs its own ``forward``, which ``router_options = {"fuse": True}`` traces to a
+program. If a field is one program, it is fused with colours, loss and gradients, whatever its activations are
 (:class:`voronerf.nerf.RayLoss`).
 """
 
@@ -42,19 +42,19 @@ from torch import nn
 Inputs = Literal["points", "gaussians"]
 Network = TypeVar("Network", bound=Callable[..., nn.Module])
 
-#: Adam's learning rate at the start for a field without one: the optimiser's own default.
+#: Adam's initial learning rate for a field that defines none: the optimiser's default.
 LEARNING_RATE = 1e-3
 
 
 @dataclass(frozen=True)
 class FieldType:
-    """A row of the table.
+    """The entry of a field in the table.
 
     Attributes:
-        name: The value of ``--field``.
-        network: The class, or the function, that makes the module.
+        name: The name of the field, the value of ``--field``.
+        network: The class of the module, or a function that returns the module.
         inputs: "points", positions [n, 3], or "gaussians", means and variances [n, 6].
-        options: Its options and their defaults in training; ``inspect.Parameter.empty`` for one that must be given.
+        options: The options and their defaults in training; ``inspect.Parameter.empty`` for a required option.
 
     Examples:
         >>> from voronerf.nerf.fields import FIELDS
@@ -75,48 +75,48 @@ class FieldType:
 
     @property
     def cones(self) -> bool:
-        """Whether its rays are cones, which are cut into Gaussians."""
+        """True if rays are cones, which are cut into Gaussians."""
         return self.inputs == "gaussians"
 
     @property
     def router_options(self) -> Mapping[str, Any]:
-        """Further arguments of the router around it."""
+        """Further arguments of the router around the field."""
         return cast("Mapping[str, Any]", self._declared("router_options", {}))
 
     @property
     def sparse_parameters(self) -> Sequence[str]:
-        """Names of tables, as patterns, of which a step of training reads few entries."""
+        """Name patterns of tables of which a training step reads few entries."""
         return cast("Sequence[str]", self._declared("sparse_parameters", ()))
 
     @property
     def ray_growth(self) -> float:
-        """The most rays of a training step, as a multiple of those of the first, where empty space is skipped."""
+        """The most rays of a training step, as a multiple of the first step's rays, if empty space is skipped."""
         return float(self._declared("ray_growth", 1.0))
 
     @property
     def lr_hold(self) -> float:
-        """Fraction of a training for which the learning rate stays before it falls."""
+        """The fraction of a training for which the learning rate stays constant before it falls."""
         return float(self._declared("lr_hold", 0.0))
 
     @property
     def scene_options(self) -> Callable[..., dict[str, Any]] | None:
-        """The rule for options that come from the scene, if the field has one."""
+        """The function that computes options from the scene; None if the field has none."""
         return cast("Callable[..., dict[str, Any]] | None", self._declared("scene_options", None))
 
     def learning_rate(self, options: Mapping[str, Any]) -> float:
-        """Adam's rate at the start of a training with these options."""
+        """Returns Adam's initial learning rate for a training with these options."""
         rule = self._declared("learning_rate", lambda **_: LEARNING_RATE)
         return float(rule(**{**self.options, **options}))
 
     def octaves(self, finest: int) -> int:
-        """Octaves of the position's encoding for images that show ``finest`` octaves of detail."""
+        """Returns the octaves of the position encoding for images that show ``finest`` octaves of detail."""
         return int(self._declared("octaves", lambda octaves: octaves)(finest))
 
     def build(self, options: Mapping[str, Any]) -> nn.Module:
-        """A field with these options and the defaults of the others.
+        """Returns a field with these options, and with defaults for all other options.
 
         Raises:
-            ValueError: for an option without a value, and for what the constructor refuses.
+            ValueError: A required option is missing, or the constructor rejects the options.
         """
         arguments = {**getattr(self.network, "training_defaults", {}), **options}
         missing = [name for name, value in {**self.options, **arguments}.items() if value is inspect.Parameter.empty]
@@ -129,11 +129,11 @@ class FieldType:
 
 
 FIELDS: dict[str, FieldType] = {}
-"""Every field that can be trained, by name."""
+"""The fields that can be trained, by name."""
 
 
 def register_field(name: str) -> Callable[[Network], Network]:
-    """Enters a field into ``FIELDS``; a decorator. A name that is taken gets the new field.
+    """Returns a decorator that enters a field into ``FIELDS``; an existing entry of this name is replaced.
 
     Examples:
         >>> import torch
@@ -152,13 +152,13 @@ def register_field(name: str) -> Callable[[Network], Network]:
         >>> FIELDS["tiny"].options
         {'width': 16}
 
-        Now ``TrainConfig(field="tiny", width=32)`` trains it. So does ``voronerf.app.cli.main`` with ``--field tiny``,
-        in a program that has run these lines.
+        After these lines, ``TrainConfig(field="tiny", width=32)`` trains the field, and so does
+        ``voronerf.app.cli.main`` with ``--field tiny`` in the same program.
 
         >>> del FIELDS["tiny"]
 
     Raises:
-        ValueError: for a name that is not a word, or inputs that are neither points nor Gaussians.
+        ValueError: The name is not a word, or the inputs are neither points nor Gaussians.
     """
     if not name or not all(part.isalnum() for part in name.replace("_", "-").split("-")):
         raise ValueError(f"register_field: name must be a word, got {name!r}")
@@ -175,22 +175,23 @@ def register_field(name: str) -> Callable[[Network], Network]:
 
 
 def _options(network: Callable[..., nn.Module]) -> dict[str, Any]:
-    """Named parameters and their defaults; those of the base classes too where ``**options`` passes them on."""
+    """Returns named parameters and their defaults, including parameters of base classes reached by ``**options``."""
     if not isinstance(network, type):
-        return _named(network)[0]
+        return _named_parameters(network)[0]
     options: dict[str, Any] = {}
     for base in network.__mro__:
         if base is nn.Module:
             break
         if "__init__" in vars(base):
-            named, passes_on = _named(base.__init__)  # type: ignore[misc]
+            named, passes_on = _named_parameters(base.__init__)  # type: ignore[misc]
             options = {**named, **options}
             if not passes_on:
                 break
     return options
 
 
-def _named(function: Callable[..., Any]) -> tuple[dict[str, Any], bool]:
+def _named_parameters(function: Callable[..., Any]) -> tuple[dict[str, Any], bool]:
+    """Returns the named parameters with their defaults, and whether the function takes ``**options``."""
     parameters = list(inspect.signature(function).parameters.values())
     by_name = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) and p.name != "self"]
     return {p.name: p.default for p in by_name}, any(p.kind is p.VAR_KEYWORD for p in parameters)

@@ -1,4 +1,4 @@
-"""What the calling thread records, for those who take part in it."""
+"""The active recording of the calling thread."""
 
 from __future__ import annotations
 
@@ -15,4 +15,5 @@ class _Active(threading.local):
 
 
 active = _Active()
-"""The :class:`voronerf.ops._core.recording.Recording`, and what makes numbers for replays, those of a GPU too."""
+"""The active :class:`voronerf.ops._core.recording.Recording`, and the function that makes numbers which vary between
+replays, on the CPU and on a GPU."""

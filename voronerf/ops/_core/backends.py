@@ -1,16 +1,16 @@
-"""Which implementation of an op runs: one table, in which each op declares its own row (``voronerf/ops``), and one
+"""The choice of an op's implementation: one table, in which each op declares its row (``voronerf/ops``), and one
 predicate that both selects and explains.
 
-An op has up to three implementations with one signature, that of its reference function:
+An op has up to three implementations, all with the signature of its reference function:
 
     reference   plain PyTorch, any device and dtype: the executable specification
     native      csrc/, C++ and CUDA
-    warp        kernels/, NVIDIA Warp, one source for CPU and CUDA; plain PyTorch where the row says so (``PLAIN``)
+    warp        kernels/, NVIDIA Warp, one source for CPU and CUDA; plain PyTorch if the row is ``PLAIN``
 
 ``backend="auto"`` takes the first entry of the device's order that is available, supports the call and is not plain.
-The choice never depends on timing. The reference is the last entry on CUDA too, so that every op runs on every device,
-although not every op has a CUDA kernel. A backend that is given by name never falls back to another: if it cannot run,
-it raises :class:`BackendUnavailable` with the reason and the remedy.
+The choice never depends on timing. The reference is the last entry on CUDA too, so every op runs on every device,
+although not every op has a CUDA kernel. A backend that the caller names has no fallback: if it cannot run, the call
+raises :class:`BackendUnavailable` with the reason and the remedy.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ ORDER = {"cpu": ("native", "reference"), "cuda": ("native", "warp", "reference")
 
 
 class BackendUnavailable(RuntimeError):
-    """A backend that was given by name cannot run here; the message says why, and what to do."""
+    """The error of a named backend that cannot run here; the message has the reason and the remedy."""
 
 
 @dataclass(frozen=True)
 class Implementation:
-    """What one implementation of an op takes, and where it lives."""
+    """One implementation of an op: its devices, its dtypes and its module."""
 
-    devices: tuple[str, ...] = ()  # device types it runs on; empty means any
-    dtypes: tuple[torch.dtype, ...] = ()  # dtypes of the op's first tensor it takes; empty means any
-    file: str | None = None  # the module that has the function, by its op; None for that of the function's name
-    function: str | None = None  # the name of the function; None for that of the op
-    plain: bool = False  # whether it is the reference, which serves where the backend needs no kernel of its own
+    devices: tuple[str, ...] = ()  # device types; empty for any
+    dtypes: tuple[torch.dtype, ...] = ()  # supported dtypes of the op's first tensor; empty for any
+    file: str | None = None  # the op whose module has the function; None if the function has that name
+    function: str | None = None  # the function's name; None if it is the op's name
+    plain: bool = False  # whether the backend uses the reference, because it needs no kernel
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class Row:
         op: name of the op.
         backend: name of the backend.
         devices: device types on which this pair can run here and now.
-        dtypes: names of the dtypes it takes, ``("any",)`` for all, ``("plain torch",)`` where that serves, empty where
-            there is no implementation.
-        reason: why it cannot run, or cannot run on some device, in one line; empty if it can.
+        dtypes: names of the supported dtypes; ``("any",)`` for all, ``("plain torch",)`` for the reference in place of
+            a kernel, empty without an implementation.
+        reason: one line on why the pair cannot run on all devices; empty if it can.
     """
 
     op: str
@@ -72,7 +72,7 @@ class Row:
 
     @property
     def available(self) -> bool:
-        """Whether the pair runs on some device of this machine."""
+        """Returns whether the pair runs on some device of this machine."""
         return bool(self.devices)
 
 
@@ -93,11 +93,11 @@ def declare(
     reference: Implementation = Implementation(),
     runs: str | None = None,
 ) -> str:
-    """Puts the row of an op into the table, and returns its name. None: the op has no such implementation.
+    """Adds the row of an op to the table and returns the op's name. None means no such implementation.
 
-    An implementation is the function of the op's name in a module of the op's name, unless ``file`` says another:
+    By default an implementation is a function with the op's name, in a module with the op's name:
     ``voronerf.ops.<op>.reference``, ``voronerf.ops.<op>.native`` or ``voronerf.kernels.<op>``, imported on first use.
-    ``runs``: another op, whose row and implementations this one takes over.
+    ``runs`` names another op, whose row and implementations this op shares.
     """
     if runs is not None:
         reference, native, warp = (replace(_TABLE[runs, backend], function=runs) for backend in BACKENDS)
@@ -108,17 +108,17 @@ def declare(
 
 
 def ops(backend: str = "reference", device: str = "cpu") -> tuple[str, ...]:
-    """Names of the ops that a backend implements for a device, which declare themselves where voronerf is imported."""
-    return tuple(op for (op, name), found in _TABLE.items() if name == backend and device in (found.devices or ORDER))
+    """Returns the names of the ops that a backend implements for a device. Ops register on the import of voronerf."""
+    return tuple(op for (op, name), entry in _TABLE.items() if name == backend and device in (entry.devices or ORDER))
 
 
 def implemented(op: str) -> tuple[str, ...]:
-    """Backends that have an implementation of their own of an op, whether or not it can run here."""
+    """Returns the backends with a separate implementation of an op, whether or not they can run here."""
     return tuple(name for name in BACKENDS if (op, name) in _TABLE and not _TABLE[op, name].plain)
 
 
 def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
-    """Implementation of `op` for a device and dtype, with the signature of the reference function.
+    """Returns the implementation of `op` for a device and dtype, with the signature of the reference function.
 
     Works inside ``torch.compile(fullgraph=True)``: the choice is made while tracing.
 
@@ -136,33 +136,33 @@ def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) 
 
 
 def resolve_composed(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
-    """`resolve` of an op whose reference calls other ops, and takes their ``backend``.
+    """Resolves an op whose reference calls other ops and takes the ``backend`` of these ops.
 
-    With "auto" it calls them where no other implementation runs, each on the backend that "auto" gives it; and where
-    the implementation is plain, on the backend that was named.
+    The reference receives "auto" if "auto" falls back to the reference, so that each inner op makes its own choice. It
+    receives the named backend if that backend's implementation is plain.
     """
     return function(op, _choose(op, backend, device.type, device.index, dtype), backend, composed=True)
 
 
 def function(op: str, name: str, backend: str, composed: bool) -> Callable[..., Any]:
-    """The implementation that was chosen for ``backend`` by its name; ``composed``: see `resolve_composed`."""
+    """Returns the implementation ``name`` that was chosen for ``backend``; ``composed`` as in `resolve_composed`."""
     run = _FUNCTIONS[op, name]
     passed = composed and (_TABLE[op, name].plain or (name == "reference" and backend == "auto"))
     return functools.partial(run, backend=backend) if passed else run
 
 
 def folder(op: str) -> str:
-    """The folder of ``voronerf.ops`` that has an op."""
+    """Returns the name of an op's folder in ``voronerf.ops``."""
     return _TABLE[op, "reference"].file or op
 
 
 def chosen(op: str, device: torch.device, dtype: torch.dtype, *, backend: str = "auto") -> str:
-    """Name of the implementation that :func:`resolve` gives, with the same arguments and errors."""
+    """Returns the name of the implementation that :func:`resolve` returns, with the same arguments and errors."""
     return _choose(op, backend, device.type, device.index, dtype)
 
 
 def why_not(op: str, backend: str, device: torch.device, dtype: torch.dtype | None = None) -> str | None:
-    """Why a backend cannot run an op, with the remedy if there is one; None if it can.
+    """Returns why a backend cannot run an op, with the remedy if there is one; None if it can.
 
     Args:
         op: name of the op.
@@ -183,7 +183,7 @@ def why_not(op: str, backend: str, device: torch.device, dtype: torch.dtype | No
 
 
 def missing(backend: str, device: torch.device) -> str | None:
-    """Reason, with the remedy, why a backend as a whole cannot run on a device here; None if it can."""
+    """Returns why a backend cannot run any op on a device here, with the remedy; None if it can."""
     if device.type == "cuda" and not torch.cuda.is_available():
         return "torch sees no CUDA device; use device='cpu', or a CUDA build of torch on a machine with a GPU"
     if backend == "reference":
@@ -199,7 +199,7 @@ def missing(backend: str, device: torch.device) -> str | None:
 
 
 def automatic(device: torch.device) -> str:
-    """What "auto" takes on a device, and why not what it prefers: one line, such as "warp (native: no GPU code)"."""
+    """Returns the choice of "auto" on a device, and why preferred backends cannot run: "warp (native: no GPU code)"."""
     reasons: list[str] = []
     for name in ORDER[device.type]:
         reason = missing(name, device)
@@ -210,10 +210,12 @@ def automatic(device: torch.device) -> str:
 
 
 def _import(module: str) -> ModuleType:
-    """A backend's module. Run from its source folder, the package has no ``voronerf.kernels``, which lie beside it.
+    """Imports a backend's module.
+
+    A package that runs from its source folder has no ``voronerf.kernels``: the kernels' folder lies beside it.
 
     Raises:
-        BackendUnavailable: It cannot be used here.
+        BackendUnavailable: The backend cannot be used here.
     """
     try:
         return importlib.import_module(module)
@@ -224,10 +226,10 @@ def _import(module: str) -> ModuleType:
 
 
 def compiled() -> Any:
-    """The package of the compiled module, which checks calls; None where it cannot be used."""
+    """Returns the package of the compiled module, or None if it cannot be used."""
     try:
         return _compiled()
-    except ValueError:  # of what the process asks it for: a call of that backend says so
+    except ValueError:  # a bad VORONERF_ISA: a call with backend="native" reports it
         return None
 
 
@@ -241,56 +243,56 @@ def _compiled() -> Any:
 
 @functools.cache
 def _warn_once(line: str) -> None:
-    """Warns of what keeps a backend from being used, the first time in a process that it is asked for."""
+    """Warns that a backend cannot be used, once per process and message."""
     warnings.warn(line, RuntimeWarning, stacklevel=2)
 
 
-class _Kept(threading.local):
+class _ThreadOverride(threading.local):
     threads: int | None = None
 
 
-_kept = _Kept()
+_override = _ThreadOverride()
 
 
 def cpu_precision() -> str:
-    """``torch.set_float32_matmul_precision`` of the CPU: "ieee" (highest), "tf32" (high) or "bf16" (medium)."""
+    """Returns torch's float32 matmul precision on the CPU: "ieee" (highest), "tf32" (high) or "bf16" (medium)."""
     if _precision is not None:
         return str(_precision("mkldnn", "matmul"))
-    backend: Any = torch.backends.mkldnn  # whose stubs lack it
+    backend: Any = torch.backends.mkldnn  # the stubs of mkldnn lack matmul
     return str(backend.matmul.fp32_precision)
 
 
-# What the public property calls, in a fifteenth of its time.
+# The function behind the public property; it takes a fifteenth of the time.
 _precision: Callable[[str, str], str] | None = getattr(torch._C, "_get_fp32_precision_getter", None)
 
 
 def threads() -> int:
-    """Threads that share the work of an op: torch's for the calling thread, or what `torch_on_one_thread` keeps."""
-    return _kept.threads or torch.get_num_threads()
+    """Returns the number of threads of an op: torch's, or the number saved by `torch_on_one_thread` within it."""
+    return _override.threads or torch.get_num_threads()
 
 
 @contextmanager
 def torch_on_one_thread() -> Iterator[None]:
-    """Runs torch's own operators on the calling thread, while native ops keep its number of threads.
+    """Runs torch's operators on the calling thread alone; native ops keep their number of threads.
 
-    Results of native ops do not depend on that number. Those of torch do: a long sum is split among the threads, and
-    the last elements of each one's part are computed by other instructions than the rest.
+    The results of native ops do not depend on the number of threads. Torch's results do: torch splits a long sum among
+    the threads, and computes the last elements of each part with other instructions than the rest.
     """
-    before, of_torch = _kept.threads, torch.get_num_threads()
-    if of_torch == 1:
+    previous, torch_threads = _override.threads, torch.get_num_threads()
+    if torch_threads == 1:
         yield
         return
-    _kept.threads = threads()
+    _override.threads = threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(of_torch)
-        _kept.threads = before
+        torch.set_num_threads(torch_threads)
+        _override.threads = previous
 
 
 def table() -> list[Row]:
-    """Every op and backend: where it runs here, which dtypes it takes, and what is missing."""
+    """Returns a row for every op and backend: its devices here, its dtypes, and why it cannot run."""
     rows = []
     for op in ops():
         for backend in BACKENDS:
@@ -330,10 +332,10 @@ def _describe(module: str) -> dict[str, Any]:
     return {"available": True, **described}
 
 
-# torch.compile runs this while tracing and keeps the answer; the function is then found by a look-up it can trace.
+# torch.compile calls this while tracing and treats the result as constant; it can trace the look-up in _FUNCTIONS.
 @constant_result
 def _choose(op: str, backend: str, device: str, index: int | None, dtype: torch.dtype) -> str:
-    if not isinstance(backend, str):  # which a list would not let the cache look up
+    if not isinstance(backend, str):  # an unhashable backend, such as a list, cannot be a cache key
         raise ValueError(f"{op}: backend must be one of {_choices(('auto', *BACKENDS))}, got {backend!r:.60}")
     return _choose_once(op, backend, device, index, dtype)
 
@@ -347,16 +349,16 @@ def _choose_once(op: str, backend: str, device_type: str, index: int | None, dty
     device = torch.device(device_type) if index is None else torch.device(device_type, index)
     if backend == "auto":
         order = ORDER.get(device_type, ("reference",))
-        own = implemented(op)
-        backend = next(name for name in order if name in own and why_not(op, name, device, dtype) is None)
+        separate = implemented(op)
+        backend = next(name for name in order if name in separate and why_not(op, name, device, dtype) is None)
     else:
         reason = why_not(op, backend, device, dtype)
         if reason is not None:
             raise BackendUnavailable(f"{op}: backend {backend!r} is not available: {reason}")
     module = _MODULES["reference" if _TABLE[op, backend].plain else backend]
-    found = _TABLE[op, "reference" if _TABLE[op, backend].plain else backend]
-    name = found.function or op
-    _FUNCTIONS[op, backend] = getattr(importlib.import_module(module.format(found.file or name)), name)
+    implementation = _TABLE[op, "reference" if _TABLE[op, backend].plain else backend]
+    name = implementation.function or op
+    _FUNCTIONS[op, backend] = getattr(importlib.import_module(module.format(implementation.file or name)), name)
     return backend
 
 

@@ -1,12 +1,12 @@
-"""Work of a GPU that is captured once as a CUDA graph, and made again by one launch.
+"""CUDA graphs: a function's work on a GPU is captured once and replayed with one launch.
 
-The counterpart of :mod:`voronerf.ops._core.recording`, of whatever the device computes, torch's operations included.
-What the host does in Python is not made again, and the host cannot wait for the device: :attr:`Capture.obstacle` says
-where it did.
+This is the GPU's counterpart of :mod:`voronerf.ops._core.recording`. It replays everything that the device computes,
+torch's operations included. A replay runs no Python, and the function must not synchronise host and device:
+:attr:`Capture.obstacle` says where it did.
 
-What changes from run to run lies in memory, as numbers do (:func:`voronerf.ops._core.rows.varying`). That memory is of
-the run before the capture: within a capture torch hands out the same memory again and again, and each replay writes all
-that was ever there. The number of rows is that of the captured run.
+Numbers that vary from replay to replay lie in device memory (:func:`voronerf.ops._core.rows.varying`). The warm-up run
+allocates this memory: within a capture torch reuses memory, so every replay would overwrite it. The number of rows is
+fixed by the captured run.
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ T = TypeVar("T")
 
 
 class Capture:
-    """The work of a function on a GPU: :meth:`warm_up`, then :meth:`capture`, then :meth:`replay` as often as wanted.
+    """A captured function on a GPU: call :meth:`warm_up` and :meth:`capture` once, then :meth:`replay` repeatedly.
 
     Attributes:
-        obstacle: Why it cannot be captured; None if it can.
+        obstacle: The reason why the function cannot be captured; None if it can.
 
     Args:
         device: The GPU.
-        generator: Of random numbers, on it.
-        before: An earlier capture, whose memory this one goes on with; it is not replayed any more.
+        generator: The generator of random numbers on this GPU.
+        before: An earlier capture, whose memory pool this one takes over. Do not replay the earlier one again.
     """
 
     def __init__(self, device: torch.device, generator: torch.Generator, before: Capture | None = None) -> None:
-        # torch wants the stream of a pool to stay the same, and a graph of the pool to be there until the next one is.
+        # A memory pool must keep its stream, and needs a live graph until the next graph of the pool exists.
         self._stream: torch.cuda.Stream = torch.cuda.Stream(device) if before is None else before._stream
         self._pool = None if before is None else before._graph.pool()
         self._graph: torch.cuda.CUDAGraph = torch.cuda.CUDAGraph()
         self._graph.register_generator_state(generator)
         self._device = device
         self._numbers = list[tuple[Tensor, Callable[[], float]]]()
-        self._taken = 0  # of the numbers, by the capture
+        self._taken = 0  # numbers that the capture has read, in order
         self._rows: list[tuple[int, Callable[[], int]]] = []
         self.obstacle: str | None = None
 
     def warm_up(self, function: Callable[[], T]) -> T:
-        """Calls the function, which runs as ever, and looks whether the host waits for the device in it."""
-        here, mode = torch.cuda.current_stream(self._device), torch.cuda.get_sync_debug_mode()
-        self._stream.wait_stream(here)
+        """Runs the function eagerly, and notes an obstacle if the host synchronises with the device in it."""
+        current, mode = torch.cuda.current_stream(self._device), torch.cuda.get_sync_debug_mode()
+        self._stream.wait_stream(current)
         active.vary = self._make_number
-        with warnings.catch_warnings(record=True) as told, torch.cuda.stream(self._stream):
+        with warnings.catch_warnings(record=True) as caught, torch.cuda.stream(self._stream):
             warnings.simplefilter("always")
             torch.cuda.set_sync_debug_mode("warn")
             try:
@@ -61,50 +61,50 @@ class Capture:
             finally:
                 torch.cuda.set_sync_debug_mode(mode)
                 active.vary = None
-        here.wait_stream(self._stream)
-        for each in told:
-            said = str(each.message)
-            if "synchronizing CUDA operation" in said:
-                self.obstacle = f"the host waits for the device, in {Path(each.filename).name}:{each.lineno}"
-            elif "synchronizing operations" not in said:  # as torch says of this mode
-                warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+        current.wait_stream(self._stream)
+        for warning in caught:
+            text = str(warning.message)
+            if "synchronizing CUDA operation" in text:
+                self.obstacle = f"the host waits for the device, in {Path(warning.filename).name}:{warning.lineno}"
+            elif "synchronizing operations" not in text:  # except torch's warning that this mode is a prototype
+                warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
         return result
 
     def capture(self, function: Callable[[], T]) -> T:
-        """Captures the warm-up's function, which computes nothing until it is replayed; its result is the replays'."""
+        """Captures the function without running its kernels. Each replay fills the tensors of the returned result."""
         active.vary = self._take_number
         try:
-            # Other threads, such as a viewer's, may ask the device for memory meanwhile.
+            # Other threads, such as a viewer's, may allocate device memory during the capture.
             with torch.cuda.graph(self._graph, self._pool, self._stream, capture_error_mode="thread_local"):
                 return function()
         finally:
             active.vary = None
 
-    def count(self, given: Callable[[], int]) -> int:
-        """A number of rows that is known before each run; that of this one, to which replays keep."""
-        rows = given()
-        self._rows.append((rows, given))
+    def count(self, count: Callable[[], int]) -> int:
+        """Returns the number of rows of this run; a replay with another number is refused."""
+        rows = count()
+        self._rows.append((rows, count))
         return rows
 
     def _make_number(self, value: Callable[[], float]) -> Tensor:
-        """A number that changes from run to run, float32 []."""
+        """Allocates a number that varies from replay to replay, float32 []."""
         number = torch.full((), value(), dtype=torch.float32, device=self._device)
         self._numbers.append((number, value))
         return number
 
     def _take_number(self, _: Callable[[], float]) -> Tensor:
-        """The number that the warm-up has made at this place."""
+        """Returns the tensor that the warm-up allocated for the same call of ``vary``."""
         self._taken += 1
         return self._numbers[self._taken - 1][0]
 
     def replay(self, threads: int, times: int = 1) -> int:
-        """Makes the work again so many times, and gives how often: not at all where the rows are other ones.
+        """Launches the graph ``times`` times and returns ``times``, or 0 if the number of rows has changed.
 
         Args:
-            threads: As of a recording; the device has its own.
-            times: How often.
+            threads: Unused; the parameter exists for the interface of a recording.
+            times: The number of launches.
         """
-        if any(given() != rows for rows, given in self._rows):
+        if any(count() != rows for rows, count in self._rows):
             return 0
         for number, value in self._numbers:
             number.fill_(value())

@@ -1,12 +1,12 @@
 """Validators shared by every public operation.
 
-Each raises at once with a message of one form, "operation: argument must <rule>, got <what came>": ValueError for
-shapes and values, TypeError for dtypes and kinds. Only shapes, dtypes and devices are checked, and by ``check_range``
-indices on the CPU. No other element of a tensor is read, so that an operation can be traced by ``torch.compile`` and
-captured in a CUDA graph.
+A validator raises an error of one form, "operation: argument must <rule>, got <value>": ValueError for shapes and
+values, TypeError for dtypes and types. Validators check shapes, dtypes and devices; ``check_range`` also checks indices
+on the CPU. No other element of a tensor is read, so that ``torch.compile`` can trace an operation and a CUDA graph can
+capture it.
 
-Dimension letters in a rule ("n", "k+1") bind at their first use. Passing the same ``sizes`` dictionary to several
-checks makes a letter mean the same number in all of them.
+Dimension letters in a rule ("n", "k+1") are bound at their first use. If several checks share a ``sizes`` dictionary, a
+letter means the same number in all of them.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from voronerf.ops._core import backends
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INDEX = (torch.int32,)
 LIKE_FIRST: tuple[torch.dtype, ...] = ()
-"""For `Checked`: the dtype of the first floating-point tensor."""
+"""A placeholder for `Checked`: the dtype of the first floating-point tensor."""
 MAX_COUNT = 2**31 - 1
-"""Rows of one call: index tensors are int32."""
+"""The largest number of rows in one call, because index tensors are int32."""
 MAX_GROUPS = 2**27
-"""Cells or rays that offsets speak of."""
+"""The largest number of cells or rays in an offsets tensor."""
 
 
 def check_tensor(op: str, name: str, value: object) -> None:
-    """Raises TypeError unless ``value`` is a tensor whose elements lie at strides: not sparse, nested or quantized."""
+    """Raises TypeError unless ``value`` is a dense, strided tensor: not sparse, nested or quantized."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{op}: {name} must be a tensor, got {type(value).__name__}")
     if value.layout is not torch.strided or value.is_nested or value.is_quantized:
@@ -44,8 +44,8 @@ def check_tensor(op: str, name: str, value: object) -> None:
         raise TypeError(f"{op}: {name} must be a dense tensor, got a {kind.removeprefix('torch.')} one")
 
 
-def of_one_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
-    """What is compared, in one type for all backends: float64 where either is, float32 otherwise."""
+def to_common_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns both tensors, detached, in one dtype for all backends: float64 if either is float64, else float32."""
     if points.dtype is centres.dtype is torch.float32 and not (points.requires_grad or centres.requires_grad):
         return points, centres
     dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
@@ -58,44 +58,44 @@ def check_shape(
     """Checks a tensor against a shape such as ``("n", 3)`` or ``("k+1",)``.
 
     Args:
-        op: operation named in the error.
-        name: argument named in the error.
-        tensor: what to check; anything but a tensor is a TypeError.
-        shape: a number, a letter, or a letter plus one, for every dimension.
-        sizes: what the letters are bound to so far; letters met for the first time are added.
+        op: the operation's name, for the error.
+        name: the argument's name, for the error.
+        tensor: the tensor to check.
+        shape: for every dimension a number, a letter, or a letter plus one.
+        sizes: the numbers that letters are bound to; unbound letters are added.
 
     Raises:
-        TypeError: not a tensor.
-        ValueError: another shape, or more rows than an int32 can number.
+        TypeError: ``tensor`` is not a tensor.
+        ValueError: ``tensor`` has another shape, or more rows than an int32 can number.
     """
     check_tensor(op, name, tensor)
-    known = {} if sizes is None else sizes
-    before, came = len(known), tensor.shape
-    fits = len(came) == len(shape)
+    bound = {} if sizes is None else sizes
+    bound_before, actual = len(bound), tensor.shape
+    fits = len(actual) == len(shape)
     if fits:
-        # Each size is read once: a small network takes no longer than a few dozen checks.
-        for entry, size in zip(shape, came):
+        # Each size is read once: a few dozen checks take as long as a small network.
+        for entry, size in zip(shape, actual):
             if isinstance(entry, int):
                 fits = size == entry
-            elif entry in known:
-                fits = size == known[entry]
+            elif entry in bound:
+                fits = size == bound[entry]
             elif entry[-2:] == "+1":
-                fits = size >= 1 and size - 1 == known.setdefault(entry[:-2], size - 1)
+                fits = size >= 1 and size - 1 == bound.setdefault(entry[:-2], size - 1)
                 if size > MAX_GROUPS + 1:
                     raise ValueError(f"{op}: {name} must have at most {MAX_GROUPS + 1} entries, got {size}")
             else:
-                known[entry] = size
+                bound[entry] = size
             if not fits:
                 break
     if not fits:
-        # Only in case of an error, because torch.compile cannot turn a symbolic size into text.
-        wanted = [str(entry) for entry in shape]
-        letters = dict.fromkeys(entry.removesuffix("+1") for entry in wanted)
-        values = ", ".join(f"{letter} = {known[letter]}" for letter in letters if letter in list(known)[:before])
-        rule = f"[{', '.join(wanted)}]" + (f" with {values}" if values else "")
+        # The text is built after a failed check alone, because torch.compile cannot format a symbolic size.
+        entries = [str(entry) for entry in shape]
+        letters = dict.fromkeys(entry.removesuffix("+1") for entry in entries)
+        values = ", ".join(f"{letter} = {bound[letter]}" for letter in letters if letter in list(bound)[:bound_before])
+        rule = f"[{', '.join(entries)}]" + (f" with {values}" if values else "")
         raise ValueError(f"{op}: {name} must have shape {rule}, got {list(tensor.shape)}")
-    if came and came[0] > MAX_COUNT:
-        check_count(op, name, came[0])
+    if actual and actual[0] > MAX_COUNT:
+        check_count(op, name, actual[0])
 
 
 def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype] = FLOATING) -> None:
@@ -108,7 +108,7 @@ def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype
 
 
 def check_same_dtype(op: str, **tensors: Tensor | None) -> None:
-    """Raises TypeError unless all named tensors (None is passed over) share the dtype of the first."""
+    """Raises TypeError unless all named tensors share the dtype of the first; None is skipped."""
     first: tuple[str, torch.dtype] | None = None
     for name, tensor in tensors.items():
         if tensor is None:
@@ -122,7 +122,7 @@ def check_same_dtype(op: str, **tensors: Tensor | None) -> None:
 
 
 def check_same_device(op: str, **tensors: Tensor | None) -> None:
-    """Raises ValueError unless all named tensors (None is passed over) are on the device of the first."""
+    """Raises ValueError unless all named tensors are on the device of the first; None is skipped."""
     first: tuple[str, torch.device] | None = None
     for name, tensor in tensors.items():
         if tensor is None:
@@ -137,11 +137,11 @@ class Checked:
     """The tensors of one call, checked one after another.
 
     Args:
-        op: operation named in errors.
+        op: the operation's name, for errors.
 
     Attributes:
-        sizes: what the letters of the shapes stand for.
-        tensors: those that are there, by name.
+        sizes: the numbers that the letters of the shapes are bound to.
+        tensors: the checked tensors, by name.
     """
 
     def __init__(self, op: str) -> None:
@@ -152,17 +152,17 @@ class Checked:
         self._float: tuple[str, Tensor] | None = None
 
     def tensor(self, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype], *shape: int | str) -> None:
-        """Checks shape, dtype, that it is on the device of the first tensor, and that an int32 can number its rows.
+        """Checks a tensor's shape and dtype, its device (the first tensor's), and that an int32 can number its rows.
 
         Args:
-            name: of the argument.
-            tensor: its value; anything but a tensor is a TypeError.
-            dtypes: what it may have; `LIKE_FIRST` for that of the first floating-point tensor.
-            shape: as in `check_shape`.
+            name: the argument's name.
+            tensor: the argument's value.
+            dtypes: the allowed dtypes; `LIKE_FIRST` for the dtype of the first floating-point tensor.
+            shape: the shape's entries, see `check_shape`.
 
         Raises:
-            TypeError: not a tensor, another dtype.
-            ValueError: another shape or device, too many rows.
+            TypeError: ``tensor`` is not a tensor, or has another dtype.
+            ValueError: ``tensor`` has another shape or device, or too many rows.
         """
         check_shape(self.op, name, tensor, shape, self.sizes)
         dtype = tensor.dtype
@@ -180,12 +180,12 @@ class Checked:
         self.tensors[name] = tensor
 
     def first_float(self) -> Tensor:
-        """The first floating-point tensor."""
+        """Returns the first floating-point tensor."""
         assert self._float is not None
         return self._float[1]
 
     def no_inference(self) -> None:
-        """`check_no_inference` of all tensors."""
+        """Runs `check_no_inference` on all tensors."""
         if torch.is_grad_enabled() and not torch.compiler.is_compiling():
             for tensor in self.tensors.values():
                 if tensor.is_inference():
@@ -193,14 +193,14 @@ class Checked:
 
 
 class Row(NamedTuple):
-    """The rule of a tensor, as `Checked.tensor` has it.
+    """The rule of a tensor: the arguments of `Checked.tensor`.
 
     Attributes:
-        name: in errors.
-        dtypes: that it may have.
-        shape: of numbers and letters; "1|k" is 1 or the letter.
-        like: the tensor whose dtype it must have, where an error is to name that.
-        empty: what an error says where the letter of its rows is 0; without it that may be.
+        name: the tensor's name, for errors.
+        dtypes: the allowed dtypes.
+        shape: the numbers and letters of the shape; "1|k" is 1 or the letter.
+        like: the name of the tensor whose dtype this one must have, if the error should name that tensor.
+        empty: the error's rule if the tensor has no rows; "" if it may be empty.
     """
 
     name: str
@@ -211,7 +211,7 @@ class Row(NamedTuple):
 
 
 class Default(NamedTuple):
-    """The number of a letter that no tensor before has bound."""
+    """The number of a letter, unless an earlier tensor has bound it."""
 
     letter: str
     number: int
@@ -219,42 +219,42 @@ class Default(NamedTuple):
 
 Rows = Sequence[Row | Default]
 Others = tuple[Sequence[Row], Sequence[Any]]
-"""Rows, and as many tensors."""
+"""Additional rows, and one tensor for each row."""
 
 
 def check_rows(
-    op: str, make: Callable[..., Rows], tensors: list[Any], *given: Any, smooth: bool = True
+    op: str, make: Callable[..., Rows], tensors: list[Any], *arguments: Any, smooth: bool = True
 ) -> dict[str, int]:
-    """Checks tensors by the rows of a table: those of a network, which tells how many there are.
+    """Checks tensors against a table of rows, whose length depends on the network.
 
-    The compiled module reads the rows once, and checks all later tensors of the network by itself. Where one breaks a
-    rule, Python says which.
+    The compiled module reads the rows once and then checks all tensors of the network. If a tensor breaks a rule,
+    Python repeats the check and raises the error.
 
     Args:
-        op: operation named in errors.
-        make: gives the rows of the tensors.
-        tensors: one for each row.
-        given: the arguments of ``make``, which are hashed.
-        smooth: whether autograd keeps the tensors, which it cannot of inference tensors.
+        op: the operation's name, for errors.
+        make: the function that returns the rows.
+        tensors: one tensor for each row.
+        arguments: the arguments of ``make``; they must be hashable.
+        smooth: whether autograd saves the tensors; inference tensors are then refused.
 
     Returns:
-        What the letters stand for; 0 for one that no tensor has bound.
+        The number of each letter; 0 for an unbound letter.
 
     Raises:
-        TypeError: not a tensor, another dtype.
-        ValueError: another shape or device, too many rows.
+        TypeError: an argument is not a tensor, or has another dtype.
+        ValueError: a tensor has another shape or device, or too many rows.
     """
     if not torch.compiler.is_dynamo_compiling():
-        letters, compiled = _compiled(make, *given)
-        found = compiled(tensors)
-        if found is not None:
-            return dict(zip(letters, found))
-    checked, by_name, there, rows = Checked(op), {}, iter(tensors), make(*given)
+        letters, compiled = _compiled(make, *arguments)
+        numbers = compiled(tensors)
+        if numbers is not None:
+            return dict(zip(letters, numbers))
+    checked, by_name, remaining, rows = Checked(op), {}, iter(tensors), make(*arguments)
     for row in rows:
         if isinstance(row, Default):
             checked.sizes.setdefault(row.letter, row.number)
             continue
-        tensor = by_name[row.name] = next(there)
+        tensor = by_name[row.name] = next(remaining)
         shape = row.shape
         if shape and isinstance(shape[0], str) and shape[0].startswith("1|"):
             check_tensor(op, row.name, tensor)
@@ -271,26 +271,30 @@ def check_rows(
 
 
 @functools.lru_cache(maxsize=4096)
-def _compiled(make: Callable[..., Rows], *given: Any) -> tuple[list[str], Callable[[list[Any]], Any]]:
-    """The letters of rows, and what checks tensors by them in the compiled module, or gives None."""
-    rows = make(*given)
+def _compiled(make: Callable[..., Rows], *arguments: Any) -> tuple[list[str], Callable[[list[Any]], Any]]:
+    """Returns the letters of the rows, and a compiled check: tensors -> the letters' numbers, or None if it fails."""
+    rows = make(*arguments)
     letters = _letters(rows)
     native = backends.compiled()
     if native is None:
         return letters, lambda tensors: None
-    told: list[Any] = []
+    rules: list[Any] = []
     for row in rows:
-        told.append(
+        rules.append(
             row
             if isinstance(row, Default)
             else ([_short(dtype) for dtype in row.dtypes], "filled" if row.empty else "", row.shape, None)
         )
-    return letters, native.Rules([tuple(row) for row in told], letters)
+    return letters, native.Rules([tuple(row) for row in rules], letters)
 
 
 def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool:
-    """Whether tensors at one place of several lists have one shape, all are float32 and on one device, those of lists
-    that are written lie in order, and scalars are tensors [] like them. False also where only Python can tell."""
+    """Returns whether several lists of tensors match, so that the compiled module can work on them.
+
+    The tensors at one index of the lists must have one shape. All tensors, and ``scalars`` of shape [], must be float32
+    and on one device, and tensors of the ``written`` lists must be contiguous. The result is also False where only
+    Python can tell.
+    """
     native = None if torch.compiler.is_dynamo_compiling() else backends.compiled()
     return native is not None and native.alike(lists, written, scalars)
 
@@ -302,24 +306,23 @@ def _letters(rows: Rows) -> list[str]:
 
 
 def check_writable(op: str, name: str, tensor: Tensor) -> None:
-    """Raises ValueError unless memory holds a tensor's values in order and as they are, so that an op can write there.
+    """Raises ValueError unless an op can write into a tensor's memory: a contiguous tensor without the negative bit.
 
-    The negative bit, of ``x.conj().imag``, says that memory holds them negated.
+    The memory of a tensor with the negative bit, such as ``x.conj().imag``, holds negated values.
     """
     if not tensor.is_contiguous():
         raise ValueError(f"{op}: {name} must be contiguous, got strides {tensor.stride()}")
-    if not torch.compiler.is_compiling() and tensor.is_neg():  # which cannot be traced
+    if not torch.compiler.is_compiling() and tensor.is_neg():  # is_neg cannot be traced
         raise ValueError(f"{op}: {name} must be a tensor of its own (clone), got a negative view")
 
 
 def check_no_inference(op: str, **tensors: Tensor | None) -> None:
-    """Raises TypeError where gradients are recorded and a named tensor was made in ``torch.inference_mode``, which
-    autograd cannot keep."""
+    """Raises TypeError if autograd records and a named tensor is an inference tensor, which autograd cannot save."""
     if not torch.is_grad_enabled() or torch.compiler.is_compiling():
         return
-    there = [(name, tensor) for name, tensor in tensors.items() if tensor is not None]
-    if any(tensor.requires_grad for _, tensor in there):
-        for name, tensor in there:
+    present = [(name, tensor) for name, tensor in tensors.items() if tensor is not None]
+    if any(tensor.requires_grad for _, tensor in present):
+        for name, tensor in present:
             if tensor.is_inference():
                 raise TypeError(f"{op}: {name} must be a copy where gradients are recorded, got an inference tensor")
 
@@ -331,9 +334,10 @@ def check_count(op: str, name: str, count: int) -> None:
 
 
 def check_range(op: str, name: str, index: Tensor, count: int) -> None:
-    """Raises ValueError for an index on the CPU that is not 0 to ``count - 1``.
+    """Raises ValueError for an index on the CPU outside 0 to ``count - 1``.
 
-    Elsewhere the values are not read, since that would wait for the device, nor while ``torch.compile`` traces.
+    Indices on a GPU are not checked, since reading them would synchronise, nor are indices while ``torch.compile``
+    traces.
     """
     if index.device.type != "cpu" or index.numel() == 0 or torch.compiler.is_compiling():
         return
@@ -353,7 +357,7 @@ def check_integer(op: str, name: str, value: int, minimum: int, maximum: int = M
 
 
 def check_number(op: str, name: str, value: float) -> None:
-    """Raises TypeError unless ``value`` is a number, ValueError for an integer beyond those of floating point."""
+    """Raises TypeError unless ``value`` is a number, ValueError for an integer that overflows a float."""
     if isinstance(value, bool) or not isinstance(value, (int, float, torch.SymFloat, torch.SymInt)):
         raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}")
     if isinstance(value, int) and abs(value) > sys.float_info.max:
@@ -361,14 +365,14 @@ def check_number(op: str, name: str, value: float) -> None:
 
 
 def check_positive(op: str, name: str, value: float) -> None:
-    """`check_number`, and ValueError unless it is above 0."""
+    """Runs `check_number`, and raises ValueError unless ``value`` is above 0."""
     check_number(op, name, value)
     if not value > 0:
         raise ValueError(f"{op}: {name} must be positive, got {value}")
 
 
 def check_interval(op: str, name: str, value: float, low: float, high: float, rule: str) -> None:
-    """`check_number`, and ValueError outside of an interval that ``rule`` writes, "[0, 1)" or "0 to 1"."""
+    """Runs `check_number`, and raises ValueError outside the interval ``rule``, "[0, 1)" or "0 to 1"."""
     check_number(op, name, value)
     if not (low <= value < high or (value == high and not rule.endswith(")"))):
         raise ValueError(f"{op}: {name} must lie in {rule}, got {value}")
@@ -398,28 +402,28 @@ def _short(dtype: torch.dtype) -> str:
 
 
 def physical_memory() -> int:
-    """Bytes of memory of this machine, or fewer where the process may have no more (``ulimit -v``).
+    """Returns the bytes of this machine's memory, or the process's limit (``ulimit -v``) if it is lower.
 
-    On Windows, where Python does not know, it is the largest number, so that nothing is refused for its size.
+    On Windows, where Python cannot tell, it returns ``sys.maxsize``, so that no size is refused.
     """
     if not hasattr(os, "sysconf"):
         return sys.maxsize
-    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    installed = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         import resource
     except ImportError:  # not on POSIX
-        return there
+        return installed
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return there if limit == resource.RLIM_INFINITY else min(there, limit)
+    return installed if limit == resource.RLIM_INFINITY else min(installed, limit)
 
 
 def available_memory() -> int:
-    """Bytes of memory that this process can still take: what is free, or the rest of its container's limit."""
+    """Returns the bytes that this process can still allocate: the free memory, or the rest of its container's limit."""
     free = physical_memory()
     with contextlib.suppress(OSError, ValueError):
-        found = re.search(r"^MemAvailable: +(\d+) kB$", Path("/proc/meminfo").read_text(), re.MULTILINE)
-        free = int(found[1]) * 1024 if found else free
+        match = re.search(r"^MemAvailable: +(\d+) kB$", Path("/proc/meminfo").read_text(), re.MULTILINE)
+        free = int(match[1]) * 1024 if match else free
     with contextlib.suppress(OSError, ValueError):
-        group = Path("/sys/fs/cgroup")  # version 2, as a container sees its own; its limit may be the word max
+        group = Path("/sys/fs/cgroup")  # cgroup v2, as seen from inside a container; memory.max may be "max"
         free = min(free, int((group / "memory.max").read_text()) - int((group / "memory.current").read_text()))
     return max(free, 0)

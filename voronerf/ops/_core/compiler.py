@@ -1,6 +1,6 @@
-"""Marks for ``torch.compile`` that do not import it.
+"""Decorators for ``torch.compile`` that do not import the compiler.
 
-The decorators of ``torch.compiler`` import the whole compiler of torch, which takes as long as importing torch.
+The decorators of ``torch.compiler`` import torch's whole compiler, which takes as long as importing torch.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ R = TypeVar("R")
 
 
 def constant_result(function: Callable[P, R]) -> Callable[P, R]:
-    """``torch.compiler.assume_constant_result``: the compiler runs the function while tracing and keeps its result."""
-    function._dynamo_marked_constant = True  # type: ignore[attr-defined]  # all that torch's own decorator does
+    """Marks a function as ``torch.compiler.assume_constant_result`` does: its result is a constant of the graph."""
+    function._dynamo_marked_constant = True  # type: ignore[attr-defined]  # torch's decorator does the same
     return function
 
 
 def not_compiled(function: Callable[P, R], reason: str) -> Callable[P, R]:
-    """``torch.compiler.disable``, applied at the first call: the compiler runs the function as it is.
+    """Applies ``torch.compiler.disable`` at the first call, so that the compiler does not trace the function.
 
     Args:
-        function: Any that is called in this way only where torch's compiler has been imported.
-        reason: What the compiler says where a graph must not break.
+        function: The function to exclude. Its first call imports torch's compiler.
+        reason: The reason in the compiler's error if graph breaks are forbidden.
     """
 
     @functools.wraps(function)
@@ -38,5 +38,5 @@ def not_compiled(function: Callable[P, R], reason: str) -> Callable[P, R]:
         result: R = disabled(*args, **kwargs)
         return result
 
-    run._torchdynamo_disable, run._torchdynamo_disable_msg = True, reason  # type: ignore[attr-defined]  # what it reads
+    run._torchdynamo_disable, run._torchdynamo_disable_msg = True, reason  # type: ignore[attr-defined]  # for dynamo
     return run

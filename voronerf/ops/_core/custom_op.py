@@ -1,5 +1,5 @@
-"""The custom op of an implementation: its schema, its fake and its gradients from one declaration, and its direct call
-where nothing listens."""
+"""The custom op of an implementation: one declaration gives its schema, its fake and its gradients. Calls bypass the
+dispatcher where nothing observes it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch.autograd import forward_ad
 
 from voronerf.ops._core.active import active
 
-# torch has no public names for these questions; without an answer the custom op is called.
+# torch has no public names for these functions; without one of them the custom op is always called.
 LISTENERS = [
     getattr(torch._C, "_len_torch_function_stack", lambda: True),
     getattr(torch._C, "_len_torch_dispatch_stack", lambda: True),
@@ -27,28 +27,28 @@ _is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
 
 
 def is_watched() -> bool:
-    """Whether modes, transforms, tracers or profilers of torch are to see what is called."""
-    for listens in LISTENERS:  # noqa: SIM110  # a generator takes twice the time
+    """Returns whether modes, transforms, tracers or profilers of torch observe calls."""
+    for listens in LISTENERS:  # noqa: SIM110  # any() with a generator takes twice the time
         if listens():
             return True
     return False
 
 
 def custom_op(name: str, memory: Callable[[Any], Any], **options: Any) -> Callable[[Callable[..., Any]], Op]:
-    """Makes a function that fills memory with its results the custom op ``voronerf::name``, with the options of `Op`.
+    """Makes a function the custom op ``voronerf::name``, with the options of `Op`. The function fills allocated memory.
 
     ::
 
-        class Given(NamedTuple):
+        class Arguments(NamedTuple):
             points: Tensor
             centres: Tensor
 
-        def memory(given: Given) -> Tensor:
-            return given.points.new_empty(given.points.shape[0], dtype=torch.int32)
+        def memory(arguments: Arguments) -> Tensor:
+            return arguments.points.new_empty(arguments.points.shape[0], dtype=torch.int32)
 
         @custom_op("nearest_centre", memory)
-        def nearest_centre(given: Given, found: Tensor) -> None:
-            native.compiled.nearest_centre(*given, found, ...)
+        def nearest_centre(arguments: Arguments, cells: Tensor) -> None:
+            native.compiled.nearest_centre(*arguments, cells, ...)
 
         cells = nearest_centre(points, centres)
     """
@@ -56,84 +56,87 @@ def custom_op(name: str, memory: Callable[[Any], Any], **options: Any) -> Callab
 
 
 class _Fields:
-    """The arguments of an op, of which some are named tuples, and those of its custom op, which knows none.
+    """The conversion between an op's arguments, some of them named tuples, and the flat arguments of its custom op.
 
     Attributes:
-        hints: the types of those of the custom op, by name.
-        nested: whether any is a named tuple.
+        hints: the types of the custom op's arguments, by name.
+        nested: whether any argument of the op is a named tuple.
     """
 
     def __init__(self, kind: Any) -> None:
         self.hints: dict[str, Any] = {}
-        self._kinds: list[Any] = []  # of each argument the named tuple, or None
+        self._kinds: list[Any] = []  # each argument's class of named tuple, or None
         self._optional: list[bool] = []
         for name, hint in typing.get_type_hints(kind).items():
-            tuples = [each for each in (hint, *typing.get_args(hint)) if hasattr(each, "_fields")]
-            own = typing.get_type_hints(tuples[0]) if tuples else {name: hint}
+            tuples = [member for member in (hint, *typing.get_args(hint)) if hasattr(member, "_fields")]
+            fields = typing.get_type_hints(tuples[0]) if tuples else {name: hint}
             optional = bool(tuples) and hint is not tuples[0]
-            self.hints |= {key: each | None for key, each in own.items()} if optional else own
+            self.hints |= {key: member | None for key, member in fields.items()} if optional else fields
             self._kinds.append(tuples[0] if tuples else None)
             self._optional.append(optional)
         self.nested = any(kind is not None for kind in self._kinds)
 
     def packed(self, flat: Sequence[Any]) -> Sequence[Any]:
-        """The arguments of the op."""
+        """Returns the arguments of the op."""
         if not self.nested:
             return flat
-        found, at = [], 0
+        arguments, start = [], 0
         for kind, optional in zip(self._kinds, self._optional):
-            end = at + (1 if kind is None else len(kind._fields))
-            missing = kind is None or (optional and flat[at] is None)
-            found.append(flat[at] if missing else kind._make(flat[at:end]))
-            at = end
-        return found
+            end = start + (1 if kind is None else len(kind._fields))
+            missing = kind is None or (optional and flat[start] is None)
+            arguments.append(flat[start] if missing else kind._make(flat[start:end]))
+            start = end
+        return arguments
 
     def flat(self, packed: Sequence[Any]) -> Sequence[Any]:
-        """Those of the custom op."""
+        """Returns the arguments of the custom op."""
         if not self.nested:
             return packed
-        found: list[Any] = []
-        for kind, given in zip(self._kinds, packed):
+        flat: list[Any] = []
+        for kind, value in zip(self._kinds, packed):
             if kind is None:
-                found.append(given)
+                flat.append(value)
             else:
-                found.extend((None,) * len(kind._fields) if given is None else given)  # torch 2.11 traces no +=
-        return found
+                flat.extend((None,) * len(kind._fields) if value is None else value)  # torch 2.11 cannot trace +=
+        return flat
 
 
 class Op:
-    """A custom op, which is called past PyTorch's dispatcher where nothing there would see the call.
+    """A custom op whose calls bypass PyTorch's dispatcher where nothing observes it.
 
-    The dispatcher and the autograd of ``torch.library`` take some 130 us for a forward and a backward pass, as long as
-    a layer of width 64 takes for a thousand samples, and more for lists of tensors. Modes, transforms, tracers and
-    profilers are given the custom op. The compiled functions check dtypes and make their inputs contiguous
+    The dispatcher and the autograd of ``torch.library`` take some 130 us for a forward and a backward pass, and more
+    for lists of tensors. A layer of width 64 takes as long for a thousand samples. Modes, transforms, tracers and
+    profilers see the custom op. The compiled functions check dtypes and make their inputs contiguous
     (csrc/bindings/load.h).
 
     Args:
-        name: of the op.
-        memory: gives memory for the results, of shapes alone, which is also the op's fake, with which torch traces. By
-            its annotations the arguments are a named tuple, some of whose members may be named tuples, which the custom
-            op takes apart. An optional one begins with what is never None.
-        fill: fills it.
-        devices: device types that it runs on.
-        mutates: the arguments that it writes into.
-        counted: whether only the kernels know how many rows there are: ``fill`` then gets the arguments alone, and
-            makes its results, and ``memory`` is nothing but the fake.
+        name: the name of the op.
+        memory: the function that allocates the results from shapes alone; it is also the op's fake, with which torch
+            traces. Its annotation says that the arguments are a named tuple. Members may be named tuples, which the
+            custom op flattens. The first field of an optional named tuple is never None.
+        fill: the function that writes the results into the allocated memory.
+        devices: the device types that the op runs on.
+        mutates: the arguments that the op writes into.
+        counted: whether only the kernels know the number of rows: ``fill`` then takes the arguments alone and returns
+            the results, and ``memory`` is only the fake.
 
     Attributes:
-        tensors: places of the arguments of the custom op that are tensors, or None.
-        plan: how the compiled module calls it by itself (`Declaration.compiled_op`); None where it does not.
-        at_once: gives the results where no gradients are recorded, or None where this class has to look at the call.
-        learning: gives them, with a node of autograd of its own, for plain tensors of the CPU with gradients; None
-            where this class makes the node.
+        tensors: the indices of the custom op's arguments that are tensors or None.
+        plan: the description with which the compiled module makes the call (`Declaration.compiled_op`), or None.
+        without_gradients: a function that returns the results if no gradients are recorded, or None if this class must
+            decide on the call.
+        with_gradients: a function that returns the results, with an autograd node, for plain CPU tensors with
+            gradients; None if this class makes the node.
     """
 
     plan: Any = None
-    at_once: Callable[..., Any] | None = None
-    learning: Callable[..., Any] | None = None
+    without_gradients: Callable[..., Any] | None = None
+    with_gradients: Callable[..., Any] | None = None
     way: Callable[[tuple[Any, ...]], int] = staticmethod(lambda flat: 2)
-    """The compiled module's answer, once that is there (csrc/bindings/signature.cpp): 0 for plain tensors of the CPU
-    past the dispatcher, 1 for those with gradients, 2 where only what follows in Python knows."""
+    """The compiled module's classification of a call, once the module is loaded (csrc/bindings/signature.cpp).
+
+    0: plain CPU tensors without gradients. 1: plain CPU tensors with gradients. 2: undecided; Python checks further.
+    """
 
     def __init__(
         self,
@@ -158,12 +161,12 @@ class Op:
         self.set_up: Any = None
 
         def run(arguments: Sequence[Any]) -> Any:
-            given = new(kind, arguments)
+            packed_arguments = new(kind, arguments)
             if counted:
-                return fill(given)
-            found = memory(given)
-            fill(given, found)
-            return found
+                return fill(packed_arguments)
+            results = memory(packed_arguments)
+            fill(packed_arguments, results)
+            return results
 
         self._run, self._nested, self._flat, packed = run, self._fields.nested, self._fields.flat, self._fields.packed
 
@@ -179,12 +182,12 @@ class Op:
         self.__module__, self.__name__, self.__doc__ = fill.__module__, fill.__name__, fill.__doc__
 
     def __call__(self, *arguments: Any) -> Any:
-        """What the op gives."""
+        """Calls the op and returns its results."""
         traced = torch.compiler.is_dynamo_compiling()
-        if self.at_once is not None and not traced and not torch.is_grad_enabled():
-            found = self.at_once(*arguments)
-            if found is not None:
-                return found
+        if self.without_gradients is not None and not traced and not torch.is_grad_enabled():
+            results = self.without_gradients(*arguments)
+            if results is not None:
+                return results
         flat = self._flat(arguments) if self._nested else arguments
         if traced:
             return self._op(*flat)
@@ -192,7 +195,7 @@ class Op:
         if way == 0:
             return self._run(arguments)
         if way == 1 and self._backward is not None:
-            return self._learning(flat, arguments) if self.learning is None else self.learning(*arguments)
+            return self._with_node(flat, arguments) if self.with_gradients is None else self.with_gradients(*arguments)
         if forward_ad._current_level >= 0:
             self._refuse_tangents(flat)
         if active.recording is None and is_watched():
@@ -200,59 +203,59 @@ class Op:
         tensors = [flat[place] for place in self.tensors if flat[place] is not None]
         for place in self._lists:
             tensors += flat[place]
-        learns = False
+        needs_gradients = False
         for tensor in tensors:
-            here = tensor.is_cpu or (tensor.is_cuda and self._on_cuda)
-            if not here or type(tensor) not in _PLAIN:  # fake tensors of other tracers among them
+            supported = tensor.is_cpu or (tensor.is_cuda and self._on_cuda)
+            if not supported or type(tensor) not in _PLAIN:  # also fake tensors of other tracers
                 return self._op(*flat)
-            learns = learns or tensor.requires_grad
-        if not (learns and torch.is_grad_enabled()):
+            needs_gradients = needs_gradients or tensor.requires_grad
+        if not (needs_gradients and torch.is_grad_enabled()):
             return self._run(arguments)
         if self._backward is None or active.recording is not None:
             return self._op(*flat)
-        if any(map(_is_wrapped, tensors)):  # by a transform that has ended, such as the arguments that vjp keeps
+        if any(map(_is_wrapped, tensors)):  # wrapped by a transform that has ended, such as the saved arguments of vjp
             return self._transformed(flat)
-        return self._learning(flat, arguments)
+        return self._with_node(flat, arguments)
 
-    def _learning(self, flat: Sequence[Any], arguments: Sequence[Any]) -> Any:
-        """The op with its node of autograd."""
+    def _with_node(self, flat: Sequence[Any], arguments: Sequence[Any]) -> Any:
+        """Calls the op with its autograd node."""
         entries = self._tensors_of(flat) if self._lists else flat
-        return self._given(_apply_directly(*entries, None, self, arguments))
+        return self._as_declared(_apply_directly(*entries, None, self, arguments))
 
     def _tensors_of(self, flat: Sequence[Any]) -> list[Any]:
-        """The entries of lists among the arguments of the custom op, and its tensors, or what is in their places."""
-        found: list[Any] = []
+        """Returns the entries of the custom op's lists, then its arguments that are tensors or None."""
+        entries: list[Any] = []
         for place in self._lists:
-            found += flat[place]
-        found += [flat[place] for place in self.tensors]
-        return found
+            entries += flat[place]
+        entries += [flat[place] for place in self.tensors]
+        return entries
 
     def _transformed(self, flat: Sequence[Any]) -> Any:
-        """The op for ``torch.func``, which does not differentiate custom ops."""
+        """Calls the op under ``torch.func``, which does not differentiate custom ops."""
         if self._backward is None:
             return self._op(*flat)
         entries, lengths = _flattened(flat)
-        return self._given(_Differentiable.apply(*entries, lengths, self, None))
+        return self._as_declared(_Differentiable.apply(*entries, lengths, self, None))
 
-    def _given(self, results: Any) -> Any:
-        return list(results) if self._listed else results  # autograd.Function knows no lists
+    def _as_declared(self, results: Any) -> Any:
+        return list(results) if self._listed else results  # autograd.Function returns no lists
 
     def refuse_batches(self, of_results: Sequence[Any]) -> None:
-        """Raises NotImplementedError for gradients of several results at once."""
+        """Raises NotImplementedError for batched gradients."""
         for gradient in of_results:
             if gradient is not None and torch._C._functorch.is_legacy_batchedtensor(gradient):
                 raise self.no_batches
 
     @property
     def no_batches(self) -> NotImplementedError:
-        """The error of batches of gradients."""
+        """The error for batched gradients."""
         return NotImplementedError(
             f"{self._name.removesuffix('_native')}: torch.func.vmap, jacrev, hessian, is_grads_batched=True and "
             "vectorize=True are not supported; ask torch.autograd.grad for one gradient at a time"
         )
 
     def _refuse_tangents(self, flat: Sequence[Any]) -> None:
-        """Raises NotImplementedError for tensors with a tangent, which would be lost."""
+        """Raises NotImplementedError for tensors with a forward-mode tangent, which would be lost."""
         for tensor in _flattened(flat)[0]:
             if isinstance(tensor, Tensor) and forward_ad.unpack_dual(tensor).tangent is not None:
                 raise NotImplementedError(
@@ -261,34 +264,34 @@ class Op:
                 )
 
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
-        """The op's backward, as of ``torch.library.custom_op``; inputs and gradients are packed like the arguments."""
+        """Registers the backward, as ``torch.library`` does; inputs and gradients have the arguments' structure."""
         packed, self._backward, self.set_up = self._fields.packed, backward, setup_context
         self._op.register_autograd(
             self.gradients, setup_context=lambda ctx, inputs, output: setup_context(ctx, packed(inputs), output)
         )
 
     def gradients(self, ctx: Any, *of_results: Any) -> tuple[Any, ...]:
-        """The gradients to the arguments of the custom op."""
+        """Returns the gradients of the custom op's arguments."""
         assert self._backward is not None
-        found = self._backward(ctx, *of_results)
-        return tuple(self._fields.flat(found if isinstance(found, tuple) else (found,)))
+        gradients = self._backward(ctx, *of_results)
+        return tuple(self._fields.flat(gradients if isinstance(gradients, tuple) else (gradients,)))
 
     def results(self, arguments: Sequence[Any]) -> Any:
-        """What is computed, as ``torch.autograd.Function`` knows it."""
-        found = self._run(arguments)
-        return tuple(found) if self._listed else found
+        """Returns the results in the form of ``torch.autograd.Function``: a tensor or a tuple."""
+        results = self._run(arguments)
+        return tuple(results) if self._listed else results
 
     def arguments(self, entries: Sequence[Any], lengths: Sequence[int]) -> Sequence[Any]:
-        """The arguments of the op, from those of the custom op with lists taken apart."""
+        """Returns the arguments of the op from the custom op's arguments with flattened lists."""
         return self._fields.packed(_nested(entries, lengths))
 
 
 class _Differentiable(torch.autograd.Function):
-    """An op with gradients, as PyTorch's autograd and ``torch.func`` take it.
+    """An op with gradients for PyTorch's autograd and ``torch.func``.
 
-    Its arguments are those of the custom op, lists of tensors taken apart; the lengths of these lists; the op; and its
-    arguments once more, where ``torch.func`` does not replace their tensors by its own. Then there are no lengths, and
-    of an op with lists it gets the tensors alone, as `Op._tensors_of` has them.
+    It takes the custom op's arguments with flattened lists, the lengths of the lists, the op, and None. Outside
+    ``torch.func``, which would replace the tensors, it takes the op's arguments in place of None. The lengths are then
+    None, and an op with lists passes the result of `Op._tensors_of` in place of the flattened arguments.
     """
 
     @staticmethod
@@ -305,24 +308,24 @@ class _Differentiable(torch.autograd.Function):
     def backward(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
         op: Op = ctx.op
         op.refuse_batches(of_results)
-        found = op.gradients(ctx, of_results) if op._listed else op.gradients(ctx, *of_results)
+        gradients = op.gradients(ctx, of_results) if op._listed else op.gradients(ctx, *of_results)
         if ctx.lengths is None:
-            return *(op._tensors_of(found) if op._lists else found), None, None, None
-        lists = zip(found, ctx.lengths, strict=True)
-        every = _flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0]
-        return *every, None, None, None
+            return *(op._tensors_of(gradients) if op._lists else gradients), None, None, None
+        lists = zip(gradients, ctx.lengths, strict=True)
+        flat_gradients = _flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0]
+        return *flat_gradients, None, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, *flat: Any) -> Any:
         raise flat[-2].no_batches
 
 
-#: `_Differentiable.apply` without its look at ``torch.func`` and at the signature of ``forward``, which takes 20 us.
+#: `_Differentiable.apply` without the checks of ``torch.func`` and of ``forward``'s signature, which take 20 us.
 _apply_directly = super(torch.autograd.Function, _Differentiable).apply
 
 
 def _flattened(arguments: Sequence[Any]) -> tuple[list[Any], list[int]]:
-    """Arguments with the entries of lists in their place, and the length of each list, -1 for what is none."""
+    """Returns the arguments with lists flattened, and for each argument the length of its list, -1 if it is no list."""
     flat: list[Any] = []
     lengths = []
     for argument in arguments:
@@ -336,24 +339,24 @@ def _flattened(arguments: Sequence[Any]) -> tuple[list[Any], list[int]]:
 
 
 def _nested(flat: Sequence[Any], lengths: Sequence[int]) -> tuple[Any, ...]:
-    """The arguments that `_flattened` took."""
+    """Inverts `_flattened`: returns the arguments with their lists."""
     entries = iter(flat)
     return tuple(next(entries) if n < 0 else [next(entries) for _ in range(n)] for n in lengths)
 
 
 def in_float32(op: Op) -> Callable[..., Any]:
-    """The function that has an op, which computes in float32, compute for other dtypes of its floating-point tensors.
+    """Wraps a float32 op so that it takes other dtypes, by casts of its floating-point tensors and its results.
 
-    All of them have the dtype of the first argument; the results are a tensor or a tuple of them.
+    All floating-point arguments have the dtype of the first one. The result is a tensor or a tuple of tensors.
     """
 
-    def run(*given: Any) -> Any:
-        narrow = given[0].dtype
-        if narrow is torch.float32:
-            return op(*given)
-        wide = [part.float() if isinstance(part, Tensor) and part.is_floating_point() else part for part in given]
-        found = op(*wide)
-        return found.to(narrow) if isinstance(found, Tensor) else tuple(part.to(narrow) for part in found)
+    def run(*arguments: Any) -> Any:
+        dtype = arguments[0].dtype
+        if dtype is torch.float32:
+            return op(*arguments)
+        floats = [part.float() if isinstance(part, Tensor) and part.is_floating_point() else part for part in arguments]
+        results = op(*floats)
+        return results.to(dtype) if isinstance(results, Tensor) else tuple(part.to(dtype) for part in results)
 
     run.op = op  # type: ignore[attr-defined]
     return run

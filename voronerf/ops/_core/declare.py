@@ -1,4 +1,4 @@
-"""One declaration an op: the signature of its public function.
+"""The declaration of an op: the signature of its public function.
 
 ::
 
@@ -11,20 +11,21 @@
     ) -> Annotated[Tensor, "int32 [n]"]:
         \"\"\"What it computes, which needs no body.\"\"\"
 
-The decorator makes the function: it checks the arguments, chooses a backend, and calls its implementation with the
-arguments one after another. The compiled module does all of it where it can (csrc/bindings/signature.cpp), and Python
-where an argument is wrong, or is no plain tensor. From the same signature come the schema of custom ops, memory for
+The decorator makes the function. It checks the arguments, chooses a backend, and calls the backend's implementation
+with positional arguments. The compiled module handles the call if it can (csrc/bindings/signature.cpp); Python handles
+invalid arguments and tensors that are not plain. The signature also gives the schema of custom ops, the allocation of
 their results (which is their fake), their gradients (`Declaration.backward_op`), and the members of compiled structs
 (`Declaration.inputs` and `Declaration.outputs`).
 
-A tensor is written as its dtypes and its shape. The dtypes are ``floating``, names of some (``float32|float64``),
-``same`` as the first floating-point tensor, or ``wide``, the same but at least float32. The shape has numbers, letters,
-a letter plus one, and arguments that are integers. Of ``[3] or [r, 3]`` the first holds for a tensor of as many
-dimensions, of ``[m] if ray_offsets else [r, s]`` where that argument is given. The shape of a result may also have
-letters that functions of the arguments give (``sizes``). An int is written as a range (``1..4``, ``0..``), a float as
-``positive``, or an interval (``[0, 1)``, ``0 to 1``), a str as its choices (``linear|disparity``). What is written by
-its class alone is an instance of it. The docstring says what arguments mean; what the signature says of tensors is put
-before it, and the backends behind it.
+A tensor's annotation has dtypes and a shape. The dtypes are ``floating``, a list of names (``float32|float64``),
+``same`` for the dtype of the first floating-point tensor, or ``wide`` for this dtype promoted to at least float32. The
+shape has numbers, letters, a letter plus one, and names of integer arguments. The number of dimensions decides between
+the two shapes of ``[3] or [r, 3]``. The presence of the argument decides in ``[m] if ray_offsets else [r, s]``. The
+shape of a result may also have letters that are functions of the arguments (``sizes``).
+
+An int's annotation is a range (``1..4``, ``0..``), a float's is ``positive`` or an interval (``[0, 1)``, ``0 to 1``), a
+str's is its choices (``linear|disparity``). An argument annotated with a class alone must be an instance of it. The
+docstring describes the arguments; the decorator adds each tensor's dtypes and shape, and the backends.
 """
 
 from __future__ import annotations
@@ -58,20 +59,20 @@ _DTYPES = {"floating": FLOATING, "same": LIKE_FIRST, "wide": LIKE_FIRST}
 def declare(**options: Any) -> Callable[[F], F]:
     """Makes the public function of an op from its signature, with the options of `Declaration`."""
 
-    def of(function: F) -> F:
-        made: F = Declaration(function, **options).public()
-        return made
+    def decorate(function: F) -> F:
+        public: F = Declaration(function, **options).public()
+        return public
 
-    return of
+    return decorate
 
 
 def declared(name: str) -> Declaration:
-    """The declaration of an op."""
+    """Returns the declaration of an op."""
     return _DECLARED[name]
 
 
 class Shaped(NamedTuple):
-    """A tensor of a signature."""
+    """The dtypes and shape of a tensor in a signature."""
 
     dtypes: tuple[torch.dtype, ...]
     shape: tuple[int | str, ...]
@@ -82,26 +83,26 @@ class Shaped(NamedTuple):
 
     @property
     def either(self) -> bool:
-        """Whether it may have the one shape or the other."""
+        """Returns whether the tensor may have either of two shapes."""
         return bool(self.otherwise) and not self.condition
 
     @property
     def row(self) -> tuple[Any, ...]:
-        """The same for the compiled module."""
+        """Describes the tensor to the compiled module."""
         names = [str(dtype).removeprefix("torch.") for dtype in self.dtypes]
         kind = "wide" if self.wide else "" if names else "same"
         return names, kind, self.shape, self.otherwise or None
 
     @staticmethod
     def parse(text: str) -> Shaped:
-        """Of what a signature says."""
-        found = re.fullmatch(r"([\w|]+) \[(.*?)\](?: (?:if (\w+) else|or) \[(.*)\])?", text)
-        assert found is not None, f"a tensor is written as dtypes and a shape, got {text!r}"
-        dtypes, shape, condition, otherwise = found.groups()
-        known = _DTYPES.get(dtypes)
-        if known is None:
-            known = tuple(getattr(torch, name) for name in dtypes.split("|"))
-        return Shaped(known, _entries(shape), dtypes == "wide", condition or "", _entries(otherwise or ""), text)
+        """Parses a tensor's annotation."""
+        match = re.fullmatch(r"([\w|]+) \[(.*?)\](?: (?:if (\w+) else|or) \[(.*)\])?", text)
+        assert match is not None, f"a tensor is written as dtypes and a shape, got {text!r}"
+        dtypes, shape, condition, otherwise = match.groups()
+        known_dtypes = _DTYPES.get(dtypes)
+        if known_dtypes is None:
+            known_dtypes = tuple(getattr(torch, name) for name in dtypes.split("|"))
+        return Shaped(known_dtypes, _entries(shape), dtypes == "wide", condition or "", _entries(otherwise or ""), text)
 
 
 def _entries(text: str) -> tuple[int | str, ...]:
@@ -120,58 +121,58 @@ class Argument(NamedTuple):
 
     @property
     def floating(self) -> bool:
-        """Whether it is a tensor that may have gradients."""
+        """Returns whether the argument is a tensor that may have a floating-point dtype."""
         return self.kind is Tensor and (not self.rule.dtypes or bool({*self.rule.dtypes} & {*FLOATING}))
 
-    def check(self, given: checks.Checked, values: dict[str, Any]) -> None:
-        """Checks its value in a call, one of ``values`` by name, and makes an integer a float where one is asked."""
+    def check(self, checked: checks.Checked, values: dict[str, Any]) -> None:
+        """Checks the argument's value, an entry of ``values`` by name, and converts an int to a float if declared."""
         name, kind, rule, value = self.name, self.kind, self.rule, values[self.name]
         if kind is Tensor:
-            self._check_tensor(given, values)
+            self._check_tensor(checked, values)
         elif kind is int:
-            checks.check_integer(given.op, name, value, *rule)
+            checks.check_integer(checked.op, name, value, *rule)
         elif kind is float:
-            rule(given.op, name, value)
+            rule(checked.op, name, value)
             values[name] = float(value)
         elif kind is bool:
-            checks.check_flag(given.op, name, value)
+            checks.check_flag(checked.op, name, value)
         elif kind is str:
-            checks.check_choice(given.op, name, value, rule)
+            checks.check_choice(checked.op, name, value, rule)
         elif isinstance(rule, type):
-            checks.check_kind(given.op, name, value, rule)
+            checks.check_kind(checked.op, name, value, rule)
 
-    def _check_tensor(self, given: checks.Checked, values: dict[str, Any]) -> None:
+    def _check_tensor(self, checked: checks.Checked, values: dict[str, Any]) -> None:
         rule, tensor = self.rule, values[self.name]
-        other = bool(rule.condition) and values[rule.condition] is None
+        second_shape = bool(rule.condition) and values[rule.condition] is None
         if rule.either:
-            checks.check_tensor(given.op, self.name, tensor)
-            other = tensor.dim() != len(rule.shape)
-        dtypes = [torch.promote_types(given.first_float().dtype, torch.float32)] if rule.wide else rule.dtypes
-        given.tensor(self.name, tensor, dtypes, *(rule.otherwise if other else rule.shape))
+            checks.check_tensor(checked.op, self.name, tensor)
+            second_shape = tensor.dim() != len(rule.shape)
+        dtypes = [torch.promote_types(checked.first_float().dtype, torch.float32)] if rule.wide else rule.dtypes
+        checked.tensor(self.name, tensor, dtypes, *(rule.otherwise if second_shape else rule.shape))
 
 
 class Source(NamedTuple):
     """The origin of a parameter of a compiled function, or of a member of its structs.
 
     Attributes:
-        of: gives it, of the arguments of an op and the memory for its results.
-        told: what the compiled module is told, which takes it from there itself.
+        get: returns the parameter, from the arguments of an op and the memory for its results.
+        plan: the description from which the compiled module reads the parameter itself.
     """
 
-    of: Callable[[Any, Any], Any]
-    told: tuple[Any, ...]
+    get: Callable[[Any, Any], Any]
+    plan: tuple[Any, ...]
 
-    def __call__(self, given: Any) -> Any:
-        """The same of the arguments alone, or of the results alone."""
-        return self.of(given, given)
+    def __call__(self, arguments: Any) -> Any:
+        """Returns the parameter from the arguments alone, or from the results alone."""
+        return self.get(arguments, arguments)
 
 
 class Memory:
-    """Memory that a compiled function writes for itself.
+    """Scratch memory of a compiled function.
 
     Args:
-        dtype: of its entries.
-        shape: letters.
+        dtype: the dtype of the memory.
+        shape: the letters of the shape.
     """
 
     def __init__(self, dtype: torch.dtype, *shape: str) -> None:
@@ -180,29 +181,29 @@ class Memory:
 
 @dataclass(eq=False)
 class Declaration:
-    """What the signature of an op says.
+    """The declaration of an op, parsed from its signature.
 
     Args:
-        function: which has the signature.
-        native: of csrc/, as the row of the table of backends has it.
-        warp: of kernels/.
-        reference: in plain PyTorch.
-        smooth: the arguments that have gradients. The others are detached.
+        function: the function with the signature.
+        native: the implementation in csrc/, for the table of backends.
+        warp: the implementation in kernels/.
+        reference: the implementation in plain PyTorch.
+        smooth: the arguments that have gradients. All other arguments are detached.
         small: the arguments whose elements an int32 must number.
-        writes: the arguments that it writes into.
-        sizes: letters of the results that are no argument's, as functions of the arguments.
-        filled: letters that are at least 1, and what an error says where they are not.
-        compared: two arguments that are compared, for which they are given one type (`checks.of_one_dtype`).
-        prepare: takes the checked arguments, as a named tuple, and gives those of the implementations; it checks what
-            the signature cannot say.
-        composed: whether the reference takes the ``backend`` of other ops that it calls (`resolve_composed`).
+        writes: the arguments that the op writes into.
+        sizes: letters that occur in results alone, as functions of the arguments.
+        filled: letters that must be at least 1, and the text of the error.
+        compared: two arguments that are compared, so they are promoted to one dtype (`checks.to_common_dtype`).
+        prepare: a function from the checked arguments, as a named tuple, to the implementations' arguments. It checks
+            rules that the signature cannot express.
+        composed: whether the reference passes ``backend`` to other ops that it calls (`resolve_composed`).
 
     Attributes:
-        name: of the op.
-        arguments: one after another, without ``backend``.
-        results: tensors, by their names.
-        allocate: memory for the results, from the named tuple.
-        Inputs: the arguments as a named tuple, which has the letters of their shapes as attributes.
+        name: the op's name.
+        arguments: the arguments in order, without ``backend``.
+        results: the result tensors, by name.
+        allocate: the function that allocates the results, from the named tuple of arguments.
+        Inputs: the named tuple of the arguments; the letters of their shapes are its attributes.
     """
 
     function: Callable[..., Any]
@@ -225,7 +226,7 @@ class Declaration:
         of_result = hints.pop("return")
         hints.pop("backend")
         self.arguments = [_argument(name, hint) for name, hint in hints.items()]
-        kinds = {each.name: each.kind | None if each.optional else each.kind for each in self.arguments}
+        kinds = {arg.name: arg.kind | None if arg.optional else arg.kind for arg in self.arguments}
         self._places = {name: place for place, name in enumerate(kinds)}
         self.Inputs = _named(f"{self.name}_inputs", kinds)
         for letter, size in {**self._letters(), **self.sizes}.items():
@@ -240,59 +241,59 @@ class Declaration:
         return [argument for argument in self.arguments if argument.kind is Tensor]
 
     def _letters(self) -> dict[str, Callable[[Any], Any]]:
-        """What gives each letter that shapes speak of, and of a tensor of either form whether it has one per ray."""
-        ways, found = dict[str, list[tuple[int, int, int, int]]](), dict[str, Callable[[Any], Any]]()
+        """Returns a function of the arguments for each letter, and ``<name>_per_ray`` for tensors of two shapes."""
+        ways, letters = dict[str, list[tuple[int, int, int, int]]](), dict[str, Callable[[Any], Any]]()
         for name, _, _, rule, _ in self._tensors():
             if rule.either:
-                found[f"{name}_per_ray"] = _is_per_ray(self._places[name])
+                letters[f"{name}_per_ray"] = _is_per_ray(self._places[name])
                 continue
             for shape in (rule.shape, rule.otherwise):
                 for dimension, entry in enumerate(shape):
                     if isinstance(entry, str) and entry not in self._places:
                         letter, _, one = entry.partition("+")
                         ways.setdefault(letter, []).append((len(shape), self._places[name], dimension, len(one)))
-        return {**found, **{letter: _size_of(sorted(each)) for letter, each in ways.items()}}
+        return {**letters, **{letter: _size_of(sorted(letter_ways)) for letter, letter_ways in ways.items()}}
 
     def _likes(self) -> list[tuple[str, torch.dtype | None]]:
-        """For each result the argument beside which its memory lies, and its dtype where that is another one."""
-        tensors, found = [each for each in self._tensors() if not each.optional], list[tuple[str, torch.dtype | None]]()
+        """Returns for each result an argument to allocate it like, and its dtype, None for the argument's dtype."""
+        tensors, likes = [arg for arg in self._tensors() if not arg.optional], list[tuple[str, torch.dtype | None]]()
         for result in self.results.values():
-            same = [each for each in tensors if {*each.rule.dtypes} <= {*(result.dtypes or FLOATING)}]
-            found.append((same[0].name, None) if same else (tensors[0].name, result.dtypes[0]))
-        return found
+            matching = [arg for arg in tensors if {*arg.rule.dtypes} <= {*(result.dtypes or FLOATING)}]
+            likes.append((matching[0].name, None) if matching else (tensors[0].name, result.dtypes[0]))
+        return likes
 
     def _memory(self) -> Callable[[Any], Any]:
-        """Makes the function that allocates the results: a named tuple where they have names."""
+        """Returns the function that allocates the results, as a named tuple if they have names."""
         rows, kind = [*zip(self.results.values(), self._likes())], tuple
         if "result0" not in self.results:
             kind = self._Results
 
         def allocate(given: Any) -> Any:
-            found = []
+            results = []
             for result, (like, dtype) in rows:
-                other = bool(result.condition) and getattr(given, result.condition) is None
-                shape = [_size_in(given, entry) for entry in (result.otherwise if other else result.shape)]
-                found.append(new_empty(getattr(given, like), *shape, dtype=dtype))
-            return tuple.__new__(kind, found) if len(found) > 1 else found[0] if found else None
+                second_shape = bool(result.condition) and getattr(given, result.condition) is None
+                shape = [_size_in(given, entry) for entry in (result.otherwise if second_shape else result.shape)]
+                results.append(new_empty(getattr(given, like), *shape, dtype=dtype))
+            return tuple.__new__(kind, results) if len(results) > 1 else results[0] if results else None
 
         hint: Any = Tensor if len(rows) == 1 else tuple[(Tensor,) * len(rows)]  # type: ignore[misc]
         allocate.__annotations__ = {"given": self.Inputs, "return": hint if rows else None}
         return allocate
 
     def public(self) -> Any:
-        """The public function: it checks its arguments, chooses a backend and calls its implementation.
+        """Returns the public function: it checks its arguments, chooses a backend and calls the implementation.
 
-        The compiled module does so where it can (csrc/bindings/signature.cpp). Where it is not there, where an argument
-        breaks a rule, or is no plain tensor, `_call` does.
+        The compiled module handles the call if it can (csrc/bindings/signature.cpp). `_call` is the fallback: without
+        the module, for an invalid argument, and for a tensor that is not plain.
         """
         function, self._calls, traces = self.function, self._first_call, torch.compiler.is_dynamo_compiling
 
         @functools.wraps(function)
         def public(*args: Any, **options: Any) -> Any:
             if not traces():
-                found = self._calls(args, options)
-                if found is not NotImplemented:
-                    return found
+                result = self._calls(args, options)
+                if result is not NotImplemented:
+                    return result
             return self._call(args, options)
 
         parameters = inspect.signature(function).parameters
@@ -301,36 +302,36 @@ class Declaration:
         self._positional = sum(each.kind is not each.KEYWORD_ONLY for each in parameters.values())
         shapes = [each.rule.shape for each in self._tensors()] + [each.shape for each in self.results.values()]
         self._bound = {str(entry).removesuffix("+1") for shape in shapes for entry in shape}
-        public.__doc__ = self._described()
+        public.__doc__ = self._docstring()
         return public
 
     def _call(self, args: tuple[Any, ...], options: dict[str, Any]) -> Any:
-        """A call in Python, which says what is wrong with its arguments."""
+        """Handles a call in Python, and raises the errors of invalid arguments."""
         named = {**dict(zip(self._ordered, args)), **options}
-        values, twice = {**self._defaults, **named}, len(named) < len(args) + len(options)
-        if twice or len(args) > self._positional or values.keys() != self._ordered.keys():
-            self.function(*args, **options)  # which has no body, and says what is wrong
-        given = checks.Checked(self.name)
-        for each in self.arguments:
-            if each.optional and values[each.name] is None:
+        values, repeated = {**self._defaults, **named}, len(named) < len(args) + len(options)
+        if repeated or len(args) > self._positional or values.keys() != self._ordered.keys():
+            self.function(*args, **options)  # the empty function raises Python's TypeError
+        checked = checks.Checked(self.name)
+        for argument in self.arguments:
+            if argument.optional and values[argument.name] is None:
                 continue
-            each.check(given, values)
-            if each.kind is not Tensor and each.name in self._bound:
-                given.sizes[each.name] = values[each.name]
-            if each.floating and each.name not in self.smooth and values[each.name].requires_grad:
-                values[each.name] = values[each.name].detach()
+            argument.check(checked, values)
+            if argument.kind is not Tensor and argument.name in self._bound:
+                checked.sizes[argument.name] = values[argument.name]
+            if argument.floating and argument.name not in self.smooth and values[argument.name].requires_grad:
+                values[argument.name] = values[argument.name].detach()
         if self.smooth:
-            given.no_inference()
+            checked.no_inference()
         for name in self.writes:
             checks.check_writable(self.name, name, values[name])
         for name in self.small:
             checks.check_count(self.name, name, values[name].numel())
         for letter, rule in self.filled.items():
-            if given.sizes[letter] < 1:
+            if checked.sizes[letter] < 1:
                 raise ValueError(f"{self.name}: {rule}")
         if self.compared:
-            one, two = self.compared
-            values[one], values[two] = checks.of_one_dtype(values[one], values[two])
+            first, second = self.compared
+            values[first], values[second] = checks.to_common_dtype(values[first], values[second])
         flat = [values[name] for name in self._places]
         if self.prepare is not None:
             flat = self.prepare(self.Inputs(*flat))
@@ -339,11 +340,11 @@ class Declaration:
         return run(*flat) if self._pack is None else self._pack(run(*flat))
 
     def _first_call(self, args: tuple[Any, ...], options: dict[str, Any]) -> Any:
-        """Makes what the compiled module calls the op with, and calls it."""
+        """Creates the compiled module's callable of the op at the first call, and calls it."""
         native = backends.compiled()
         if native is None:
             return NotImplemented
-        rows = [{**self._row(each), **self._default(each.name)} for each in self.arguments]
+        rows = [{**self._row(arg), **self._default(arg.name)} for arg in self.arguments]
         rows.append({"name": "backend", "kind": "any", "optional": False, "rule": None, **self._default("backend")})
         more = {
             "filled": list(self.filled),
@@ -351,7 +352,7 @@ class Declaration:
             "smooth": bool(self.smooth),
             "inputs": self.Inputs,
             "prepare": self.prepare,
-            "found": self._found,
+            "found": self._implementation,
             "pack": self._pack,
         }
         self._calls = native.signature(self.name, rows, self._positional, more)
@@ -382,51 +383,51 @@ class Declaration:
             return {**row, "kind": kind.__name__}
         return {**row, "kind": "instance"} if isinstance(rule, type) else row
 
-    def _found(self, name: str, backend: str) -> tuple[Any, Any, bool]:
-        """An implementation, how the compiled module calls it by itself (`Op.plan`), and whether in float32 alone."""
+    def _implementation(self, name: str, backend: str) -> tuple[Any, Any, bool]:
+        """Returns an implementation, its `Op.plan` or None, and whether it is wrapped by `in_float32`."""
         run = backends.function(self.name, name, backend, self.composed)
         op = getattr(run, "op", run)
         return run, getattr(op, "plan", None), op is not run
 
-    def _described(self) -> str:
-        """The docstring, with the dtypes and the shape of each tensor, which the signature has, and the backends."""
+    def _docstring(self) -> str:
+        """Returns the docstring, with each tensor's dtypes and shape from the signature, and with the backends."""
         text = self.function.__doc__ or ""
         for name, _, optional, rule, _ in self._tensors():
             form = f"{rule.text} or None" if optional else rule.text
             text = re.sub(rf"^( +{name}: )", rf"\g<1>{form}, ", text, count=1, flags=re.MULTILINE)
-        known = {"auto": True, "reference": True, "native": self.native, "warp": self.warp}
-        *others, last = [f'"{name}"' for name, there in known.items() if there]
+        backends = {"auto": True, "reference": True, "native": self.native, "warp": self.warp}
+        *others, last = [f'"{name}"' for name, exists in backends.items() if exists]
         backend = f"        backend: {', '.join(others)} or {last}.\n"
         return re.sub(r"^ {4}Args:\n(?: {8}.+\n)+", rf"\g<0>{backend}", text, count=1, flags=re.MULTILINE)
 
     def custom_op(self, name: str = "", **options: Any) -> Callable[[Callable[..., Any]], Op]:
-        """Makes ``fill(given, found)`` a custom op: it is handed the arguments, and memory for the results.
+        """Makes ``fill(arguments, results)`` a custom op: it writes into the allocated results.
 
         Args:
-            name: of the custom op; without it that of the op.
-            options: of `custom_op`; with ``fake`` only the kernels know how many rows there are, and ``fill(given)``
-                makes its results.
+            name: the name of the custom op; by default the op's name.
+            options: the options of `custom_op`. With ``fake`` only the kernels know the number of rows, and
+                ``fill(arguments)`` returns its results.
         """
         memory, fake = self.allocate, options.pop("fake", None)
         if fake is not None:
-            memory = functools.wraps(self.allocate)(lambda given: fake(given))
+            memory = functools.wraps(self.allocate)(lambda arguments: fake(arguments))
         return custom_op(name or self.name, memory, mutates=self.writes, counted=fake is not None, **options)
 
     def backward_op(self, name: str, forward: Op, formula: Callable[..., Any]) -> Callable[[Callable[..., None]], Op]:
-        """Makes ``fill(given, arriving, gradients)`` the gradients of a custom op.
+        """Makes ``fill(arguments, arriving, gradients)`` the backward of a custom op.
 
-        It is handed the arguments; named tuples of the gradients of the results, None for zero; and of memory for those
-        of the smooth arguments, None where not wanted or not there.
+        ``arriving`` is a named tuple of the results' gradients, None for zero. ``gradients`` is a named tuple of memory
+        for the gradients of the smooth arguments, None for an unwanted gradient or an absent argument.
 
         Args:
-            name: of the custom op.
-            forward: the op that it is the backward of, made by `custom_op`.
-            formula: the reference, whose derivatives are the further ones.
+            name: the name of the backward's custom op.
+            forward: the custom op to differentiate, made by `custom_op`.
+            formula: the reference, which gives the second derivatives.
         """
         count, width, new = len(self.results), len(self.arguments), tuple.__new__
-        places = [place for place, each in enumerate(self.arguments) if each.name in self.smooth]
+        places = [place for place, entry in enumerate(self.arguments) if entry.name in self.smooth]
         gradients = _named("gradients", dict.fromkeys(self.smooth, Tensor | None))
-        arriving = {f"of_{each}": Tensor | None for each in self.results}
+        arriving = {f"of_{entry}": Tensor | None for entry in self.results}
         kind = _named("given", {**arriving, **typing.get_type_hints(self.Inputs), "wanted": Sequence[bool]})
 
         def memory(flat: Any) -> list[Tensor]:
@@ -438,38 +439,38 @@ class Declaration:
 
         memory.__annotations__["flat"] = kind
 
-        def of(fill: Callable[..., None]) -> Op:
+        def decorate(fill: Callable[..., None]) -> Op:
             @functools.wraps(fill)
-            def run(flat: Any, found: list[Tensor]) -> None:
-                given, parts = new(self.Inputs, flat[count:-1]), zip(found, flat[-1], places)
-                there = [part if want and given[place] is not None else None for part, want, place in parts]
-                fill(given, new(self._Results, flat[:count]), new(gradients, there))
+            def run(flat: Any, memories: list[Tensor]) -> None:
+                arguments, parts = new(self.Inputs, flat[count:-1]), zip(memories, flat[-1], places)
+                used = [part if want and arguments[place] is not None else None for part, want, place in parts]
+                fill(arguments, new(self._Results, flat[:count]), new(gradients, used))
 
             op = custom_op(name, memory)(run)
             register_derivatives(forward, op, formula, places, width, count)
             return op
 
-        return of
+        return decorate
 
     def inputs(self, kind: Any, **others: Any) -> Source:
-        """What makes a struct of the compiled module of the arguments.
+        """Returns the source of a compiled struct whose members are arguments.
 
         Args:
-            kind: the struct, whose members are arguments or letters of their shapes.
-            others: for members that are neither, or have another name: the name, a function of the arguments, or what
-                the member is in every call.
+            kind: the struct; its members have the names of arguments or letters of their shapes.
+            others: sources of members with other names: the name of an argument or letter, a function of the arguments,
+                or a constant.
 
         Raises:
-            NameError: a member that is none of this.
+            NameError: a member that has no source.
         """
         return self._struct(kind, others, self.Inputs)
 
     def outputs(self, kind: Any, **others: str) -> Source:
-        """What makes a struct of the compiled module, whose members are the results, of memory for these.
+        """Returns the source of a compiled struct whose members are the results' memory.
 
         Args:
             kind: the struct.
-            others: results by the names of members, where they have another.
+            others: for members with other names than their results: member -> result.
         """
         return self._struct(kind, others, self._Results)
 
@@ -478,55 +479,55 @@ class Declaration:
         names = [value for value in values if isinstance(value, str)]
         if unknown := [name for name in names if not hasattr(source, name.partition(".")[0])]:
             raise NameError(f"{self.name}: {kind.__name__} must have members of its declaration, got {unknown}")
-        of_results, new, known = source is self._Results, tuple.__new__, operator.attrgetter(*names, "__len__")
+        of_results, new, get_named = source is self._Results, tuple.__new__, operator.attrgetter(*names, "__len__")
         rest = [(place, value) for place, value in enumerate(values) if not isinstance(value, str)]
 
-        def of(given: Any, found: Any) -> Any:
-            *parts, _ = known(found if of_results else given)  # all at once: members are many
+        def get(arguments: Any, results: Any) -> Any:
+            *parts, _ = get_named(results if of_results else arguments)  # one call for all members, which are many
             for place, value in rest:
-                parts.insert(place, value(given) if callable(value) else value)
+                parts.insert(place, value(arguments) if callable(value) else value)
             return new(kind, parts)
 
-        return Source(of, ("structure", [self._source(value, of_results).told for value in values]))
+        return Source(get, ("structure", [self._source(value, of_results).plan for value in values]))
 
     def _source(self, value: Any, of_results: bool = False) -> Source:
-        """The origin of a parameter or a member, by its name or what else `compiled_op` takes."""
+        """Returns the source of a parameter or a member, from a name or any other parameter of `compiled_op`."""
         if isinstance(value, Source):
             return value
         if isinstance(value, Memory):
             shape, dtype = value.shape, value.dtype
-            make = lambda given, _: new_empty(given[0], *[getattr(given, n) for n in shape], dtype=dtype)  # noqa: E731
+            make = lambda args, _: new_empty(args[0], *[getattr(args, n) for n in shape], dtype=dtype)  # noqa: E731
             return Source(make, ("memory", dtype.itemsize, shape))
         if not isinstance(value, str):
             if callable(value):
-                return Source(lambda given, _: value(given), ("function", value))
-            return Source(lambda given, _: value, ("constant", value))
+                return Source(lambda args, _: value(args), ("function", value))
+            return Source(lambda args, _: value, ("constant", value))
         if value in self.results and (of_results or value not in self._places):
             place = [*self.results].index(value)
             alone = len(self.results) == 1
-            return Source(lambda _, found: found if alone else found[place], ("result", place))
+            return Source(lambda _, results: results if alone else results[place], ("result", place))
         get = operator.attrgetter(value)
-        told: tuple[Any, ...] = ("letter", value) if value in self._letters() else ("function", get)
+        plan: tuple[Any, ...] = ("letter", value) if value in self._letters() else ("function", get)
         if value in self._places:
-            told = "argument", self._places[value]
+            plan = "argument", self._places[value]
         elif value.endswith("_per_ray"):
-            told = "rays", self._places[value.removesuffix("_per_ray")]
-        return Source(lambda given, _: get(given), told)
+            plan = "rays", self._places[value.removesuffix("_per_ray")]
+        return Source(lambda args, _: get(args), plan)
 
     def _result_rows(self) -> list[tuple[Any, ...]]:
         """Describes the results to the compiled module."""
         known = {*self._places, *self._letters()}
 
-        def told(shape: Sequence[int | str]) -> list[Any]:
-            """Letters that only a function of the arguments gives, as that."""
+        def sizes(shape: Sequence[int | str]) -> list[Any]:
+            """Replaces letters that the compiled module does not know by functions of the arguments."""
             return [
                 entry if isinstance(entry, int) or entry.removesuffix("+1") in known else operator.attrgetter(entry)
                 for entry in shape
             ]
 
         return [
-            (self._places[like], dtype, self._places.get(each.condition, -1), told(each.shape), told(each.otherwise))
-            for each, (like, dtype) in zip(self.results.values(), self._likes())
+            (self._places[like], dtype, self._places.get(row.condition, -1), sizes(row.shape), sizes(row.otherwise))
+            for row, (like, dtype) in zip(self.results.values(), self._likes())
         ]
 
     def compiled_op(
@@ -538,72 +539,76 @@ class Declaration:
         fault: Callable[[Any], Any] | None = None,
         **options: Any,
     ) -> Op:
-        """The custom op that is a function of the compiled module.
+        """Makes a custom op that calls a function of the compiled module.
 
-        A plain call of it, on the CPU, is made without Python (csrc/bindings/signature.cpp).
+        A plain call on the CPU runs without Python (csrc/bindings/signature.cpp).
 
         Args:
-            name: of the custom op; without it that of the op.
-            function: its name.
-            parameters: of the function, without the machine: names of arguments, results and letters, what `inputs`
-                and `outputs` give, a `Memory`, a function of the arguments, or what is the same in every call.
-            on_cuda: what fills the results there, of the arguments, the results and the machine, where that function
-                has other parameters.
-            fault: what is called with the arguments where the function gives False: it raises the error.
-            options: of `custom_op`.
+            name: the name of the custom op; by default the op's name.
+            function: the name of the compiled function.
+            parameters: the parameters of the function except the machine: names of arguments, results and letters,
+                results of `inputs` and `outputs`, a `Memory`, a function of the arguments, or a constant.
+            on_cuda: a function (arguments, results, machine) that fills the results on a GPU, if the function there has
+                other parameters.
+            fault: a function that raises the error; it is called with the arguments if the compiled function returns
+                False.
+            options: the options of `custom_op`.
         """
         from voronerf.ops._core import native
 
         sources, on_devices = [*map(self._source, parameters)], "cuda" in options.get("devices", ("cuda",))
 
-        def fill(given: Any, found: Any) -> None:
-            machine = native.machine(given[0]) if on_devices else native.cpu()
+        def fill(arguments: Any, results: Any) -> None:
+            machine = native.machine(arguments[0]) if on_devices else native.cpu()
             if on_cuda is not None and isinstance(machine, native.compiled.Cuda):
-                on_cuda(given, found, machine)
+                on_cuda(arguments, results, machine)
                 return
-            said = getattr(native.compiled, function)(*[source.of(given, found) for source in sources], machine)
-            if said is False and fault is not None:
-                fault(given)
+            valid = getattr(native.compiled, function)(*[source.get(arguments, results) for source in sources], machine)
+            if valid is False and fault is not None:
+                fault(arguments)
 
         op = self.custom_op(name, **options)(functools.wraps(self.function)(fill))
         op.__module__ = f"voronerf.ops.{backends.folder(self.name)}.native"
         pack = self._results_class or self._pack
-        op.plan = function, [source.told for source in sources], self._result_rows(), pack, fault
+        op.plan = function, [source.plan for source in sources], self._result_rows(), pack, fault
         return op
 
 
 def _size_of(ways: Sequence[tuple[int, int, int, int]]) -> Callable[[Any], int]:
-    """What gives a letter, of the first tensor that is there with so many dimensions, by its place: the size of one of
-    its dimensions, less one or not. 0 where there is none."""
+    """Returns the function of the arguments that gives a letter.
 
-    def size(given: Any) -> int:
+    Each way is (dimensions, place, dimension, less): if the argument at ``place`` has that many dimensions, the
+    letter is the size of its ``dimension`` minus ``less``. The first way that applies counts; the default is 0.
+    """
+
+    def size(arguments: Any) -> int:
         for dimensions, place, dimension, less in ways:
-            tensor = given[place]
+            tensor = arguments[place]
             if tensor is not None and tensor.dim() == dimensions:
-                found = tensor.shape[dimension] if dimension else rows_of(tensor)
-                return found - less
+                count = tensor.shape[dimension] if dimension else rows_of(tensor)
+                return count - less
         return 0
 
     return size
 
 
 def _is_per_ray(place: int) -> Callable[[Any], bool]:
-    return lambda given: given[place] is not None and given[place].dim() > 1
+    return lambda arguments: arguments[place] is not None and arguments[place].dim() > 1
 
 
-def _size_in(given: Any, entry: int | str) -> int:
-    """A size of a shape."""
+def _size_in(arguments: Any, entry: int | str) -> int:
+    """Returns the size for one entry of a shape."""
     if isinstance(entry, int):
         return entry
-    size: int = getattr(given, entry.removesuffix("+1"))
+    size: int = getattr(arguments, entry.removesuffix("+1"))
     return size + 1 if entry.endswith("+1") else size
 
 
 def _named(name: str, hints: dict[str, Any]) -> Any:
-    make: Any = collections.namedtuple  # whose fields a type checker wants to read
-    found = make(name, hints)
-    found.__annotations__ = hints
-    return found
+    make: Any = collections.namedtuple  # Any: type checkers require literal fields
+    kind = make(name, hints)
+    kind.__annotations__ = hints
+    return kind
 
 
 def _argument(name: str, hint: Any) -> Argument:
@@ -612,20 +617,20 @@ def _argument(name: str, hint: Any) -> Argument:
         hint, rule = typing.get_args(hint)
     options = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else [hint]
     (kind,) = (kind for kind in options if kind is not type(None))
-    made: Any = kind
+    parsed: Any = kind
     if kind is Tensor:
-        made = Shaped.parse(rule)
+        parsed = Shaped.parse(rule)
     elif kind is int:
         low, _, high = rule.partition("..")
-        made = int(low), int(high or MAX_COUNT)
+        parsed = int(low), int(high or MAX_COUNT)
     elif kind is float:
-        made = _of_floats(rule)
+        parsed = _float_check(rule)
     elif kind is str:
-        made = rule.split("|")
-    return Argument(name, kind, hint is not kind, made, rule)
+        parsed = rule.split("|")
+    return Argument(name, kind, hint is not kind, parsed, rule)
 
 
-def _of_floats(rule: str) -> Callable[[str, str, float], None]:
+def _float_check(rule: str) -> Callable[[str, str, float], None]:
     if rule == "positive":
         return checks.check_positive
     if not rule:
@@ -635,7 +640,7 @@ def _of_floats(rule: str) -> Callable[[str, str, float], None]:
 
 
 def _results(hint: Any) -> tuple[Callable[[Any], Any] | None, dict[str, Shaped]]:
-    """What puts results together for the caller, if anything, and all tensors by their names."""
+    """Returns the function that packs the results for the caller, or None, and the tensors by name."""
     if hint is type(None):
         return None, {}
     if typing.get_origin(hint) is typing.Annotated:
@@ -644,9 +649,9 @@ def _results(hint: Any) -> tuple[Callable[[Any], Any] | None, dict[str, Shaped]]
         fields = typing.get_type_hints(hint, include_extras=True)
         return hint._make, {name: _results(field)[1]["result"] for name, field in fields.items()}
     first, *others = typing.get_args(hint)
-    if hasattr(first, "_fields"):  # what is found, and its gradient
+    if hasattr(first, "_fields"):  # the results, and their gradient
         count = len(first._fields)
-        return lambda found: (first(*found[:count]), *found[count:]), {
+        return lambda results: (first(*results[:count]), *results[count:]), {
             **_results(first)[1],
             "gradient": _results(*others)[1]["result"],
         }

@@ -1,4 +1,4 @@
-"""What the autograd of several ops shares. An op's own is in ``voronerf/ops/<op>/autograd.py``."""
+"""Autograd helpers shared by several ops. The rest of an op's autograd is in ``voronerf/ops/<op>/autograd.py``."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 from voronerf.ops._core.custom_op import Op
 
 
-def asked_for(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
-    """For each tensor that an op took (None where an optional one is absent): will its gradient be used?
+def needed_gradients(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
+    """Returns for each input of an op whether its gradient will be used; an absent optional input is None.
 
-    ``ctx.needs_input_grad`` says which inputs require a gradient, not which the caller has asked for: in
-    ``torch.autograd.grad(y, x, create_graph=True)`` the gradients of the weights would be computed and dropped, half of
-    the products of an eikonal loss. torch's own layers ask the engine, and so does this.
+    ``ctx.needs_input_grad`` says which inputs require a gradient, not which gradients the caller has asked for. In
+    ``torch.autograd.grad(y, x, create_graph=True)`` the weights' gradients, half of the products of an eikonal loss,
+    would be computed and dropped. This function asks the autograd engine, as torch's layers do.
     """
     edges = iter(ctx.next_functions)
     nodes = [None if tensor is None else next(edges)[0] for tensor in inputs]
     if _ask is None:
         return [node is not None for node in nodes]
     answers, sure = list[bool](), False
-    # Parameters are the last inputs, and mostly leaves: after the first whose gradient is used, the leaves before it
-    # count as asked for. The engine refuses to answer, in 10 us, for one that torch.autograd.grad was asked for.
+    # Parameters are the last inputs, and mostly leaves. Once a leaf's gradient is used, the leaves before it count as
+    # used. For an input of torch.autograd.grad the engine raises RuntimeError, which takes 10 us.
     for node in reversed(nodes):
         leaf = type(node).__name__ == "AccumulateGrad"
         if node is None or (sure and leaf):
@@ -38,22 +38,22 @@ def asked_for(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
     return answers[::-1]
 
 
-# torch has no public name for this question; without the answer every gradient is computed.
+# torch has no public name for this function; without it every gradient is computed.
 _ask = getattr(torch._C, "_will_engine_execute_node", None)
 
 
 def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:
-    """Tensors to differentiate by within the derivative of a backward op, and whether that is differentiated again.
+    """Returns tensors to differentiate by within a double backward, and whether it is differentiated again.
 
-    Where it is, they stay parts of the caller's graph, as aliases: where one of them was computed from another, that
-    path is the caller's. To be called before gradients are switched on.
+    If it is, the tensors are aliases within the caller's graph: if one of them was computed from another, the caller's
+    graph differentiates that path. Call this function before ``torch.enable_grad``.
     """
     graph = torch.is_grad_enabled()
-    found = [
+    leaves = [
         None if t is None else t.view_as(t) if graph and t.requires_grad else t.detach().requires_grad_()
         for t in tensors
     ]
-    return found, graph
+    return leaves, graph
 
 
 def second_derivatives(
@@ -62,16 +62,16 @@ def second_derivatives(
     tensors: Sequence[Tensor | None],
     graph: bool,
 ) -> list[Tensor | None]:
-    """The derivative of gradients.
+    """Returns the second derivatives of a formula: the derivatives of its gradients.
 
     Args:
-        outputs: results of a formula, each with the gradient that arrives at it.
-        firsts: tensors that the formula read, each with the cotangent of the gradient that it has got.
+        outputs: pairs of a result of the formula and the gradient that arrives at it.
+        firsts: pairs of an input of the formula and the cotangent of its gradient.
         tensors: the inputs to differentiate by, None for an absent one.
         graph: whether the results are differentiated again.
 
     Returns:
-        For each of the tensors its derivative, None where there is none.
+        The derivative for each of ``tensors``, None if there is none.
     """
     if not firsts:
         return [None] * len(tensors)
@@ -98,42 +98,43 @@ def register_derivatives(
     width: int,
     count: int,
 ) -> None:
-    """Registers the derivatives of an op whose gradients are another op, and whose further ones are those of a formula.
+    """Registers the derivatives of an op: another op is its backward, and a formula gives its second derivatives.
 
     Args:
-        forward: of ``width`` arguments; it gives ``count`` tensors.
-        backward: takes what has arrived at the results, None for zero, the arguments of ``forward``, and a bool for
-            each of those with gradients. It gives these in a list; what is not wanted or not there may be anything.
-        formula: takes and gives what ``forward`` does.
-        places: of the arguments with gradients.
-        width: arguments of ``forward``.
-        count: its results.
+        forward: the op, with ``width`` arguments and ``count`` results.
+        backward: the op that takes the results' gradients (None for zero), the arguments of ``forward``, and a list of
+            bools: whether the gradient of each differentiable argument is wanted. It returns the list of these
+            gradients; the entry of an unwanted gradient or an absent argument is ignored.
+        formula: a differentiable function with the arguments and results of ``forward``.
+        places: the indices of the differentiable arguments.
+        width: the number of arguments of ``forward``.
+        count: the number of results of ``forward``.
     """
 
-    def placed(given: Sequence[Any], values: Sequence[Tensor | None]) -> list[Any]:
-        found = list(given)
+    def placed(arguments: Sequence[Any], values: Sequence[Tensor | None]) -> list[Any]:
+        entries = list(arguments)
         for place, value in zip(places, values):
-            found[place] = value
-        return found
+            entries[place] = value
+        return entries
 
     nothing = [None] * width
 
     def first(ctx: Any, *arriving: Tensor | None) -> tuple[Any, ...]:
-        given = _kept(ctx, forward)
+        arguments = _saved(ctx, forward)
         wanted = [ctx.needs_input_grad[place] for place in places]
-        found: list[Tensor | None] = []
+        entries: list[Tensor | None] = []
         if any(gradient is not None for gradient in arriving):
-            parts = backward(*arriving, *given, wanted)
-            found = [part if want else None for part, want in zip(parts, wanted)]
-        return tuple(placed(nothing, found))
+            parts = backward(*arriving, *arguments, wanted)
+            entries = [part if want else None for part, want in zip(parts, wanted)]
+        return tuple(placed(nothing, entries))
 
     def second(ctx: Any, cotangents: Sequence[Tensor | None]) -> tuple[Any, ...]:
-        *flat, wanted = _kept(ctx, backward)
-        arriving, given = flat[:count], flat[count:]
-        leaves, graph = aliases([*arriving, *(given[place] for place in places)])
+        *flat, wanted = _saved(ctx, backward)
+        arriving, arguments = flat[:count], flat[count:]
+        leaves, graph = aliases([*arriving, *(arguments[place] for place in places)])
         inputs = leaves[count:]
         with torch.enable_grad():
-            results = formula(*placed(given, inputs))
+            results = formula(*placed(arguments, inputs))
             outputs = zip((results,) if isinstance(results, Tensor) else results, leaves)
             pairs = [
                 (leaf, cotangent)
@@ -141,15 +142,15 @@ def register_derivatives(
                 if want and leaf is not None and cotangent is not None
             ]
             used = [(part, gradient) for part, gradient in outputs if gradient is not None]
-            found = second_derivatives(used, pairs, leaves, graph)
-        return *found[:count], *placed(nothing, found[count:]), None
+            entries = second_derivatives(used, pairs, leaves, graph)
+        return *entries[:count], *placed(nothing, entries[count:]), None
 
-    forward.register_autograd(first, setup_context=_keeping(forward))
-    backward.register_autograd(second, setup_context=_keeping(backward))
+    forward.register_autograd(first, setup_context=_saver(forward))
+    backward.register_autograd(second, setup_context=_saver(backward))
 
 
-def _keeping(op: Op) -> Callable[..., None]:
-    """Saves the arguments of an op."""
+def _saver(op: Op) -> Callable[..., None]:
+    """Returns a ``setup_context`` that saves the arguments of an op."""
 
     def keep(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
         rest = list(inputs)
@@ -162,15 +163,15 @@ def _keeping(op: Op) -> Callable[..., None]:
     return keep
 
 
-def _kept(ctx: Any, op: Op) -> list[Any]:
-    found = list(ctx.rest)
+def _saved(ctx: Any, op: Op) -> list[Any]:
+    arguments = list(ctx.rest)
     for place, tensor in zip(op.tensors, ctx.saved_tensors):
-        found[place] = tensor
-    return found
+        arguments[place] = tensor
+    return arguments
 
 
-def learnt(loss: Tensor, defer: bool) -> Tensor:
-    """A loss, after its backward pass unless that is deferred."""
+def run_backward(loss: Tensor, defer: bool) -> Tensor:
+    """Returns the loss, detached after its backward pass; with ``defer`` the backward pass is left to the caller."""
     if defer:
         return loss
     loss.backward()
@@ -178,12 +179,12 @@ def learnt(loss: Tensor, defer: bool) -> Tensor:
 
 
 def with_gradients(loss: Tensor, tensors: Sequence[Tensor], gradients: Sequence[Tensor]) -> Tensor:
-    """A loss [] whose gradient to some tensors is known; it is handed over once."""
-    total: Tensor = _Known.apply(loss, list(gradients), *tensors)
+    """Returns a loss [] whose gradients are precomputed; one backward pass hands them over."""
+    total: Tensor = _KnownGradients.apply(loss, list(gradients), *tensors)
     return total
 
 
-class _Known(torch.autograd.Function):
+class _KnownGradients(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, loss: Tensor, gradients: list[Tensor], *tensors: Tensor) -> Tensor:
         ctx.gradients, ctx.dtypes = gradients, [tensor.dtype for tensor in tensors]
@@ -191,10 +192,10 @@ class _Known(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():  # what the gradients follow from is not known here
+        if torch.is_grad_enabled():  # the precomputed gradients have no graph
             raise RuntimeError("forward_with_tape: gradients are differentiable no further, got create_graph=True")
-        found, ctx.gradients = ctx.gradients, None  # to be taken as they are, not copied
-        if not of_loss.is_cpu or float(of_loss) != 1:  # nothing is read of a device
-            found = [gradient * of_loss for gradient in found]
-        # Narrowed last: a scaled loss keeps small ones.
-        return (None, None, *(gradient.to(dtype) for gradient, dtype in zip(found, ctx.dtypes, strict=True)))
+        gradients, ctx.gradients = ctx.gradients, None  # freed here, so that autograd can take them without a copy
+        if not of_loss.is_cpu or float(of_loss) != 1:  # on a GPU the value is not read, which would synchronise
+            gradients = [gradient * of_loss for gradient in gradients]
+        # The cast comes last, so that a scaled loss keeps small gradients.
+        return (None, None, *(gradient.to(dtype) for gradient, dtype in zip(gradients, ctx.dtypes, strict=True)))

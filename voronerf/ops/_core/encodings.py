@@ -1,6 +1,6 @@
-"""Encodings without parameters, a row each: what programs, layer tables and the compiled module know of them.
+"""The table of encodings without parameters, used by programs, layer tables and the compiled module.
 
-n rows, d columns that are encoded, L octaves. An encoding has one number, its size: octaves, or the degree of spherical
+n rows, d encoded columns, L octaves. An encoding has one number, its size: the octaves, or the degree of spherical
 harmonics.
 """
 
@@ -17,14 +17,14 @@ class Encoding(NamedTuple):
     """An encoding of rows.
 
     Attributes:
-        formula: (x [n, d], size) -> the encoding [n, columns] in the dtype of x, in PyTorch. The compiled module has it
-            and its gradient, in a row of its own (csrc/encoding/encodings.h).
-        columns: (d, size) -> the number of its columns.
-        fits: (d, size) -> whether it exists.
-        octaves: columns of x for each angle, where the compiled module computes sines and cosines of octaves; else 0,
-            and it has the formula of a row.
-        positions: whether a layer table may encode positions so.
-        directions: whether a layer table may encode directions so.
+        formula: (x [n, d], size) -> the encoding [n, columns] in the dtype of x, in PyTorch. The compiled module has a
+            row with the values and the gradient (csrc/encoding/encodings.h).
+        columns: (d, size) -> the number of the encoding's columns.
+        fits: (d, size) -> whether the encoding exists.
+        octaves: the columns of x for each angle if the compiled module computes sines and cosines of octaves; 0 if the
+            compiled module has a formula for each row.
+        positions: whether a layer table may use the encoding for positions.
+        directions: whether a layer table may use the encoding for directions.
     """
 
     formula: Callable[[Tensor, int], Tensor]
@@ -36,16 +36,16 @@ class Encoding(NamedTuple):
 
 
 MOST_OCTAVES = 127
-"""2^128 is beyond float32."""
+"""The largest number of octaves, since 2^128 overflows float32."""
 
 
 def wide(x: Tensor) -> Tensor:
-    """The same in float32 at least."""
+    """Promotes x to at least float32."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
 def frequency(x: Tensor, octaves: int) -> Tensor:
-    """``frequency_encode`` with the input included: ``[x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...]``."""
+    """Computes ``frequency_encode`` with the input included: ``[x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...]``."""
     parts = [wide(x)]
     for octave in range(octaves):
         angle = parts[0] * 2.0**octave
@@ -54,7 +54,7 @@ def frequency(x: Tensor, octaves: int) -> Tensor:
 
 
 def integrated(x: Tensor, octaves: int) -> Tensor:
-    """``integrated_encode`` of means and then variances."""
+    """Computes ``integrated_encode``; the columns of x are the means, then the variances."""
     mean, variance = wide(x).chunk(2, dim=1)
     parts = [mean[:, :0]]
     for octave in range(octaves):
@@ -65,19 +65,19 @@ def integrated(x: Tensor, octaves: int) -> Tensor:
 
 
 def spherical(directions: Tensor, degree: int) -> Tensor:
-    """``spherical_harmonics``: bands 0 to degree - 1 as polynomials."""
+    """Computes ``spherical_harmonics``: bands 0 to degree - 1 as polynomials."""
     direction = wide(directions)
     x, y, z = direction.unbind(1)
     constant, *others = harmonics(x, y, z, degree)
-    zero = direction[:, :0].sum(1)  # so that the constant has a gradient of 0
+    zero = direction[:, :0].sum(1)  # gives the constant a gradient of 0
     return torch.stack([constant + zero, *others], dim=1).to(directions.dtype)
 
 
 def harmonics(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
-    """The real spherical harmonics of a direction, of all that can be multiplied and subtracted.
+    """Returns the real spherical harmonics of a direction; x, y and z may be of any type with products and differences.
 
-    Constants: of band l and order m the square root of (2l + 1) (l - |m|)! / (4 pi (l + |m|)!), times the square root
-    of 2 where m is not 0, and the factors of the polynomial.
+    The constant of band l and order m is sqrt((2l + 1) (l - |m|)! / (4 pi (l + |m|)!)), times sqrt(2) if m is not 0,
+    times the factors of the polynomial.
     """
     return [
         0.28209479177387814,
@@ -114,4 +114,4 @@ ENCODINGS = {
         spherical, lambda d, size: size**2, lambda d, size: d == 3 and 1 <= size <= 4, positions=False
     ),
 }
-"""By their names in the compiled module."""
+"""The encodings, by name in the compiled module."""

@@ -1,7 +1,7 @@
 """Hash grids: tables of features at the corners of grids of several resolutions.
 
-Müller et al. 2022, "Instant Neural Graphics Primitives". A grid describes where the features of a point lie in a table
-[entries, features]; the table itself is a tensor.
+Müller et al. 2022, "Instant Neural Graphics Primitives". A grid describes the layout of a table [entries, features];
+the table itself is a tensor.
 """
 
 from __future__ import annotations
@@ -21,44 +21,44 @@ UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
 
 class GridLevel(NamedTuple):
-    """One level, in the numbers that an implementation needs.
+    """One level of a hash grid, as the numbers that an implementation needs.
 
-    A point x in 0..1 lies at ``x * scale + shift``, between integer corners. The corner (i, j, k) has the entry
-    ``i + side * j + side**2 * k`` modulo ``entries``; or, where the level is hashed, the lowest bits of ``i ^
-    2654435761 j ^ 805459861 k`` in unsigned 32 bit numbers."""
+    A point x in 0..1 lies at ``x * scale + shift``, between integer corners. The index of the corner (i, j, k) is
+    ``i + side * j + side**2 * k`` modulo ``entries``. In a hashed level it is the lowest bits of
+    ``i ^ 2654435761 j ^ 805459861 k`` in unsigned 32-bit arithmetic."""
 
-    scale: float  # corners between the two sides of the box
-    shift: float  # of the corners
+    scale: float  # the box's side in grid cells
+    shift: float  # the offset of a position, in cells
     side: int  # stride of the second axis
-    entries: int  # of this level; a power of two where it is hashed
+    entries: int  # the level's entries; a power of two if hashed
     offset: int  # the level's first entry in the table
     hashed: bool  # whether corners share entries
 
 
 @dataclass(frozen=True)
 class HashGrid:
-    """Levels of a hash grid, as ``hash_encode`` reads them.
+    """The levels of a hash grid, for ``hash_encode``.
 
-    Level l has a resolution of ``base * (finest / base) ** (l / (levels - 1))``, equation 2 and 3 of the paper. A level
-    whose corners all fit into its entries has one for each of them; in a finer one corners share entries by a hash.
+    Level l has the resolution ``base * (finest / base) ** (l / (levels - 1))``, equations 2 and 3 of the paper. A level
+    whose corners fit into its entries has one entry for each corner; in a finer level corners share entries by a hash.
 
     Attributes:
-        levels: 1 to 24.
-        features: 1, 2, 4 or 8 for each level.
-        log2_entries: 10 to 24, the most entries of a level.
-        base: resolution of the coarsest level, at least 1.
-        finest: resolution of the finest one, at least ``base``.
-        box: smallest and largest corner of the space, three numbers each. Points outside of it have the features of the
-            nearest point inside.
+        levels: the number of levels, 1 to 24.
+        features: the features of each level: 1, 2, 4 or 8.
+        log2_entries: the base-2 logarithm of the largest number of entries of a level, 10 to 24.
+        base: the resolution of the coarsest level, at least 1.
+        finest: the resolution of the finest level, at least ``base``.
+        box: the smallest and the largest corner of the space, three numbers each. A point outside the box has the
+            features of the nearest point inside.
         interpolation: "linear", or "smoothstep", whose first derivative is continuous.
-        convention: whose tables are read. "tiny-cuda-nn" (and instant-ngp): corners are shifted by half, a level of
-            resolution N has N corners along an axis. "torch-ngp" (its gridencoder, with ``align_corners=False``): as
-            before, with one more corner. "nerfstudio" (``HashEncoding`` in PyTorch, and HashNeRF): no shift, whole
-            resolutions, and hashes on every level.
-        text: the grid as JSON, which :meth:`parse` reads.
+        convention: the library whose table layout is used. "tiny-cuda-nn" (and instant-ngp): corners are shifted by
+            half a cell, and a level of resolution N has N corners along an axis. "torch-ngp" (its gridencoder, with
+            ``align_corners=False``): the same shift with N + 1 corners. "nerfstudio" (``HashEncoding`` in PyTorch, and
+            HashNeRF): no shift, integer resolutions, and hashes on every level.
+        text: the grid as JSON; :meth:`parse` reads it.
 
     Raises:
-        ValueError: a number out of its range, a box without a volume, or another word.
+        ValueError: a number is out of range, the box has no volume, or a name is unknown.
 
     Examples:
         >>> from voronerf import HashGrid
@@ -94,10 +94,10 @@ class HashGrid:
             )
         try:
             low, high = (tuple(map(float, corner)) for corner in self.box)
-            right = len(low) == len(high) == 3 and all(0 < b - a < math.inf for a, b in zip(low, high))
+            valid = len(low) == len(high) == 3 and all(0 < b - a < math.inf for a, b in zip(low, high))
         except (TypeError, ValueError, OverflowError):
-            right = False
-        if not right:
+            valid = False
+        if not valid:
             raise ValueError(
                 f"HashGrid: box must be two corners of which the second is larger on each axis, got {self.box!r:.60}"
             )
@@ -106,17 +106,17 @@ class HashGrid:
             value = getattr(self, name)
             if not isinstance(value, str) or value not in words:
                 raise ValueError(f"HashGrid: {name} must be one of {', '.join(words)}, got {value!r:.60}")
-        said = {own.name: getattr(self, own.name) for own in dataclasses.fields(self) if own.init}
-        # Not by a cached property, whose lock torch.compile does not enter.
-        object.__setattr__(self, "text", json.dumps(said))
+        settings = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self) if entry.init}
+        # A cached property would not do: torch.compile cannot trace its lock.
+        object.__setattr__(self, "text", json.dumps(settings))
 
     @functools.cached_property
     def rows(self) -> tuple[GridLevel, ...]:
-        """The levels, the coarsest first."""
-        most, found, offset = 2**self.log2_entries, [], 0
-        # In float32, as their libraries compute them: a rounding may decide how many corners there are.
+        """The levels, coarsest first."""
+        max_entries, levels, offset = 2**self.log2_entries, [], 0
+        # Computed in float32, as these libraries do: rounding may change the number of corners.
         growth = math.exp((math.log(self.finest) - math.log(self.base)) / max(self.levels - 1, 1))
-        index = torch.arange(self.levels, device="cpu")  # also where networks are made on the meta device
+        index = torch.arange(self.levels, device="cpu")  # on the CPU even if the default device is meta
         if self.convention == "nerfstudio":
             scales, shift, extra = torch.floor(self.base * growth**index), 0.0, None
         else:
@@ -124,27 +124,27 @@ class HashGrid:
             extra = 2 if self.convention == "torch-ngp" else 1
         for scale in scales.tolist():
             side = 0 if extra is None else math.ceil(scale) + extra
-            hashed = extra is None or side**3 > most
-            entries = most if hashed else -(-(side**3) // 8) * 8
-            found.append(GridLevel(scale, shift, side, entries, offset, hashed))
+            hashed = extra is None or side**3 > max_entries
+            entries = max_entries if hashed else -(-(side**3) // 8) * 8
+            levels.append(GridLevel(scale, shift, side, entries, offset, hashed))
             offset += entries
-        return tuple(found)
+        return tuple(levels)
 
     @property
     def out_features(self) -> int:
-        """Features of an encoded point."""
+        """The features of an encoded point."""
         return self.levels * self.features
 
     @property
     def table_shape(self) -> tuple[int, int]:
-        """Shape [entries of all levels, features] of the table."""
+        """The shape [entries of all levels, features] of the table."""
         last = self.rows[-1]
         return last.offset + last.entries, self.features
 
     @staticmethod
     @functools.lru_cache(maxsize=256)
     def parse(text: str) -> HashGrid:
-        """The grid whose ``text`` this is."""
-        said: dict[str, Any] = json.loads(text)
-        low, high = said.pop("box")
-        return HashGrid(box=(tuple(low), tuple(high)), **said)
+        """Parses a grid from its ``text``."""
+        settings: dict[str, Any] = json.loads(text)
+        low, high = settings.pop("box")
+        return HashGrid(box=(tuple(low), tuple(high)), **settings)

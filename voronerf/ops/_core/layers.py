@@ -1,8 +1,8 @@
 """The layer table of a per-cell network, which ``grouped_mlp`` runs.
 
-A network is a list of linear layers with elementwise activations. Each layer names the sources of its inputs, so that
-skip connections and a branch that sees the view direction are entries of a table rather than code, and one kernel runs
-them all. The original NeRF (Mildenhall et al. 2020, figure 7) and the networks of KiloNeRF are both such tables.
+A network is a list of linear layers with elementwise activations. Each layer names the sources of its inputs. Skip
+connections and a branch that reads the view direction are thus table entries rather than code, and one kernel runs all
+networks. The original NeRF (Mildenhall et al. 2020, figure 7) and the networks of KiloNeRF are both such tables.
 
 Letters: d features of a raw position (3) or direction (3), L octaves of the frequency encoding, i inputs and o outputs
 of a layer, k cells.
@@ -25,9 +25,9 @@ DIRECTION_ENCODINGS = tuple(name for name, encoding in ENCODINGS.items() if enco
 POSITIONS = "positions"
 DIRECTIONS = "directions"
 NUMBERS = {"softplus": (1.0, 20.0), "sine": (1.0, 0.0)}
-"""Of activations that are functions with two numbers."""
+"""The two numbers of a :data:`~voronerf.ops._core.program.FUNCTIONS` entry, for activations that need them."""
 MOST_FEATURES = 2**20
-"""Of a layer."""
+"""The largest width of a layer."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Layer:
     """One linear layer and its activation.
 
     Attributes:
-        inputs: sources concatenated in this order: "positions", "directions", or the index of an earlier layer.
-        width: output features.
-        activation: one of ``ACTIVATIONS``, applied to the sum of product and bias.
+        inputs: the sources, concatenated in order: "positions", "directions", or the index of an earlier layer.
+        width: the number of output features.
+        activation: one of ``ACTIVATIONS``, applied after the bias.
 
     Examples:
         >>> from voronerf import Layer
@@ -57,23 +57,23 @@ class MLP:
     """A network as a table of layers.
 
     Attributes:
-        layers: in order of evaluation.
-        outputs: indices of the layers whose results are concatenated into the network's output.
-        position_octaves: octaves of the encoding of the positions; None takes the positions as they come.
-        direction_octaves: octaves of the encoding of the view directions, or None.
+        layers: the layers in order of evaluation.
+        outputs: the indices of the layers whose results are concatenated into the network's output.
+        position_octaves: the octaves of the positions' encoding; None for raw positions.
+        direction_octaves: the octaves of the view directions' encoding; None for raw directions.
         position_encoding: "frequency", ``frequency_encode`` with the input included (d -> d + 2dL); or "integrated",
             ``integrated_encode`` of Gaussians: positions are [n, 6], the mean and then the diagonal variance (6 -> 6L);
-            or "hash", ``hash_encode`` (3 -> levels * features), whose table of features is an argument of its own.
-        grid: the levels of the "hash" encoding, else None.
+            or "hash", ``hash_encode`` (3 -> levels * features), whose table of features is a separate argument.
+        grid: the grid of the "hash" encoding, else None.
         direction_encoding: "frequency", or "spherical", ``spherical_harmonics`` of unit vectors (3 -> degree^2).
-        direction_degree: of the spherical harmonics, 1 to 4, else None.
-        text: the whole table as JSON, the form in which it passes through a ``torch.library`` operator; see ``parse``.
+        direction_degree: the degree of the spherical harmonics, 1 to 4; None for other encodings.
+        text: the table as JSON, the argument of ``torch.library`` operators; ``parse`` reads it.
 
     Raises:
-        ValueError: a table that cannot be evaluated: no layers or outputs, a source that is not an earlier layer, a
-            width below 1, an unknown activation or encoding, negative octaves, the integrated encoding without octaves,
-            the hash encoding without a grid or with octaves, spherical harmonics without a degree or with octaves, a
-            degree without them.
+        ValueError: the table is invalid: no layers or outputs, a source that is not an earlier layer, a width below 1,
+            an unknown activation or encoding, negative octaves, the integrated encoding without octaves, the hash
+            encoding without a grid or with octaves, spherical harmonics without a degree or with octaves, or a degree
+            without spherical harmonics.
 
     Examples:
         >>> from voronerf import MLP, Layer
@@ -109,12 +109,12 @@ class MLP:
         ):
             if octaves is not None and (type(octaves) is not int or not 0 <= octaves <= 127):
                 raise ValueError(f"MLP: {name} must be None or 0 to 127, got {octaves!r:.60}")
-        for name, encoding, known in (
+        for name, encoding, names in (
             ("position_encoding", self.position_encoding, POSITION_ENCODINGS),
             ("direction_encoding", self.direction_encoding, DIRECTION_ENCODINGS),
         ):
-            if encoding not in known:
-                raise ValueError(f"MLP: {name} must be one of {', '.join(known)}, got {encoding!r:.60}")
+            if encoding not in names:
+                raise ValueError(f"MLP: {name} must be one of {', '.join(names)}, got {encoding!r:.60}")
         for name, encoding, octaves in (
             ("position_octaves", self.position_encoding, self.position_octaves),
             ("direction_octaves", self.direction_encoding, self.direction_octaves),
@@ -132,7 +132,7 @@ class MLP:
         self._check_degree()
         rows = [[list(layer.inputs), layer.width, layer.activation] for layer in self.layers]
         table = [rows, list(self.outputs), self.position_octaves, self.direction_octaves]
-        # Tables from before there was a choice have four entries; nor are later choices written that are not made.
+        # Tables with default encodings have four entries, as in old saved runs: trailing defaults are not written.
         choices: list[object] = [self.position_encoding, self.grid and self.grid.text]
         choices += [self.direction_encoding, self.direction_degree]
         while choices and choices[-1] in (None, "frequency"):
@@ -151,12 +151,12 @@ class MLP:
             raise ValueError(f"MLP: direction_octaves must be None with spherical harmonics, got {octaves}")
 
     def __hash__(self) -> int:
-        return hash(self.text)  # which is kept
+        return hash(self.text)  # Python caches the hash of a str
 
     @staticmethod
     @functools.lru_cache(maxsize=256)
     def parse(text: str) -> MLP:
-        """The table whose ``text`` this is."""
+        """Parses a table from its ``text``."""
         rows, outputs, *encodings = json.loads(text)
         if len(encodings) > 3 and encodings[3] is not None:
             encodings[3] = HashGrid.parse(encodings[3])
@@ -165,21 +165,21 @@ class MLP:
 
     @property
     def integrated(self) -> bool:
-        """Whether positions are Gaussians, [n, 6], for the integrated encoding."""
+        """Returns whether positions are Gaussians, [n, 6], for the integrated encoding."""
         return self.position_encoding == "integrated"
 
     @property
     def out_features(self) -> int:
-        """Features of the network's output."""
+        """The number of features of the network's output."""
         return sum(self.layers[index].width for index in self.outputs)
 
     @property
     def uses_directions(self) -> bool:
-        """Whether any layer reads the view directions."""
+        """Returns whether any layer reads the view directions."""
         return any(DIRECTIONS in layer.inputs for layer in self.layers)
 
     def encoding(self, source: str) -> tuple[str, int] | None:
-        """The encoding of positions or directions by its name in :data:`ENCODINGS`, and its size; None for none."""
+        """Returns the name and size of the encoding of "positions" or "directions"; None if they are raw."""
         if source == POSITIONS:
             name, size = self.position_encoding, self.position_octaves
         else:
@@ -187,7 +187,7 @@ class MLP:
         return (name, size) if size else None
 
     def source_width(self, source: int | str, positions_d: int, directions_d: int = 0) -> int:
-        """Features that a source contributes to a layer's input, after encoding."""
+        """Returns the number of features of a source after encoding."""
         if isinstance(source, int):
             return self.layers[source].width
         if source == POSITIONS and self.grid is not None:
@@ -196,11 +196,11 @@ class MLP:
         return width if encoding is None else encoded_columns(encoding[0], width, encoding[1])
 
     def input_width(self, layer: int, positions_d: int, directions_d: int = 0) -> int:
-        """Input features i of layer number ``layer``, for raw positions and directions of the given widths."""
+        """Returns the input features i of a layer, for raw positions and directions of these widths."""
         return sum(self.source_width(source, positions_d, directions_d) for source in self.layers[layer].inputs)
 
     def weight_shapes(self, positions_d: int, directions_d: int = 0) -> list[tuple[int, int]]:
-        """Shape [o, i] of every layer's weight (without the leading k cells)."""
+        """Returns the shape [o, i] of every layer's weight, without the leading k cells."""
         return [
             (layer.width, self.input_width(index, positions_d, directions_d)) for index, layer in enumerate(self.layers)
         ]
@@ -208,22 +208,22 @@ class MLP:
     def program(
         self, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool = False
     ) -> Program:
-        """The network as a program, which ``grouped_program`` runs.
+        """Builds the network's program, which ``grouped_program`` runs.
 
-        Its inputs are the positions and, if any layer reads them, the directions, raw if the table encodes them. Its
-        parameters are the weight (o, i) of each layer, the bias (o,) of each layer that has one, and the table (e, f)
-        of the grid if there is one, in this order. They are there also if no output depends on them. It has one output,
+        Its inputs are the positions and, if any layer reads them, the directions, both before encoding. Its parameters
+        are the weight (o, i) of each layer, the bias (o,) of each biased layer, and the grid's table (e, f) if there is
+        a grid, in this order. The program keeps parameters that no output depends on. It has one output,
         [n, out_features].
 
         Args:
-            p: columns of the positions.
-            q: columns of the directions; 0 if no layer reads them.
-            widths: output features o of each layer's weight; None for those of the table.
-            biased: which layers have a bias.
+            p: the number of columns of the positions.
+            q: the number of columns of the directions; 0 if no layer reads them.
+            widths: the output features o of each layer's weight; None for the widths in the table.
+            biased: for each layer, whether it has a bias.
             ray: whether directions have one row for each ray, [r, q].
 
         Returns:
-            The program, the same one for the same arguments.
+            The program; it is cached, so equal arguments give the same object.
 
         Examples:
             >>> from voronerf import MLP, Layer
@@ -239,29 +239,29 @@ class MLP:
 
 @functools.lru_cache(maxsize=256)
 def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool) -> Program:
-    """:meth:`MLP.program` of the table whose text this is."""
-    table, b = MLP.parse(text), Builder()
+    """Builds :meth:`MLP.program` of a table from its text."""
+    table, builder = MLP.parse(text), Builder()
     if widths is not None:
         layers = zip(table.layers, widths, strict=True)
         table = replace(table, layers=tuple(replace(layer, width=width) for layer, width in layers))
-    raw = {POSITIONS: b.input(p)}
+    raw = {POSITIONS: builder.input(p)}
     if table.uses_directions:
-        raw[DIRECTIONS] = b.input(q, ray)
-    weights = [b.parameter(*shape) for shape in table.weight_shapes(p, q)]
+        raw[DIRECTIONS] = builder.input(q, ray)
+    weights = [builder.parameter(*shape) for shape in table.weight_shapes(p, q)]
     biases = [
-        Columns(PARAMETER, b.parameter(layer.width), 0, layer.width) if has else None
+        Columns(PARAMETER, builder.parameter(layer.width), 0, layer.width) if has else None
         for layer, has in zip(table.layers, biased, strict=True)
     ]
-    features = None if table.grid is None else b.parameter(*table.grid.table_shape)
+    features = None if table.grid is None else builder.parameter(*table.grid.table_shape)
     values: dict[int | str, Columns] = {}
 
     def source(name: int | str) -> Columns:
         if name not in values:
             x, encoding = raw[str(name)], table.encoding(str(name))
             if name == POSITIONS and table.grid is not None and features is not None:
-                x = b.encode(HASH, x, b.grid(table.grid.text), features)
+                x = builder.encode(HASH, x, builder.grid(table.grid.text), features)
             elif encoding is not None:
-                x = b.encode(encoding[0], x, encoding[1])
+                x = builder.encode(encoding[0], x, encoding[1])
             values[name] = x
         return values[name]
 
@@ -269,22 +269,22 @@ def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: 
         total, start = biases[index], 0
         for name in layer.inputs:
             x = source(name)
-            total = b.linear(x, weights[index], layer.width, start, add=total)
+            total = builder.linear(x, weights[index], layer.width, start, add=total)
             start += x.width
         assert total is not None
         if layer.activation != "none":
-            total = b.apply(layer.activation, total, *NUMBERS.get(layer.activation, (0.0, 0.0)))
+            total = builder.apply(layer.activation, total, *NUMBERS.get(layer.activation, (0.0, 0.0)))
         values[index] = total
     parts, at = [], 0
     for output in table.outputs:
         parts.append((values[output], at))
         at += values[output].width
-    return pruned(b.program([b.move(at, parts)]))
+    return pruned(builder.program([builder.move(at, parts)]))
 
 
 @constant_result
 def program_text(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool) -> str:
-    """The text of :meth:`MLP.program` of the table whose text this is; ``torch.compile`` takes it as it finds it."""
+    """Returns the text of :meth:`MLP.program` of a table; for ``torch.compile`` the result is a constant."""
     return _program(text, p, q, widths, biased, ray).text
 
 

@@ -1,7 +1,7 @@
-"""Memory of large results on CPUs: huge pages, and that of earlier results that are gone.
+"""Memory of large results on CPUs: huge pages, and reuse of the blocks of freed results.
 
-The C library gives large blocks back to the system when they are freed, so each step would wait for the same pages
-again. Its limits are those of the whole process and stay as they are: blocks that are kept here are our own.
+The C library returns large freed blocks to the system, so each step would wait for the same page faults again. Its
+thresholds affect the whole process, so this module leaves them alone and caches blocks itself.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from torch import Tensor
 from voronerf.ops._core.active import active
 
 LARGE = 1 << 22
-"""Bytes of a result that is put on huge pages; for smaller ones the allocator usually has warm memory."""
-_KEPT = 1 << 29  # bytes of blocks that no result uses
+"""The smallest size of a result on huge pages, in bytes; for smaller results the allocator usually has warm memory."""
+_MAX_UNUSED = 1 << 29  # the largest size of all unused blocks, in bytes
 _unused: list[mmap.mmap] = []
 
 
 def on_huge_pages(result: Tensor) -> Tensor:
-    """Gives a new result, where it is large, the memory of an earlier one, or huge pages, on Linux.
+    """Moves a large new result into the memory of a freed one, or onto huge pages. A no-op outside Linux.
 
     Args:
-        result: What was allocated and not written yet.
+        result: An allocated tensor that has not been written yet.
 
     Returns:
         The same tensor.
@@ -44,14 +44,14 @@ def on_huge_pages(result: Tensor) -> Tensor:
         block = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         with suppress(OSError):  # a kernel without huge pages
             block.madvise(mmap.MADV_HUGEPAGE)
-    held = (ctypes.c_char * size).from_buffer(block)  # which lives as long as a tensor of this memory
-    weakref.finalize(held, _keep, block).atexit = False
-    memory = torch.frombuffer(held, dtype=result.dtype).untyped_storage()
+    buffer = (ctypes.c_char * size).from_buffer(block)  # lives as long as any tensor in this memory
+    weakref.finalize(buffer, _recycle, block).atexit = False
+    memory = torch.frombuffer(buffer, dtype=result.dtype).untyped_storage()
     result.set_(memory, 0, result.shape, result.stride())
     return result
 
 
-def _keep(block: mmap.mmap) -> None:
+def _recycle(block: mmap.mmap) -> None:
     _unused.append(block)
-    while sum(map(len, _unused)) > _KEPT:
+    while sum(map(len, _unused)) > _MAX_UNUSED:
         _unused.pop(0)

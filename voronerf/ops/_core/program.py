@@ -1,9 +1,9 @@
-"""Programs of a tile: what an op does with the rows of one cell, step by step.
+"""Programs: the sequence of steps that an op runs on the rows of one cell.
 
-A program takes rows, [n, w] for each of its inputs, and parameters, [k, o, i] or [k, w], one for each cell. Its steps
-make values of rows, [n, w], and sums over the rows of a cell. Rows are samples of rays: an input may have one row for
-each ray, [r, w], and an output may be the sum over each ray's samples. The gradient of a program is a program
-(:func:`gradient`), so derivatives of every order run as the program itself does.
+A program takes inputs with one row for each sample, [n, w], and parameters with one entry for each cell, [k, o, i] or
+[k, w]. Its steps compute values, [n, w], and sums over the rows of a cell. Rows are samples of rays: an input may have
+one row for each ray, [r, w], and an output may be the sum over each ray's samples. The gradient of a program is a
+program (:func:`gradient`), so the same kernels run derivatives of every order.
 
 Letters: n rows, r rays, k cells, w columns of a value, o outputs and i inputs of a matrix, e entries and f features of
 the table of a hash grid, m the order of a derivative.
@@ -11,21 +11,21 @@ the table of a hash grid, m the order of a derivative.
 The steps:
 
     input      the columns of an input
-    linear     x W^T, or x W if transposed, of columns ``start`` on of a matrix's inputs, and what is added to it
-    function   f(x) of :data:`FUNCTIONS`, or one of its derivatives; times another value
+    linear     x W^T, or x W if transposed, where W is a matrix from input column ``start`` on; plus an optional value
+    function   f(x) for f of :data:`FUNCTIONS` or one of its derivatives; times an optional value
     binary     one of :data:`BINARY` of two values
-    total      sums over groups of columns next to each other
-    move       columns of values, put next to each other or added up
-    encode     one of :data:`ENCODINGS` of columns, or "hash", or one of its derivatives
+    total      the sums over groups of adjacent columns
+    move       columns of values, placed side by side; overlapping columns are added
+    encode     one of :data:`ENCODINGS`, or "hash", of columns; or one of its derivatives
     outer      g^T x, summed over the rows of a cell: the gradient of a matrix
     columns    the sum over the rows of a cell: the gradient of a vector
-    scatter    the gradient of a table, summed over the rows of a cell, or over all rows where cells share the table
+    scatter    the gradient of a table, summed over the rows of a cell, or over all rows if the cells share the table
 
-Derivatives of an encoding e(x), with the table T where it has one, close under differentiation:
+The derivatives of an encoding e(x), which may have a table T, are closed under differentiation:
 
-    F_m(x; h_1 .. h_m)        the m-th derivative of e at x along h_1, ..., h_m: as many columns as e(x) has
-    G_m(x, g; h_1 .. h_m-1)   the gradient to x of <g, F_m-1(x; h_1 .. h_m-1)>: as many columns as x has
-    T_m(x, g; h_1 .. h_m)     the gradient to the table of <g, F_m(x; h_1 .. h_m)>, which a scatter adds up
+    F_m(x; h_1 .. h_m)        the m-th derivative of e at x along h_1, ..., h_m, with as many columns as e(x)
+    G_m(x, g; h_1 .. h_m-1)   the gradient to x of <g, F_m-1(x; h_1 .. h_m-1)>, with as many columns as x
+    T_m(x, g; h_1 .. h_m)     the gradient to the table of <g, F_m(x; h_1 .. h_m)>, which a scatter sums
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ _ANY = 1 << 30
 
 
 class Function(NamedTuple):
-    """A function of each entry, with two numbers a and b.
+    """An elementwise function with two numbers a and b.
 
     Attributes:
-        formula: (x, a, b) -> f(x), in PyTorch. The compiled module has f and its derivatives, in a line of its own
+        formula: (x, a, b) -> f(x), in PyTorch. The compiled module has f and its derivatives
             (csrc/network/functions.h).
-        orders: the highest derivative that is not 0.
+        orders: the order of the highest derivative that is not 0.
     """
 
     formula: Callable[[Tensor, float, float], Tensor]
@@ -86,7 +86,7 @@ FUNCTIONS = {
     "erf": Function(lambda x, a, b: x.erf()),
     "atan": Function(lambda x, a, b: x.atan()),
 }
-"""By their names in the compiled module."""
+"""The elementwise functions, by name in the compiled module."""
 
 BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "add": torch.add,
@@ -95,33 +95,33 @@ BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "div": torch.div,
     "gate": lambda x, y: torch.where(y != 0, x, 0),  # x where y is not 0, else 0
 }
-"""Of two values, by their names in the compiled module."""
+"""The functions of two values, by name in the compiled module."""
 
 HASH = "hash"
-"""The name of ``hash_encode``, the encoding that has a parameter, beside :data:`ENCODINGS`."""
+"""The name of ``hash_encode``, the one encoding with a parameter, which :data:`ENCODINGS` lacks."""
 
 
 def encoded_columns(name: str, raw: int, size: int, grids: Sequence[str] = ()) -> int:
-    """How many columns an encoding gives.
+    """Returns the number of columns of an encoding.
 
     Args:
         name: one of :data:`ENCODINGS`, or "hash".
-        raw: columns that are encoded.
-        size: the encoding's; for "hash" the number of the grid.
-        grids: texts of the grids.
+        raw: the number of columns before encoding.
+        size: the encoding's size; for "hash" the index of the grid.
+        grids: the texts of the grids.
     """
     return HashGrid.parse(grids[size]).out_features if name == HASH else ENCODINGS[name].columns(raw, size)
 
 
 class Columns(NamedTuple):
-    """Columns of a value or of a parameter, as a step reads them.
+    """A range of columns of a value or of a parameter: an operand of a step.
 
     Attributes:
         of: "value" or "parameter".
-        index: of the value or parameter.
-        start: the first column; of a parameter, the first of its entries in a row.
-        width: how many.
-        spread: one column, in the place of ``width``.
+        index: the index of the value or parameter.
+        start: the first column; for a parameter, the first entry in its flattened shape.
+        width: the number of columns.
+        spread: whether one column is broadcast to ``width`` columns.
     """
 
     of: str
@@ -131,26 +131,26 @@ class Columns(NamedTuple):
     spread: bool = False
 
     def part(self, start: int, width: int) -> Columns:
-        """Some of these columns."""
+        """Returns a subrange of the columns."""
         return self._replace(start=self.start + (0 if self.spread else start), width=width)
 
 
 class Step(NamedTuple):
-    """One step.
+    """One step of a program.
 
     Attributes:
-        op: one of the table above.
-        out: the value that it makes; of outer, columns and scatter, the sum that it adds to.
-        width: columns that it makes; of a scatter, those of g.
-        operands: what it reads. linear: x, then what is added if anything is, then the value of ``relu_slope``;
-            function: x, then what it is multiplied by if anything is. encode, scatter: rows alone, as F_m, G_m and T_m
-            name them; G_1 has the value F_0(x) as a third one, which kernels use. It has no gradient of its own: what
-            it says is known from x and the table.
-        numbers: input: (index,). linear: (parameter, start, transposed). function: (order, a, b). total: (columns of a
-            group,). move: for each operand where its columns go. outer, columns: (start,). encode: (size, parameter, m,
-            back), the size as in :func:`encoded_columns`, the parameter that is the table of "hash", else 0, and 0 for
-            F_m or 1 for G_m. scatter: (grid, parameter, m), with the table whose layout the sum has.
-        name: of the function, of the binary one or of the encoding. linear: "relu" or "relu_slope", done on the way.
+        op: the name of the operation, see the table above.
+        out: the index of the computed value; for outer, columns and scatter, the index of the sum.
+        width: the number of columns of the value; for a scatter, the columns of g.
+        operands: the columns that the step reads. linear: x, an optional addend, and the operand of ``relu_slope``.
+            function: x and an optional factor. encode, scatter: the arguments of F_m, G_m and T_m, all of them values;
+            G_1 has F_0(x) as a third operand, for the kernels. No gradient flows to this operand, because it depends on
+            x and the table alone.
+        numbers: input: (index,). linear: (parameter, start, transposed). function: (order, a, b). total: (group size,).
+            move: the first target column of each operand. outer, columns: (start,). encode: (size, parameter, m, back):
+            the size as in :func:`encoded_columns`, the parameter with the table of "hash" or 0, the order, and back = 0
+            for F_m or 1 for G_m. scatter: (grid, parameter, m); the parameter's table has the layout of the sum.
+        name: the name of the function, binary function or encoding. linear: "" or a fused "relu" or "relu_slope".
     """
 
     op: str
@@ -163,24 +163,24 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Program:
-    """What is done with the rows of a cell.
+    """A program on the rows of a cell.
 
     Raises:
-        ValueError: a step, an output or a sum of anything that is not there: what runs a program trusts it.
+        ValueError: a step, an output or a sum refers to something that does not exist. The kernels trust a program.
     """
 
-    inputs: tuple[int, ...]  # columns of each input
-    parameters: tuple[tuple[int, ...], ...]  # shape for one cell of each parameter, (o, i), (w,) or (e, f)
-    steps: tuple[Step, ...]  # in their order
-    outputs: tuple[Columns, ...]  # columns that are results, [n, w] each
-    sums: tuple[tuple[int, ...], ...] = ()  # shape for one cell of each result that is a sum over its rows
-    rays: tuple[int, ...] = ()  # inputs that have one row for each ray, [r, w]
-    by_ray: tuple[int, ...] = ()  # outputs that are sums over the samples of each ray, [r, w], 0 without samples
-    grids: tuple[str, ...] = ()  # texts of hash grids
-    text: str = field(init=False, compare=False)  # the program as a string, which ops take
-    orders: int = field(init=False, compare=False)  # the highest derivative of a function in it; see _order
-    tables: tuple[int, ...] = field(init=False, compare=False)  # parameters that are tables of grids
-    sum_tables: tuple[int | None, ...] = field(init=False, compare=False)  # the table whose layout each sum has
+    inputs: tuple[int, ...]  # the number of columns of each input
+    parameters: tuple[tuple[int, ...], ...]  # the shape of each parameter for one cell, (o, i), (w,) or (e, f)
+    steps: tuple[Step, ...]  # the steps, in order
+    outputs: tuple[Columns, ...]  # the columns of each result, [n, w]
+    sums: tuple[tuple[int, ...], ...] = ()  # the shape of each sum over rows, for one cell
+    rays: tuple[int, ...] = ()  # the inputs with one row for each ray, [r, w]
+    by_ray: tuple[int, ...] = ()  # the outputs summed over the samples of each ray, [r, w]
+    grids: tuple[str, ...] = ()  # the texts of the hash grids
+    text: str = field(init=False, compare=False)  # the program as JSON, the argument of ops
+    orders: int = field(init=False, compare=False)  # the highest order of derivative of a function; see _order
+    tables: tuple[int, ...] = field(init=False, compare=False)  # the parameters that are tables of grids
+    sum_tables: tuple[int | None, ...] = field(init=False, compare=False)  # the table that each sum is the gradient of
 
     def __post_init__(self) -> None:
         check(self)
@@ -189,37 +189,40 @@ class Program:
         object.__setattr__(self, "orders", max(map(_order, self.steps), default=0))
         read = {int(step.numbers[1]) for step in self.steps if _reads_table(step)}
         object.__setattr__(self, "tables", tuple(sorted(read)))
-        of_sums = {step.out: int(step.numbers[1]) for step in self.steps if step.op == "scatter"}
-        object.__setattr__(self, "sum_tables", tuple(of_sums.get(index) for index in range(len(self.sums))))
+        tables_of_sums = {step.out: int(step.numbers[1]) for step in self.steps if step.op == "scatter"}
+        object.__setattr__(self, "sum_tables", tuple(tables_of_sums.get(index) for index in range(len(self.sums))))
 
     def __hash__(self) -> int:
-        return hash(self.text)  # which is kept
+        return hash(self.text)  # Python caches the hash of a str
 
     @staticmethod
     @functools.lru_cache(maxsize=1024)
     def parse(text: str) -> Program:
-        """The program of a string."""
+        """Parses a program from its text."""
         inputs, parameters, steps, outputs, sums, *others = json.loads(text)
-        shapes = [tuple(map(tuple, given)) for given in (parameters, sums)]
-        known = [
-            Step(op, out, width, tuple(Columns(*each) for each in operands), tuple(numbers), name)
+        shapes = [tuple(map(tuple, shape_lists)) for shape_lists in (parameters, sums)]
+        parsed_steps = [
+            Step(op, out, width, tuple(Columns(*columns) for columns in operands), tuple(numbers), name)
             for op, out, width, operands, numbers, name in steps
         ]
-        results = tuple(Columns(*each) for each in outputs)
-        return Program(tuple(inputs), shapes[0], tuple(known), results, shapes[1], *map(tuple, others))
+        results = tuple(Columns(*columns) for columns in outputs)
+        return Program(tuple(inputs), shapes[0], tuple(parsed_steps), results, shapes[1], *map(tuple, others))
 
     def cells_of_sums(self, parameters: Sequence[Tensor], k: int) -> list[int]:
-        """For how many cells each sum has entries: 1 if it is that of a table [1, e, f] that all share, else k."""
+        """Returns the number of cells of each sum: 1 if it is the gradient of a shared table [1, e, f], else k."""
         return [k if table is None else parameters[table].shape[0] for table in self.sum_tables]
 
 
-_WIDEST = 1 << 20  # columns
-_ORDERS = 20  # of derivatives
+_WIDEST = 1 << 20  # the largest number of columns
+_ORDERS = 20  # orders of derivatives
 
 
 def _order(step: Step) -> int:
-    """The derivative of a function in a step. Of encodings the compiled module has F_0, G_1 and T_0, and any further
-    derivative counts as one that it has of no function."""
+    """Returns the order of derivative of a step.
+
+    The compiled module has F_0, G_1 and T_0 of an encoding. Every higher derivative counts as `_ORDERS`, an order that
+    it has for no function.
+    """
     if step.op == "function":
         return int(step.numbers[0])
     further = step.op == "encode" and step.numbers[2] > step.numbers[3]
@@ -227,50 +230,56 @@ def _order(step: Step) -> int:
 
 
 def check(program: Program) -> None:
-    """Raises ValueError unless a program reads and writes what is there alone."""
+    """Raises ValueError unless all indices and column ranges of a program are within bounds."""
     inputs, parameters, sums, grids = program.inputs, program.parameters, program.sums, program.grids
-    values: dict[int, Step] = {}  # what makes them
-    tables: dict[int, bool] = {}  # whether a parameter that is read is the table of a grid
-    summed: dict[int, int] = {}  # the table whose gradient a sum is; -1 for none
-    _rule("inputs", _sizes(inputs), inputs)
-    _rule("grids", isinstance(grids, tuple) and all(map(_is_grid, grids)), grids, "texts of hash grids")
+    values: dict[int, Step] = {}  # the step that computes each value
+    tables: dict[int, bool] = {}  # parameter -> whether it is the table of a grid
+    summed: dict[int, int] = {}  # sum -> the table whose gradient it is, -1 if none
+    _require("inputs", _are_sizes(inputs), inputs)
+    _require("grids", isinstance(grids, tuple) and all(map(_is_grid, grids)), grids, "texts of hash grids")
     large = {HashGrid.parse(text).table_shape for text in grids}
     for name, shapes in (("parameters", parameters), ("sums", sums)):
-        known = isinstance(shapes, tuple)
-        known = known and all((_sizes(shape) and len(shape) in (1, 2)) or shape in large for shape in shapes)
-        _rule(name, known, shapes)
-    _rule("rays", _numbers(program.rays, len(inputs)), program.rays, "numbers of inputs, each once")
+        valid = isinstance(shapes, tuple)
+        valid = valid and all((_are_sizes(shape) and len(shape) in (1, 2)) or shape in large for shape in shapes)
+        _require(name, valid, shapes)
+    _require("rays", _are_indices(program.rays, len(inputs)), program.rays, "numbers of inputs, each once")
 
     def fits(columns: Any, *widths: int, rows: bool = False) -> bool:
-        """Whether columns are there, of one of these widths if any are given; or even each a column of a value."""
-        if not isinstance(columns, Columns) or not _sizes(columns[1:4]) or not isinstance(columns.spread, bool):
+        """Returns whether columns exist and have one of the widths; with ``rows`` they must be unspread values."""
+        if not isinstance(columns, Columns) or not _are_sizes(columns[1:4]) or not isinstance(columns.spread, bool):
             return False
         of, index, start, width, spread = columns
         if of == VALUE:
-            there = values[index].width if index in values else -1
+            available = values[index].width if index in values else -1
         else:
-            known = of == PARAMETER and index < len(parameters) and not tables.setdefault(index, False)
-            there = math.prod(parameters[index]) if known else -1
-        inside = start + (1 if spread else width) <= there
+            valid = of == PARAMETER and index < len(parameters) and not tables.setdefault(index, False)
+            available = math.prod(parameters[index]) if valid else -1
+        inside = start + (1 if spread else width) <= available
         return inside and (not widths or width in widths) and not (rows and (spread or of != VALUE))
 
     def hashed(x: Columns, grid: int, table: int) -> bool:
-        """Whether columns are positions for a grid, a whole input that is not of rays, and a parameter is its table."""
+        """Returns whether columns are a whole per-sample input of positions, and a parameter is the grid's table."""
         maker = values[x.index]
         whole = maker.op == "input" and maker.numbers[0] not in program.rays and x.width == maker.width == 3
-        there = whole and grid < len(grids) and table < len(parameters)
-        return there and parameters[table] == HashGrid.parse(grids[grid]).table_shape and tables.setdefault(table, True)
+        available = whole and grid < len(grids) and table < len(parameters)
+        return (
+            available
+            and parameters[table] == HashGrid.parse(grids[grid]).table_shape
+            and tables.setdefault(table, True)
+        )
 
     def encodes(step: Step) -> bool:
         operands, numbers = step.operands, step.numbers
-        if not (operands and all(fits(each, rows=True) for each in operands) and _sizes(numbers) and len(numbers) == 4):
+        if not (
+            operands and all(fits(each, rows=True) for each in operands) and _are_sizes(numbers) and len(numbers) == 4
+        ):
             return False
         (x, *rest), (size, table, order, back) = operands, map(int, numbers)
         if step.name == HASH:
-            known = hashed(x, size, table)
+            valid = hashed(x, size, table)
         else:
-            known = table == 0 and step.name in ENCODINGS and ENCODINGS[step.name].fits(x.width, size)
-        if not (known and back < 2 and back <= order < _ORDERS):
+            valid = table == 0 and step.name in ENCODINGS and ENCODINGS[step.name].fits(x.width, size)
+        if not (valid and back < 2 and back <= order < _ORDERS):
             return False
         encoded = encoded_columns(step.name, x.width, size, grids)
         widths = [encoded] * back + [x.width] * (order - back)
@@ -285,7 +294,7 @@ def check(program: Program) -> None:
         operands, numbers = step.operands, step.numbers
         if not (len(operands) > 1 and all(fits(each, rows=True) for each in operands)):
             return False
-        if not (_sizes(numbers) and len(numbers) == 3 and numbers[2] < _ORDERS):
+        if not (_are_sizes(numbers) and len(numbers) == 3 and numbers[2] < _ORDERS):
             return False
         (x, *rest), (grid, table, order) = operands, map(int, numbers)
         if not (hashed(x, grid, table) and sums[step.out] == parameters[table]):
@@ -293,16 +302,16 @@ def check(program: Program) -> None:
         encoded = encoded_columns(HASH, 3, grid, grids)
         return [step.width, *(each.width for each in rest)] == [encoded, encoded] + [3] * order
 
-    def right(step: Step) -> bool:
+    def step_is_valid(step: Step) -> bool:
         op, _, width, operands, numbers, name = step
-        count, whole = len(operands), _sizes(numbers)
+        count, whole = len(operands), _are_sizes(numbers)
         if op == "input":
             return whole and len(numbers) == 1 and numbers[0] < len(inputs) and width == inputs[int(numbers[0])]
         if op == "encode":
             return encodes(step)
         if op == "function":
-            known = name in FUNCTIONS and len(numbers) == 3 and _sizes(numbers[:1]) and numbers[0] < _ORDERS
-            return known and count in (1, 2) and all(fits(each, width) for each in operands)
+            valid = name in FUNCTIONS and len(numbers) == 3 and _are_sizes(numbers[:1]) and numbers[0] < _ORDERS
+            return valid and count in (1, 2) and all(fits(each, width) for each in operands)
         if op == "binary":
             return name in BINARY and count == 2 and all(fits(each, width) for each in operands)
         if op == "total":
@@ -311,22 +320,22 @@ def check(program: Program) -> None:
             places = whole and len(numbers) == count and all(map(fits, operands))
             return places and all(at + each.width <= width for each, at in zip(operands, numbers))
         if op == "linear":
-            known = whole and len(numbers) == 3 and name in _FINISHES
-            if not (known and numbers[0] < len(parameters) and numbers[2] < 2):
+            valid = whole and len(numbers) == 3 and name in _FINISHES
+            if not (valid and numbers[0] < len(parameters) and numbers[2] < 2):
                 return False
             (matrix, start, transposed), extra = map(int, numbers), name == "relu_slope"
             o, i = (*parameters[matrix], -1)[:2]
             if not (count in (1 + extra, 2 + extra) and fits(operands[0], rows=True)):
                 return False
             depth = operands[0].width
-            if not (depth and width):  # the products walk them with loops that test at the end
+            if not (depth and width):  # the loops of the matrix products run at least once
                 return False
             inside = (depth, start + width) if transposed else (width, start + depth)
             spread = any(isinstance(each, Columns) and each.spread for each in operands[1:])
-            _rule("steps", not spread, step, "without spread columns in what a linear one adds")
+            _require("steps", not spread, step, "without spread columns in what a linear one adds")
             others = all(fits(each, width, rows=each.of == VALUE) for each in operands[1:])
             return inside[0] == o and inside[1] <= i and others and not tables.setdefault(matrix, False)
-        if not _sums(step) or step.out >= len(sums):
+        if not _is_sum(step) or step.out >= len(sums):
             return False
         if op == "scatter":
             return scatters(step) and summed.setdefault(step.out, int(numbers[1])) == numbers[1]
@@ -338,50 +347,50 @@ def check(program: Program) -> None:
         last = count == len(shape) == 2 and fits(operands[1], width, rows=True) and start + width <= shape[1]
         return last and fits(operands[0], shape[0], rows=True)
 
-    _rule("steps", isinstance(program.steps, tuple), program.steps)
+    _require("steps", isinstance(program.steps, tuple), program.steps)
     for step in program.steps:
-        made = isinstance(step, Step) and _sizes(step[1:3]) and step.op in _STEPS
-        made = made and isinstance(step.operands, tuple) and isinstance(step.numbers, tuple)
-        _rule("steps", made and right(step) and (_sums(step) or step.out not in values), step)
-        if not _sums(step):
+        well_formed = isinstance(step, Step) and _are_sizes(step[1:3]) and step.op in _STEPS
+        well_formed = well_formed and isinstance(step.operands, tuple) and isinstance(step.numbers, tuple)
+        _require("steps", well_formed and step_is_valid(step) and (_is_sum(step) or step.out not in values), step)
+        if not _is_sum(step):
             values[step.out] = step
-    _rule("outputs", isinstance(program.outputs, tuple) and all(map(fits, program.outputs)), program.outputs)
-    known = _numbers(program.by_ray, len(program.outputs)) and bool(program.rays or not program.by_ray)
-    _rule("by_ray", known, program.by_ray, "numbers of outputs, each once, of a program with rays")
+    _require("outputs", isinstance(program.outputs, tuple) and all(map(fits, program.outputs)), program.outputs)
+    valid = _are_indices(program.by_ray, len(program.outputs)) and bool(program.rays or not program.by_ray)
+    _require("by_ray", valid, program.by_ray, "numbers of outputs, each once, of a program with rays")
 
 
 _FINISHES = ("", "relu", "relu_slope")
 _STEPS = ("input", "linear", "function", "binary", "total", "move", "encode", "outer", "columns", "scatter")
 
 
-def _sizes(values: Any) -> bool:
-    """Whether all values are columns that can be counted."""
+def _are_sizes(values: Any) -> bool:
+    """Returns whether the values are a tuple of integers from 0 to `_WIDEST`."""
     return isinstance(values, tuple) and all(type(value) is int and 0 <= value <= _WIDEST for value in values)
 
 
-def _numbers(values: Any, count: int) -> bool:
-    """Whether values are different numbers of so many things."""
-    return _sizes(values) and all(value < count for value in values) and len(set(values)) == len(values)
+def _are_indices(values: Any, count: int) -> bool:
+    """Returns whether the values are distinct indices below ``count``."""
+    return _are_sizes(values) and all(value < count for value in values) and len(set(values)) == len(values)
 
 
 def _is_grid(text: Any) -> bool:
-    """Whether something is the text of a grid."""
+    """Returns whether an object is the text of a grid."""
     try:
         return isinstance(text, str) and HashGrid.parse(text).text == text
     except (ValueError, TypeError, LookupError, AttributeError):
         return False
 
 
-def _rule(name: str, kept: bool, given: object, rule: str = "of values, parameters and sums that are there") -> None:
-    if not kept:
-        raise ValueError(f"Program: {name} must be {rule}, got {given!r:.100}")
+def _require(name: str, ok: bool, value: object, rule: str = "of values, parameters and sums that are there") -> None:
+    if not ok:
+        raise ValueError(f"Program: {name} must be {rule}, got {value!r:.100}")
 
 
 class Builder:
-    """Makes a program step by step. A step that is there already is not made twice.
+    """A builder of programs. It reuses the value of an equal earlier step.
 
     Args:
-        program: to start from.
+        program: the program to extend; by default an empty one.
     """
 
     def __init__(self, program: Program | None = None) -> None:
@@ -389,58 +398,58 @@ class Builder:
         self.inputs, self.parameters = list(program.inputs), list(program.parameters)
         self.steps = list(program.steps)
         self.sums, self.rays, self.grids = list(program.sums), list(program.rays), list(program.grids)
-        self._makers = {step.out: step for step in self.steps if not _sums(step)}
+        self._makers = {step.out: step for step in self.steps if not _is_sum(step)}
         self._values = max(self._makers, default=-1) + 1
-        made = self._makers.values()
-        self._made = {step._replace(out=0): Columns(VALUE, step.out, 0, step.width) for step in made}
+        makers = self._makers.values()
+        self._by_step = {step._replace(out=0): Columns(VALUE, step.out, 0, step.width) for step in makers}
 
     def program(self, outputs: Iterable[Columns], by_ray: Iterable[int] = ()) -> Program:
-        """What has been made; ``by_ray`` numbers the outputs that are sums over the samples of each ray."""
-        given = (self.inputs, self.parameters, self.steps, outputs, self.sums, self.rays, by_ray, self.grids)
-        return Program(*map(tuple, given))  # type: ignore[arg-type]
+        """Returns the program; ``by_ray`` has the indices of the outputs that are summed over each ray's samples."""
+        parts = (self.inputs, self.parameters, self.steps, outputs, self.sums, self.rays, by_ray, self.grids)
+        return Program(*map(tuple, parts))  # type: ignore[arg-type]
 
     def emit(
         self, op: str, width: int, operands: Sequence[Columns] = (), numbers: Sequence[float] = (), name: str = ""
     ) -> Columns:
-        """Adds a step and gives the columns of its value."""
+        """Adds a step, unless an equal one exists, and returns the columns of its value."""
         key = Step(op, 0, width, tuple(operands), tuple(numbers), name)
-        if key not in self._made:
-            self._made[key] = Columns(VALUE, self._values, 0, width)
+        if key not in self._by_step:
+            self._by_step[key] = Columns(VALUE, self._values, 0, width)
             self.steps.append(key._replace(out=self._values))
             self._makers[self._values] = self.steps[-1]
             self._values += 1
-        return self._made[key]
+        return self._by_step[key]
 
     def input(self, width: int, ray: bool = False) -> Columns:
-        """Another input, with one row for each ray if ``ray``."""
+        """Adds an input, with one row for each ray if ``ray``, and returns its columns."""
         self.inputs.append(width)
         if ray:
             self.rays.append(len(self.inputs) - 1)
         return self.emit("input", width, (), (len(self.inputs) - 1,))
 
     def parameter(self, *shape: int) -> int:
-        """Another parameter: its number."""
+        """Adds a parameter and returns its index."""
         self.parameters.append(shape)
         return len(self.parameters) - 1
 
     def grid(self, text: str) -> int:
-        """The number of a hash grid, by its text."""
+        """Returns the index of a hash grid, and adds the grid if it is new."""
         if text not in self.grids:
             self.grids.append(text)
         return self.grids.index(text)
 
     def replay(self, program: Program, inputs: Mapping[int, Columns]) -> list[Columns]:
-        """Adds the steps of a program without sums, and gives its outputs; its parameters become further ones.
+        """Inlines a program without sums: adds its parameters and steps, and returns its outputs.
 
         Args:
-            program: whose steps.
-            inputs: what takes the place of its inputs that are read, by their numbers.
+            program: the program to inline.
+            inputs: the columns that replace each input of the program that is read, by index.
         """
         first, grids = len(self.parameters), [self.grid(text) for text in program.grids]
         self.parameters += program.parameters
         values: dict[int, Columns] = {}
 
-        def own(c: Columns) -> Columns:
+        def mapped(c: Columns) -> Columns:
             if c.of == PARAMETER:
                 return c._replace(index=first + c.index)
             return values[c.index].part(c.start, c.width)._replace(spread=c.spread)
@@ -454,72 +463,72 @@ class Builder:
                 numbers = (first + int(numbers[0]), *numbers[1:])
             elif step.op == "encode" and step.name == HASH:
                 numbers = (grids[int(numbers[0])], first + int(numbers[1]), *numbers[2:])
-            values[step.out] = self.emit(step.op, step.width, [own(c) for c in step.operands], numbers, step.name)
-        return [own(c) for c in program.outputs]
+            values[step.out] = self.emit(step.op, step.width, [mapped(c) for c in step.operands], numbers, step.name)
+        return [mapped(c) for c in program.outputs]
 
     def linear(
         self, x: Columns, matrix: int, width: int, start: int = 0, transposed: bool = False, add: Columns | None = None
     ) -> Columns:
-        """``x W[:, start:]^T``, or ``x W[:, start:]`` if transposed, of so many columns, and what is added to it."""
+        """Adds ``x W[:, start:]^T``, or ``x W[:, start:]`` if transposed, with ``width`` columns; plus ``add``."""
         operands = (self.rows(x),) if add is None else (self.rows(x), self.rows(add) if add.spread else add)
         return self.emit("linear", width, operands, (matrix, start, int(transposed)))
 
     def function(
         self, name: str, x: Columns, a: float = 0.0, b: float = 0.0, order: int = 0, times: Columns | None = None
     ) -> Columns | None:
-        """A derivative of a function, times a value; None where it is 0."""
+        """Adds a function's derivative of some order, times a value; returns None if the derivative is 0."""
         if order > FUNCTIONS[name].orders or (name == "power" and a == int(a) and 0 <= a < order):
             return None
         if order == 1 and times is not None and name in ("copy", "affine"):
             return times if name == "copy" or a == 1 else self.function("affine", times, a)
-        before = self._makers[x.index] if x.of == VALUE and order == 0 and name in ("affine", "sine") else None
-        if before is not None and before.name == "affine" and before.numbers[0] == 0 and len(before.operands) == 1:
-            x = before.operands[0].part(x.start, x.width)._replace(spread=x.spread or before.operands[0].spread)
-            a, b = a * before.numbers[1], a * before.numbers[2] + b
+        maker = self._makers[x.index] if x.of == VALUE and order == 0 and name in ("affine", "sine") else None
+        if maker is not None and maker.name == "affine" and maker.numbers[0] == 0 and len(maker.operands) == 1:
+            x = maker.operands[0].part(x.start, x.width)._replace(spread=x.spread or maker.operands[0].spread)
+            a, b = a * maker.numbers[1], a * maker.numbers[2] + b
         operands = (x,) if times is None else (x, times)
         return self.emit("function", x.width, operands, (order, float(a), float(b)), name)
 
     def apply(self, name: str, x: Columns, a: float = 0.0, b: float = 0.0) -> Columns:
-        """A function itself."""
-        made = self.function(name, x, a, b)
-        assert made is not None
-        return made
+        """Adds an elementwise function."""
+        columns = self.function(name, x, a, b)
+        assert columns is not None
+        return columns
 
     def binary(self, name: str, x: Columns, y: Columns) -> Columns:
-        """One of :data:`BINARY`."""
+        """Adds one of :data:`BINARY`."""
         return self.emit("binary", x.width, (x, y), (), name)
 
     def total(self, x: Columns, group: int) -> Columns:
-        """Sums over groups of columns."""
+        """Adds the sums over groups of adjacent columns."""
         return self.emit("total", x.width // group, (self.rows(x),), (group,))
 
     def move(self, width: int, parts: Sequence[tuple[Columns, int]]) -> Columns:
-        """Columns, each added to what is at its place among ``width``; 0 where nothing is."""
+        """Adds parts to a value of ``width`` zero columns, each at its place; overlapping parts are summed."""
         if len(parts) == 1 and parts[0][0].width == width and not parts[0][0].spread and parts[0][0].of == VALUE:
             return parts[0][0]
         return self.emit("move", width, [columns for columns, _ in parts], [at for _, at in parts])
 
     def side_by_side(self, parts: Sequence[Columns]) -> Columns:
-        """Columns next to each other; as they are where they lie so already."""
-        joined, places, at = parts[0], [], 0
-        for each in parts[1:]:
-            following = joined.part(joined.width, each.width)
-            joined = joined._replace(width=joined.width + each.width) if following == each else joined
-        width = sum(each.width for each in parts)
+        """Returns the parts side by side; without a step if they are already adjacent columns of a value."""
+        joined, places, start = parts[0], [], 0
+        for part in parts[1:]:
+            following = joined.part(joined.width, part.width)
+            joined = joined._replace(width=joined.width + part.width) if following == part else joined
+        width = sum(part.width for part in parts)
         if joined.width == width and joined.of == VALUE and not joined.spread:
             return joined
-        for each in parts:
-            places.append((each, at))
-            at += each.width
+        for part in parts:
+            places.append((part, start))
+            start += part.width
         return self.move(width, places)
 
     def encode(self, name: str, x: Columns, size: int, parameter: int = 0, along: Sequence[Columns] = ()) -> Columns:
-        """An encoding F_0(x), or its derivative F_m along m values.
+        """Adds an encoding F_0(x), or its derivative F_m along m values.
 
         Args:
             name: one of :data:`ENCODINGS`, or "hash".
-            x: to encode; of "hash" a whole input.
-            size: the encoding's; of "hash" the number of the grid.
+            x: the columns to encode; for "hash" a whole input.
+            size: the encoding's size; for "hash" the index of the grid.
             parameter: the table of "hash".
             along: the directions of the derivative, each as wide as x.
         """
@@ -530,22 +539,22 @@ class Builder:
     def encode_backward(
         self, name: str, x: Columns, g: Columns, size: int, parameter: int = 0, along: Sequence[Columns] = ()
     ) -> Columns:
-        """The gradient to x of ``<g, F_m(x; along)>``, which is G_m+1; arguments as of :meth:`encode`."""
+        """Adds the gradient to x of ``<g, F_m(x; along)>``, which is G_m+1; see :meth:`encode` for the arguments."""
         operands = [self.rows(each) for each in (x, g, *along)]
         if not along:
             operands.append(self.encode(name, x, size, parameter))
         return self.emit("encode", x.width, operands, (size, parameter, len(along) + 1, 1), name)
 
     def rows(self, columns: Columns) -> Columns:
-        """The same as a value of rows, with each of its columns."""
+        """Returns the columns as a value: a parameter or a spread column is copied."""
         return self.apply("copy", columns) if columns.of == PARAMETER or columns.spread else columns
 
     def add_outer(self, index: int, g: Columns, x: Columns, start: int) -> None:
-        """Adds ``g^T x`` to columns ``start`` on of a sum [o, i]."""
+        """Adds ``g^T x`` to a sum [o, i], from column ``start`` on."""
         self.steps.append(Step("outer", index, x.width, (self.rows(g), self.rows(x)), (start,)))
 
     def add_columns(self, index: int, g: Columns, start: int) -> None:
-        """Adds the rows to entries ``start`` on of a sum."""
+        """Adds the sum of g's rows to a sum, from entry ``start`` on."""
         if g.spread and g.of == VALUE and g.width == 1:
             g = g._replace(spread=False)
         self.steps.append(Step("columns", index, g.width, (self.rows(g),), (start,)))
@@ -553,12 +562,12 @@ class Builder:
     def add_scatter(
         self, index: int, x: Columns, g: Columns, grid: int, parameter: int, along: Sequence[Columns] = ()
     ) -> None:
-        """Adds the gradient to a table of ``<g, F_m(x; along)>`` to a sum [e, f]."""
+        """Adds the gradient of ``<g, F_m(x; along)>`` with respect to a table to a sum [e, f]."""
         operands = tuple(self.rows(each) for each in (x, g, *along))
         self.steps.append(Step("scatter", index, g.width, operands, (grid, parameter, len(along))))
 
 
-def _sums(step: Step) -> bool:
+def _is_sum(step: Step) -> bool:
     return step.op in ("outer", "columns", "scatter")
 
 
@@ -570,18 +579,18 @@ def _reads_table(step: Step) -> bool:
 
 
 class _Arriving:
-    """Gradients on their way to the values and parameters of a program."""
+    """The gradients that have arrived at the values and parameters of a program so far."""
 
     def __init__(self, builder: Builder, active: set[int], sums: dict[int, int], widths: dict[int, int]) -> None:
         self.builder, self.active, self.sums, self.widths = builder, active, sums, widths
         self.parts: dict[int, list[tuple[Columns, int]]] = {}
 
     def wants(self, columns: Columns) -> bool:
-        """Whether a gradient of these columns is asked for."""
+        """Returns whether a gradient of these columns is wanted."""
         return columns.index in (self.active if columns.of == VALUE else self.sums)
 
     def add(self, columns: Columns, g: Columns | None) -> None:
-        """A gradient of some columns."""
+        """Adds a gradient of some columns, if it is wanted."""
         if g is None or not self.wants(columns):
             return
         if columns.spread and columns.width > 1:
@@ -591,23 +600,23 @@ class _Arriving:
         else:
             self.parts.setdefault(columns.index, []).append((g, columns.start))
 
-    def whole(self, value: int) -> Columns | None:
-        """A gradient of a whole value that has arrived and to which another may be added on the way."""
-        found = self.parts.get(value, [])
-        for i, (g, start) in enumerate(found):
+    def take_full(self, value: int) -> Columns | None:
+        """Removes and returns one gradient of all columns of a value, which a linear step can take as its addend."""
+        parts = self.parts.get(value, [])
+        for i, (g, start) in enumerate(parts):
             if start == 0 and g.width == self.widths[value] and g.of == VALUE and not g.spread:
-                return found.pop(i)[0]
+                return parts.pop(i)[0]
         return None
 
     def take(self, value: int) -> Columns | None:
-        """The sum of all that has arrived at a value."""
+        """Removes the gradients of a value and returns their sum."""
         parts, width = self.parts.pop(value, []), self.widths[value]
-        whole = [g for g, start in parts if g.width == width]
+        full = [g for g, start in parts if g.width == width]
         rest = [part for part in parts if part[0].width != width]
         if rest:
-            whole.append(self.builder.move(width, rest))
-        total = whole[0] if whole else None
-        for g in whole[1:]:
+            full.append(self.builder.move(width, rest))
+        total = full[0] if full else None
+        for g in full[1:]:
             total = self.builder.binary("add", total, g)  # type: ignore[arg-type]
         return total
 
@@ -620,23 +629,23 @@ def gradient(
     outputs: tuple[bool, ...],
     sums: tuple[bool, ...],
 ) -> Program:
-    """The program of the gradients of another.
+    """Returns the program that computes the gradients of another program.
 
     Args:
-        program: to differentiate.
-        inputs: which of its inputs' gradients are asked for.
-        parameters: which of its parameters'.
-        outputs: which of its outputs have a gradient.
-        sums: which of its sums have one.
+        program: the program to differentiate.
+        inputs: for each input, whether its gradient is wanted.
+        parameters: for each parameter, whether its gradient is wanted.
+        outputs: for each output, whether it has a gradient.
+        sums: for each sum, whether it has a gradient.
 
     Returns:
-        A program whose inputs are those of ``program``, then the gradients of its outputs that have one; whose
-        parameters are its parameters, then the gradients of its sums; whose outputs are the gradients of inputs, and
-        whose sums are those of parameters. Gradients of inputs of rays are summed by ray, those of outputs that are
-        summed by ray are inputs of rays. The gradient of a table that all cells share is [1, e, f], that of any other
-        parameter has k cells.
+        A program. Its inputs are the inputs of ``program``, then the gradients of the outputs that have one. Its
+        parameters are the parameters of ``program``, then the gradients of the sums. Its outputs are the gradients of
+        the inputs, and its sums are the gradients of the parameters. The gradient of a per-ray input is summed by ray;
+        the gradient of an output that is summed by ray is a per-ray input. The gradient of a table that all cells share
+        is [1, e, f]; the gradient of any other parameter has k cells.
     """
-    b = Builder(replace(program, steps=tuple(step for step in program.steps if not _sums(step)), sums=()))
+    b = Builder(replace(program, steps=tuple(step for step in program.steps if not _is_sum(step)), sums=()))
     wanted = {p: i for i, p in enumerate(p for p, want in enumerate(parameters) if want)}
     b.sums = [program.parameters[p] for p in wanted]
     active: set[int] = set()
@@ -652,30 +661,30 @@ def gradient(
             active.add(step.out)
     widths = {step.out: step.width for step in b.steps}
     arriving = _Arriving(b, active, wanted, widths)
-    for index, (columns, given) in enumerate(zip(program.outputs, outputs, strict=True)):
-        if given:
+    for index, (columns, exists) in enumerate(zip(program.outputs, outputs, strict=True)):
+        if exists:
             arriving.add(columns, b.input(columns.width, ray=index in program.by_ray))
-    of_sums = [b.parameter(*shape) if given else None for shape, given in zip(program.sums, sums, strict=True)]
-    found: dict[int, Columns] = {}
+    sum_gradients = [b.parameter(*shape) if exists else None for shape, exists in zip(program.sums, sums, strict=True)]
+    input_gradients: dict[int, Columns] = {}
     for step in reversed(program.steps):
-        if _sums(step):
-            matrix = of_sums[step.out]
+        if _is_sum(step):
+            matrix = sum_gradients[step.out]
             if matrix is not None:
-                _of_sum(b, arriving, step, matrix)
+                _differentiate_sum(b, arriving, step, matrix)
             continue
         g = arriving.take(step.out) if step.out in active else None
         if g is None:
             continue
         if step.op == "input":
-            found[int(step.numbers[0])] = g
+            input_gradients[int(step.numbers[0])] = g
         elif step.op == "linear":
-            _of_linear(b, arriving, step, g)
+            _differentiate_linear(b, arriving, step, g)
         elif step.op == "function":
-            _of_function(b, arriving, step, g)
+            _differentiate_function(b, arriving, step, g)
         elif step.op == "binary":
-            _of_binary(b, arriving, step, g)
+            _differentiate_binary(b, arriving, step, g)
         elif step.op == "encode":
-            _of_encode(b, arriving, step, g)
+            _differentiate_encode(b, arriving, step, g)
         elif step.op == "total":
             (x,), group = step.operands, int(step.numbers[0])
             if step.width == 1:
@@ -686,16 +695,16 @@ def gradient(
         else:
             for columns, at_ in zip(step.operands, step.numbers, strict=True):
                 arriving.add(columns, g.part(int(at_), columns.width))
-    asked = [i for i, want in enumerate(inputs) if want]
-    results = [found.get(i) or b.move(program.inputs[i], []) for i in asked]
-    return pruned(b.program(results, [at for at, i in enumerate(asked) if i in program.rays]))
+    wanted_inputs = [i for i, want in enumerate(inputs) if want]
+    results = [input_gradients.get(i) or b.move(program.inputs[i], []) for i in wanted_inputs]
+    return pruned(b.program(results, [at for at, i in enumerate(wanted_inputs) if i in program.rays]))
 
 
-def _of_sum(b: Builder, arriving: _Arriving, step: Step, parameter: int) -> None:
+def _differentiate_sum(b: Builder, arriving: _Arriving, step: Step, parameter: int) -> None:
     if step.op == "scatter":
-        # <C, T_m(x, g; h ..)> is <g, F_m(x; h ..)> with C as the table.
+        # For a gradient C of the sum, <C, T_m(x, g; h ..)> is <g, F_m(x; h ..)> with C as the table.
         x, g, *along = step.operands
-        _of_product(b, arriving, HASH, int(step.numbers[0]), parameter, x, g, along)
+        _differentiate_product(b, arriving, HASH, int(step.numbers[0]), parameter, x, g, along)
         return
     start = int(step.numbers[0])
     if step.op == "columns":
@@ -708,7 +717,7 @@ def _of_sum(b: Builder, arriving: _Arriving, step: Step, parameter: int) -> None
         arriving.add(x, b.linear(g, parameter, x.width, start, transposed=True))
 
 
-def _of_linear(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
+def _differentiate_linear(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
     (x, *rest), (matrix, start, transposed) = step.operands, map(int, step.numbers)
     for add in rest:
         arriving.add(add, g)
@@ -716,12 +725,12 @@ def _of_linear(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
     if matrix in arriving.sums:
         b.add_outer(arriving.sums[matrix], *((x, g) if transposed else (g, x)), start)
     if arriving.wants(x):
-        whole = x.start == 0 and x.width == arriving.widths[x.index]
-        before = arriving.whole(x.index) if whole else None
-        arriving.add(x, b.linear(g, matrix, x.width, start, not transposed, add=before))
+        full = x.start == 0 and x.width == arriving.widths[x.index]
+        addend = arriving.take_full(x.index) if full else None
+        arriving.add(x, b.linear(g, matrix, x.width, start, not transposed, add=addend))
 
 
-def _of_function(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
+def _differentiate_function(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
     (x, *rest), (order, a, c) = step.operands, step.numbers
     if rest:
         arriving.add(rest[0], b.function(step.name, x, a, c, int(order), g))
@@ -729,14 +738,14 @@ def _of_function(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> Non
             arriving.add(x, b.function(step.name, x, a, c, int(order) + 1, b.binary("mul", g, rest[0])))
     elif arriving.wants(x):
         if step.name == "relu" and order == 0:
-            # What ReLU returns tells its slope too, and the value before it need not be kept. It stops any gradient, as
-            # in PyTorch: 0 times an infinite one would be NaN.
+            # The slope follows from ReLU's output, so its input need not be stored. "gate" blocks infinite gradients
+            # too, as PyTorch does: 0 times infinity would be NaN.
             arriving.add(x, b.binary("gate", g, Columns(VALUE, step.out, 0, step.width)))
             return
         arriving.add(x, b.function(step.name, x, a, c, int(order) + 1, g))
 
 
-def _of_binary(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
+def _differentiate_binary(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
     x, y = step.operands
     if step.name in ("add", "sub"):
         arriving.add(x, g)
@@ -757,16 +766,16 @@ def _of_binary(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
         arriving.add(x, b.binary("gate", g, y))
 
 
-def _of_encode(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
+def _differentiate_encode(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
     size, parameter, order, back = map(int, step.numbers)
     x, *along = step.operands
     if back:
-        # Where c arrives, <c, G_m(x, g; h ..)> is <g, F_m(x; h .., c)>. An encoded value has no gradient of its own.
+        # If c arrives, <c, G_m(x, g; h ..)> is <g, F_m(x; h .., c)>. F_0(x) as an operand has no gradient.
         g, along = along[0], [*along[1:order], g]
-    _of_product(b, arriving, step.name, size, parameter, x, g, along)
+    _differentiate_product(b, arriving, step.name, size, parameter, x, g, along)
 
 
-def _of_product(
+def _differentiate_product(
     b: Builder,
     arriving: _Arriving,
     name: str,
@@ -776,7 +785,7 @@ def _of_product(
     g: Columns,
     along: Sequence[Columns],
 ) -> None:
-    """The gradients of ``<g, F_m(x; along)>`` to all that it reads. What has arrived itself wants none."""
+    """Adds the gradients of ``<g, F_m(x; along)>`` with respect to its operands and its table."""
     if arriving.wants(g):
         arriving.add(g, b.encode(name, x, size, parameter, along))
     if arriving.wants(x):
@@ -790,7 +799,7 @@ def _of_product(
 
 
 class Ahead(NamedTuple):
-    """An encoding that is computed before a program runs: of ``width`` columns of an input from ``start`` on."""
+    """An encoding that is computed before a program runs: ``width`` columns of an input, from ``start`` on."""
 
     input: int
     start: int
@@ -801,7 +810,7 @@ class Ahead(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def encoded_ahead(program: Program, chosen: tuple[bool, ...]) -> tuple[Program, tuple[Ahead, ...]]:
-    """The same with further inputs in the place of encodings, but for hash grids, of those inputs that are chosen."""
+    """Replaces the encodings of the chosen inputs, except hash encodings, by additional inputs."""
     ahead, steps, inputs, rays = list[Ahead](), list[Step](), list(program.inputs), list(program.rays)
     read = {step.out: int(step.numbers[0]) for step in program.steps if step.op == "input"}
     for step in program.steps:
@@ -817,45 +826,45 @@ def encoded_ahead(program: Program, chosen: tuple[bool, ...]) -> tuple[Program, 
 
 
 def pruned(program: Program) -> Program:
-    """The same without steps whose values are not used."""
+    """Removes the steps whose values are unused."""
     needed = {columns.index for columns in program.outputs if columns.of == VALUE}
     kept: list[Step] = []
     for step in reversed(program.steps):
-        if _sums(step) or step.out in needed:
+        if _is_sum(step) or step.out in needed:
             kept.append(step)
             needed.update(columns.index for columns in step.operands if columns.of == VALUE)
     return replace(program, steps=tuple(reversed(kept)))
 
 
 def merged(program: Program) -> Program:
-    """The same with ReLU done on the way of the layer before it: for running, not for :func:`gradient`."""
+    """Fuses ReLU and its gradient into the preceding linear step; for running, not for :func:`gradient`."""
     kept, uses = list(program.steps), dict[int, int]()
     for columns in (*program.outputs, *(c for step in kept for c in step.operands)):
         if columns.of == VALUE:
             uses[columns.index] = uses.get(columns.index, 0) + 1
-    made = {step.out: place for place, step in enumerate(kept) if not _sums(step)}
+    place_of = {step.out: place for place, step in enumerate(kept) if not _is_sum(step)}
     dropped = set()
     for place, step in enumerate(kept):
         slope = step.op == "binary" and step.name == "gate"
         if not slope and (step.op != "function" or step.name != "relu" or step.numbers[0] or len(step.operands) > 1):
             continue
-        source, *known = step.operands
+        source, *rest = step.operands
         if any(c.of != VALUE or c.spread or c.start for c in step.operands) or uses[source.index] != 1:
             continue
-        before = kept[made[source.index]]
-        if before.op != "linear" or before.name or before.width != source.width:
+        linear = kept[place_of[source.index]]
+        if linear.op != "linear" or linear.name or linear.width != source.width:
             continue
         if slope:
-            first = kept[made[known[0].index]]  # what is not 0 behind a ReLU is where it lets gradients through
-            there = made[known[0].index] < made[source.index] and first.width == step.width
-            if not there or first.name != "relu":
+            first = kept[place_of[rest[0].index]]  # a ReLU's output is nonzero exactly where its slope is 1
+            valid = place_of[rest[0].index] < place_of[source.index] and first.width == step.width
+            if not valid or first.name != "relu":
                 continue
-            kept[made[source.index]] = before._replace(
-                out=step.out, operands=(*before.operands, known[0]), name="relu_slope"
+            kept[place_of[source.index]] = linear._replace(
+                out=step.out, operands=(*linear.operands, rest[0]), name="relu_slope"
             )
         else:
-            kept[made[source.index]] = before._replace(out=step.out, name="relu")
-        made[step.out] = made[source.index]
+            kept[place_of[source.index]] = linear._replace(out=step.out, name="relu")
+        place_of[step.out] = place_of[source.index]
         dropped.add(place)
     steps = tuple(step for place, step in enumerate(kept) if place not in dropped)
     return replace(program, steps=steps)

@@ -1,18 +1,18 @@
-"""Compiled calls that are recorded once and made again, without Python in between.
+"""Recordings: a function's calls of the compiled module are recorded once and replayed without Python.
 
-While a function is recorded, it runs as ever. Each of its calls of the compiled module is kept with what it has loaded
-(csrc/bindings/bind.cpp), and everything that it asks of torch is looked at: new memory is made large enough for later
-runs, random integers are drawn again for each of them, views change nothing, and what torch computes entry by entry
-(``torch.Tag.pointwise``) is computed again. Whatever else torch computes would be missing later, so it keeps the
-function from being replayed: :attr:`Recording.obstacle` says what it is.
+A recorded function runs normally. The recording keeps each call of the compiled module with its loaded arguments
+(csrc/bindings/bind.cpp), and inspects every torch operation. New memory is made large enough for later runs. Random
+integers are drawn again in each run. Views need no replay. Pointwise operations (``torch.Tag.pointwise``) are computed
+again. Any other torch operation would be missing from a replay, so the function cannot be replayed:
+:attr:`Recording.obstacle` names the operation.
 
-A recording holds the storages of all tensors that its calls take. Where one of these tensors, or one that they are
-views of, has moved (``x.data = y``), the calls are not made: :meth:`Recording.replay` says so.
+A recording holds the storages of all tensors that its calls take. If one of these tensors or its base has moved
+(``x.data = y``), :meth:`Recording.replay` makes no calls and returns 0.
 
-What changes lies in memory: numbers of rows (rows.py), other numbers (:func:`voronerf.ops._core.rows.varying`), random
-integers, and what earlier calls have computed. Several runs can be made in one call; between them only random integers
-change, and what calls compute. There is memory for a quarter more rows than the recorded run had. A run that would
-exceed it is not made: :meth:`Recording.replay` says so.
+All values that vary from run to run lie in memory: numbers of rows (rows.py), other numbers
+(:func:`voronerf.ops._core.rows.varying`), random integers, and results of earlier calls. One call of
+:meth:`Recording.replay` can make several runs; between them only random integers and results of calls change. The
+memory has room for a quarter more rows than the recorded run. :meth:`Recording.replay` makes no run that exceeds it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from voronerf.ops._core.active import active
 from voronerf.ops._core.rows import Count, RowCount
 
-#: Rows that there is memory for, beside those of the recorded run: one for so many, and some.
+#: The spare rows of memory: a recorded run of n rows gets n // SPARE + SOME more.
 SPARE, SOME = 4, 64
 _NEW = ("aten::new_empty", "aten::empty")
 _HARMLESS = ("aten::promote_types", "aten::result_type")
@@ -40,23 +40,23 @@ _PASSED_OVER = (str(Path(torch.__file__).absolute().parent), str(Path(__file__).
 
 
 class _Memory(NamedTuple):
-    """Memory that was made for the calls: all of it, and the number of its rows if there can be more of them."""
+    """An allocation for the calls: the whole tensor, and the `Count` of its rows if this number can vary."""
 
     whole: Tensor
     rows: Count | None = None
 
 
 class _Held(NamedTuple):
-    """Something that holds tensors of the recorded run, and the same with as many rows as it last had."""
+    """An object that holds tensors of the recorded run, and its copy with the rows of the last run."""
 
-    found: Any
+    recorded: Any
     counts: list[Count]
     rows: list[int]
     value: Any
 
 
 class _Computed(NamedTuple):
-    """What torch computes again, after so many of the compiled calls, and where its result lies; None for in place."""
+    """A torch operation to compute again after the first ``after`` compiled calls; ``result`` is None if in place."""
 
     after: int
     function: Any
@@ -66,13 +66,13 @@ class _Computed(NamedTuple):
 
 
 class Recording(TorchDispatchMode):
-    """The compiled calls of a function; a context around the function, to be entered once.
+    """The recorded calls of a function; a context around the function, to be entered once.
 
     Attributes:
-        obstacle: Why they cannot be made again; None if they can.
+        obstacle: The reason why the calls cannot be replayed; None if they can.
 
     Args:
-        before: Recordings whose memory the function reads.
+        before: The earlier recordings whose memory the function reads.
 
     Examples:
         >>> import torch
@@ -93,28 +93,28 @@ class Recording(TorchDispatchMode):
         from voronerf.ops._core import native
 
         self._compiled, self._calls = native.compiled, native.compiled.Recording()
-        self._counts = list[Count]()  # that are given
+        self._counts = list[Count]()  # numbers of rows that functions return before each run
         self._numbers = list[tuple[ctypes.c_float, Tensor, Callable[[], float]]]()
         self._drawn, self._computed = list[Tensor](), list[_Computed]()
-        self._inputs, self._taken = list[Tensor](), list[Tensor]()  # memory for what is taken, and that of this run
-        self._range: tuple[int, int, torch.Generator, torch.dtype, int] | None = None  # that all are drawn from
-        self._memory: dict[int, _Memory] = {}  # by address
-        for each in before:
-            self._memory |= each._memory
-        held = (each.rows for each in self._memory.values() if each.rows is not None)
-        self._rows = {count: count.now for count in held}  # of the recorded run
+        self._inputs, self._taken = list[Tensor](), list[Tensor]()  # memory for the inputs, and the inputs of this run
+        self._range: tuple[int, int, torch.Generator, torch.dtype, int] | None = None  # arguments of all random draws
+        self._memory: dict[int, _Memory] = {}  # by the address of the storage
+        for recording in before:
+            self._memory |= recording._memory
+        held = (recording.rows for recording in self._memory.values() if recording.rows is not None)
+        self._rows = {count: count.now for count in held}  # numbers of rows in the recorded run
         self._places: dict[Tensor, RowCount | None] = {}
         self._views: dict[Tensor, Tensor] = {}
-        self._held: dict[int, _Held] = {}  # by id
+        self._held: dict[int, _Held] = {}  # by the id of the object
         self.obstacle: str | None = None
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return False  # torch's own imports its compiler, to keep it off this class, which takes over a second
+        return False  # torch's method imports the compiler, which takes over a second
 
     def __enter__(self) -> Recording:
-        for address, each in self._memory.items():
-            self._calls.made(address, each.rows is not None)
+        for address, memory in self._memory.items():
+            self._calls.made(address, memory.rows is not None)
         self._calls.begin()
         active.recording, active.vary = self, self.vary
         super().__enter__()
@@ -127,88 +127,88 @@ class Recording(TorchDispatchMode):
         self._refuse(self._calls.obstacle)
 
     def __len__(self) -> int:
-        """How many compiled calls are made again."""
+        """Returns the number of recorded calls."""
         return len(self._calls)
 
     def hold(self, tensor: Tensor) -> None:
-        """Makes no calls any more where a tensor has moved that was made for them, as others may give it memory."""
+        """Refuses replays once a tensor that the recording allocated has moved: its users may replace its memory."""
         self._calls.hold_tensor(tensor)
 
-    def count(self, given: Callable[[], int]) -> int:
-        """A number of rows that is known before each run; that of this one."""
+    def count(self, source: Callable[[], int]) -> int:
+        """Returns the number of rows of this run, which the function returns again before each run."""
         with _disable_current_modes():
-            count = self._new_count(torch.tensor([given()]), given)
+            count = self._new_count(torch.tensor([source()]), source)
         self._counts.append(count)
         return RowCount.of(count)
 
     def computed(self, memory: Tensor) -> int:
-        """A number of rows that a call has computed, int64 [1]."""
+        """Returns a number of rows that a call has computed, int64 [1]."""
         with _disable_current_modes():
-            if memory.dtype is not torch.int64:  # of a device, whose calls are not recorded
+            if memory.dtype is not torch.int64:  # a number on a GPU, whose calls are not recorded
                 self._refuse("a number of rows is no int64")
                 return int(memory)
             return RowCount.of(self._new_count(memory, None))
 
-    def _new_count(self, memory: Tensor, given: Callable[[], int] | None) -> Count:
+    def _new_count(self, memory: Tensor, source: Callable[[], int] | None) -> Count:
         rows = int(memory)
         self._refuse("there are no rows" if rows == 0 else "")
-        count = Count(memory, rows + rows // SPARE + SOME, given)
+        count = Count(memory, rows + rows // SPARE + SOME, source)
         self._rows[count] = rows
         return count
 
     def vary(self, value: Callable[[], float]) -> Tensor:
-        """A number that changes from run to run, float32 []."""
+        """Returns a number that varies from run to run, float32 []."""
         with _disable_current_modes():
             number = torch.tensor(value(), dtype=torch.float32)
         self._numbers.append((ctypes.c_float.from_address(number.data_ptr()), number, value))
         return number
 
-    def take(self, given: Tensor) -> Tensor:
-        """Memory for a tensor that each run is given, with as many rows as it then has; it holds that of this run."""
+    def take(self, tensor: Tensor) -> Tensor:
+        """Copies an input of the runs into the recording's memory, and returns that memory; the rows may vary."""
         place = len(self._taken)
-        self._taken.append(given)  # and then that of each run
-        shape = given.shape
-        if given.dim():
-            memory = self.new_rows(given, (self.count(lambda: len(self._taken[place])), *shape[1:]), None)
+        self._taken.append(tensor)  # replaced by the input of each run
+        shape = tensor.shape
+        if tensor.dim():
+            memory = self.new_rows(tensor, (self.count(lambda: len(self._taken[place])), *shape[1:]), None)
         else:
-            memory = given.new_empty(())
+            memory = tensor.new_empty(())
         with _disable_current_modes():
-            memory.copy_(given.detach())
+            memory.copy_(tensor.detach())
         self._inputs.append(memory)
         return memory
 
     def new_rows(self, like: Tensor, shape: Sequence[int], dtype: torch.dtype | None) -> Tensor:
-        """New memory whose rows are a `RowCount`; there is some for the most of them."""
+        """Allocates memory whose number of rows is a `RowCount`, with room for the largest number."""
         rows, *columns = shape
         assert isinstance(rows, RowCount)
         with _disable_current_modes():
             whole = like.new_empty([rows.most + max(rows.more, 0), *columns], dtype=dtype)
             self._compiled.advise_huge_pages(whole, whole.nbytes)
-        self._made(whole, rows.count)
+        self._register(whole, rows.count)
         return whole[: int(rows)]
 
-    def _made(self, whole: Tensor, count: Count | None = None) -> Tensor:
+    def _register(self, whole: Tensor, count: Count | None = None) -> Tensor:
         address = whole.untyped_storage().data_ptr()
         self._memory[address] = _Memory(whole, count)
         self._calls.made(address, count is not None)
         return whole
 
-    def _refuse(self, why: str) -> None:
-        self.obstacle = self.obstacle or why or None
+    def _refuse(self, reason: str) -> None:
+        self.obstacle = self.obstacle or reason or None
 
     def replay(self, threads: int, times: int = 1, taken: Sequence[Tensor] = ()) -> int:
-        """Makes the calls again.
+        """Makes the recorded calls again.
 
         Args:
-            threads: Of the calls.
-            times: How often, in a row.
-            taken: In the place of what :meth:`take` was given, for this run.
+            threads: The number of threads of the calls.
+            times: The number of runs.
+            taken: The inputs of these runs, one for each call of :meth:`take`.
 
         Returns:
-            How often they were made: less where there is no memory for the rows, 0 where a tensor has moved.
+            The number of completed runs: fewer than ``times`` if memory is too small for the rows, 0 if a tensor moved.
 
         Raises:
-            ValueError: As of the calls, for what they find in their arguments.
+            ValueError: A call has found an invalid value in its arguments.
         """
         if not self._calls.hold():
             return 0
@@ -220,75 +220,75 @@ class Recording(TorchDispatchMode):
             count.now = rows
         for number, _, value in self._numbers:
             number.value = value()
-        for memory, given in zip(self._inputs, taken, strict=True):
-            self._tensor_now(memory).copy_(given.detach())
+        for memory, tensor in zip(self._inputs, taken, strict=True):
+            self._tensor_now(memory).copy_(tensor.detach())
         if self._range is None:
             return self._run(threads, times, 0, [], 0)
         low, high, generator, dtype, size = self._range
-        before, drawn = generator.get_state(), torch.empty(times, len(self._drawn), size, dtype=dtype)
+        state, drawn = generator.get_state(), torch.empty(times, len(self._drawn), size, dtype=dtype)
         drawn.random_(low, high, generator=generator)
-        places = [each.data_ptr() for each in self._drawn]
-        made = self._run(threads, times, drawn.data_ptr(), places, size * drawn.element_size())
-        if made < times:  # what follows draws the others again
-            generator.set_state(before)
-            drawn[:made].random_(low, high, generator=generator)
-        return made
+        places = [integers.data_ptr() for integers in self._drawn]
+        completed = self._run(threads, times, drawn.data_ptr(), places, size * drawn.element_size())
+        if completed < times:  # the next run draws the remaining integers again
+            generator.set_state(state)
+            drawn[:completed].random_(low, high, generator=generator)
+        return completed
 
     def _run(self, threads: int, times: int, drawn: int, places: Sequence[int], size: int) -> int:
-        """Makes the calls, and what torch computes in between; there are random integers of so many bytes for them."""
+        """Runs the calls and torch operations in order; ``size`` is the bytes of each array of random integers."""
         calls, every = self._calls, len(self._calls)
         if not self._computed:
-            made: int = calls.replay(threads, times, 0, every, drawn, places, size)
-            return made
+            completed: int = calls.replay(threads, times, 0, every, drawn, places, size)
+            return completed
         for run in range(times):
             first, new = 0, places
-            for each in self._computed:
-                if (new or each.after > first) and not calls.replay(threads, 1, first, each.after, drawn, new, size):
+            for op in self._computed:
+                if (new or op.after > first) and not calls.replay(threads, 1, first, op.after, drawn, new, size):
                     return run
-                arguments = [self.now(argument) for argument in each.arguments]
-                result = each.function(*arguments, **{name: self.now(value) for name, value in each.options.items()})
-                if each.result is not None:
-                    self._tensor_now(each.result).copy_(result)
-                first, new = each.after, []
+                arguments = [self.now(argument) for argument in op.arguments]
+                result = op.function(*arguments, **{name: self.now(value) for name, value in op.options.items()})
+                if op.result is not None:
+                    self._tensor_now(op.result).copy_(result)
+                first, new = op.after, []
             if not calls.replay(threads, 1, first, every, 0, [], 0):
                 return run
             drawn += len(places) * size
         return times
 
     def rows_of(self, tensor: Tensor) -> int:
-        """How many rows a tensor has: a `RowCount` where there can be more of them."""
+        """Returns the number of rows of a tensor, as a `RowCount` if it can vary."""
         place = self._place(tensor)
         return tensor.shape[0] if place is None else place
 
-    def now(self, found: Any) -> Any:
-        """Tensors of the recorded run, in whatever holds them, with as many rows as the last run has filled."""
-        if isinstance(found, Tensor):
-            return self._tensor_now(found)
-        if isinstance(found, RowCount):
-            return found.now
-        entries = entries_of(found)
+    def now(self, recorded: Any) -> Any:
+        """Returns an object of the recorded run, with all its tensors resized to the rows of the last run."""
+        if isinstance(recorded, Tensor):
+            return self._tensor_now(recorded)
+        if isinstance(recorded, RowCount):
+            return recorded.now
+        entries = entries_of(recorded)
         if not entries:
-            return found
-        held = self._held.get(id(found))
+            return recorded
+        held = self._held.get(id(recorded))
         if held is None:
-            held = self._held[id(found)] = _Held(found, self._counts_of(found), [], found)
+            held = self._held[id(recorded)] = _Held(recorded, self._counts_of(recorded), [], recorded)
         rows = [count.now for count in held.counts]
         if rows != held.rows:
-            held = self._held[id(found)] = held._replace(rows=rows, value=mapped(self.now, found))
+            held = self._held[id(recorded)] = held._replace(rows=rows, value=mapped(self.now, recorded))
         return held.value
 
-    def counted_now(self, found: Any) -> Any:
-        """As :meth:`now`, for another recording, which reads numbers of rows again, too."""
-        if isinstance(found, RowCount):
-            return RowCount.of(found.count, found.more)
-        return self._tensor_now(found) if isinstance(found, Tensor) else mapped(self.counted_now, found)
+    def counted_now(self, recorded: Any) -> Any:
+        """Returns :meth:`now` for use in another recording: numbers of rows stay `RowCount`."""
+        if isinstance(recorded, RowCount):
+            return RowCount.of(recorded.count, recorded.more)
+        return self._tensor_now(recorded) if isinstance(recorded, Tensor) else mapped(self.counted_now, recorded)
 
-    def _counts_of(self, found: Any) -> list[Count]:
-        """The numbers of rows that tensors have, in whatever holds them."""
-        if isinstance(found, (RowCount, Tensor)):
-            place = found if isinstance(found, RowCount) else self._place(found)
+    def _counts_of(self, recorded: Any) -> list[Count]:
+        """Returns the distinct counts of the rows of all tensors in an object."""
+        if isinstance(recorded, (RowCount, Tensor)):
+            place = recorded if isinstance(recorded, RowCount) else self._place(recorded)
             return [] if place is None else [place.count]
-        return [*dict.fromkeys(count for each in entries_of(found) or () for count in self._counts_of(each))]
+        return [*dict.fromkeys(count for entry in entries_of(recorded) or () for count in self._counts_of(entry))]
 
     def _tensor_now(self, tensor: Tensor) -> Tensor:
         if tensor not in self._places:
@@ -301,7 +301,7 @@ class Recording(TorchDispatchMode):
         return view
 
     def _place(self, tensor: Tensor) -> RowCount | None:
-        """The number of a tensor's rows; None for one that stays."""
+        """Returns the number of a tensor's rows, or None if it is constant."""
         held = self._memory.get(tensor.untyped_storage().data_ptr())
         if held is None or held.rows is None or not tensor.dim() or tensor.stride(0) != held.whole.stride(0):
             return None
@@ -309,15 +309,15 @@ class Recording(TorchDispatchMode):
         return RowCount.of(held.rows, more) if abs(more) <= 1 else None
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """What torch is asked while a function is recorded."""
+        """Inspects each torch operation of the recorded function."""
         name, kwargs = func._schema.name, kwargs or {}
         result = func(*args, **kwargs)
         if name in _NEW:
             if name == "aten::new_empty" and self._place(args[0]) is not None and [*args[1][:1]] == [len(args[0])]:
                 self._refuse(f"new memory of {len(args[0])} rows is not counted{_line()}")
-            return self._made(result)
+            return self._register(result)
         if func.is_view:
-            self._calls.add_tensor(args[0])  # a view of it would stay where it was
+            self._calls.add_tensor(args[0])  # a view would keep the old memory if its base moved
             if isinstance(result, Tensor) and (held := self._memory.get(result.untyped_storage().data_ptr())):
                 moved = result.storage_offset() - held.whole.storage_offset()
                 if held.rows is not None and moved >= held.whole.stride(0):
@@ -335,7 +335,7 @@ class Recording(TorchDispatchMode):
         return result
 
     def _compute(self, func: Any, args: Any, kwargs: Any, result: Tensor) -> Tensor:
-        """What torch computes entry by entry: in place, or in memory where it is computed again."""
+        """Records a pointwise operation, to be computed again in place or into its result's memory."""
         rows = None
         for tensor in (each for each in (*args, *kwargs.values()) if isinstance(each, Tensor)):
             self._calls.add_tensor(tensor)
@@ -347,7 +347,7 @@ class Recording(TorchDispatchMode):
                     return result
         memory = None
         if not func._schema.is_mutable:
-            memory = self._made(result) if rows is None else self.new_rows(result, (rows, *result.shape[1:]), None)
+            memory = self._register(result) if rows is None else self.new_rows(result, (rows, *result.shape[1:]), None)
             if memory is not result:
                 with _disable_current_modes():
                     memory.copy_(result)
@@ -355,28 +355,28 @@ class Recording(TorchDispatchMode):
         return result if memory is None else memory
 
 
-def mapped(function: Callable[[Any], Any], held: Any) -> Any:
-    """The same tuple, list, dictionary or dataclass of what a function gives for its entries; all else as it is."""
-    if isinstance(held, (list, tuple)):
-        own = map(function, held)
-        return type(held)(*own) if hasattr(held, "_fields") else type(held)(own)
-    if isinstance(held, dict):
-        return {name: function(value) for name, value in held.items()}
-    if hasattr(held, "__dataclass_fields__"):
-        return type(held)(**{name: function(value) for name, value in vars(held).items()})
-    return held
+def mapped(function: Callable[[Any], Any], tree: Any) -> Any:
+    """Applies a function to the entries of a tuple, list, dictionary or dataclass; returns other objects unchanged."""
+    if isinstance(tree, (list, tuple)):
+        entries = map(function, tree)
+        return type(tree)(*entries) if hasattr(tree, "_fields") else type(tree)(entries)
+    if isinstance(tree, dict):
+        return {name: function(value) for name, value in tree.items()}
+    if hasattr(tree, "__dataclass_fields__"):
+        return type(tree)(**{name: function(value) for name, value in vars(tree).items()})
+    return tree
 
 
-def entries_of(held: Any) -> list[Any] | None:
-    """What `mapped` gives to its function; None for what has no entries."""
-    if isinstance(held, (list, tuple)):
-        return [*held]
-    known = held if isinstance(held, dict) else vars(held) if hasattr(held, "__dataclass_fields__") else None
-    return None if known is None else [*known.values()]
+def entries_of(tree: Any) -> list[Any] | None:
+    """Returns the entries to which `mapped` applies its function, or None for an object without entries."""
+    if isinstance(tree, (list, tuple)):
+        return [*tree]
+    by_name = tree if isinstance(tree, dict) else vars(tree) if hasattr(tree, "__dataclass_fields__") else None
+    return None if by_name is None else [*by_name.values()]
 
 
 def _line() -> str:
-    """Where the package, or its caller, is."""
+    """Returns the source line, in the package or its caller, that runs a torch operation."""
     for frame, line in traceback.walk_stack(sys._getframe()):
         file = frame.f_code.co_filename
         if not file.startswith(_PASSED_OVER):

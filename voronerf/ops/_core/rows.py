@@ -1,8 +1,8 @@
-"""Numbers of rows, such as the rays and samples of a step, which a recording reads again (recording.py).
+"""Numbers of rows, such as a step's rays and samples, which replays of a recording read again (recording.py).
 
-While nothing is recorded they are ints. In a recording they are :class:`RowCount`: an op gets one from the tensors that
-it is given (:func:`rows_of`), makes memory for its results with it (:func:`new_empty`), and hands it to a compiled
-function, whose parameter is a ``RowCount`` too (csrc/common/row_count.h).
+Outside a recording, a number of rows is an int. In a recording it is a :class:`RowCount`: an op reads it from its
+tensors (:func:`rows_of`), allocates its results with it (:func:`new_empty`), and passes it to a compiled function
+(csrc/common/row_count.h).
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from voronerf.ops._core.active import active
 
 
 class Count:
-    """Where a number of rows lies.
+    """A number of rows in memory.
 
     Attributes:
-        memory: int64 [1].
-        most: What there is memory for.
-        given: What gives it before each run; None for one that a call computes.
+        memory: The number, int64 [1].
+        most: The largest number that there is memory for.
+        given: The function that returns the number before each run; None if a compiled call computes it.
     """
 
     __slots__ = ("_number", "given", "memory", "most")
@@ -34,7 +34,7 @@ class Count:
 
     @property
     def now(self) -> int:
-        """What it is in this run."""
+        """The number of rows in this run."""
         return self._number.value
 
     @now.setter
@@ -43,10 +43,10 @@ class Count:
 
 
 class RowCount(int):
-    """The rows of a `Count` and some more, of a recording. Compiled calls read them again from its memory.
+    """A number of rows in a recording: a `Count` plus a constant. Compiled calls read it from memory in each run.
 
-    A sum or difference with an int is one, too; whatever else is computed of it is an int, which a compiled call that
-    wants a number of rows refuses while it is recorded.
+    Its sum or difference with an int is a `RowCount` too. Any other arithmetic gives an int, which compiled calls
+    refuse as a number of rows during a recording.
     """
 
     count: Count
@@ -56,14 +56,14 @@ class RowCount(int):
 
     @classmethod
     def of(cls, count: Count, more: int = 0) -> RowCount:
-        """That of a count in this run, and so many more."""
+        """Returns the number of a count in this run, plus ``more``."""
         rows = cls(count.now + more)
         rows.count, rows.more, rows.address, rows.most = count, more, count.memory.data_ptr(), count.most
         return rows
 
     @property
     def now(self) -> int:
-        """What it is in this run."""
+        """The number of rows in this run."""
         return self.count.now + self.more
 
     def __add__(self, more: Any) -> Any:
@@ -74,17 +74,17 @@ class RowCount(int):
 
 
 def rows_of(tensor: Tensor) -> int:
-    """How many rows a tensor has."""
+    """Returns the number of rows of a tensor."""
     recording = active.recording
     rows: int = tensor.shape[0] if recording is None else recording.rows_of(tensor)
     return rows
 
 
 def new_empty(like: Tensor, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-    """New memory beside a tensor; with a `RowCount` of rows there can be more of them in later runs."""
+    """Allocates memory on a tensor's device; with a `RowCount` of rows, later runs may have more rows."""
     recording = active.recording
     if recording is None or not (shape and isinstance(shape[0], RowCount)):
-        # Of a tuple, and of a dtype, torch takes longer.
+        # torch takes longer with a tuple of sizes, and with a dtype.
         sizes: Any = shape or ((),)
         return like.new_empty(*sizes) if dtype is None else like.new_empty(*sizes, dtype=dtype)
     memory: Tensor = recording.new_rows(like, shape, dtype)
@@ -92,7 +92,7 @@ def new_empty(like: Tensor, *shape: int, dtype: torch.dtype | None = None) -> Te
 
 
 def read_count(memory: Tensor) -> int:
-    """A number of rows that a call has computed, int64 [1]. Replays read it again from there."""
+    """Reads a number of rows that a call has computed, int64 [1]. Replays read it again from this memory."""
     if active.recording is None:
         return int(memory)
     rows: int = active.recording.computed(memory)
@@ -100,18 +100,18 @@ def read_count(memory: Tensor) -> int:
 
 
 def fixed_count(rows: int) -> int:
-    """A number of rows that is the same in each run."""
+    """Returns a number of rows that is the same in each run."""
     return rows if active.recording is None else active.recording.count(lambda: rows)
 
 
 def following_count(rows: int, follows: Callable[[int], int]) -> int:
-    """A number of rows that follows from another one, which is given. Replays find it again."""
+    """Returns ``follows(rows)``, a number of rows that depends on another one. Replays evaluate it again."""
     if not isinstance(rows, RowCount):
         return follows(rows)
-    found: int = active.recording.count(lambda: follows(rows.now))
-    return found
+    count: int = active.recording.count(lambda: follows(rows.now))
+    return count
 
 
 def varying(value: Callable[[], float]) -> float | Tensor:
-    """A number that changes from run to run, rounded to float32. While it is recorded it is a tensor [] for replays."""
+    """Returns a number that varies from run to run, rounded to float32; in a recording or capture it is a tensor []."""
     return ctypes.c_float(value()).value if active.vary is None else active.vary(value)

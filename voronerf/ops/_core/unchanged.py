@@ -1,4 +1,4 @@
-"""One question for routers, fields and steps: is what a result was made for as it was?"""
+"""Guards of cached results: have the objects that a result depends on changed? Used by routers, fields and steps."""
 
 from __future__ import annotations
 
@@ -8,20 +8,19 @@ from voronerf.ops._core import backends
 
 
 class Never:
-    """The answer without the compiled module: nothing is known to be as it was, and what depends on it is looked at
-    again in every call."""
+    """The guard without the compiled module: it never holds, so every call checks its dependencies again."""
 
     def holds(self) -> bool:
-        """Whether all that was noted is as it was."""
+        """Returns whether all noted objects are unchanged."""
         return False
 
     def _note(self, *noted: Any) -> None:
-        """Forgets it."""
+        """Ignores the objects."""
 
     contents = entries = attributes = answer = place = layout = kind = _note
 
 
 def unchanged() -> Any:
-    """A guard that has noted nothing yet (csrc/bindings/unchanged.h says of what it can take note)."""
+    """Creates an empty guard; csrc/bindings/unchanged.h lists the properties that it can note."""
     module = backends.compiled()
     return Never() if module is None else module.compiled.Unchanged()

@@ -1,4 +1,4 @@
-"""A step of Adam, of whole parameters or of the entries of a table that have a gradient."""
+"""A step of Adam, on whole parameters or only on the entries with a gradient."""
 
 from __future__ import annotations
 
@@ -43,31 +43,30 @@ def adam(
     loss: Tensor | None = None,
     backend: str = "auto",
 ) -> None:
-    """A step of Adam of several parameters, in place; no device value is read.
+    """Makes a step of Adam for several parameters, in place; the host reads no device value.
 
-    With the step number s that is counted from 1 (Kingma and Ba 2015, algorithm 1):
+    With the step number s, counted from 1 (Kingma and Ba 2015, algorithm 1):
 
         mean    <- b1 mean + (1 - b1) g
         square  <- b2 square + (1 - b2) g^2
         p       <- p - rate / (1 - b1^s) mean / (sqrt(square) / sqrt(1 - b2^s) + epsilon)
 
-    Where a rule does not have ``every``, an entry without a gradient keeps its value and both moments, as tiny-cuda-nn
-    does it with its hash grids. An entry that gets its first gradient late then moves by less than the rate at first,
-    by (1 - b1) / sqrt(1 - b2) of it.
+    If a rule does not have ``every``, an entry without a gradient keeps its value and both moments, like hash grids in
+    tiny-cuda-nn. If an entry gets its first gradient late, its first step is (1 - b1) / sqrt(1 - b2) times the rate.
 
     Args:
-        rules: One for each parameter.
+        rules: One rule for each parameter.
         parameters: float32, any shapes, contiguous.
-        gradients: float32, of the same shapes. Not differentiable.
-        means: float32, of the same shapes, contiguous: the first moments.
-        squares: float32, of the same shapes, contiguous, >= 0: the second moments.
-        guard: Leaves the step out where it has ``found`` something; None for never.
-        loss: float32 [], of the step. With it the guard judges first: the step is left out, and counted as such, unless
-            the magnitudes of the loss, and of the gradients whose rule has ``every``, are all below the limit.
+        gradients: float32, the shapes of the parameters. Not differentiable.
+        means: float32, the shapes of the parameters, contiguous: the first moments.
+        squares: float32, the shapes of the parameters, contiguous, >= 0: the second moments.
+        guard: The guard, which skips the step if ``found`` is not 0; None to skip no step.
+        loss: float32 [], the loss of the step. With a loss, the guard first checks this step: it is skipped and counted
+            unless the magnitudes of the loss, and of the gradients whose rule has ``every``, are all below the limit.
         backend: "auto", "reference", "native" or "warp".
 
     Raises:
-        ValueError: a tensor that is not contiguous, lists of other lengths, a loss without a guard.
+        ValueError: a tensor that is not contiguous, lists of different lengths, a loss without a guard.
 
     Examples:
         >>> import torch
@@ -81,10 +80,10 @@ def adam(
         >>> (table[0] != 0).tolist()
         [False, True, False]
     """
-    taken = rules, parameters, gradients, means, squares, guard, loss
-    if _makes_step(parameters, backend) and backends.compiled().adam_step(Rule, Guard, *taken):
+    arguments = rules, parameters, gradients, means, squares, guard, loss
+    if _makes_step(parameters, backend) and backends.compiled().adam_step(Rule, Guard, *arguments):
         return
-    _check_all(*taken)
+    _check_all(*arguments)
     if not rules:
         return
     loss = None if loss is None else loss.detach()
@@ -93,7 +92,7 @@ def adam(
 
 
 def _makes_step(parameters: Any, backend: str) -> bool:
-    """Whether the compiled module is asked to check and make the whole step."""
+    """Returns whether the compiled module checks the arguments and makes the whole step."""
     first = parameters[0] if isinstance(parameters, (list, tuple)) and parameters else None
     if not isinstance(first, Tensor) or torch.compiler.is_dynamo_compiling():
         return False
@@ -103,16 +102,16 @@ def _makes_step(parameters: Any, backend: str) -> bool:
 def average(
     averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, share: float | Tensor, *, backend: str = "auto"
 ) -> None:
-    """Moves averages a share of the way to parameters, or to zero, in place.
+    """Moves averages towards the parameters, in place: ``averages += share * (parameters - averages)``.
 
     Args:
         averages: float32, any shapes, contiguous.
-        parameters: float32, of the same shapes, contiguous; None for zero. Not differentiable.
+        parameters: float32, the shapes of the averages, contiguous; None for zero. Not differentiable.
         share: 0 to 1; or float32 [].
         backend: "auto", "reference", "native" or "warp".
 
     Raises:
-        ValueError: a tensor that is not contiguous, lists of other lengths.
+        ValueError: a tensor that is not contiguous, lists of different lengths.
 
     Examples:
         >>> import torch
@@ -146,13 +145,13 @@ def _check_all(
     lists = {"parameters": parameters, "gradients": gradients, "means": means, "squares": squares}
     if not _are_lists(_OP, lists, "rules", rules):
         return
-    before: Any = None
+    checked: Any = None
     for rule in rules:
         if not isinstance(rule, Rule):
             raise TypeError(f"{_OP}: rules must hold a Rule for each parameter, got {type(rule).__name__}")
-        if before is None or any(part is not known for part, known in zip(rule[1:], before[1:])):
-            _check_rule(rule, parameters[0])  # a training has the same rule many times
-        before = rule
+        if checked is None or any(part is not previous for part, previous in zip(rule[1:], checked[1:])):
+            _check_rule(rule, parameters[0])  # equal rules in a row are checked once
+        checked = rule
     if guard is not None:
         if not isinstance(guard, Guard):
             raise TypeError(f"{_OP}: guard must be a Guard, got {type(guard).__name__}")
@@ -161,30 +160,32 @@ def _check_all(
         raise ValueError(f"{_OP}: loss must come with a guard, got none")
     scalars: list[tuple[str, Any]] = [("step", rule.step) for rule in rules]
     if guard is not None:
-        scalars += [(name, each) for name, each in zip(guard._fields, guard[:4]) if each is not None or name != "scale"]
+        scalars += [
+            (name, value) for name, value in zip(guard._fields, guard[:4]) if value is not None or name != "scale"
+        ]
     if loss is not None:
         scalars.append(("loss", loss))
     _check_lists(_OP, lists, read="gradient", scalars=scalars)
 
 
 def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Sequence[Any]) -> bool:
-    """Whether there is anything in the lists, which must be as many as the one of a name."""
-    for key, given in {name: first, **lists}.items():
-        if not isinstance(given, Sequence):
-            raise TypeError(f"{op}: {key} must be a list, got {type(given).__name__}")
-        if len(given) != len(first):
-            raise ValueError(f"{op}: {key} must be as many as the {len(first)} {name}, got {len(given)}")
+    """Returns whether the lists hold anything; raises unless each is as long as ``first``, the list called ``name``."""
+    for key, tensors in {name: first, **lists}.items():
+        if not isinstance(tensors, Sequence):
+            raise TypeError(f"{op}: {key} must be a list, got {type(tensors).__name__}")
+        if len(tensors) != len(first):
+            raise ValueError(f"{op}: {key} must be as many as the {len(first)} {name}, got {len(tensors)}")
     return bool(first)
 
 
 def _check_lists(
     op: str, lists: dict[str, Sequence[Tensor]], read: str, scalars: Sequence[tuple[str, Any]] = ()
 ) -> None:
-    """Checks tensors of all parameters, of which those that are ``read`` alone may have any strides, and those []."""
-    if alike([*lists.values()], [name[:-1] != read for name in lists], [each for _, each in scalars]):
+    """Checks the tensors of all parameters, and scalars []; the tensors called ``read`` may have any strides."""
+    if alike([*lists.values()], [name[:-1] != read for name in lists], [value for _, value in scalars]):
         return
-    for own in zip(*lists.values(), strict=True):
-        _check(op, {name[:-1]: tensor for name, tensor in zip(lists, own, strict=True)}, read)
+    for tensors in zip(*lists.values(), strict=True):
+        _check(op, {name[:-1]: tensor for name, tensor in zip(lists, tensors, strict=True)}, read)
     name, first = next(iter(lists.items()))
     check_same_device(op, **{f"{name}[{index}]": tensor for index, tensor in enumerate(first)})
     for key, scalar in scalars:

@@ -1,4 +1,4 @@
-"""``adam`` and ``average`` of the compiled module: no custom ops, whose arguments could not be lists of rules."""
+"""``adam`` and ``average`` of the compiled module. They are no custom ops, which cannot take lists of rules."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ def adam(
     guard: Guard | None,
     loss: Tensor | None,
 ) -> None:
-    """A step of several parameters, see ``voronerf.ops.adam``; on CUDA in two launches for 36 of them."""
+    """Makes a step for several parameters; see ``voronerf.ops.adam``. On CUDA 36 parameters take two launches."""
     compiled, machine = native.compiled, native.machine(parameters[0])
-    given = []
+    records = []
     for step, rate, (first, second), epsilon, every in rules:
         number, at = (0.0, rate) if isinstance(rate, Tensor) else (rate, None)
-        given.append(compiled.AdamRule(number, at, step, first, second, epsilon, every))
+        records.append(compiled.AdamRule(number, at, step, first, second, epsilon, every))
     found, skipped, in_a_row, scale, limit = guard or (None, None, None, None, 0.0)
     if scale is not None and isinstance(machine, compiled.Cpu):
         gradients, scale = [gradient / scale for gradient in gradients], None
     judged = compiled.AdamGuard(loss, limit, found, skipped, in_a_row, scale)
-    taken = given, parameters, gradients, means, squares, judged, [parameter.numel() for parameter in parameters]
+    arguments = records, parameters, gradients, means, squares, judged, [parameter.numel() for parameter in parameters]
     if isinstance(machine, compiled.Cuda):
-        compiled.adam(*taken, parameters[0].new_empty(compiled.adam_workspace(len(rules), machine)), machine)
+        compiled.adam(*arguments, parameters[0].new_empty(compiled.adam_workspace(len(rules), machine)), machine)
     else:
-        compiled.adam(*taken, machine)
+        compiled.adam(*arguments, machine)
 
 
 def average(averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, share: float | Tensor) -> None:
-    """A share of the way; see ``voronerf.ops.average``."""
+    """Moves averages towards the parameters; see ``voronerf.ops.average``."""
     if native.on_cuda(averages[0]):
-        reference.average(averages, parameters, share)  # a launch for many of them
+        reference.average(averages, parameters, share)  # one launch for many tensors
         return
-    share, sizes = torch.as_tensor(share, dtype=torch.float32), [each.numel() for each in averages]
+    share, sizes = torch.as_tensor(share, dtype=torch.float32), [tensor.numel() for tensor in averages]
     native.compiled.average(averages, parameters, share, sizes, native.cpu())

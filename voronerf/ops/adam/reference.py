@@ -10,12 +10,12 @@ from torch import Tensor
 
 
 class Rule(NamedTuple):
-    """How a parameter moves.
+    """The Adam settings of a parameter.
 
     Attributes:
-        step: float32 [], the steps done, on the device of the parameter; `adam` counts it on.
+        step: float32 [], the number of steps done, on the device of the parameter; `adam` increments it.
         learning_rate: the rate; or float32 [] on the device of the parameter, which a CUDA graph can read.
-        betas: decay of the two moments, in [0, 1).
+        betas: the decay rates of the two moments, in [0, 1).
         epsilon: > 0, added outside of the root.
         every: whether entries without a gradient move too, as in ``torch.optim.Adam``.
 
@@ -34,14 +34,16 @@ class Rule(NamedTuple):
 
 
 class Guard(NamedTuple):
-    """Which steps are left out. All tensors are float32 [] on the device of the parameters, so that no host reads them.
+    """A guard that skips steps with a loss or gradients that are NaN or too large.
+
+    All tensors are float32 [] on the device of the parameters, so the host reads none of them.
 
     Attributes:
-        found: not 0 if the step is left out; with a loss `adam` writes it.
-        skipped: how many steps were left out; with a loss `adam` counts it on.
-        in_a_row: how many of the last ones; counted like ``skipped``.
-        scale: of which the gradients are multiples; None for 1.
-        limit: of the magnitudes of the loss, and of gradients of rules with ``every``.
+        found: not 0 if the step is to be skipped; `adam` writes it if it gets a loss.
+        skipped: the number of skipped steps; `adam` increments it if it gets a loss.
+        in_a_row: the number of skipped steps since the last step that was made; counted like ``skipped``.
+        scale: the loss scale by which the gradients are divided; None for 1.
+        limit: the limit on the magnitudes of the loss, and of the gradients whose rule has ``every``.
 
     Examples:
         >>> from voronerf.ops import Guard
@@ -53,29 +55,31 @@ class Guard(NamedTuple):
     skipped: Tensor
     in_a_row: Tensor
     scale: Tensor | None = None
-    limit: float = 1e18  # from here on squares are beyond float32, and make the second moment infinite for good
+    limit: float = 1e18  # larger gradients overflow when squared, and the second moment would stay infinite
 
     @staticmethod
     def on(device: torch.device | str) -> Guard:
-        """A guard that has left out no steps."""
+        """Returns a guard that has skipped no steps."""
         found, skipped, in_a_row = (torch.zeros((), device=device) for _ in range(3))
         return Guard(found, skipped, in_a_row)
 
     def begin(self, skipped: int) -> None:
-        """Begins anew, after so many steps that were left out."""
+        """Resets the guard, with the number of steps that were skipped until now."""
         for tensor, value in zip(self[:3], (0, skipped, 0), strict=True):
             tensor.fill_(value)
 
     def judge(self, loss: Tensor | None, gradients: Sequence[Tensor]) -> None:
-        """Leaves out a step, where there is a loss, unless it and all gradients are below the limit; counts it.
+        """Marks the step as skipped, and counts it, unless the loss and all gradients are below the limit.
 
         Args:
-            loss: []; None leaves the guard as it is.
-            gradients: Of any shapes.
+            loss: [], the loss of the step; None leaves the guard as it is.
+            gradients: The gradients, of any shapes.
         """
         if loss is None:
             return
-        beyond = ~torch.stack([(tensor.abs() < self.limit).all() for tensor in (loss, *gradients)])  # true for NaN
+        beyond = ~torch.stack(
+            [(tensor.abs() < self.limit).all() for tensor in (loss, *gradients)]
+        )  # NaN counts as beyond the limit
         self.found.copy_(beyond.any())
         self.skipped.add_(self.found)
         self.in_a_row.add_(1).mul_(self.found)
@@ -91,7 +95,7 @@ def adam(
     guard: Guard | None,
     loss: Tensor | None,
 ) -> None:
-    """A step of several parameters; see ``voronerf.ops.adam``."""
+    """Makes a step for several parameters; see ``voronerf.ops.adam``."""
     left_out = torch.zeros((), dtype=torch.bool, device=parameters[0].device)
     if guard is not None:
         guard.judge(loss, [gradient for rule, gradient in zip(rules, gradients) if rule.every])
@@ -102,9 +106,9 @@ def adam(
         first, second = rule.betas
         step = rule.step.double() + 1
         root = (1 - second**step).sqrt()
-        given = rule.learning_rate
-        given = given if isinstance(given, Tensor) else float(given)
-        rate, epsilon = (given * root / (1 - first**step)).float(), (float(rule.epsilon) * root).float()
+        learning_rate = rule.learning_rate
+        learning_rate = learning_rate if isinstance(learning_rate, Tensor) else float(learning_rate)
+        rate, epsilon = (learning_rate * root / (1 - first**step)).float(), (float(rule.epsilon) * root).float()
         new_mean = first * mean + (1 - first) * gradient
         new_square = second * square + (1 - second) * gradient.square()
         moved = parameter - rate * (new_mean / (new_square.sqrt() + epsilon))
@@ -116,7 +120,7 @@ def adam(
 
 @torch.no_grad()
 def average(averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, share: float | Tensor) -> None:
-    """A share of the way; see ``voronerf.ops.average``."""
+    """Moves averages towards the parameters; see ``voronerf.ops.average``."""
     if parameters is None:
         torch._foreach_mul_(list(averages), 1 - share)
     else:

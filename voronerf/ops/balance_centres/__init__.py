@@ -11,10 +11,10 @@ from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.declare import declare
 
 
-def _prepare(given: Any) -> Any:
-    if given.k < 1:
+def _prepare(arguments: Any) -> Any:
+    if arguments.k < 1:
         raise ValueError("balance_centres: centres must hold at least one centre, got none")
-    return given
+    return arguments
 
 
 @declare(native=Implementation(("cpu",), (torch.float32,)), warp=PLAIN, prepare=_prepare)
@@ -28,20 +28,20 @@ def balance_centres(
     neighbours: Annotated[int, "1.."] = 8,
     backend: str = "auto",
 ) -> tuple[Annotated[Tensor, "float32 [k, 3]"], Annotated[Tensor, "float64 [k]"]]:
-    """Moves all centres `steps` times towards cells of equal mass; see ``voronerf.diagram.balance``.
+    """Moves all centres `steps` times, towards cells of equal mass; see ``voronerf.diagram.balance``.
 
     ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i`` (Elsner et al. 2023, section 3.2). N(i)
     are the `neighbours` closest centres, or all others if there are fewer; at equal distance, the first ones. norm_i is
-    the largest W of i and N(i). Updates are computed in float64 and stored in float32. The result is the same at every
-    call. Not differentiable.
+    the largest W of i and N(i). Updates are computed in float64 and stored in float32. The result is deterministic. Not
+    differentiable.
 
     Args:
-        samples: finite.
-        masses: >= 0 and finite.
-        centres: finite, k >= 1.
-        steps: number of updates, >= 0.
-        alpha: step size, no unit.
-        neighbours: size of N(i), >= 1.
+        samples: the positions of the samples, finite.
+        masses: the masses of the samples, >= 0 and finite.
+        centres: the centres to start from, finite, k >= 1.
+        steps: the number of updates, >= 0.
+        alpha: the step size, no unit.
+        neighbours: the size of N(i), >= 1.
 
     Returns:
         (centres float32 [k, 3], weights float64 [k], the mass in each cell of the returned centres).

@@ -11,14 +11,16 @@ from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 
 _OP = declared("balance_centres")
-_inputs = _OP.inputs(native.compiled.BalanceInputs, neighbours=lambda given: min(given.neighbours, given.k - 1))
+_inputs = _OP.inputs(
+    native.compiled.BalanceInputs, neighbours=lambda arguments: min(arguments.neighbours, arguments.k - 1)
+)
 
 
 @_OP.custom_op("balance_centres_native", devices=("cpu",))
-def balance_centres(given: Any, found: tuple[Tensor, Tensor]) -> None:
-    """The published update, repeated; see ``voronerf.ops.balance_centres``."""
-    moved, weights = found
-    cells = moved.new_empty(given.m, dtype=torch.int32)
-    workspace = weights.new_empty(native.compiled.balance_centres_workspace(given.k))
-    moved.copy_(given.centres)
-    native.compiled.balance_centres(_inputs(given), moved, weights, cells, workspace, native.cpu())
+def balance_centres(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
+    """Repeats the published update; see ``voronerf.ops.balance_centres``."""
+    moved, weights = results
+    cells = moved.new_empty(arguments.m, dtype=torch.int32)
+    workspace = weights.new_empty(native.compiled.balance_centres_workspace(arguments.k))
+    moved.copy_(arguments.centres)
+    native.compiled.balance_centres(_inputs(arguments), moved, weights, cells, workspace, native.cpu())

@@ -12,7 +12,7 @@ from voronerf.ops.nearest_centre.reference import nearest_centre
 def balance_centres(
     samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int
 ) -> tuple[Tensor, Tensor]:
-    """The published update, repeated; see ``voronerf.ops.balance_centres``."""
+    """Repeats the published update; see ``voronerf.ops.balance_centres``."""
     weights = cell_masses(samples, masses, centres)
     for _ in range(steps if centres.shape[0] > 1 else 0):
         centres = published_step(centres, weights, alpha=alpha, neighbours=neighbours)
@@ -21,20 +21,20 @@ def balance_centres(
 
 
 def cell_masses(samples: Tensor, masses: Tensor, centres: Tensor) -> Tensor:
-    """float64 [k]: the mass in each cell, added up in the order of the samples."""
+    """Returns float64 [k], the mass in each cell, added up in the order of the samples."""
     cells = nearest_centre(samples, centres)
     return torch.zeros(centres.shape[0], dtype=masses.dtype, device=masses.device).index_add(0, cells, masses)
 
 
 def published_step(centres: Tensor, weights: Tensor, *, alpha: float, neighbours: int) -> Tensor:
-    """One update of all centres [k, 3], k >= 2, from the mass [k] of their cells."""
+    """Returns the centres after one update, from centres [k, 3], k >= 2, and the mass [k] of their cells."""
     wide = centres.double()
     nearby = min(neighbours, centres.shape[0] - 1)
     distances = (wide[:, None] - wide[None]).square().sum(-1).fill_diagonal_(float("inf"))
-    # Stable: of centres equally far the first count.
+    # The sort is stable: at equal distance the first centres are the neighbours.
     others = distances.sort(dim=1, stable=True).indices[:, :nearby]
     heaviest = torch.maximum(weights[others].amax(1), weights)[:, None]
-    # A neighbourhood without any weight has only zero differences: any positive divisor does.
+    # In a neighbourhood of weight 0 all differences are 0, so any positive divisor works.
     pull = (weights[others] - weights[:, None]) / heaviest.clamp(min=torch.finfo(weights.dtype).tiny)
     shift = ((wide[others] - wide[:, None]) * pull[:, :, None]).mean(1)
     return (wide + alpha * shift).to(centres.dtype)

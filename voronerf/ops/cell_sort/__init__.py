@@ -15,23 +15,23 @@ from voronerf.ops._core.declare import declare
 def cell_sort(
     cells: Annotated[Tensor, "int32 [n]"], k: Annotated[int, "1..134217728"], *, backend: str = "auto"
 ) -> tuple[Annotated[Tensor, "int32 [n]"], Annotated[Tensor, "int32 [k + 1]"]]:
-    """Stable order of samples by cell, and where each cell begins.
+    """Returns the stable order of samples by cell, and the offset of each cell.
 
-    ``x[order]`` is sorted by cell, and the samples of a cell keep their order; ``y_sorted`` is put back by
-    ``y[order] = y_sorted``. The result is the same to the bit on every backend. Cells may be empty.
+    ``x[order]`` is sorted by cell, and the samples of a cell keep their order. ``y[order] = y_sorted`` undoes the
+    sorting. The result is bitwise the same on every backend. Cells may be empty.
 
     Args:
         cells: values 0 to k - 1, n < 2**31.
-        k: number of cells, 1 to 2**27.
+        k: the number of cells, 1 to 2**27.
 
     Returns:
-        order int32 [n], the original row of each sorted row; offsets int32 [k + 1], cell c being sorted rows
+        order int32 [n], the original row of each sorted row; offsets int32 [k + 1]: cell c owns sorted rows
         ``offsets[c]`` to ``offsets[c + 1]``.
 
     Raises:
-        ValueError: on the CPU a cell outside 0 to k - 1. (On a GPU and in a compiled graph the values are not
-            read. Values below 0 are then sorted before ``offsets[0]`` and values above k - 1 after ``offsets[k]``, to
-            rows that belong to no cell.)
+        ValueError: on the CPU a cell outside 0 to k - 1. (On a GPU and in a compiled graph the values are not checked.
+            Values below 0 are then sorted before ``offsets[0]``, and values above k - 1 from ``offsets[k]`` on, to rows
+            of no cell.)
 
     Examples:
         >>> import torch

@@ -11,18 +11,18 @@ from voronerf.ops._core.declare import declared
 from voronerf.ops._core.rows import rows_of
 
 WAYS = native.compiled.CellSortWay
-"""Of sorting on CUDA; "automatic" is by the number of cells."""
+"""The sorting algorithms on CUDA; "automatic" chooses by the number of cells."""
 
 
 def sort(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = "automatic") -> None:
     """Fills the order and the offsets of cells.
 
     Args:
-        cells: int32 [n].
-        order: int32 [n].
-        offsets: int32 [k + 1].
+        cells: int32 [n], the cell of each sample.
+        order: int32 [n], to be written.
+        offsets: int32 [k + 1], to be written.
         caller: the operation that errors name.
-        way: of sorting on CUDA, one of ``WAYS``, for measurements.
+        way: the sorting algorithm on CUDA, one of ``WAYS``, for measurements.
     """
     compiled, machine = native.compiled, native.machine(cells)
     n, k = rows_of(cells), offsets.shape[0] - 1
@@ -38,6 +38,6 @@ cell_sort = declared("cell_sort").compiled_op(
     "",
     "cell_sort",
     *("cells", "result0", "result1", "n", "k"),
-    on_cuda=lambda given, found, _: sort(given.cells, found[0], found[1], "cell_sort"),
-    fault=lambda given: check_range("cell_sort", "cells", given.cells, given.k),
+    on_cuda=lambda arguments, found, _: sort(arguments.cells, found[0], found[1], "cell_sort"),
+    fault=lambda arguments: check_range("cell_sort", "cells", arguments.cells, arguments.k),
 )

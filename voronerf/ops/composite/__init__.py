@@ -27,30 +27,30 @@ def composite(
     background: Annotated[Tensor | None, "same [c] or [r, c]"] = None,
     backend: str = "auto",
 ) -> Composite:
-    """Volume rendering: colour, opacity and depth of rays, from the density and colour of their samples.
+    """Renders the colour, opacity and depth of rays from the density and colour of their samples (volume rendering).
 
     ``weight_i = T_i (1 - exp(-sigma_i delta_i))`` with ``T_i = exp(-sum over j < i of sigma_j delta_j)``: Max 1995, and
     Mildenhall et al. 2020, equation 3. The samples of a ray are in order of depth. Infinite density is opaque, unless
     its delta is 0. A NaN sample affects only its own ray.
 
     Args:
-        sigma: density, per unit of length, at least 0.
-        rgb: colour, or other channels.
-        depths: distance along the ray.
-        deltas: length of the part of the ray that a sample stands for, at least 0.
-        ray_offsets: of packed samples: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none.
-            None for the dense form.
-        background: added with weight 1 - opacity. A ray without samples shows only the background.
+        sigma: the density per unit of length, at least 0.
+        rgb: the colours, or other channels.
+        depths: the distance of each sample along its ray.
+        deltas: the length of the ray segment of each sample, at least 0.
+        ray_offsets: the offsets of packed samples: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``,
+            possibly none. None for the dense form.
+        background: a colour added with weight 1 - opacity. A ray without samples shows only the background.
 
-    All floating-point arguments share one dtype, float16 to float64; sums are taken in float32 at least. Differentiable
-    in all of them.
+    All floating-point arguments share one dtype, float16 to float64, and all are differentiable. Sums are float32 at
+    least.
 
     Returns:
         Composite(colour [r, c], opacity [r], depth [r], weights like sigma). ``depth`` is the sum of weight times depth
         and is not divided by the opacity.
 
     Raises:
-        ValueError: on the CPU offsets that fall or exceed m.
+        ValueError: on the CPU offsets that decrease or exceed m.
 
     Examples:
         >>> import torch

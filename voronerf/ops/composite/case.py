@@ -9,9 +9,9 @@ def _make(draw: Draw, n: int) -> Arguments:
     dtype, s, c = draw.dtype(), draw.among("s", 5, 0, 1, 7, 16, 33, 64), draw.among("channels", 3, 3, 1, 5)
     packed = draw.among("packed", False, True)
     shape = (n * s,) if packed else (n, s)
-    r = n if not packed or n < 64 else n // 64  # of long rays, which packed ones may be
+    r = n if not packed or n < 64 else n // 64  # few, long rays if packed
     call: Arguments = {name: draw.uniform(*shape, dtype=dtype) for name in ("sigma", "depths", "deltas")}
-    if packed:  # so that light reaches the end of a long ray
+    if packed:  # low density, so light reaches the end of a long ray
         call["sigma"] = 0.05 * call["sigma"]
     call["rgb"] = draw.uniform(*shape, c, dtype=dtype)
     if packed:

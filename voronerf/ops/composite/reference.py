@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 _OPAQUE = 1e30
-"""Stands for infinite density: as opaque over any length but 0, and 0 times it is 0."""
+"""The finite value for infinite density: opaque over any length except 0, and 0 times it is 0, not NaN."""
 
 
 class Composite(NamedTuple):
@@ -37,11 +37,11 @@ class Composite(NamedTuple):
 
 
 def check_ray_offsets(op: str, ray_offsets: Tensor, m: int) -> None:
-    """On the CPU, as the kernels do: ValueError unless the offsets rise from 0 or more to m or less."""
-    traced = torch.compiler.is_compiling() or type(ray_offsets) is not Tensor  # which has no values
+    """Raises ValueError on the CPU, like the kernels, unless the offsets ascend within 0 to m."""
+    traced = torch.compiler.is_compiling() or type(ray_offsets) is not Tensor  # a tracer has no values
     if traced or ray_offsets.device.type != "cpu":
         return
-    values = ray_offsets.numpy()  # whose operations take a tenth of the time of torch's for some hundred rays
+    values = ray_offsets.numpy()  # numpy takes a tenth of torch's time for some hundred rays
     if len(values) == 0 or (values[0] >= 0 and values[-1] <= m and (values[1:] >= values[:-1]).all()):
         return
     wrong = (ray_offsets < 0) | (ray_offsets > m)
@@ -62,14 +62,14 @@ def composite(
     ray_offsets: Tensor | None = None,
     background: Tensor | None = None,
 ) -> Composite:
-    """Absorption and emission along rays; see ``voronerf.ops.composite``."""
+    """Renders absorption and emission along rays; see ``voronerf.ops.composite``."""
     storage = rgb.dtype
     wide = torch.promote_types(storage, torch.float32)
     sigma, rgb, depths, deltas = (tensor.to(wide) for tensor in (sigma, rgb, depths, deltas))
     optical = optical_depth(sigma, deltas)
     if ray_offsets is None:
         weights = _in_front(optical) * -torch.expm1(-optical)
-        colour = (weights[:, :, None] * rgb).sum(dim=1)  # no product, which autocast would narrow
+        colour = (weights[:, :, None] * rgb).sum(dim=1)  # a matrix product would be narrowed by autocast
         opacity = weights.sum(dim=1)
         depth = (weights * depths).sum(dim=1)
     else:
@@ -78,7 +78,7 @@ def composite(
         light, ray = packed_light(optical, ray_offsets)
         weights = light * -torch.expm1(-optical)
         weights = torch.where((ray > 0) & (ray <= rays), weights, 0)
-        # Colour, opacity and depth are one sum, over columns side by side.
+        # Colour, opacity and depth are computed by one sum, over adjacent columns.
         columns = torch.cat([rgb, torch.ones_like(depths)[:, None], depths[:, None]], dim=1) * weights[:, None]
         total = columns.new_zeros(rays + 2, columns.shape[1]).index_add(0, ray, columns)[1:-1]
         colour, opacity, depth = total[:, :-2], total[:, -2], total[:, -1]
@@ -87,20 +87,20 @@ def composite(
     return Composite(colour.to(storage), opacity.to(storage), depth.to(storage), weights.to(storage))
 
 
-def kept(value: Any) -> Any:
-    """The same, or a copy of an inference tensor, which autograd can keep."""
+def saveable(value: Any) -> Any:
+    """Returns the value, or a copy of an inference tensor, because autograd cannot save inference tensors."""
     return value.clone() if isinstance(value, Tensor) and value.is_inference() else value
 
 
 def optical_depth(sigma: Tensor, deltas: Tensor) -> Tensor:
-    """Density times length, of infinite density too."""
+    """Returns density times length, also for infinite density."""
     return sigma.clamp(max=_OPAQUE) * deltas
 
 
 def packed_light(optical: Tensor, ray_offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """The share of the light that arrives at each packed sample [m], and one more than its ray, int64 [m].
+    """Returns the transmittance in front of each packed sample [m], and its ray plus 1, int64 [m].
 
-    0 and r + 1 are the rays of samples that belong to none.
+    Samples outside all rays have 0 or r + 1.
     """
     rays, row = ray_offsets.shape[0] - 1, torch.arange(optical.shape[0], device=optical.device)
     ray = torch.searchsorted(ray_offsets.long(), row, right=True)
@@ -111,19 +111,19 @@ def packed_light(optical: Tensor, ray_offsets: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _in_front(optical: Tensor) -> Tensor:
-    """Transmittance in front of each sample [r, s]: exp of minus the optical depth up to there.
+    """Returns the transmittance in front of each sample, [r, s]: exp of minus the optical depth in front.
 
-    The sum is shifted. Subtracting its last term instead would be inf - inf for an opaque sample.
+    The exclusive sum is a shifted one: subtracting each last term would give inf - inf for an opaque sample.
     """
     before = torch.nn.functional.pad(optical[:, :-1], (1, 0))
     return torch.exp(-before.cumsum(dim=1))
 
 
 def _packed_in_front(optical: Tensor, first: Tensor, last: Tensor) -> Tensor:
-    """The same for packed samples [m], whose ray has samples ``first`` to ``last``.
+    """Returns the transmittance in front of each packed sample [m], whose ray has samples ``first`` to ``last``.
 
-    One sample counts for at most ``limit``, where nothing visible passes: an opaque ray then costs the rays behind it
-    no digits of the running sum.
+    The optical depth of a sample is clamped to ``limit``, where no light passes: an opaque ray then does not reduce the
+    precision of the running sum for later rays.
     """
     limit = 128.0 if optical.dtype == torch.float32 else 768.0
     before = _RaySum.apply(optical.double().clamp(max=limit), first, last, False)
@@ -131,12 +131,11 @@ def _packed_in_front(optical: Tensor, first: Tensor, last: Tensor) -> Tensor:
 
 
 class _RaySum(torch.autograd.Function):
-    """Sum over the samples of the same ray in front of each sample or, with ``behind``, behind it. Each is the other's
-    adjoint.
+    """The sum over the samples of the same ray in front of each sample or, with ``behind``, behind it.
 
-    One running sum over all rays, less its value where the ray begins or ends; float64 carries millions of samples.
-    What is not finite is left out of it and spoils, as it should, the later sums of its own ray only: forward and
-    backward.
+    Each sum is the adjoint of the other. One running sum over all rays, minus its value at the ray's start or end, is
+    precise enough in float64 for millions of samples. Values that are not finite are excluded from it and make only the
+    later sums of their own ray NaN, in the forward and the backward pass.
     """
 
     @staticmethod

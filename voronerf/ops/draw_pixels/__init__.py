@@ -24,28 +24,28 @@ def _of_runs() -> list[Row]:
     return [_SEED, *of_pixels, Row("first", INDEX, ("p",))]
 
 
-def _prepare(given: Any) -> Any:
-    runs, below, known = given.runs, given.below, given.known
+def _prepare(arguments: Any) -> Any:
+    runs, below, known = arguments.runs, arguments.below, arguments.known
     if known is not None:
-        sizes = check_rows("draw_pixels", _of_known, [given.seed, known.pixels, known.distances], smooth=False)
+        sizes = check_rows("draw_pixels", _of_known, [arguments.seed, known.pixels, known.distances], smooth=False)
         if not sizes["p"]:
             raise ValueError("draw_pixels: known must hold at least one pixel, got none")
-        check_integer("draw_pixels", "several", known.several, 0, given.count)
+        check_integer("draw_pixels", "several", known.several, 0, arguments.count)
     if runs is not None:
-        sizes = check_rows("draw_pixels", _of_runs, [given.seed, runs.ends, runs.shift, runs.first], smooth=False)
+        sizes = check_rows("draw_pixels", _of_runs, [arguments.seed, runs.ends, runs.shift, runs.first], smooth=False)
         if not (sizes["n"] and sizes["p"]):
             raise ValueError("draw_pixels: runs must hold at least one run, got none")
         check_integer("draw_pixels", "bits", runs.bits, 0, 48)
         check_integer("draw_pixels", "total", runs.total, 1, 2**48)
         if below != runs.total:
             raise ValueError(f"draw_pixels: below must be the {runs.total} pixels of the runs, got {below}")
-    return given
+    return arguments
 
 
 @declare(
     native=Implementation(EVERYWHERE, (torch.int32,)),
     warp=PLAIN,
-    sizes={"several": lambda given: 0 if given.known is None else given.known.several},
+    sizes={"several": lambda arguments: 0 if arguments.known is None else arguments.known.several},
     prepare=_prepare,
 )
 def draw_pixels(
@@ -61,19 +61,21 @@ def draw_pixels(
     Annotated[Tensor, "float32 [count, 3]"],
     Annotated[Tensor, "float32 [several]"],
 ]:
-    """Pixels, and three uniform numbers for each; all are hashes of the seed and of the number in the batch.
+    """Draws pixels with replacement, and three uniform numbers for each pixel.
 
-    The same on every backend and on any number of threads. Not differentiable.
+    All are hashes of the seed and of the index in the batch: the same on every backend and on any number of threads.
+    Not differentiable.
 
     Args:
-        seed: of the hashes.
-        count: Of pixels, b, 1 to 2**27.
-        below: Pixels to draw from, 1 to 2**48; with runs as many as they have.
-        runs: The pixels to draw from; None for 0 to ``below`` - 1.
-        known: Others, of known distances, that the first of the batch are drawn from; None for none.
+        seed: the seed of the hashes.
+        count: the number of pixels to draw, b, 1 to 2**27.
+        below: the number of pixels to draw from, 1 to 2**48; with ``runs``, their total.
+        runs: the pixels to draw from; None for 0 to ``below`` - 1.
+        known: pixels of known distance, from which the first pixels of the batch are drawn; None for none.
 
     Returns:
-        int64 [b], float32 [b, 3] in [0, 1), and float32 [several], the distances of the first; [0] without ``known``.
+        int64 [b], the pixels; float32 [b, 3], uniform in [0, 1); and float32 [several], the distances of the first
+        pixels ([0] without ``known``).
 
     Examples:
         >>> import torch

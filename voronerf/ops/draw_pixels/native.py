@@ -11,8 +11,8 @@ _OP = declared("draw_pixels")
 
 
 def _of(part: str, name: str) -> Any:
-    """A member of the runs or the known pixels; None where there are none."""
-    return lambda given: getattr(getattr(given, part), name, None)
+    """Returns a function that reads an attribute of ``runs`` or ``known`` (``part``), or None if that is None."""
+    return lambda arguments: getattr(getattr(arguments, part), name, None)
 
 
 _inputs = _OP.inputs(
@@ -20,12 +20,12 @@ _inputs = _OP.inputs(
     ends=_of("runs", "ends"),
     shift=_of("runs", "shift"),
     first=_of("runs", "first"),
-    n=lambda given: 0 if given.runs is None else len(given.runs.ends),
-    places=lambda given: 0 if given.runs is None else len(given.runs.first),
-    bits=lambda given: 0 if given.runs is None else given.runs.bits,
+    n=lambda arguments: 0 if arguments.runs is None else len(arguments.runs.ends),
+    places=lambda arguments: 0 if arguments.runs is None else len(arguments.runs.first),
+    bits=lambda arguments: 0 if arguments.runs is None else arguments.runs.bits,
     b="count",
     known=_of("known", "pixels"),
     distances=_of("known", "distances"),
-    p=lambda given: 0 if given.known is None else len(given.known.pixels),
+    p=lambda arguments: 0 if arguments.known is None else len(arguments.known.pixels),
 )
 draw_pixels = _OP.compiled_op("draw_pixels_native", "draw_pixels", _inputs, "result0", "result1", "result2")

@@ -19,17 +19,19 @@ class _Runs(NamedTuple):
 
 
 class Runs(_Runs):
-    """Pixels to draw from, in rising runs: few entries where most of a row counts.
+    """The pixels to draw from, as runs in ascending order: a compact form if most pixels of a row count.
+
+    A place is an index into the pixels of all runs, one run after another.
 
     Attributes:
-        ends: int64 [n], how many pixels the runs up to each have.
-        shift: int64 [n], what is added to a place in all runs, one after another, to get the pixel.
-        first: int32, the first run that ends behind place 0, 2^bits, 2 * 2^bits and so on, up to all pixels.
-        bits: of `first`: about as many places as a run has.
-        total: the pixels of all runs.
+        ends: int64 [n], the inclusive cumulative sum of the lengths of the runs.
+        shift: int64 [n], the difference between pixel and place in each run.
+        first: int32, the first run that ends behind place 0, 2^bits, 2 * 2^bits and so on, up to ``total``.
+        bits: the binary logarithm of the step of ``first``; 2^bits is about the length of a run.
+        total: the number of pixels in all runs.
 
     Raises:
-        ValueError: Where these do not fit each other, which is looked at when runs are made.
+        ValueError: attributes that do not fit each other; they are checked on construction.
 
     Examples:
         >>> import torch
@@ -41,8 +43,8 @@ class Runs(_Runs):
     __slots__ = ()
 
     def __new__(cls, ends: Tensor, shift: Tensor, first: Tensor, bits: int, total: int) -> Runs:
-        """Runs that fit each other; dtypes and shapes are left to ``draw_pixels``."""
-        plain = all(type(each) is Tensor and each.dim() == 1 and not each.is_meta for each in (ends, shift, first))
+        """Checks that the attributes fit each other; ``draw_pixels`` checks their dtypes and shapes."""
+        plain = all(type(part) is Tensor and part.dim() == 1 and not part.is_meta for part in (ends, shift, first))
         if plain and len(ends) and 0 <= bits <= 48 and 1 <= total <= 2**48:
             if int(ends[0]) < 1 or int(ends[-1]) != total or not bool((ends[1:] > ends[:-1]).all()):
                 raise ValueError(
@@ -57,7 +59,7 @@ class Runs(_Runs):
 
     @staticmethod
     def of(start: Tensor, length: Tensor) -> Runs:
-        """Runs from their first pixels, int64 [n], and how many each has, int64 [n], >= 1; n >= 1."""
+        """Returns runs from their first pixels, int64 [n], and their lengths, int64 [n], >= 1; n >= 1."""
         ends = length.cumsum(0)
         total = int(ends[-1])
         bits = max(total // len(ends), 1).bit_length()
@@ -65,18 +67,18 @@ class Runs(_Runs):
 
 
 def _first_runs(ends: Tensor, bits: int, total: int) -> Tensor:
-    """int32, the first run that ends behind place 0, 2^bits, 2 * 2^bits and so on."""
+    """Returns int32, the first run that ends behind place 0, 2^bits, 2 * 2^bits and so on."""
     places = torch.arange(0, total, 1 << bits, device=ends.device)
     return torch.searchsorted(ends, places, right=True).int()
 
 
 class Known(NamedTuple):
-    """Pixels that show what lies at a known distance, and how many of a batch are drawn from them.
+    """Pixels that show a point at a known distance, and the number of pixels to draw from them.
 
     Attributes:
         pixels: int64 [p], p >= 1.
-        distances: float32 [p].
-        several: the first so many of a batch.
+        distances: float32 [p], the distance of the point in each pixel.
+        several: the number of leading pixels of a batch that are drawn from these pixels.
 
     Examples:
         >>> import torch
@@ -95,7 +97,7 @@ class Known(NamedTuple):
 def draw_pixels(
     seed: Tensor, count: int, below: int, runs: Runs | None, known: Known | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels, three uniform numbers for each, and distances of the first; see ``voronerf.ops.draw_pixels``."""
+    """Draws pixels, uniform numbers and known distances; see ``voronerf.ops.draw_pixels``."""
     numbers = hashed_uniforms(seed, count, 5)
     fraction = numbers[:, 0].double() + numbers[:, 1].double() / 2**24
     place = (fraction * below).long()

@@ -19,18 +19,18 @@ def draw_points(
     *,
     backend: str = "auto",
 ) -> Annotated[Tensor, "float32 [count, 3]"]:
-    """Points spread evenly over a box, hashes of the seed and of their numbers.
+    """Draws points uniformly from a box.
 
-    So are random points in random cells of any grid of the box. The same on every backend and on any number of threads.
-    Not differentiable.
+    This equals drawing a random cell of a regular grid of the box, then a random point in it. Points are hashes of the
+    seed and of their indices: the same on every backend and on any number of threads. Not differentiable.
 
     Args:
-        seed: of the hashes.
-        count: Of points, n, 1 to 2**27.
-        box: lowest and highest corner.
+        seed: the seed of the hashes.
+        count: the number of points, n, 1 to 2**27.
+        box: the lowest and the highest corner.
 
     Returns:
-        float32 [n, 3].
+        float32 [n, 3], the points.
 
     Examples:
         >>> import torch

@@ -8,5 +8,5 @@ from voronerf.ops.march_rays.reference import hashed_uniforms
 
 
 def draw_points(seed: Tensor, count: int, box: Tensor) -> Tensor:
-    """Points in a box; see ``voronerf.ops.draw_points``."""
+    """Draws points from a box; see ``voronerf.ops.draw_points``."""
     return box[0] + (box[1] - box[0]) * hashed_uniforms(seed, count, 3).to(box.dtype)

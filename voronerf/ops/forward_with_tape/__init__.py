@@ -1,4 +1,4 @@
-"""Networks whose parameters learn from the gradient of a loss to what they put out. n samples."""
+"""Networks with an autograd tape that starts from the gradient of a loss to their outputs. n samples."""
 
 from __future__ import annotations
 
@@ -8,27 +8,26 @@ from typing import Any
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops.forward_with_tape.reference import Tape
-from voronerf.ops.routed_program import routed_of
+from voronerf.ops.routed_program import check_network
 
 _OP = backends.declare("forward_with_tape", native=Implementation(EVERYWHERE, FLOATS), warp=PLAIN)
 _NEEDED = ("program", "inputs", "parameters")
 
 
 def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> Tape:
-    """Evaluates networks that learn from the gradient of a loss to their outputs.
+    """Evaluates networks and returns a tape, whose ``backward`` takes the gradient of a loss to their outputs.
 
-    ``tape.backward(loss, gradient)`` is equivalent to the backward pass of a loss of ``routed_program(**network)``, for
-    a loss that knows its own gradient. The native CPU implementation has all gradients of the parameters before
-    ``backward`` is called. Only once differentiable.
+    ``tape.backward(loss, gradient)`` equals the backward pass of a loss on ``routed_program(**network)``, for a loss
+    whose gradient the caller computes. Only first derivatives exist.
 
     Args:
-        network: The arguments of `routed_program` by name, but for ``backend``: ``program``, with one output,
-            ``inputs`` and ``parameters``, and where there are any, ``ray_index`` and what tells the cells. Gradients go
-            to the parameters, and to inputs that ask for them.
+        network: the arguments of `routed_program` by name, except ``backend``: ``program``, with one output, ``inputs``
+            and ``parameters``; optionally ``ray_index`` and the arguments that locate the samples. Gradients go to all
+            parameters and inputs with ``requires_grad``.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        :class:`Tape`, with an example.
+        :class:`Tape`, with the outputs and ``backward``.
 
     Raises:
         ValueError: a network without a program, inputs or parameters.
@@ -49,9 +48,9 @@ def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> T
         raise ValueError(f"{_OP}: network must hold program, inputs and parameters, got {came}")
     if not all(isinstance(name, str) for name in network):
         raise TypeError(f"{_OP}: network must hold arguments by name, got {list(network)!r:.100}")
-    routed = routed_of(_OP, network)
-    given, leaves = routed.given(_OP), [*routed.inputs, *routed.parameters]
+    routed = check_network(_OP, network)
+    arguments, leaves = routed.arguments(_OP), [*routed.inputs, *routed.parameters]
     device = leaves[0].device
-    run = backends.resolve_composed(_OP, backend=backend, device=device, dtype=given.dtype)
-    tape: Tape = run(given, routed.where, leaves)
+    run = backends.resolve_composed(_OP, backend=backend, device=device, dtype=arguments.dtype)
+    tape: Tape = run(arguments, routed.routing, leaves)
     return tape

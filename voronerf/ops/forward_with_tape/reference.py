@@ -1,4 +1,4 @@
-"""What networks put out, and what they learn from its gradient."""
+"""The tape of a forward pass of networks, by torch.autograd."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_flag, check_shape
-from voronerf.ops._core.derivatives import learnt, with_gradients
-from voronerf.ops.grouped_program.given import Given
-from voronerf.ops.routed_program import of_samples, run
-from voronerf.ops.routed_program.where import Where
+from voronerf.ops._core.derivatives import run_backward, with_gradients
+from voronerf.ops.grouped_program.arguments import ProgramArguments
+from voronerf.ops.routed_program import frozen_rows, run
+from voronerf.ops.routed_program.routing import Routing
 
 
 class Tape(ABC):
-    """What networks put out, to learn from.
+    """The tape of a forward pass: the outputs of the networks, and their backward pass.
 
     Attributes:
-        raw: float32 [n, out], without gradients.
+        raw: float32 [n, out], the outputs, detached from the autograd graph.
 
     Examples:
         >>> import torch
@@ -37,15 +37,15 @@ class Tape(ABC):
     raw: Tensor
 
     def backward(self, loss: Tensor, gradient: Tensor, *, defer: bool = False) -> Tensor:
-        """Adds to ``.grad`` of the parameters what follows from the gradient of a loss to ``raw``. To be called once.
+        """Adds the gradients of a loss to ``.grad`` of the parameters. It may be called once.
 
         Args:
-            loss: [].
-            gradient: [n, out], of the loss to ``raw``.
-            defer: Whether that waits for the ``backward`` of the result.
+            loss: [], the loss.
+            gradient: [n, out], the gradient of the loss to ``raw``.
+            defer: Whether to add the gradients only when ``backward`` of the returned loss is called.
 
         Returns:
-            The loss [], without gradients unless deferred.
+            The loss [], detached unless deferred.
 
         Raises:
             ValueError: a loss or gradient of another shape.
@@ -59,15 +59,17 @@ class Tape(ABC):
     def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor: ...
 
 
-def forward_with_tape(given: Given, where: Where, leaves: Sequence[Tensor], backend: str = "reference") -> Tape:
-    """The outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
-    (out,), cells = run(given, where._replace(frozen=None), backend=backend)
-    return Graph(out.detach().float(), out, cells, where.frozen)
+def forward_with_tape(
+    arguments: ProgramArguments, routing: Routing, leaves: Sequence[Tensor], backend: str = "reference"
+) -> Tape:
+    """Returns the outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
+    (out,), cells = run(arguments, routing._replace(frozen=None), backend=backend)
+    return Graph(out.detach().float(), out, cells, routing.frozen)
 
 
 @dataclass(frozen=True)
 class Graph(Tape):
-    """That of torch's own autograd."""
+    """The tape that delegates to torch.autograd."""
 
     raw: Tensor
     out: Tensor
@@ -76,5 +78,5 @@ class Graph(Tape):
 
     def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor:
         if self.frozen is not None:
-            gradient = gradient.masked_fill(of_samples(self.frozen, self.cells), 0)
-        return learnt(with_gradients(loss, [self.out], [gradient]), defer)
+            gradient = gradient.masked_fill(frozen_rows(self.frozen, self.cells), 0)
+        return run_backward(with_gradients(loss, [self.out], [gradient]), defer)

@@ -14,7 +14,7 @@ from voronerf.ops._core.declare import declare
     native=Implementation(EVERYWHERE, FLOATS),
     warp=Implementation(EVERYWHERE, FLOATS),
     smooth=["x"],
-    sizes={"w": lambda given: given.d * (int(given.include_input) + 2 * given.octaves)},
+    sizes={"w": lambda arguments: arguments.d * (int(arguments.include_input) + 2 * arguments.octaves)},
 )
 def frequency_encode(
     x: Annotated[Tensor, "floating [n, d]"],
@@ -23,14 +23,14 @@ def frequency_encode(
     include_input: bool = True,
     backend: str = "auto",
 ) -> Annotated[Tensor, "same [n, w]"]:
-    """``[x, sin x, cos x, sin 2x, cos 2x, ..., sin 2^(L-1) x, cos 2^(L-1) x]``, each a block of d features.
+    """Returns ``[x, sin x, cos x, sin 2x, cos 2x, ..., sin 2^(L-1) x, cos 2^(L-1) x]``, in blocks of d features.
 
-    The layout of nerf-pytorch: no factor of pi, and x itself first. Mildenhall et al. 2020, equation 4. Angles are
-    taken in float32 at least.
+    The layout follows nerf-pytorch: no factor of pi, and x itself first. Mildenhall et al. 2020, equation 4. Angles
+    are float32 at least.
 
     Args:
-        x: angles of the first octave, n < 2**31.
-        octaves: L, at least 0.
+        x: the angles of the first octave, n < 2**31.
+        octaves: the number of octaves L, at least 0.
         include_input: whether x itself comes first.
 
     Returns:

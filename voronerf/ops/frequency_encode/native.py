@@ -9,5 +9,5 @@ frequency_encode = encoding_op(
     "frequency_encode",
     "frequency",
     reference.frequency_encode,
-    lambda given: (given.x, None, given.d, given.octaves, given.include_input),
+    lambda arguments: (arguments.x, None, arguments.d, arguments.octaves, arguments.include_input),
 )

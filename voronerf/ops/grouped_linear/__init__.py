@@ -13,12 +13,12 @@ from voronerf.ops._core.declare import declare
 from voronerf.ops._core.layers import ACTIVATIONS
 
 
-def _prepare(given: Any) -> Any:
-    if 0 in given.weight.shape:
-        raise ValueError(f"grouped_linear: weight must have no empty dimension, got {list(given.weight.shape)}")
-    if not torch.is_autocast_enabled(given.x.device.type):
-        check_same_dtype("grouped_linear", x=given.x, weight=given.weight, bias=given.bias)
-    return given
+def _prepare(arguments: Any) -> Any:
+    if 0 in arguments.weight.shape:
+        raise ValueError(f"grouped_linear: weight must have no empty dimension, got {list(arguments.weight.shape)}")
+    if not torch.is_autocast_enabled(arguments.x.device.type):
+        check_same_dtype("grouped_linear", x=arguments.x, weight=arguments.weight, bias=arguments.bias)
+    return arguments
 
 
 @declare(
@@ -36,24 +36,24 @@ def grouped_linear(
     activation: Annotated[str, "|".join(ACTIVATIONS)] = "none",
     backend: str = "auto",
 ) -> Annotated[Tensor, "floating [n, o]"]:
-    """A linear layer for each cell: ``activation(W_c x + b_c)``, where c is the cell of the sample.
+    """Applies the linear layer of each sample's cell c: ``activation(W_c x + b_c)``.
 
     Gradients of every order to x, weight and bias. Products are accumulated in float32 at least. Under
-    ``torch.autocast`` the arguments are cast to its dtype, float64 excepted, as for ``torch.nn.functional.linear``.
+    ``torch.autocast`` the arguments are cast to its dtype, except float64, as for ``torch.nn.functional.linear``.
 
     Args:
-        x: samples, sorted by cell, n < 2**31, i >= 1.
-        offsets: rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells (before
+        x: the samples, sorted by cell, n < 2**31, i >= 1.
+        offsets: ascending; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells (before
             ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
-        weight: of each cell, o >= 1.
-        bias: of each cell.
+        weight: the weights of each cell, o >= 1.
+        bias: the biases of each cell, or None.
         activation: "none", "relu", "softplus", "sigmoid" or "sine".
 
     Returns:
-        [n, o] in the dtype of x (of autocast, where it is on).
+        [n, o] in the dtype of x (of autocast, if it is enabled).
 
     Raises:
-        ValueError: on the CPU offsets that fall or exceed n.
+        ValueError: on the CPU offsets that decrease or exceed n.
 
     Examples:
         >>> import torch

@@ -10,24 +10,24 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer, program_text
-from voronerf.ops.grouped_program.native import PRODUCTS, How, Rows, run_program
+from voronerf.ops.grouped_program.native import PRODUCTS, Rows, RunOptions, run_program
 
-# Of one layer, whose width is that of its weight.
+# Layer tables of one layer by activation, as text; the width 1 is replaced by the width of the weight.
 _TABLES = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
 
 
 def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
-    """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``."""
+    """Applies the layer of each sample's cell; see ``voronerf.ops.grouped_linear``."""
     dtype = x.dtype
     if torch.is_autocast_enabled(x.device.type) and dtype != torch.float64:
         dtype = torch.get_autocast_dtype(x.device.type)
     stored = dtype if dtype == torch.bfloat16 else torch.float32
     rounded = [p.to(dtype).float() for p in (weight, bias) if p is not None]
     rows = Rows([x.to(dtype).to(stored)], rounded, offsets, None, None)
-    o, i = len(range(weight.shape[1])), len(range(weight.shape[2]))  # no symbols
+    o, i = len(range(weight.shape[1])), len(range(weight.shape[2]))  # plain ints, not symbolic ones
     shape = i, 0, (o,), (bias is not None,), False
-    how = How(program_text(_TABLES[activation], *shape), "grouped_linear", PRODUCTS.get(dtype, "float32"))
-    (out,) = run_program(rows, how)
+    options = RunOptions(program_text(_TABLES[activation], *shape), "grouped_linear", PRODUCTS.get(dtype, "float32"))
+    (out,) = run_program(rows, options)
     return out.to(dtype)

@@ -1,11 +1,11 @@
 """One linear layer for each cell, on samples sorted by cell. n samples, k cells, i inputs, o outputs.
 
-Two operators, each the gradient of the other, so that derivatives of every order exist:
+Each of the two operators is the gradient of the other, so derivatives of every order exist:
 
     voronerf::grouped_product   y[r] = W[c] x[r]                     for the rows r of cell c
     voronerf::grouped_outer     W[c] = sum over r of g[r] x[r]^T
 
-They read ``offsets`` on the host, which ``torch.compile`` cannot trace.
+The host reads ``offsets``, which ``torch.compile`` cannot trace; hence the custom operators.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ _PIECE = 1024
 def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
-    """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``."""
+    """Applies the layer of each sample's cell; see ``voronerf.ops.grouped_linear``."""
     dtype = x.dtype
     if torch.is_autocast_enabled(x.device.type) and dtype != torch.float64:
         dtype = torch.get_autocast_dtype(x.device.type)
-    # Half types are rounded to, and multiplied in float32: torch's float16 products take a minute on a CPU.
+    # Operands are rounded to half types but multiplied in float32: torch's float16 products take a minute on a CPU.
     wide = torch.promote_types(dtype, torch.float32)
     x, weight = x.to(dtype).to(wide), weight.to(dtype).to(wide)
     if bias is not None:
-        # The weight of an input that is 1.
+        # The bias is the weight of an additional input that is 1.
         x = torch.nn.functional.pad(x, (0, 1), value=1.0)
         weight = torch.cat([weight, bias.to(dtype).to(wide)[:, :, None]], dim=2)
-    # Custom ops have no gradient within torch.func.
+    # Custom ops have no gradient within torch.func transforms.
     product = _product_in_torch if torch._C._are_functorch_transforms_active() else torch.ops.voronerf.grouped_product
     y = activate(activation, product(x, offsets, weight))
     row = torch.arange(x.shape[0], device=x.device)
@@ -45,7 +45,7 @@ def grouped_linear(
 
 
 def check_offsets(op: str, offsets: Tensor, n: int) -> list[int]:
-    """The offsets on the host; ValueError unless they rise from 0 or more to n or less."""
+    """Returns the offsets on the host; raises ValueError unless they ascend within 0 to n."""
     bounds: list[int] = offsets.tolist()
     if bounds[0] < 0 or bounds[-1] > n or bounds != sorted(bounds):
         raise ValueError(f"{op}: offsets must rise from 0 or more to at most the number of rows, {n}, got {bounds}")
@@ -53,7 +53,7 @@ def check_offsets(op: str, offsets: Tensor, n: int) -> list[int]:
 
 
 def _pieces(offsets: Tensor, n: int) -> Iterator[tuple[int, slice]]:
-    """The rows of each cell, so few at a time that sums over them round little and operands stay in the cache."""
+    """Yields the rows of each cell in short pieces, whose sums round little and whose operands stay in the cache."""
     for cell, (low, high) in enumerate(itertools.pairwise(check_offsets("grouped_linear", offsets, n))):
         for start in range(low, high, _PIECE):
             yield cell, slice(start, min(start + _PIECE, high))
@@ -70,7 +70,7 @@ def _product_in_torch(x: Tensor, offsets: Tensor, weight: Tensor) -> Tensor:
 def _product(x: Tensor, offsets: Tensor, weight: Tensor) -> Tensor:
     y = x.new_zeros(x.shape[0], weight.shape[1])
     for cell, rows in _pieces(offsets, x.shape[0]):
-        torch.mm(x[rows], weight[cell].t(), out=y[rows])  # into memory that is there, autocast or not
+        torch.mm(x[rows], weight[cell].t(), out=y[rows])  # writes into y, also under autocast
     return y
 
 

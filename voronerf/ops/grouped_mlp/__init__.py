@@ -29,33 +29,33 @@ def grouped_mlp(
 ) -> Tensor:
     """Evaluates every sample by the network of its cell, encodings included.
 
-    Equivalent to ``frequency_encode`` (or ``integrated_encode``) where ``layers`` has octaves, ``hash_encode`` where it
-    has a grid, or ``spherical_harmonics`` of the directions where it has a degree, followed by one ``grouped_linear``
-    for each layer on the concatenation of its sources. Gradients of every order to positions, directions, features,
-    weights and biases. Of weights in 16 bits, and under ``torch.autocast``, operands of products are rounded, and the
-    result; all else is float32 at least.
+    Equivalent to the encodings, followed by one ``grouped_linear`` for each layer on the concatenation of its sources.
+    The encodings are ``frequency_encode`` (or ``integrated_encode``) if ``layers`` has octaves, ``hash_encode`` if it
+    has a grid, and ``spherical_harmonics`` of the directions if it has a degree. Gradients of every order to positions,
+    directions, features, weights and biases. With 16-bit weights, and under ``torch.autocast``, the operands of
+    products and the result are rounded to 16 bits; all other values are float32 at least.
 
     Args:
-        positions: [n, p] floating point, sorted by cell, n < 2**31; raw if the table has octaves, else already encoded.
-            p >= 1 if a layer reads them, like q >= 1 for directions. p = 6, mean and diagonal variance, for the
-            integrated encoding.
-        offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
+        positions: [n, p] floating point, sorted by cell, n < 2**31; raw if ``layers`` encodes them, else already
+            encoded. p >= 1 if a layer reads positions, and q >= 1 if a layer reads directions. For the integrated
+            encoding p = 6: mean and diagonal variance.
+        offsets: int32 [k + 1], ascending; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
             (before ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
-        weights: one [k, o, i] for each layer, all of one dtype; i as ``layers.input_width`` says.
+        weights: one [k, o, i] for each layer, all of one dtype; i is ``layers.input_width``.
         biases: one [k, o] or None for each layer.
         layers: the layer table.
-        directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions. q = 3, unit
-            vectors, for spherical harmonics.
+        directions: [n, q], or [r, q] with ``direction_index``; None if no layer reads directions. For spherical
+            harmonics q = 3: unit vectors.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample.
-        features: the table of the hash encoding, [e, f] for all cells (``layers.grid.table_shape``), or [k, e, f] with
-            one for each cell; None without a grid.
+        features: the table of the hash encoding: one [e, f] for all cells (``layers.grid.table_shape``), or [k, e, f],
+            one table for each cell; None without a grid.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        [n, layers.out_features] in the dtype of the weights (of autocast, where it is on).
+        [n, layers.out_features] in the dtype of the weights (of autocast, if it is enabled).
 
     Raises:
-        ValueError: on the CPU offsets that fall or exceed n, and a direction_index outside 0 to r - 1.
+        ValueError: on the CPU offsets that decrease or exceed n, and a direction_index outside 0 to r - 1.
 
     Examples:
         >>> import torch
@@ -71,5 +71,5 @@ def grouped_mlp(
     """
     network = Layered(positions, weights, biases, layers, directions, direction_index, features)
     network.check(_OP, ([_OFFSETS], [offsets]))
-    (out,) = network.given(_OP).run(offsets, backend=backend, op=_OP)
+    (out,) = network.arguments(_OP).run(offsets, backend=backend, op=_OP)
     return out

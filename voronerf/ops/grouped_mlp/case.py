@@ -9,14 +9,14 @@ from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 
 _PLAIN = MLP((Layer((POSITIONS,), 6, "sine"), Layer((0, DIRECTIONS), 4, "sigmoid")), (1, 0), 2, 1)
-# The 16 features of whole vectors: what a forward pass keeps has no padding, which is never written.
+# 16 features fill whole vectors: the encodings kept by a forward pass then have no (uninitialised) padding lanes.
 _GRID = HashGrid(levels=8, features=2, log2_entries=10, base=3, finest=40)
 GAUSSIANS = {"layers": MLP(_PLAIN.layers, _PLAIN.outputs, 2, 1, "integrated")}
 HASHED = {"layers": MLP(_PLAIN.layers, _PLAIN.outputs, None, 1, "hash", _GRID)}
 
 
 def layer_table(draw: Draw) -> MLP:
-    """Some layers, each of which reads earlier ones, positions or directions."""
+    """Draws a table of layers, each of which reads earlier layers, positions or directions."""
     if not draw.free:
         return _PLAIN
     layers: list[Layer] = []
@@ -33,7 +33,7 @@ def layer_table(draw: Draw) -> MLP:
 
 
 def network(draw: Draw, n: int, k: int) -> Arguments:
-    """Samples of n rows, and the parameters of k cells."""
+    """Draws n samples, and the parameters of k cells."""
     layers, dtype = draw.among("layers", layer_table(draw)), draw.dtype()
     p = 6 if layers.integrated else 3
     shapes = layers.weight_shapes(p, 3)

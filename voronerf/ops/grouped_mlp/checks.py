@@ -20,11 +20,11 @@ from voronerf.ops._core.checks import (
 )
 from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, program_text
-from voronerf.ops.grouped_program.given import Given
+from voronerf.ops.grouped_program.arguments import ProgramArguments
 
 
 class Layered(NamedTuple):
-    """The arguments of `grouped_mlp` that are a network and its samples."""
+    """The network and the samples of `grouped_mlp` and `routed_mlp`."""
 
     positions: Tensor
     weights: Sequence[Tensor]
@@ -35,12 +35,12 @@ class Layered(NamedTuple):
     features: Tensor | None
 
     def check(self, op: str, behind: Others = ((), ()), last: Others = ((), ())) -> dict[str, int]:
-        """Checks the layer table and its tensors, and gives what the letters of their shapes stand for.
+        """Checks the layer table and its tensors, and returns the sizes that the letters of their shapes stand for.
 
         Args:
-            op: operation named in errors.
-            behind: rows of others that are checked behind the positions, and these.
-            last: of others that are checked last.
+            op: the operation that errors name.
+            behind: the rules of further tensors, checked after the positions, and these tensors.
+            last: the rules of further tensors, checked last, and these tensors.
         """
         positions, weights, biases, layers, directions, direction_index, features = self
         if not isinstance(layers, MLP):
@@ -74,15 +74,15 @@ class Layered(NamedTuple):
         read = [tensor for tensor in (directions, direction_index, features) if tensor is not None]
         parameters = [*weights, *[bias for bias in biases if bias is not None]]
         tensors = [positions, *behind[1], *read, *parameters, *last[1]]
-        known = layers, p, q, form, biased, weights[0].dtype, tuple(behind[0]), tuple(last[0])
-        sizes = check_rows(op, _rows, tensors, *known)
+        settings = layers, p, q, form, biased, weights[0].dtype, tuple(behind[0]), tuple(last[0])
+        sizes = check_rows(op, _rows, tensors, *settings)
         if direction_index is not None and not sizes["r"] and sizes["n"]:
             assert directions is not None
             raise ValueError(f"{op}: directions must hold a row for the direction_index, got {list(directions.shape)}")
         return sizes
 
-    def given(self, caller: str) -> Given:
-        """The program of the table, and its tensors as :meth:`MLP.program` orders them, once they are checked."""
+    def arguments(self, caller: str) -> ProgramArguments:
+        """Returns the program of the table and its checked tensors, in the order of :meth:`MLP.program`."""
         inputs, parameters = [self.positions], [*self.weights, *(bias for bias in self.biases if bias is not None)]
         index = None
         if self.directions is not None and self.layers.uses_directions:
@@ -90,14 +90,14 @@ class Layered(NamedTuple):
             index = self.direction_index
         if self.features is not None:
             parameters.append(self.features if self.features.dim() == 3 else self.features[None])
-        p, q = (len(range(x.shape[1])) for x in (self.positions, inputs[-1]))  # no symbols
+        p, q = (len(range(x.shape[1])) for x in (self.positions, inputs[-1]))  # plain ints, not symbolic ones
         biased = tuple([bias is not None for bias in self.biases])
         text = program_text(self.layers.text, p, q if len(inputs) > 1 else 0, None, biased, index is not None)
-        return Given.of(caller, text, inputs, parameters, index)
+        return ProgramArguments.of(caller, text, inputs, parameters, index)
 
 
 def _check_widths(op: str, layers: MLP, p: int, q: int, directed: bool) -> None:
-    """Checks how many features positions and directions have."""
+    """Checks the number of features of positions and directions."""
     if layers.integrated and p != 6:
         raise ValueError(f"{op}: positions must have 6 features, mean and variance, where they are integrated, got {p}")
     if directed and layers.direction_degree is not None and q != 3:
@@ -122,9 +122,10 @@ def _rows(
     behind: Sequence[Row],
     last: Sequence[Row],
 ) -> list[Row]:
-    """The rules for the tensors of a network: positions, what they are read with, and parameters, between others.
+    """Returns the rules for the tensors of a network: positions, ``behind``, further inputs, parameters and ``last``.
 
-    ``form``: whether directions have an index, the dimensions of the features or 0, and whether there are directions.
+    ``form``: whether directions have an index, the number of dimensions of the features or 0, and whether there are
+    directions.
     """
     indexed, dimensions, directed = form
     rows = [Row("positions", FLOATING, ("n", "p")), *behind]

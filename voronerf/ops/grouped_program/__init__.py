@@ -12,7 +12,7 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.checks import FLOATING, INDEX, Default, Others, Row, Rows, check_rows, check_tensor
 from voronerf.ops._core.program import Program
-from voronerf.ops.grouped_program.given import Given
+from voronerf.ops.grouped_program.arguments import ProgramArguments
 
 _OP = backends.declare(
     "grouped_program", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
@@ -31,34 +31,34 @@ def grouped_program(
 ) -> list[Tensor]:
     """Runs a program on the rows of each cell, with the cell's parameters.
 
-    A program is a list of steps: layers, activations, encodings, sums, products, columns that are moved
+    A program is a list of steps: layers, activations, encodings, sums, products and moves of columns
     (:mod:`voronerf.ops._core.program`). All values of a tile of rows stay in cache. Gradients of every order to inputs
     and parameters; the gradient of a program is a program itself.
 
     Args:
-        inputs: [n, w] floating point for each input of the program, sorted by cell, n < 2**31; at least one. [r, w],
-            r < 2**31, for those of ``program.rays``, which have one row for each ray.
-        parameters: [k, o, i] or [k, w] for each parameter of the program, or [1, ...] where all cells share it, all of
-            one dtype. The table [k, e, f] or [1, e, f] of a hash grid may be of any.
-        offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
+        inputs: [n, w] floating point for each input of the program, sorted by cell, n < 2**31; at least one. [r, w], r
+            < 2**31, for the inputs in ``program.rays``, which have one row for each ray.
+        parameters: [k, o, i] or [k, w] for each parameter of the program, or [1, ...] if all cells share it; all of one
+            dtype, except the table [k, e, f] or [1, e, f] of a hash grid.
+        offsets: int32 [k + 1], ascending; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
             give 0. Cells may be empty.
-        program: what to do.
-        order: int32 [n]: row i that the offsets speak of is row ``order[i]`` of inputs and results, which need not be
-            sorted then. None for rows that are sorted.
-        ray_index: int32 [n], values 0 to r - 1: the ray of each row of inputs and results, so that ``order`` leads to
-            ``ray_index[order[i]]``. None for a program without inputs of rays.
-        backend: "auto", "reference", "native" or "warp", which has kernels for layers alone: what follows them, and a
-            program that is no chain of layers, runs in PyTorch there.
+        program: the program to run.
+        order: int32 [n], the row of inputs and results for each sorted row i: ``order[i]``. Inputs and results then
+            need not be sorted. None for sorted rows.
+        ray_index: int32 [n], values 0 to r - 1: the ray of each row of inputs and results, before sorting by ``order``.
+            None for a program without inputs of rays.
+        backend: "auto", "reference", "native" or "warp". Warp has kernels for layers only: later steps, and programs
+            that are not a chain of layers, run in PyTorch.
 
     Returns:
-        In the dtype of the parameters (of autocast, where it is on), or without any in that of the first input: [n, w]
-        for each output of the program, or [r, w], the sum over the rows of each ray, for those of ``program.by_ray``;
-        then [k, ...] for each of its sums over the rows of a cell, or [1, e, f] for the sum of a table that all cells
-        share. Rows outside all cells add nothing to sums.
+        [n, w] for each output of the program, or [r, w], the sum over the rows of each ray, for the outputs in
+        ``program.by_ray``; then [k, ...] for each sum over the rows of a cell, or [1, e, f] for the sum of a table that
+        all cells share. The results have the dtype of the parameters (of autocast, if it is enabled), or without
+        parameters the dtype of the first input. Rows outside all cells add nothing to sums.
 
     Raises:
-        ValueError: on the CPU offsets that fall or exceed n, an order outside 0 to n - 1, and a ray_index outside 0 to
-            r - 1.
+        ValueError: on the CPU offsets that decrease or exceed n, an order outside 0 to n - 1, and a ray_index outside 0
+            to r - 1.
 
     Examples:
         >>> import torch
@@ -77,7 +77,7 @@ def grouped_program(
     cells: Others = ([_OFFSETS], [offsets])
     sorting: Others = ((), ()) if order is None else ([_ORDER], [order])
     check_program(_OP, program, inputs, parameters, ray_index, cells, sorting)
-    return Given.of(_OP, program.text, inputs, parameters, ray_index).run(offsets, order, backend=backend)
+    return ProgramArguments.of(_OP, program.text, inputs, parameters, ray_index).run(offsets, order, backend=backend)
 
 
 def check_program(
@@ -89,24 +89,24 @@ def check_program(
     first: Others = ((), ()),
     last: Others = ((), ()),
 ) -> dict[str, int]:
-    """Checks a program and its tensors, and gives what the letters of their shapes stand for.
+    """Checks a program and its tensors, and returns the sizes that the letters of their shapes stand for.
 
     Args:
-        op: operation named in errors.
-        program: which tells how many tensors there are.
-        inputs: its own.
-        parameters: its own.
+        op: the operation that errors name.
+        program: the program.
+        inputs: the inputs of the program.
+        parameters: the parameters of the program.
         ray_index: int32 [n], or None.
-        first: rows of others that are checked before, and these.
-        last: of others that are checked behind.
+        first: the rules of further tensors, checked first, and these tensors.
+        last: the rules of further tensors, checked last, and these tensors.
     """
     if not isinstance(program, Program):
         raise TypeError(f"{op}: program must be a Program, got {type(program).__name__}")
-    for name, given, wanted in (("inputs", inputs, program.inputs), ("parameters", parameters, program.parameters)):
-        if not isinstance(given, Sequence):
-            raise TypeError(f"{op}: {name} must be a list, got {type(given).__name__}")
-        if len(given) != len(wanted) or not (wanted or name == "parameters"):
-            raise ValueError(f"{op}: {name} must be {len(wanted)} tensors (inputs at least one), got {len(given)}")
+    for name, values, wanted in (("inputs", inputs, program.inputs), ("parameters", parameters, program.parameters)):
+        if not isinstance(values, Sequence):
+            raise TypeError(f"{op}: {name} must be a list, got {type(values).__name__}")
+        if len(values) != len(wanted) or not (wanted or name == "parameters"):
+            raise ValueError(f"{op}: {name} must be {len(wanted)} tensors (inputs at least one), got {len(values)}")
     if (ray_index is not None) != (len(program.rays) > 0):
         rule = "given for a program with" if program.rays else "None for a program without"
         came = "None" if ray_index is None else "an index"
@@ -121,8 +121,8 @@ def check_program(
     sizes = check_rows(op, _rows, tensors, program, dtype, tuple(first[0]), tuple(last[0]))
     if ray_index is not None and not sizes["r"] and sizes["n"]:
         at = next(i for i in range(len(inputs)) if _among(i, program.rays))
-        found = list(inputs[at].shape)
-        raise ValueError(f"{op}: inputs[{at}] must hold a row for the ray_index, got {found}")
+        shape = list(inputs[at].shape)
+        raise ValueError(f"{op}: inputs[{at}] must hold a row for the ray_index, got {shape}")
     return sizes
 
 
@@ -131,19 +131,21 @@ _ORDER = Row("order", INDEX, ("n",))
 
 
 def _rows(program: Program, dtype: torch.dtype | None, first: Sequence[Row], last: Sequence[Row]) -> Rows:
-    """The rules for the tensors of a program, between others: inputs, parameters, the index of rays. ``dtype``: of all
-    parameters but tables, None without any."""
+    """Returns the rules for the tensors of a program: ``first``, inputs, parameters, the ray index and ``last``.
+
+    ``dtype`` is the dtype of all parameters except tables, or None without such parameters.
+    """
     rows: list[Row | Default] = [*first]
     for i, width in enumerate(program.inputs):
         rows.append(Row(f"inputs[{i}]", FLOATING, ("r" if _among(i, program.rays) else "n", width)))
     for i, shape in enumerate(program.parameters):
-        known = FLOATING if dtype not in FLOATING or _among(i, program.tables) else (dtype,)
-        rows.append(Row(f"parameters[{i}]", known, ("1|k", *shape)))
+        dtypes = FLOATING if dtype not in FLOATING or _among(i, program.tables) else (dtype,)
+        rows.append(Row(f"parameters[{i}]", dtypes, ("1|k", *shape)))
     if program.rays:
         rows.append(Row("ray_index", INDEX, ("n",)))
     return [*rows, Default("k", 1), *last]
 
 
 def _among(i: int, numbers: Sequence[int]) -> bool:
-    """Whether a number is one of a program's, which torch.compile may take for sizes and not find by ``in``."""
+    """Returns whether a number is in a list; torch.compile may make the list's numbers symbolic, and ``in`` fail."""
     return any(i == number for number in numbers)

@@ -11,7 +11,7 @@ from voronerf.ops._core.program import HASH, PARAMETER, Builder, Columns, Progra
 
 
 def every_step() -> Program:
-    """A program with every kind of step, and operands of every kind."""
+    """Returns a program with every kind of step and of operand."""
     b = Builder()
     x, y = b.input(5), b.input(3)
     weight, vector = b.parameter(7, 8), b.parameter(7)
@@ -27,12 +27,12 @@ def every_step() -> Program:
     share = b.binary("div", back, b.apply("affine", squared, 1.0, 3.0))
     moved = b.move(12, [(share.part(1, 4), 0), (y, 5), (total, 8), (one, 11)])
     added = b.move(4, [(moved.part(0, 3), 1), (share.part(2, 3), 0)])
-    gated = b.binary("gate", added, b.apply("step", x.part(0, 4)))  # jumps where no rounding decides
+    gated = b.binary("gate", added, b.apply("step", x.part(0, 4)))  # inputs are not rounded, so the jump is exact
     return b.program([b.binary("sub", gated, moved.part(7, 4)), shifted, one])
 
 
 def smooth(width: int = 9) -> Program:
-    """Layers with smooth activations, a skip connection between them."""
+    """Returns a program of layers with smooth activations and a skip connection."""
     b = Builder()
     x = b.input(4)
     h = b.apply("softplus", b.linear(x, b.parameter(width, 4), width), 5.0, 20.0)
@@ -44,7 +44,7 @@ GRID = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=12, interp
 
 
 def encoded(width: int = 9) -> Program:
-    """Every encoding, with directions of rays and a sum by ray beside the rows' own result."""
+    """Returns a program with every encoding, directions of rays, and outputs by row and by ray."""
     b = Builder()
     x, gaussians, direction = b.input(3), b.input(4), b.input(3, ray=True)
     parts = [b.encode(HASH, x, b.grid(GRID.text), b.parameter(*GRID.table_shape))]
@@ -63,7 +63,7 @@ def _make(draw: Draw, n: int) -> Arguments:
     jumps = kind == "steps"
     width = draw.number("w", 9, 1, 70)
     program = every_step() if jumps else smooth(width) if kind == "smooth" else encoded(width)
-    dtype = torch.float32 if jumps else draw.dtype()  # half precision may fall on the other side of a jump
+    dtype = torch.float32 if jumps else draw.dtype()  # in half precision a value may cross a jump
     r = draw.number("rays", 4, 1, 9)
     inputs = [draw.uniform(r if i in program.rays else n, w, dtype=dtype) for i, w in enumerate(program.inputs)]
     if kind != "encoded":

@@ -1,4 +1,4 @@
-"""Programs as the compiled module reads them: the records of csrc/network/program_code.h. Made once for each program.
+"""The lowering of programs to the records of the compiled module (csrc/network/program_code.h), once for each program.
 
 Letters: n rows, k cells, w columns of a value.
 """
@@ -27,18 +27,18 @@ from voronerf.ops._core.program import (
 )
 from voronerf.ops.hash_encode.native import compiled_grid
 
-_ORDERS = 3  # of derivatives that the compiled module has
-_FLOATS = 96 << 10  # of the values of a tile: they share the second cache level with the weights
-_ROWS = (24, 96)  # of a tile, whole blocks of the products (gemm_tile.h)
-_WHOLE = 48  # rows of a tile where encodings write whole vectors of rows
+_ORDERS = 3  # the highest order of derivatives in the compiled module
+_FLOATS = 96 << 10  # the values of a tile, in floats: they share the L2 cache with the weights
+_ROWS = (24, 96)  # the fewest and most rows of a tile: whole blocks of products (gemm_tile.h)
+_WHOLE = 48  # the fewest rows of a tile if encodings write whole vectors of rows
 _TILE = 32  # rows of a block of products in tile registers
-_GRANULE = 16
-_FEW = 4  # outputs of a layer that has a product of its own (few_outputs_tile.h)
+_GRANULE = 16  # floats to which widths are padded
+_FEW = 4  # the most outputs of a layer that uses the kernel for few outputs (few_outputs_tile.h)
 _NONE = -1
 
 
 class Lookup(NamedTuple):
-    """A hash grid at the points of an input: which value of a program it is."""
+    """A lookup in a hash grid: the numbers of the input with the points, of the table and of the grid."""
 
     input: int
     parameter: int
@@ -47,15 +47,15 @@ class Lookup(NamedTuple):
 
 @dataclass(frozen=True)
 class Lowered:
-    """A program that is ready to run.
+    """A lowered program, ready to run.
 
     Attributes:
-        program: that of the compiled module.
-        lookups: those whose values may be kept, [n, width] each in the order of the cells.
-        widths: floats of a row of each.
-        sizes: entries of each parameter for one cell.
-        tables: numbers of the parameters that are tables of hash grids.
-        call: calls it on the CPU, with memory for its results.
+        program: the compiled module's program.
+        lookups: the lookups whose features may be kept, [n, width] each, sorted by cell.
+        widths: the floats in a row of the features of each lookup.
+        sizes: the entries of each parameter for one cell.
+        tables: the numbers of the parameters that are tables of hash grids.
+        call: a callable that allocates the results and runs the program on the CPU.
     """
 
     program: native.compiled.Program
@@ -68,7 +68,7 @@ class Lowered:
 
 @functools.lru_cache(maxsize=1024)
 def compiled_runs(text: str) -> bool:
-    """Whether the compiled module has all derivatives that a program takes."""
+    """Returns whether the compiled module has all derivatives of a program."""
     program = Program.parse(text)
     sums = [step.out for step in program.steps if step.op == "scatter"]
     return program.orders <= _ORDERS and len(sums) == len(set(sums))
@@ -76,13 +76,14 @@ def compiled_runs(text: str) -> bool:
 
 @functools.lru_cache(maxsize=1024)
 def lower(text: str, layout: str = "floats", cuda: bool = False) -> Lowered:
-    """The records of a program, given by its text.
+    """Returns the lowered program, cached.
 
     Args:
-        text: of the program.
-        layout: what products take: "floats", "pairs" of bfloat16, pairs in "tiles" (tile registers), or there floats
-            in two "parts" each.
-        cuda: for CUDA, whose products have one source: of "floats", or of "tiles", which are any 16-bit numbers there.
+        text: the text of the program.
+        layout: the layout of the operands of products: "floats"; "pairs" of bfloat16; "tiles", pairs for tile
+            registers; or "parts", floats in two parts for tile registers.
+        cuda: whether the program is for CUDA. Its products have one source, and layouts "floats" or "tiles" (of any
+            16-bit type).
     """
     return _Lowering(merged(Program.parse(text)), layout, cuda).lowered()
 
@@ -92,14 +93,14 @@ def _padded(width: int, to: int = _GRANULE) -> int:
 
 
 class _Slots:
-    """Places of values in the workspace of a tile, in columns; one that is free again is used again."""
+    """An allocator of columns for values in the workspace of a tile; it reuses freed slots of equal width."""
 
     def __init__(self) -> None:
         self.size = 0
         self._free: list[tuple[int, int]] = []  # (width, place)
 
     def take(self, width: int) -> int:
-        """A place for so many columns."""
+        """Allocates a slot of ``width`` columns and returns its first column."""
         fitting = [slot for slot in self._free if slot[0] == width]
         if fitting:
             self._free.remove(fitting[-1])
@@ -108,41 +109,41 @@ class _Slots:
         return self.size - width
 
     def give(self, width: int, place: int) -> None:
-        """It is free again."""
+        """Frees a slot."""
         self._free.append((width, place))
 
 
 @dataclass
 class _Value:
-    """Where a value is: its slot, rows of ``stride`` floats, and what else a step may read it from."""
+    """The locations of a value: its slot, with rows of ``stride`` floats, and further memory that holds it."""
 
     width: int
     stride: int
     slot: int = _NONE
     memory: int = _NONE
-    input: int = _NONE  # which may be read in place
+    input: int = _NONE  # the input that steps may read in place
     pairs: int = _NONE
-    floats: bool = True  # whether anything reads them, where there are pairs
+    floats: bool = True  # whether any step reads the floats; if not, only the pairs are written
 
 
 class _Lowering:
-    """Records on their way."""
+    """The lowering of one program: the state while its records are made."""
 
     def __init__(self, program: Program, layout: str, cuda: bool) -> None:
         self.program, self.layout, self.cuda = program, layout, cuda
         self.half, self.tiles, self.parts = layout != "floats", layout in ("tiles", "parts"), layout == "parts"
         self.compiled = native.compiled
         self.slots, self.values = _Slots(), dict[int, _Value]()
-        self.packs: dict[tuple[Any, ...], tuple[int, int]] = {}  # their number, and where they are
+        self.packs: dict[tuple[Any, ...], tuple[int, int]] = {}  # the number of each pack, and its position
         self.packed, self.partial = 0, 0
-        self.at, self.in_registers = 0, _NONE  # the step in hand, and the value that a warp on CUDA holds
+        self.at, self.in_registers = 0, _NONE  # the number of the current step; the value in registers (CUDA)
         self.steps: list[Any] = []
         self.operands: list[Any] = []
         self.sums: list[tuple[int, str, int, int, int, int, int, int, int]] = []
         self.memories: list[int] = []
         self.lookups: list[tuple[Lookup, int]] = []
         self.scatters: list[tuple[Lookup, int, int]] = []
-        self.own: dict[int, int] = {}  # the memory of outputs that values may be made in
+        self.output_memories: dict[int, int] = {}  # memory of outputs into which steps write their values directly
         self.work = self._in_order()
         if cuda and self.half:
             self.work = _delayed(self.work)
@@ -157,10 +158,13 @@ class _Lowering:
         parts = 3 if self.tiles else 2
         self.scratch = self.slots.take(parts * self.scratch_width) if self.scratch_width else 0
 
-    # What there is to do ----------------------------------------------------------------------------------------------
+    # The order of steps -----------------------------------------------------------------------------------------------
 
     def _in_order(self) -> list[Step]:
-        """The steps, then those that write outputs; each part of a value that a move only puts together is written."""
+        """Returns the steps, followed by steps that write outputs.
+
+        If a move only concatenates values for an output, it is dropped and each part is written directly.
+        """
         program, fresh = self.program, 1 + max((s.out for s in self.program.steps if not _sums(s)), default=0)
         steps, uses = list[Step](), dict[int, int]()
         for step in program.steps:
@@ -173,10 +177,10 @@ class _Lowering:
         for c in (*program.outputs, *(c for step in steps for c in step.operands)):
             if c.of == VALUE:
                 uses[c.index] = uses.get(c.index, 0) + 1
-        made = {step.out: step for step in steps if not _sums(step)}
+        makers = {step.out: step for step in steps if not _sums(step)}
         written: list[Step] = []
         for number, c in enumerate(program.outputs):
-            maker = made.get(c.index) if c.of == VALUE else None
+            maker = makers.get(c.index) if c.of == VALUE else None
             parts: list[tuple[Columns, float]] = [(c, 0)]
             alone = maker is not None and uses[c.index] == 1 and _all_of(c, maker.width)
             if maker is not None and alone and maker.op == "move" and _covered(maker):
@@ -186,15 +190,15 @@ class _Lowering:
         return [*steps, *written]
 
     def _whole(self, g: Columns) -> bool:
-        """Whether columns are a whole value that a step makes, which then can live in memory of the call."""
-        made = {step.out: step for step in self.program.steps if not _sums(step)}
+        """Returns whether columns are all of a step's value, which can then be kept in memory of the call."""
+        makers = {step.out: step for step in self.program.steps if not _sums(step)}
         scattered = [step.operands[1].index for step in self.program.steps if step.op == "scatter"]
-        step = made[g.index]
+        step = makers[g.index]
         alone = scattered.count(g.index) == 1 and step.op not in ("input", "encode")
         return alone and g.start == 0 and g.width == step.width and not g.spread
 
     def _scratch(self) -> int:
-        """Columns of each part of the memory that a step may use."""
+        """Returns the columns of each part of the scratch memory of steps."""
         widths = [0]
         for step in [] if self.cuda else self.work:
             if step.op == "encode" and step.name == HASH:
@@ -206,17 +210,17 @@ class _Lowering:
         return _padded(max(widths))
 
     def pairs_of(self, width: int) -> int:
-        """Floats of a row of pairs, and in parts of what rounding has left of them."""
+        """Returns the floats in a row of pairs; in the layout "parts" the rounding remainders double it."""
         return _padded(width, 2 * _GRANULE) // 2 * (2 if self.parts else 1)
 
     def padded_outputs(self, width: int) -> int:
-        """Floats of a row of packed weights, of one for each output."""
+        """Returns the padded floats in a row of packed weights, one float for each output."""
         return _padded(width, 2 * _GRANULE if self.cuda else _GRANULE)
 
     # Records ----------------------------------------------------------------------------------------------------------
 
     def pack(self, kind: str, parameter: int, start: int, width: int, floats: int, shape: tuple[int, int]) -> int:
-        """The number of the pack of a part of a parameter."""
+        """Returns the number of the pack of a part of a parameter; adds the pack if it is new."""
         key = (kind, parameter, *shape, start, width)
         if key not in self.packs:
             self.packs[key] = len(self.packs), self.packed
@@ -224,28 +228,31 @@ class _Lowering:
         return self.packs[key][0]
 
     def shape(self, parameter: int) -> tuple[int, int]:
-        """Of a matrix; a vector is one row."""
+        """Returns the shape of a parameter as a matrix; a vector is one row."""
         shape = self.program.parameters[parameter]
         return (shape[0], shape[1]) if len(shape) == 2 else (1, shape[0])
 
     def operand(self, c: Columns, place: int = 0, *, product: bool = False) -> Any:
-        """One operand's record; ``product``: what reads pairs where there are some: x of a linear step, and in tile
-        registers its slope and the operands of sums."""
-        given: dict[str, Any] = dict.fromkeys(("memory", "input", "pairs"), _NONE)
-        given |= {"start": c.start, "width": c.width, "place": place, "spread": c.spread}
+        """Returns the record of an operand.
+
+        ``product``: whether the step reads pairs if they exist. This holds for x of a linear step and, with tile
+        registers, for its slope and the operands of sums.
+        """
+        fields: dict[str, Any] = dict.fromkeys(("memory", "input", "pairs"), _NONE)
+        fields |= {"start": c.start, "width": c.width, "place": place, "spread": c.spread}
         if c.of == PARAMETER:
             width = 1 if c.spread else c.width
             floats = self.padded_outputs(width) * (2 if self.cuda else 1)
             number = self.pack("vector", c.index, c.start, width, floats, self.shape(c.index))
-            return self.compiled.ProgramOperand(parameter=True, slot=number, stride=0, **(given | {"start": 0}))
+            return self.compiled.ProgramOperand(parameter=True, slot=number, stride=0, **(fields | {"start": 0}))
         value = self.values[c.index]
-        given |= {"memory": value.memory, "input": value.input}
+        fields |= {"memory": value.memory, "input": value.input}
         if product:
-            given["pairs"] = value.pairs if _all_of(c, value.width) else _NONE
-        return self.compiled.ProgramOperand(parameter=False, slot=max(value.slot, 0), stride=value.stride, **given)
+            fields["pairs"] = value.pairs if _all_of(c, value.width) else _NONE
+        return self.compiled.ProgramOperand(parameter=False, slot=max(value.slot, 0), stride=value.stride, **fields)
 
-    def emit(self, op: str, operands: Iterable[Any] = (), value: _Value | None = None, **given: Any) -> None:
-        """One step's record."""
+    def emit(self, op: str, operands: Iterable[Any] = (), value: _Value | None = None, **members: Any) -> None:
+        """Appends the record of a step."""
         operands = list(operands)
         fields: dict[str, Any] = {"function": "copy", "binary": "add", "encoding": "frequency", "finish": "none"}
         fields |= {"hands": "nothing", "from_registers": False}
@@ -265,18 +272,18 @@ class _Lowering:
             fields |= {"width": value.width, "slot": max(value.slot, 0), "stride": value.stride}
             fields |= {"memory": value.memory, "pairs": value.pairs, "floats": value.floats}
         fields |= {"first": len(self.operands), "taken": len(operands)}
-        self.steps.append(self.compiled.ProgramStep(op=op, **(fields | given)))
+        self.steps.append(self.compiled.ProgramStep(op=op, **(fields | members)))
         self.operands += operands
 
     def memory(self, width: int) -> int:
-        """The number of another memory of the call, [n][width]."""
+        """Adds a memory of the call, [n][width], and returns its number."""
         self.memories.append(width)
         return len(self.memories) - 1
 
     # Steps ------------------------------------------------------------------------------------------------------------
 
     def lowered(self) -> Lowered:
-        """All records."""
+        """Makes all records and returns the lowered program."""
         last = {c.index: at for at, step in enumerate(self.work) for c in step.operands if c.of == VALUE}
         for at, step in enumerate(self.work):
             self.at, dying = at, {c.index for c in step.operands if c.of == VALUE and last[c.index] == at}
@@ -291,16 +298,15 @@ class _Lowering:
         return self.finished()
 
     def free(self, value: int) -> None:
-        """A value is not needed any more."""
-        known = self.values[value]
-        if known.slot != _NONE:
-            self.slots.give(known.stride, known.slot)
-        if known.pairs != _NONE:
-            self.slots.give(self.pairs_of(known.width), known.pairs)
+        """Frees the slots of a value after its last use."""
+        location = self.values[value]
+        if location.slot != _NONE:
+            self.slots.give(location.stride, location.slot)
+        if location.pairs != _NONE:
+            self.slots.give(self.pairs_of(location.width), location.pairs)
 
     def make(self, step: Step, dying: set[int], entrywise: Iterable[Columns] = (), stride: int = 0) -> _Value:
-        """Where a step's value is to be: in the place of an operand that is read entry by entry and not needed any
-        more, or in a place of its own."""
+        """Allocates the value of a step: in the slot of an entrywise operand in its last use, or in a new slot."""
         value = _Value(step.width, stride or _padded(step.width))
         self.values[step.out] = value
         if step.op not in ("input", "encode"):
@@ -308,8 +314,8 @@ class _Lowering:
         scattered = [reader for reader, place in self.readers.get(step.out, []) if reader.op == "scatter" and place]
         if scattered:
             value.memory = self.memory(value.stride)
-        if self.cuda and self.half and any(as_pairs := self._as_pairs(step)):  # which any step makes there
-            looked_up = step.op == "encode" and step.name == HASH  # and may be kept
+        if self.cuda and self.half and any(as_pairs := self._as_pairs(step)):  # any step can write pairs on CUDA
+            looked_up = step.op == "encode" and step.name == HASH  # its floats may be kept
             if len(self._multipliers(step)) < len(as_pairs):
                 place = self._slope_of(step, dying)
                 value.pairs = self.slots.take(self.pairs_of(step.width)) if place is None else place
@@ -318,19 +324,19 @@ class _Lowering:
         if scattered or not value.floats:
             return value
         for c in entrywise:
-            known = self.values[c.index] if c.of == VALUE else None
-            if known is None or c.index not in dying or c.spread or c.start or known.stride != value.stride:
+            location = self.values[c.index] if c.of == VALUE else None
+            if location is None or c.index not in dying or c.spread or c.start or location.stride != value.stride:
                 continue
             others = [other for other in step.operands if other.of == VALUE and other.index == c.index]
-            here = known.slot != _NONE and known.memory == _NONE and known.input == _NONE
+            here = location.slot != _NONE and location.memory == _NONE and location.input == _NONE
             if here and all(other.start == 0 and not other.spread for other in others):
-                value.slot, known.slot = known.slot, _NONE
+                value.slot, location.slot = location.slot, _NONE
                 return value
         value.slot = self.slots.take(value.stride)
         return value
 
     def _carries(self, at: int) -> bool:
-        """Whether a step on CUDA leaves its sums in registers: the next one alone reads them, and adds to them."""
+        """Returns whether a step on CUDA leaves its sums in registers for the next step, which alone adds to them."""
         if not (self.half and self.cuda) or at + 1 == len(self.work):
             return False
         step = self.work[at]
@@ -338,39 +344,43 @@ class _Lowering:
         return alone and step.width <= self.compiled.most_held
 
     def _multipliers(self, step: Step) -> list[Step]:
-        """The steps right behind a linear one on CUDA that may read its words in registers."""
-        found = list[Step]()
-        scattered = any(reader.op == "scatter" for reader, _ in self.readers.get(step.out, []))  # by the warp meanwhile
+        """Returns the steps after a linear step on CUDA that can read its packed values from registers."""
+        steps = list[Step]()
+        # A value that is scattered does not stay in registers: the warp scatters in between.
+        scattered = any(reader.op == "scatter" for reader, _ in self.readers.get(step.out, []))
         if not (self.half and self.cuda) or step.op != "linear" or scattered or self._carries(self.at):
-            return found
+            return steps
         for at in range(self.at + 1, len(self.work)):
             after = self.work[at]
             if after.op != "linear" or max(step.width, after.width) > self.compiled.most_held:
                 break
             if after.operands[0][:2] == (VALUE, step.out) and _all_of(after.operands[0], step.width):
-                found.append(after)
+                steps.append(after)
             if not self._carries(at):
                 break
-        return found
+        return steps
 
     def _slope_of(self, step: Step, dying: set[int]) -> int | None:
-        """The place of the pairs of ReLU that a gradient is cut by, if nothing needs them any more."""
+        """Returns the slot of a ReLU's pairs, which gate the gradient, if this is their last use; else None."""
         if step.name != "relu_slope" or step.operands[0][:2] == step.operands[-1][:2]:
             return None
-        known = self.values[step.operands[-1].index]
-        if known.floats or step.operands[-1].index not in dying:
+        location = self.values[step.operands[-1].index]
+        if location.floats or step.operands[-1].index not in dying:
             return None
-        place, known.pairs = known.pairs, _NONE
+        place, location.pairs = location.pairs, _NONE
         return place
 
     def _own_output(self, step: Step) -> int:
-        """The memory of an output that is a whole value and whose rows end with whole vectors: it can be made there."""
+        """Returns the output memory into which a step can write its value directly, else -1.
+
+        The output must be the whole value, and its rows must have no padding.
+        """
         for reader, _ in self.readers.get(step.out, []):
             whole = step.width % _GRANULE == 0 and self._within(step, step.width)
             if reader.op == "output" and whole and _all_of(reader.operands[0], step.width):
                 number, first = map(int, reader.numbers)
                 if number not in self.program.by_ray and self.program.outputs[number].width == step.width and not first:
-                    return self.own.setdefault(number, self.memory(step.width))
+                    return self.output_memories.setdefault(number, self.memory(step.width))
         return _NONE
 
     def _input(self, step: Step, dying: set[int]) -> None:
@@ -388,12 +398,15 @@ class _Lowering:
         self.emit("input", value=value, number=number, points=points, in_place=value.input != _NONE)
 
     def _within(self, step: Step, stride: int) -> bool:
-        """Whether no vector that reads a value goes beyond its rows, behind the last of which a tensor may end."""
+        """Returns whether no vector load of a value passes the end of its rows, where the tensor may end."""
         columns = [r.operands[p] for r, p in self.readers.get(step.out, []) if r.op not in ("move", "total", "output")]
         return all(c.spread or c.start + _padded(c.width) <= stride for c in columns)
 
     def _product(self, step: Step, place: int) -> bool:
-        """Whether an operand is read no further than its columns: as x of a linear step, or broadcast in a sum."""
+        """Returns whether a step reads exactly the columns of an operand, without padding lanes.
+
+        This holds for x of a linear step and for the broadcast operand of a sum.
+        """
         if step.op == "linear":
             return place < _sources(step)
         return step.op == "outer" and not self.half and place == (0 if self._by_outputs(step) else 1)
@@ -420,21 +433,21 @@ class _Lowering:
         as_pairs = self._as_pairs(step)
         narrow = self.half and not self.cuda and any(as_pairs) and not few and (self.tiles or not relu_slope)
         filled = value.stride % (2 * _GRANULE) == 0 and step.width % 2 == 0 and value.memory == _NONE
-        if self.tiles:  # what is added fills up rows with what may be infinite
+        if self.tiles:  # addends could write infinities to padding lanes
             filled = step.width % _GRANULE == 0 or all(c.of == PARAMETER for c in added)
         if narrow and filled:
             floats = value.memory != _NONE or not all(as_pairs)
             value.pairs, value.floats = self.slots.take(self.pairs_of(step.width)), floats
-        given = {"order": order, "number": number, "depth": depth, "sources": count, "finish": step.name or "none"}
+        members = {"order": order, "number": number, "depth": depth, "sources": count, "finish": step.name or "none"}
         held = sources[0][:2] == (VALUE, self.in_registers)
-        given["from_registers"] = held and _all_of(sources[0], self.values[self.in_registers].width)
-        given["hands"] = "sums" if self._carries(self.at) else "words" if self._multipliers(step) else "nothing"
-        if given["hands"] != "sums":
-            self.in_registers = step.out if given["hands"] == "words" else _NONE
-        self.emit("linear", records, value, **given)
+        members["from_registers"] = held and _all_of(sources[0], self.values[self.in_registers].width)
+        members["hands"] = "sums" if self._carries(self.at) else "words" if self._multipliers(step) else "nothing"
+        if members["hands"] != "sums":
+            self.in_registers = step.out if members["hands"] == "words" else _NONE
+        self.emit("linear", records, value, **members)
 
     def _as_pairs(self, step: Step) -> list[bool]:
-        """Of each reader of a value, whether it takes pairs."""
+        """Returns for each reader of a value whether it takes pairs."""
 
         def takes(reader: Step, place: int) -> bool:
             if not _all_of(reader.operands[place], step.width):
@@ -468,8 +481,8 @@ class _Lowering:
         size, parameter, order, _ = map(int, step.numbers)
         records = [self.operand(c) for c in step.operands]
         value = self.make(step, dying)
-        given: dict[str, Any] = {"encoding": step.name, "order": order, "parameter": parameter}
-        given |= {"number": size, "depth": size}
+        members: dict[str, Any] = {"encoding": step.name, "order": order, "parameter": parameter}
+        members |= {"number": size, "depth": size}
         if step.name == HASH and not order and self._within(step, value.stride):
             value.memory = self.memory(value.stride)
             source = self._input_of(step.operands[0])
@@ -477,11 +490,11 @@ class _Lowering:
         if octaves := _by_octaves(step):
             raw = step.operands[0].width
             width = _padded(encoded_columns(step.name, raw, size))
-            given["number"] = self.pack("waves", 0, int(octaves == 1), width, 3 * width, (size, raw // octaves))
+            members["number"] = self.pack("waves", 0, int(octaves == 1), width, 3 * width, (size, raw // octaves))
         if self.tiles and not self.cuda and not order and octaves == 1 and any(as_pairs := self._as_pairs(step)):
             value.pairs = self.slots.take(self.pairs_of(step.width))
             value.floats = value.memory != _NONE or not all(as_pairs)
-        self.emit("encode", records, value, **given)
+        self.emit("encode", records, value, **members)
 
     def _input_of(self, x: Columns) -> int:
         (number,) = [int(step.numbers[0]) for step in self.work if step.op == "input" and step.out == x.index]
@@ -497,7 +510,7 @@ class _Lowering:
         self.emit("output", [self.operand(step.operands[0])], width=step.width, number=number, depth=first)
 
     def _by_outputs(self, step: Step) -> bool:
-        """Whether a sum has its inputs next to each other in the partial, which wastes less for few outputs."""
+        """Returns whether the partial sum has contiguous inputs, which needs less padding for few outputs."""
         o, i = step.operands[0].width, step.operands[1].width
         return o * _padded(i) < i * _padded(o)
 
@@ -522,7 +535,7 @@ class _Lowering:
         self.emit("columns", records, number=at, stride=stride, width=step.width)
 
     def finished(self) -> Lowered:
-        """The compiled program."""
+        """Returns the lowered program."""
         program, compiled = self.program, self.compiled
         scattered = [out for _, _, out in self.scatters]
         for i, shape in enumerate(program.sums):
@@ -534,7 +547,9 @@ class _Lowering:
         for number, c in enumerate(program.outputs):
             ray = number in program.by_ray
             outputs.append(
-                compiled.ProgramOutput(c.width, ray, self.memory(c.width) if ray else self.own.get(number, _NONE))
+                compiled.ProgramOutput(
+                    c.width, ray, self.memory(c.width) if ray else self.output_memories.get(number, _NONE)
+                )
             )
         steps = [
             step._replace(memory=outputs[step.number].memory)
@@ -568,11 +583,11 @@ class _Lowering:
             scratch_width=self.scratch_width,
             layout=self.layout,
         )
-        made = compiled.make_program(table)
+        compiled_program = compiled.make_program(table)
         widths = tuple(self.memories[memory] for _, memory in self.lookups)
         sizes = tuple(map(math.prod, program.parameters))
         call = compiled.ProgramCall(
-            made,
+            compiled_program,
             [(columns.width, i in program.by_ray) for i, columns in enumerate(program.outputs)],
             [(-1 if of is None else of, shape) for of, shape in zip(program.sum_tables, program.sums)],
             widths,
@@ -582,11 +597,16 @@ class _Lowering:
             LARGE,
             on_huge_pages,
         )
-        return Lowered(made, tuple(lookup for lookup, _ in self.lookups), widths, sizes, program.tables, call)
+        return Lowered(
+            compiled_program, tuple(lookup for lookup, _ in self.lookups), widths, sizes, program.tables, call
+        )
 
 
 def _sum_records(parts: list[tuple[int, str, int, int, int, int, int, int, int]]) -> list[Any]:
-    """The records of the parts of sums, in their order; those of a sum that cover it side by side are written."""
+    """Returns the records of the parts of sums, in order.
+
+    If the parts of a sum cover it without overlap, they are written; otherwise they are added.
+    """
     spans: dict[int, list[tuple[int, int]]] = {}
     for out, _, _, _, _, start, width, _, _ in parts:
         spans.setdefault(out, []).append((start, start + width))
@@ -600,7 +620,7 @@ def _sum_records(parts: list[tuple[int, str, int, int, int, int, int, int, int]]
 
 
 def _all_of(c: Columns, width: int) -> bool:
-    """Whether columns are all those of a value."""
+    """Returns whether columns are all columns of a value."""
     return c.start == 0 and c.width == width and not c.spread
 
 
@@ -609,39 +629,41 @@ def _sums(step: Step) -> bool:
 
 
 def _by_octaves(step: Step) -> int:
-    """Columns of x for each angle where a step makes sines and cosines of octaves, else 0."""
+    """Returns the columns of x for each angle if a step encodes octaves of sines and cosines, else 0."""
     return ENCODINGS[step.name].octaves if step.name in ENCODINGS else 0
 
 
 def _sources(step: Step) -> int:
-    """How many operands of a linear step are multiplied, one behind the other."""
+    """Returns the number of operands that a linear step multiplies; they are concatenated along the depth."""
     return int(step.numbers[3]) if len(step.numbers) > 3 else 1
 
 
 def _adds(step: Step, to: Step) -> bool:
-    """Whether a linear step adds its product to what another one has made, a product itself."""
+    """Returns whether a linear step adds its product to the value of ``to``, a linear step without activation."""
     added = step.operands[1 : len(step.operands) - (step.name == "relu_slope")] if step.op == "linear" else ()
     plain = to.op == "linear" and not to.name
     return plain and any(c.of == VALUE and c.index == to.out and _all_of(c, to.width) for c in added)
 
 
 def _delayed(steps: list[Step]) -> list[Step]:
-    """The steps with those products right before the one that adds to them, which nothing else reads."""
+    """Returns the steps, with each product directly before the step that adds to it, if that is its only reader."""
     uses = [c.index for step in steps for c in step.operands if c.of == VALUE]
-    found = list(steps)
+    result = list(steps)
     for step in reversed(steps):
         for to in [to for to in steps if _adds(step, to) and uses.count(to.out) == 1]:
-            found.remove(to)
-            found.insert(found.index(step), to)
-    return found
+            result.remove(to)
+            result.insert(result.index(step), to)
+    return result
 
 
 def _joined(steps: list[Step]) -> list[Step]:
-    """The steps with layers of several sources, next to each other in the weights, as one product: the number of
-    sources is a fourth number then. The sums stay in registers from one source to the next."""
+    """Returns the steps with layers of several sources, adjacent in the weights, joined to one product.
+
+    The number of sources becomes the fourth number of the step. The sums stay in registers from source to source.
+    """
     uses = [c.index for step in steps for c in step.operands if c.of == VALUE]
     makers = {step.out: step for step in steps if not _sums(step) and step.op != "output"}
-    gone: set[int] = set()
+    joined: set[int] = set()
     for place, step in enumerate(steps):
         add = step.operands[1] if step.op == "linear" and len(step.operands) == 2 else None
         before = makers.get(add.index) if add is not None and add.of == VALUE else None
@@ -656,11 +678,11 @@ def _joined(steps: list[Step]) -> list[Step]:
         steps[place] = makers[step.out] = step._replace(
             operands=operands, numbers=(matrix, start - width, transposed, count + 1)
         )
-        gone.add(before.out)
-    return [step for step in steps if _sums(step) or step.op == "output" or step.out not in gone]
+        joined.add(before.out)
+    return [step for step in steps if _sums(step) or step.op == "output" or step.out not in joined]
 
 
 def _covered(step: Step) -> bool:
-    """Whether each column of a move comes from one part."""
-    taken = [column for c, at in zip(step.operands, step.numbers) for column in range(int(at), int(at) + c.width)]
-    return sorted(taken) == list(range(step.width))
+    """Returns whether each column of a move comes from exactly one part."""
+    columns = [column for c, at in zip(step.operands, step.numbers) for column in range(int(at), int(at) + c.width)]
+    return sorted(columns) == list(range(step.width))

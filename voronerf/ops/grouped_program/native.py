@@ -1,7 +1,7 @@
-"""Programs of the compiled module: every op on networks of cells. n rows, r rays, k cells, w columns of a value.
+"""Programs of the compiled module, which run every op on networks of cells. n rows, r rays, k cells, w columns.
 
-The gradient of a program is a program, and runs by the same op; so do further derivatives. A program with higher
-derivatives than the compiled module has runs in PyTorch.
+The gradient of a program is a program and runs by the same op, and so do higher derivatives. A program with derivatives
+that the compiled module lacks runs in PyTorch.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from torch import Tensor
 from voronerf.ops._core import backends, native
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
-from voronerf.ops._core.derivatives import asked_for
+from voronerf.ops._core.derivatives import needed_gradients
 from voronerf.ops._core.program import Program, gradient
 from voronerf.ops._core.rows import new_empty, rows_of
-from voronerf.ops.grouped_program.given import Given, index_name
+from voronerf.ops.grouped_program.arguments import ProgramArguments, index_name
 from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
 from voronerf.ops.grouped_program.reference import evaluate
 
 
 class Rows(NamedTuple):
-    """What a program runs on.
+    """The tensors of a program.
 
     Attributes:
-        inputs: [n, w] each, or [r, w] with a row for each ray; float32 or bfloat16, all alike.
-        parameters: [k, ...] each, or [1, ...] where all cells share it; float32, but for tables of hash grids.
-        offsets: int32 [k + 1].
+        inputs: [n, w] each, or [r, w] with a row for each ray; all float32 or all bfloat16.
+        parameters: [k, ...] each, or [1, ...] if all cells share the parameter; float32, except tables of hash grids.
+        offsets: int32 [k + 1], the first row of each cell, and the end of the last.
         order: int32 [n], or None for rows that are sorted by cell.
         ray_index: int32 [n], or None without rays.
-        kept: float32 [n, w], what each hash grid was looked up to before, in the order of the cells; none for a first
-            pass.
+        kept: float32 [n, w] for each hash grid: the features that an earlier pass looked up, sorted by cell. Empty for
+            a first pass.
     """
 
     inputs: Sequence[Tensor]
@@ -45,15 +45,15 @@ class Rows(NamedTuple):
     kept: Sequence[Tensor] = ()
 
 
-class How(NamedTuple):
-    """How a program runs.
+class RunOptions(NamedTuple):
+    """The options with which a program runs.
 
     Attributes:
-        text: of the program.
+        text: the text of the program.
         caller: the op that errors name.
-        products: what they take: "float32", "bfloat16" or, on CUDA, "float16".
-        keep: whether what hash grids are looked up to are further results, as `Rows` has it.
-        gradients: the first of the inputs whose rows, where all of them are 0, add nothing to any sum; -1 for none.
+        products: the type of the operands of products: "float32", "bfloat16" or, on CUDA, "float16".
+        keep: whether the features looked up in hash grids are further results, see `Rows`.
+        gradients: the first input that is a gradient. Rows whose gradients are all 0 add nothing to any sum. -1: none.
     """
 
     text: str
@@ -64,206 +64,210 @@ class How(NamedTuple):
 
 
 class Network(NamedTuple):
-    """A program with its tensors as the op takes them, of the caller's.
+    """A program with its tensors in the dtypes of the op.
 
-    Samples are read and results written as they are stored where all are bfloat16; else, and parameters always, a cell
-    having few of them, they are cast to float32 on the way in and back on the way out. Where the results are bfloat16,
-    products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16, AMX), and float32 ones
-    elsewhere; sums are float32 always.
+    If all inputs and the results are bfloat16, they are read and written as such. Otherwise inputs are cast to float32,
+    and results back. Parameters are always cast to float32; a cell has few of them. If the results are bfloat16,
+    products take bfloat16 operands on processors that multiply them faster (AVX512-BF16, AMX), and float32 operands
+    elsewhere. Sums are always float32.
 
     Attributes:
-        inputs: in float32, or all in the bfloat16 of the results.
-        parameters: in float32, but for tables of hash grids.
-        ray_index: int32 [n] where some inputs have one row for each ray, or None.
-        how: it runs.
-        dtype: of the results.
+        inputs: in float32, or all in bfloat16 like the results.
+        parameters: in float32, except tables of hash grids.
+        ray_index: int32 [n] if some inputs have one row for each ray, or None.
+        options: the options with which the program runs.
+        dtype: the dtype of the results.
     """
 
     inputs: Sequence[Tensor]
     parameters: Sequence[Tensor]
     ray_index: Tensor | None
-    how: How
+    options: RunOptions
     dtype: torch.dtype
 
     @staticmethod
-    def of(given: Given) -> Network:
-        """Casts the tensors that the public functions take."""
-        text, inputs, parameters, index, dtype, caller = given
-        tables = _tables(text)  # of which positions are read in float32
+    def of(arguments: ProgramArguments) -> Network:
+        """Returns the network of the arguments, with its tensors cast."""
+        text, inputs, parameters, index, dtype, caller = arguments
+        tables = _tables(text)  # hash grids take positions in float32
         stored = dtype is torch.bfloat16 and not tables and all(x.dtype is dtype for x in inputs)
         rows = inputs if stored else [x if x.dtype is torch.float32 else x.float() for x in inputs]
-        kept = [
+        cast_parameters = [
             p if p.dtype is torch.float32 or (any(i == table for table in tables) and p.dtype in _NAMES) else p.float()
             for i, p in enumerate(parameters)
         ]
-        return Network(rows, kept, index, How(text, caller, PRODUCTS.get(dtype, "float32")), dtype)
+        return Network(rows, cast_parameters, index, RunOptions(text, caller, PRODUCTS.get(dtype, "float32")), dtype)
 
     def rows(self, offsets: Tensor, order: Tensor | None = None) -> Rows:
-        """The tensors of the program, for rows of cells by offsets [k + 1] and an order."""
+        """Returns the tensors of the program, with the offsets [k + 1] of the cells and the order of the rows."""
         return Rows(self.inputs, self.parameters, offsets, order, self.ray_index)
 
     def run(self, offsets: Tensor, order: Tensor | None = None) -> list[Tensor]:
-        """The results, [n, w] each and sums."""
-        found = run_program(self.rows(offsets, order), self.how)
-        return [out if out.dtype is self.dtype else out.to(self.dtype) for out in found]
+        """Returns the results: outputs [n, w] and sums."""
+        results = run_program(self.rows(offsets, order), self.options)
+        return [out if out.dtype is self.dtype else out.to(self.dtype) for out in results]
 
 
 PRODUCTS = {torch.bfloat16: "bfloat16", torch.float16: "float16"}
-"""Operands of products by the dtype of the results; float32 for any other."""
+"""The type of the operands of products by the dtype of the results; "float32" for other dtypes."""
 
 
-def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
-    """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
-    return Network.of(given).run(offsets, order)
+def grouped_program(arguments: ProgramArguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
+    """Runs a program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
+    return Network.of(arguments).run(offsets, order)
 
 
-def run_program(rows: Rows, how: How) -> list[Tensor]:
-    """The outputs and sums of a program, with gradients of every order."""
-    if torch.is_grad_enabled() and _tables(how.text):
-        how = how._replace(keep=any(t.requires_grad for t in (*rows.inputs, *rows.parameters)))
-    found: list[Tensor] = run(rows, how)
-    return found[: _results(how.text)] if how.keep else found
+def run_program(rows: Rows, options: RunOptions) -> list[Tensor]:
+    """Returns the outputs and sums of a program, with gradients of every order."""
+    if torch.is_grad_enabled() and _tables(options.text):
+        options = options._replace(keep=any(t.requires_grad for t in (*rows.inputs, *rows.parameters)))
+    results: list[Tensor] = run(rows, options)
+    return results[: _results(options.text)] if options.keep else results
 
 
 @constant_result
 def _results(text: str) -> int:
-    """How many outputs and sums there are; behind them comes what is kept."""
+    """Returns the number of outputs and sums; kept features follow them in the list of results."""
     program = Program.parse(text)
     return len(program.outputs) + len(program.sums)
 
 
 @constant_result
 def _tables(text: str) -> tuple[int, ...]:
-    """The parameters that are tables of hash grids."""
+    """Returns the numbers of the parameters that are tables of hash grids."""
     return Program.parse(text).tables
 
 
 class _Call(NamedTuple):
-    """The tensors of a program, and how it runs."""
+    """The arguments of the custom op: the tensors of a program, and its options."""
 
     rows: Rows
-    how: How
+    options: RunOptions
 
 
 def _sizes(program: Program, rows: Rows) -> tuple[int, int]:
-    """The numbers of rows and rays."""
+    """Returns the numbers of rows and rays."""
     n = rows_of(rows.inputs[0] if rows.ray_index is None else rows.ray_index)
     return n, rows_of(rows.inputs[program.rays[0]]) if program.rays else 0
 
 
-def _memory(given: _Call) -> list[Tensor]:
-    """For the outputs of a program, its sums, and what is kept."""
-    rows, how = given
-    program, like = Program.parse(how.text), rows.inputs[0]
+def _memory(arguments: _Call) -> list[Tensor]:
+    """Allocates the outputs of a program, its sums and the kept features."""
+    rows, options = arguments
+    program, like = Program.parse(options.text), rows.inputs[0]
     n, r = _sizes(program, rows)
-    found = [
+    results = [
         new_empty(like, r if i in program.by_ray else n, columns.width) for i, columns in enumerate(program.outputs)
     ]
     if program.sums:
         counts = program.cells_of_sums(rows.parameters, rows.offsets.shape[0] - 1)
         dtype = None if like.dtype is torch.float32 else torch.float32
-        found += [new_empty(like, count, *shape, dtype=dtype) for count, shape in zip(counts, program.sums)]
-    if how.keep and program.grids and compiled_runs(program.text):
-        widths = lower(program.text).widths  # of every layout: tensors without memory have no device to ask
-        found += [new_empty(like, n, width, dtype=torch.float32) for width in widths]
-    return found
+        results += [new_empty(like, count, *shape, dtype=dtype) for count, shape in zip(counts, program.sums)]
+    if options.keep and program.grids and compiled_runs(program.text):
+        widths = lower(program.text).widths  # the same in every layout; tensors without memory have no layout
+        results += [new_empty(like, n, width, dtype=torch.float32) for width in widths]
+    return results
 
 
 @custom_op("grouped_program_native", _memory, counted=True)
-def run(given: _Call) -> list[Tensor]:
-    """A program."""
-    return _made(*given)
+def run(arguments: _Call) -> list[Tensor]:
+    """Runs a program."""
+    return _run(*arguments)
 
 
-def _made(rows: Rows, how: How) -> list[Tensor]:
-    """Its results."""
-    program = Program.parse(how.text)
+def _run(rows: Rows, options: RunOptions) -> list[Tensor]:
+    """Returns the results of a program: outputs, sums and kept features."""
+    program = Program.parse(options.text)
     if not compiled_runs(program.text):
-        found = _memory(_Call(rows, how))
+        results = _memory(_Call(rows, options))
         inputs = [x.float() for x in rows.inputs]
-        made = evaluate(inputs, rows.parameters, rows.offsets, rows.order, rows.ray_index, program.text)
-        for to, result in zip(found, made, strict=True):
+        values = evaluate(inputs, rows.parameters, rows.offsets, rows.order, rows.ray_index, program.text)
+        for to, result in zip(results, values, strict=True):
             to.copy_(result)
-        return found
+        return results
     on_cuda = native.on_cuda(rows.offsets)
-    lowered = lower(program.text, _layout(how.products, rows.offsets), on_cuda)
-    results = None if on_cuda else lowered.call(rows, how.keep, how.gradients, how.caller, False)
-    return _by_structs(program, lowered, _Call(rows, how)) if results is None else results
+    lowered = lower(program.text, _layout(options.products, rows.offsets), on_cuda)
+    direct = None if on_cuda else lowered.call(rows, options.keep, options.gradients, options.caller, False)
+    return _run_by_structs(program, lowered, _Call(rows, options)) if direct is None else direct
 
 
-def _at_once(rows: Rows, how: How) -> list[Tensor] | None:
-    """The results where no gradients are recorded and nothing of torch's is to see the call; else None."""
-    text = how.text
+def _run_without_gradients(rows: Rows, options: RunOptions) -> list[Tensor] | None:
+    """Returns the results of a CPU call without gradients that nothing in torch observes, or None to use the op."""
+    text = options.text
     if native.on_cuda(rows.offsets) or not compiled_runs(text):
         return None
-    lowered = lower(text, _layout(how.products, rows.offsets), False)
-    found: list[Tensor] | None = lowered.call(rows, how.keep, how.gradients, how.caller, True)
-    return found
+    lowered = lower(text, _layout(options.products, rows.offsets), False)
+    results: list[Tensor] | None = lowered.call(rows, options.keep, options.gradients, options.caller, True)
+    return results
 
 
-run.at_once = _at_once
+run.without_gradients = _run_without_gradients
 
 
-def _by_structs(program: Program, lowered: Lowered, given: _Call) -> list[Tensor]:
-    """The call where it is recorded, or not of the CPU alone: with memory, and structs that Python makes."""
-    (rows, how), found = given, _memory(given)
+def _run_by_structs(program: Program, lowered: Lowered, arguments: _Call) -> list[Tensor]:
+    """Returns the results of a call that is recorded or on CUDA: Python allocates the results and makes the structs."""
+    (rows, options), tensors = arguments, _memory(arguments)
     n, r = _sizes(program, rows)
     split, end = len(program.outputs), len(program.outputs) + len(program.sums)
-    outputs, sums, keeps = found[:split], found[split:end], found[end:]
-    gradients = -1 if keeps else how.gradients  # what is kept is of all rows
-    looked = keeps or rows.kept or None
-    taken = program_inputs(lowered, rows, n, r, kept=looked, ready=not keeps, gradients=gradients, caller=how.caller)
+    outputs, sums, keeps = tensors[:split], tensors[split:end], tensors[end:]
+    gradients = -1 if keeps else options.gradients  # features are kept for all rows
+    lookups = keeps or rows.kept or None
+    inputs = program_inputs(
+        lowered, rows, n, r, kept=lookups, ready=not keeps, gradients=gradients, caller=options.caller
+    )
     if native.on_cuda(rows.offsets):
-        _run_on_cuda(program, lowered, rows, how, taken, outputs, sums)
-        return found
-    made = outputs
+        _run_on_cuda(program, lowered, rows, options, inputs, outputs, sums)
+        return tensors
+    written = outputs
     if program.by_ray:  # sums of rays are float32
-        made = [to.float() if i in program.by_ray else to for i, to in enumerate(outputs)]
-    results = native.compiled.ProgramResults(outputs=made, output_types=[_NAMES[to.dtype] for to in made], sums=sums)
-    native.compiled.grouped_program(lowered.program, taken, results, native.cpu())
-    for to, result in zip(outputs, made):
+        written = [to.float() if i in program.by_ray else to for i, to in enumerate(outputs)]
+    results = native.compiled.ProgramResults(
+        outputs=written, output_types=[_NAMES[to.dtype] for to in written], sums=sums
+    )
+    native.compiled.grouped_program(lowered.program, inputs, results, native.cpu())
+    for to, result in zip(outputs, written):
         if to is not result:
             to.copy_(result)
-    return found
+    return tensors
 
 
 def _run_on_cuda(
     program: Program,
     lowered: Lowered,
     rows: Rows,
-    how: How,
-    given: native.compiled.ProgramInputs,
+    options: RunOptions,
+    arguments: native.compiled.ProgramInputs,
     outputs: list[Tensor],
     sums: list[Tensor],
 ) -> None:
-    """The call, and the sums over the samples of each ray, of which the kernels give the rows."""
+    """Runs a program on CUDA. The kernels write one row for each sample, which are summed by ray here."""
     offsets, index = rows.offsets, rows.ray_index
     if any(step.op == "scatter" for step in program.steps):
-        native.refuse_where_deterministic(how.caller, offsets)
-    tf32 = how.products == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32"
-    made = list(outputs)
+        native.refuse_where_deterministic(options.caller, offsets)
+    tf32 = options.products == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32"
+    written = list(outputs)
     for i in program.by_ray:
-        made[i] = torch.empty(given.n, outputs[i].shape[1], device=offsets.device)
+        written[i] = torch.empty(arguments.n, outputs[i].shape[1], device=offsets.device)
     results = native.compiled.ProgramResults(
-        outputs=made, output_types=[_NAMES[result.dtype] for result in made], sums=sums
+        outputs=written, output_types=[_NAMES[result.dtype] for result in written], sums=sums
     )
     machine = native.compiled.Cuda(*native.stream(offsets))
-    size = native.compiled.grouped_program_workspace(lowered.program, given.n, given.r, given.k, machine)
+    size = native.compiled.grouped_program_workspace(lowered.program, arguments.n, arguments.r, arguments.k, machine)
     workspace = torch.empty(size, dtype=torch.uint8, device=offsets.device)
-    layout = _layout(how.products, offsets)
-    products = "tf32" if tf32 else how.products if layout == "tiles" else "float32"
+    layout = _layout(options.products, offsets)
+    products = "tf32" if tf32 else options.products if layout == "tiles" else "float32"
     code = _code(program.text, layout, offsets.device)
-    native.compiled.grouped_program(lowered.program, code, given, results, products, workspace, machine)
+    native.compiled.grouped_program(lowered.program, code, arguments, results, products, workspace, machine)
     for i in program.by_ray:
-        total = torch.zeros(given.r, outputs[i].shape[1], device=offsets.device)
-        if index is not None and given.n and given.r:
-            total.index_add_(0, index.clamp(0, given.r - 1), made[i])
+        total = torch.zeros(arguments.r, outputs[i].shape[1], device=offsets.device)
+        if index is not None and arguments.n and arguments.r:
+            total.index_add_(0, index.clamp(0, arguments.r - 1), written[i])
         outputs[i].copy_(total)
 
 
 @functools.lru_cache(maxsize=1024)
 def _code(text: str, layout: str, device: torch.device) -> Tensor:
-    """The records of a program on a device, copied there once."""
+    """Returns the records of a program on a device, cached."""
     program = lower(text, layout, True).program
     code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8)
     native.compiled.program_code(program, code)
@@ -281,21 +285,21 @@ def program_inputs(
     gradients: int = -1,
     caller: str = "grouped_program",
 ) -> native.compiled.ProgramInputs:
-    """The tensors of a program as the compiled module takes them.
+    """Returns the compiled module's struct of a program's tensors.
 
     Args:
         lowered: the program.
         rows: the tensors.
-        n: rows.
-        r: rays.
-        kept: what is kept of each look-up, or None.
-        ready: whether it is there already.
-        gradients: see `How`.
+        n: the number of rows.
+        r: the number of rays.
+        kept: the kept features of each hash grid, or None.
+        ready: whether the kept features have been written.
+        gradients: see `RunOptions`.
         caller: the op that errors name.
     """
     inputs, parameters, offsets, order, ray_index, _ = rows
-    samples = -1 if ray_index is not None and n == r else n  # which inputs are of samples, none if that is not known
-    turned = [0 if x.is_contiguous() else int(_columns_lie_together(x, samples)) for x in inputs]
+    samples = -1 if ray_index is not None and n == r else n  # the length of inputs of samples; -1 if rays have it, too
+    turned = [0 if x.is_contiguous() else int(_is_column_major(x, samples)) for x in inputs]
     if 1 in turned:
         inputs = [x.t() if turn else x for x, turn in zip(inputs, turned)]
     kind, kinds = _NAMES[inputs[0].dtype], ["float32"] * len(parameters)
@@ -322,9 +326,11 @@ def program_inputs(
     )
 
 
-def _columns_lie_together(x: Tensor, n: int) -> bool:
-    """Whether rows of samples lie as PyTorch's look-ups in planes give them. Points of hash grids, which are read where
-    they are, are copied."""
+def _is_column_major(x: Tensor, n: int) -> bool:
+    """Returns whether samples [n, w] are column-major, like PyTorch's look-ups in planes.
+
+    Points of hash grids [n, 3], which kernels read in place, are not: they are copied to row-major.
+    """
     planes = x.stride(0) == 1 and x.t().is_contiguous()
     return planes and x.shape[0] == n and x.shape[1] != 3 and x.dtype == torch.float32
 
@@ -339,8 +345,10 @@ _LAYOUTS = {
 
 
 def _layout(products: str, tensor: Tensor) -> str:
-    """What values are laid out for: products of 16 bits where they are asked for, and the device has them; for float32
-    on the CPU as ``torch.set_float32_matmul_precision`` says, of which "high" are products in parts."""
+    """Returns the layout of values: for 16-bit products if they are requested and the device has them, else "floats".
+
+    For float32 on the CPU, ``torch.set_float32_matmul_precision`` decides; "high" means products in two parts.
+    """
     if native.on_cuda(tensor):
         return "tiles" if products != "float32" and _multiplies_halves(products, tensor.device) else "floats"
     layouts = _LAYOUTS.get(native.isa())
@@ -351,14 +359,14 @@ def _layout(products: str, tensor: Tensor) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _multiplies_halves(products: str, device: torch.device) -> bool:
-    """Whether a GPU has products of this 16-bit type."""
-    there = native.compiled.Cuda(*native.stream(torch.empty(0, device=device)))
-    return native.compiled.multiplies_halves(products, there)
+    """Returns whether a GPU has products of this 16-bit type."""
+    machine = native.compiled.Cuda(*native.stream(torch.empty(0, device=device)))
+    return native.compiled.multiplies_halves(products, machine)
 
 
-def _keep(ctx: Any, inputs: tuple[Rows, How], output: Sequence[Tensor]) -> None:
-    rows, ctx.how = inputs
-    ctx.count, ctx.parameters, ctx.results = len(rows.inputs), len(rows.parameters), _results(ctx.how.text)
+def _setup(ctx: Any, inputs: tuple[Rows, RunOptions], output: Sequence[Tensor]) -> None:
+    rows, ctx.options = inputs
+    ctx.count, ctx.parameters, ctx.results = len(rows.inputs), len(rows.parameters), _results(ctx.options.text)
     ctx.set_materialize_grads(False)
     ctx.kept, kept = len(rows.kept), output[ctx.results :]
     if kept:
@@ -367,44 +375,49 @@ def _keep(ctx: Any, inputs: tuple[Rows, How], output: Sequence[Tensor]) -> None:
 
 
 def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
-    found, nothing = _of_saved(ctx, arriving), cast(Any, (None,) * len(How._fields))
-    of_rows: Any = (found[: ctx.count], found[ctx.count :], *nothing[:3], [None] * ctx.kept)
-    return Rows._make(of_rows), How(*nothing)
+    gradients, none = _saved_gradients(ctx, arriving), cast(Any, (None,) * len(RunOptions._fields))
+    row_gradients: Any = (gradients[: ctx.count], gradients[ctx.count :], *none[:3], [None] * ctx.kept)
+    return Rows._make(row_gradients), RunOptions(*none)
 
 
-def _of_saved(ctx: Any, arriving: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """The gradients to the inputs, then those to the parameters."""
+def _saved_gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> list[Tensor | None]:
+    """Returns the gradients to the inputs, then to the parameters; None if not wanted."""
     count, saved = ctx.count + ctx.parameters, ctx.saved_tensors
-    wanted = asked_for(ctx, saved[:count])
-    found: list[Tensor | None] = [None] * count
+    wanted = needed_gradients(ctx, saved[:count])
+    gradients: list[Tensor | None] = [None] * count
     arriving = arriving[: ctx.results]
     if any(g is not None for g in arriving) and any(wanted):
         offsets, order, ray_index, *kept = saved[count:]
         rows = Rows(saved[: ctx.count], saved[ctx.count : count], offsets, order, ray_index, kept)
-        results = iter(run_gradient(rows, ctx.how, arriving, wanted))
-        found = [next(results) if want else None for want in wanted]
-    return found
+        results = iter(run_gradient(rows, ctx.options, arriving, wanted))
+        gradients = [next(results) if want else None for want in wanted]
+    return gradients
 
 
-def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor]:
-    """The gradients to those inputs and parameters that are wanted.
+def run_gradient(
+    rows: Rows, options: RunOptions, arriving: Sequence[Tensor | None], wanted: Sequence[bool]
+) -> list[Tensor]:
+    """Returns the gradients to the wanted inputs and parameters.
 
     Args:
-        rows: those of the program, with what it kept.
-        how: as the program ran.
-        arriving: the gradient to each of its results, None where there is none.
-        wanted: of each input, then of each parameter.
+        rows: the tensors of the program, with the kept features.
+        options: the options with which the program ran.
+        arriving: the gradient to each result of the program, or None.
+        wanted: whether to return the gradient, for each input, then for each parameter.
     """
-    program, count = Program.parse(how.text), len(rows.inputs)
-    split, given = len(program.outputs), tuple([g is not None for g in arriving])
-    own = _gradient(program.text, how.caller, how.products, count, tuple(wanted), given)
+    program, count = Program.parse(options.text), len(rows.inputs)
+    split, present = len(program.outputs), tuple([g is not None for g in arriving])
+    derived = _gradient(program.text, options.caller, options.products, count, tuple(wanted), present)
     inputs = [*rows.inputs, *[g for g in arriving[:split] if g is not None]]
     parameters = [*rows.parameters, *[g for g in arriving[split:] if g is not None]]
-    call = Rows(inputs, parameters, rows.offsets, rows.order, rows.ray_index, rows.kept if own.keeps else ())
-    # Of a pass that is differentiated again, what is looked up may be kept once more.
-    found = run_program(call, own.how) if torch.is_grad_enabled() else run(call, own.how)
-    results, learning = found[: own.outputs], [p for p, want in zip(rows.parameters, wanted[count:]) if want]
-    for total, p in zip(found[own.outputs :], learning, strict=True):
+    call = Rows(inputs, parameters, rows.offsets, rows.order, rows.ray_index, rows.kept if derived.keeps else ())
+    # `run_program` keeps the looked-up features again, for a pass that is differentiated further.
+    values = run_program(call, derived.options) if torch.is_grad_enabled() else run(call, derived.options)
+    results, learning = (
+        values[: derived.outputs],
+        [p for p, want in zip(rows.parameters, wanted[count:]) if want],
+    )
+    for total, p in zip(values[derived.outputs :], learning, strict=True):
         if p.shape[0] == 1 and total.shape[0] > 1:
             total = total.sum(0, keepdim=True)
         results.append(total if p.dtype is total.dtype else total.to(p.dtype))
@@ -412,52 +425,63 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
 
 
 class _Gradient(NamedTuple):
-    """The program of gradients and how it runs, how many of its results are gradients of inputs, and whether what the
-    program kept is what it looks up."""
+    """The gradient of a program.
 
-    how: How
+    Attributes:
+        options: the options of the gradient's program.
+        outputs: the number of its results that are gradients to inputs.
+        keeps: whether it can use the features that the program kept.
+    """
+
+    options: RunOptions
     outputs: int
     keeps: bool
 
 
 @functools.lru_cache(maxsize=1024)
 def _gradient(
-    text: str, caller: str, products: str, count: int, wanted: tuple[bool, ...], given: tuple[bool, ...]
+    text: str, caller: str, products: str, count: int, wanted: tuple[bool, ...], present: tuple[bool, ...]
 ) -> _Gradient:
     program = Program.parse(text)
     split = len(program.outputs)
-    own = gradient(program, wanted[:count], wanted[count:], given[:split], given[split:])
-    sifts = not own.outputs and all(i < count for i in own.rays) and not any(given[split:])
-    keeps = bool(program.grids) and compiled_runs(own.text) and compiled_runs(text)
-    keeps = keeps and lower(own.text).lookups == lower(text).lookups
-    return _Gradient(How(own.text, caller, products, False, count if sifts else -1), len(own.outputs), keeps)
+    derived = gradient(program, wanted[:count], wanted[count:], present[:split], present[split:])
+    sifts = not derived.outputs and all(i < count for i in derived.rays) and not any(present[split:])
+    keeps = bool(program.grids) and compiled_runs(derived.text) and compiled_runs(text)
+    keeps = keeps and lower(derived.text).lookups == lower(text).lookups
+    return _Gradient(
+        RunOptions(derived.text, caller, products, False, count if sifts else -1),
+        len(derived.outputs),
+        keeps,
+    )
 
 
 class _Node(torch.autograd.Function):
-    """A program in autograd, where nothing else of torch's has to see the call. A node that serves every op takes 30 us
-    more, a sixth of a small network with its gradients."""
+    """The autograd node of a call that nothing else in torch observes.
+
+    The general node of custom ops takes 30 us more, a sixth of a small network with its gradients.
+    """
 
     @staticmethod
-    def forward(ctx: Any, given: _Call, *tensors: Tensor | None) -> tuple[Tensor, ...]:
-        found = tuple(_made(*given))
-        _keep(ctx, given, found)
-        return found
+    def forward(ctx: Any, arguments: _Call, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+        results = tuple(_run(*arguments))
+        _setup(ctx, arguments, results)
+        return results
 
     @staticmethod
     def backward(ctx: Any, *arriving: Tensor | None) -> tuple[Tensor | None, ...]:
         run.refuse_batches(arriving)
-        return None, *_of_saved(ctx, arriving), None, None, None
+        return None, *_saved_gradients(ctx, arriving), None, None, None
 
 
-#: Without the look of ``apply`` at ``torch.func``.
+#: ``apply`` without its check for ``torch.func`` transforms.
 _apply_node = super(torch.autograd.Function, _Node).apply
 
 
-def _learning(rows: Rows, how: How) -> list[Tensor]:
-    """The results where gradients are recorded, and torch has to see nothing but these."""
+def _run_with_gradients(rows: Rows, options: RunOptions) -> list[Tensor]:
+    """Returns the results of a call with gradients that nothing else in torch observes."""
     inputs, parameters, offsets, order, ray_index, _ = rows
-    return list(_apply_node(_Call(rows, how), *inputs, *parameters, offsets, order, ray_index))
+    return list(_apply_node(_Call(rows, options), *inputs, *parameters, offsets, order, ray_index))
 
 
-run.register_autograd(_gradients, setup_context=_keep)
-run.learning = _learning
+run.register_autograd(_gradients, setup_context=_setup)
+run.with_gradients = _run_with_gradients

@@ -1,4 +1,4 @@
-"""Programs of a tile in plain PyTorch. n rows, r rays, k cells, w columns of a value."""
+"""Programs in plain PyTorch. n rows, r rays, k cells, w columns of a value."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.program import BINARY, FUNCTIONS, PARAMETER, VALUE, Columns, Program, Step
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
-from voronerf.ops.grouped_program.given import Given, index_name
+from voronerf.ops.grouped_program.arguments import ProgramArguments, index_name
 from voronerf.ops.hash_encode.reference import interpolate
 
 
-def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
-    """A program on the rows of each cell; see ``voronerf.ops.grouped_program``. Of halves, products are rounded."""
-    check_rows(given, offsets, order)
-    text, inputs, parameters, ray_index, dtype, _ = given
+def grouped_program(arguments: ProgramArguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
+    """Runs a program on the rows of each cell; see ``voronerf.ops.grouped_program``.
+
+    With half types, the operands and results of products are rounded.
+    """
+    check_rows(arguments, offsets, order)
+    text, inputs, parameters, ray_index, dtype, _ = arguments
     wide = torch.promote_types(dtype, torch.float32)
     with torch.autocast(offsets.device.type, enabled=False):
-        taken = [x.to(wide) for x in inputs], [p.to(wide) for p in parameters]
-        results = evaluate(*taken, offsets, order, ray_index, text, dtype)
+        cast = [x.to(wide) for x in inputs], [p.to(wide) for p in parameters]
+        results = evaluate(*cast, offsets, order, ray_index, text, dtype)
     return [result.to(dtype) for result in results]
 
 
@@ -39,8 +42,10 @@ def evaluate(
     text: str,
     products: torch.dtype | None = None,
 ) -> list[Tensor]:
-    """The results of a program, given by its text, of tensors of one dtype that have been checked; ``products`` are
-    rounded to a dtype with their operands."""
+    """Returns the results of a program, for checked tensors of one dtype.
+
+    ``products`` is the dtype to which products and their operands are rounded, or None.
+    """
     program = parsed(text)
     n = len(inputs[0] if ray_index is None else ray_index)
     if order is not None and ray_index is not None:
@@ -64,42 +69,42 @@ def evaluate(
 
 @constant_result
 def parsed(text: str) -> Program:
-    """The program of a text."""
+    """Parses a program, with a cache."""
     return Program.parse(text)
 
 
 @constant_result
 def _grid(text: str) -> HashGrid:
     grid = HashGrid.parse(text)
-    assert grid.rows  # which a compiler finds, but does not compute
+    assert grid.rows  # fills the cached property, which a compiler can read but not compute
     return grid
 
 
-def check_rows(given: Given, offsets: Tensor, order: Tensor | None) -> None:
-    """Raises ValueError for offsets, an order or an index of rays that name no row; on the CPU, as it reads them."""
+def check_rows(arguments: ProgramArguments, offsets: Tensor, order: Tensor | None) -> None:
+    """Raises ValueError on the CPU for offsets, an order or a ray index out of range."""
     if offsets.device.type != "cpu" or torch.compiler.is_compiling():
         return
-    index, n = given.ray_index, len(given.inputs[0] if given.ray_index is None else given.ray_index)
-    check_offsets(given.caller, offsets, n)
+    index, n = arguments.ray_index, len(arguments.inputs[0] if arguments.ray_index is None else arguments.ray_index)
+    check_offsets(arguments.caller, offsets, n)
     if order is not None:
-        check_range(given.caller, "order", order, n)
+        check_range(arguments.caller, "order", order, n)
     if index is not None and len(index):
-        last = len(given.inputs[parsed(given.text).rays[0]]) - 1
+        last = len(arguments.inputs[parsed(arguments.text).rays[0]]) - 1
         low, high = (int(bound) for bound in index.aminmax())
         if low < 0 or high > last:
             wrong = low if low < 0 else high
-            raise ValueError(f"{given.caller}: {index_name(given.caller)} must be 0 to {last}, got {wrong}")
+            raise ValueError(f"{arguments.caller}: {index_name(arguments.caller)} must be 0 to {last}, got {wrong}")
 
 
-def of_rows(inputs: Sequence[Tensor], text: str) -> list[Tensor]:
-    """The outputs of a program without parameters, for which rows need no cells; nothing is read on the host."""
+def evaluate_rows(inputs: Sequence[Tensor], text: str) -> list[Tensor]:
+    """Returns the outputs of a program without parameters, whose rows need no cells; the host reads no values."""
     program = parsed(text)
     run = _Run(program, inputs, [], torch.zeros(1, dtype=torch.int32), None)
     return [run.columns(columns) for columns in program.outputs]
 
 
 class _Run:
-    """The values of a program; ``inside``, bool [n, 1], says of rows whether they are of a cell."""
+    """One run of a program and its values. ``inside``: bool [n, 1], whether a row belongs to a cell."""
 
     def __init__(
         self,
@@ -128,21 +133,22 @@ class _Run:
                 self.values[step.out] = self.value(step)
 
     def columns(self, columns: Columns) -> Tensor:
-        """[n, w] of an operand."""
+        """Returns the values of an operand, [n, w]."""
         width = 1 if columns.spread else columns.width
         if columns.of == VALUE:
-            found = self.values[columns.index][:, columns.start : columns.start + width]
+            values = self.values[columns.index][:, columns.start : columns.start + width]
         else:
-            ones = self.inputs[0].new_ones(len(self.inputs[0]), 1)  # whose product sums the gradient in pieces
-            found = grouped_linear(ones, self.offsets, self.vectors(columns, width).unsqueeze(2))
-        return found.expand(-1, columns.width)
+            # As a product, its backward pass sums the gradient in pieces.
+            ones = self.inputs[0].new_ones(len(self.inputs[0]), 1)
+            values = grouped_linear(ones, self.offsets, self.vectors(columns, width).unsqueeze(2))
+        return values.expand(-1, columns.width)
 
     def vectors(self, columns: Columns, width: int) -> Tensor:
-        """[k, w], columns of a parameter."""
+        """Returns columns of a parameter, [k, w]."""
         return self.parameters[columns.index].flatten(1)[:, columns.start : columns.start + width]
 
     def value(self, step: Step) -> Tensor:
-        """What a step makes, [n, w]."""
+        """Returns the value of a step, [n, w]."""
         if step.op == "input":
             return self.inputs[int(step.numbers[0])]
         if step.op == "linear":
@@ -150,8 +156,8 @@ class _Run:
         operands = [self.columns(columns) for columns in step.operands]
         if step.op == "function":
             order, a, b = step.numbers
-            found = derivative(step.name, operands[0], a, b, int(order))
-            return found * operands[1] if len(operands) > 1 else found
+            slope = derivative(step.name, operands[0], a, b, int(order))
+            return slope * operands[1] if len(operands) > 1 else slope
         if step.op == "encode":
             return self.encoded(step, operands)
         if step.op == "binary":
@@ -164,7 +170,7 @@ class _Run:
         return result
 
     def layer(self, step: Step) -> Tensor:
-        """A product, what is added to it, and its ReLU, [n, w]."""
+        """Returns the value of a linear step, [n, w]: a product, with its addends and its ReLU."""
         (read, *others), (matrix, start, transposed) = step.operands, map(int, step.numbers)
         x, weight = self.columns(read), self.parameters[matrix][:, :, start:]
         weight = weight[:, :, : step.width].transpose(1, 2) if transposed else weight[:, :, : x.shape[1]]
@@ -177,7 +183,7 @@ class _Run:
         return y.relu() if step.name == "relu" else y
 
     def encoded(self, step: Step, operands: Sequence[Tensor]) -> Tensor:
-        """An encoding, or one of its derivatives, [n, w]."""
+        """Returns an encoding or one of its derivatives, [n, w]."""
         size, parameter, order, back = map(int, step.numbers)
         table = self.tables.get(parameter) if step.name == "hash" else None
         encode = functools.partial(self.encoding, step.name, size, table=table)
@@ -190,14 +196,14 @@ class _Run:
             return torch.func.vjp(along(encode, directions), x)[1](g)[0]
 
     def encoding(self, name: str, size: int, x: Tensor, table: Tensor | None) -> Tensor:
-        """The encoding of rows, with a table [k, e, f] of cells or [1, e, f] of all of them."""
+        """Returns the encoding of rows; the table is [k, e, f], or [1, e, f] if all cells share it."""
         if name in ENCODINGS:
             return ENCODINGS[name].formula(x, size)
         assert table is not None
         return interpolate(x, table, self.grids[size], self.cells if len(table) > 1 else None)
 
     def scattered(self, step: Step) -> Tensor:
-        """What a step adds to the sum of a table, [k, e, f] or [1, e, f]."""
+        """Returns the gradient that a step adds to the sum of a table, [k, e, f] or [1, e, f]."""
         grid, parameter, _ = map(int, step.numbers)
         assert self.inside is not None
         x, g, *directions = (self.columns(columns) for columns in step.operands)
@@ -205,34 +211,34 @@ class _Run:
         def encoded(table: Tensor) -> Tensor:
             return along(functools.partial(self.encoding, "hash", grid, table=table), directions)(x)
 
-        with recording():  # the same for every table, as an encoding is linear in it
+        with recording():  # an encoding is linear in its table, so a table of zeros gives the same gradient
             inside = torch.where(self.inside, g, 0)
             return torch.func.vjp(encoded, torch.zeros_like(self.tables[parameter]))[1](inside)[0]
 
     def summed(self, step: Step, like: Tensor) -> Tensor:
-        """What a step adds to a sum, [k, ...]."""
+        """Returns the term that a step adds to a sum, [k, ...]."""
         start = int(step.numbers[0])
         g, x = (self.columns(step.operands[i % len(step.operands)]) for i in range(2))
         if step.op == "columns":
             x = torch.ones_like(g[:, :1])
-        found = torch.ops.voronerf.grouped_outer(g, x, self.offsets)
+        term = torch.ops.voronerf.grouped_outer(g, x, self.offsets)
         if step.op == "outer":
-            return torch.nn.functional.pad(found, (start, like.shape[-1] - start - found.shape[-1]))
-        flat = torch.nn.functional.pad(found[:, :, 0], (start, like[0].numel() - start - found.shape[1]))
+            return torch.nn.functional.pad(term, (start, like.shape[-1] - start - term.shape[-1]))
+        flat = torch.nn.functional.pad(term[:, :, 0], (start, like[0].numel() - start - term.shape[1]))
         return flat.reshape(like.shape)
 
 
 def cells_of(offsets: Tensor, rows: Tensor) -> Tensor:
-    """int32 [n], the cell of each row that is sorted by cell; the nearest one for a row of no cell."""
+    """Returns int32 [n], the cell of each sorted row; the nearest cell for a row of no cell."""
     index = torch.arange(rows.shape[0], dtype=torch.int32, device=rows.device)
     return torch.searchsorted(offsets[1:-1].contiguous(), index, right=True, out_int32=True)
 
 
 @contextlib.contextmanager
 def recording() -> Iterator[None]:
-    """Has autograd record within a custom op too: what PyTorch calls there it does not see, and gradients would be 0.
+    """Enables autograd within a custom op, where it otherwise does not record and gradients would be 0.
 
-    There is no public way to ask for this.
+    PyTorch has no public function for this.
     """
     left_out = torch._C._dispatch_tls_local_exclude_set()
     for key in ("AutogradCPU", "AutogradCUDA", "ADInplaceOrView"):
@@ -242,7 +248,7 @@ def recording() -> Iterator[None]:
 
 
 def along(encode: Callable[[Tensor], Tensor], directions: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
-    """The derivative of an encoding along directions, which may be differentiated further."""
+    """Returns the derivative of an encoding along directions, which is differentiable."""
     for direction in directions:
         encode = functools.partial(_slope, encode, direction)
     return encode
@@ -250,12 +256,13 @@ def along(encode: Callable[[Tensor], Tensor], directions: Sequence[Tensor]) -> C
 
 def _slope(encode: Callable[[Tensor], Tensor], direction: Tensor, x: Tensor) -> Tensor:
     y, back, *_ = torch.func.vjp(encode, x)
-    # The gradient of <direction, back(v)> to v; PyTorch's forward mode compiles TorchScript.
+    # Forward derivative by two backward passes: the gradient of <direction, back(v)> to v. PyTorch's own forward mode
+    # compiles TorchScript.
     return torch.func.vjp(lambda v: back(v)[0], torch.zeros_like(y))[1](direction)[0]
 
 
 def derivative(name: str, x: Tensor, a: float, b: float, order: int) -> Tensor:
-    """A derivative of a function, which may be differentiated further."""
+    """Returns a derivative of a function, which is differentiable."""
     formula, orders = FUNCTIONS[name]
     if order == 0:
         return formula(x, a, b)
@@ -264,9 +271,9 @@ def derivative(name: str, x: Tensor, a: float, b: float, order: int) -> Tensor:
     differentiable = torch.is_grad_enabled() and x.requires_grad
     with torch.enable_grad(), recording():
         leaf = x if differentiable else x.detach().requires_grad_()
-        found = formula(leaf, a, b)
+        value = formula(leaf, a, b)
         for _ in range(order):
-            if not found.requires_grad:
+            if not value.requires_grad:
                 return torch.zeros_like(x)
-            (found,) = torch.autograd.grad(found.sum(), leaf, create_graph=True)
-    return found if differentiable else found.detach()
+            (value,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
+    return value if differentiable else value.detach()

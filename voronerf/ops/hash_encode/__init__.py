@@ -18,28 +18,27 @@ _OP = backends.declare(
 def hash_encode(
     positions: Tensor, table: Tensor, grid: HashGrid, *, cells: Tensor | None = None, backend: str = "auto"
 ) -> Tensor:
-    """Features of points, interpolated between the corners of every level of a hash grid.
+    """Returns the features of points, interpolated on every level of a hash grid.
 
-    Müller et al. 2022, section 3: for each level, the eight corners around a point name eight entries of the table, by
-    the place of the corner or by its hash, and their features are interpolated. Gradients of every order to positions
-    and table; with linear interpolation the gradient to the positions jumps where a point passes a corner. Sums are
-    float32 at least. Results do not depend on the number of threads; on CUDA the gradient of the table is added up
+    Müller et al. 2022, section 3: on each level, the eight corners of the point's voxel select eight entries of the
+    table, by their row-major index or by a hash, and the features are interpolated. Gradients of every order to
+    positions and table; with linear interpolation the gradient to the positions is discontinuous at voxel faces. Sums
+    are float32 at least. Results do not depend on the number of threads; on CUDA the gradient of the table is added up
     in any order.
 
     Args:
-        positions: [n, 3] floating point, n < 2**31, in the units of ``grid.box``. A coordinate outside of the box
-            counts as the nearest one inside, with no gradient. NaN gives NaN.
-        table: [e, f], ``grid.table_shape``, floating point, levels one after the other; or [k, e, f] with ``cells``.
-        grid: the levels.
-        cells: int32 [n], the table of each point, 0 to k - 1. Values outside are refused on the CPU.
+        positions: [n, 3] floating point, n < 2**31, in the units of ``grid.box``. A coordinate outside of the box is
+            clamped to it and has no gradient. NaN gives NaN.
+        table: [e, f], ``grid.table_shape``, floating point, level after level; or [k, e, f] with ``cells``.
+        grid: the levels of the grid.
+        cells: int32 [n], the table of each point, 0 to k - 1. The CPU refuses values out of range.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        [n, grid.out_features], the features of the coarsest level first, in float32, or float64 if positions or table
-        are float64.
+        [n, grid.out_features], coarsest level first, in float32, or float64 if positions or table are float64.
 
     Raises:
-        ValueError: a table of another size than the grid's, cells without several tables.
+        ValueError: a table of another size than the grid's, ``cells`` with a table [e, f].
 
     Examples:
         >>> import torch

@@ -9,7 +9,7 @@ from voronerf.ops._core.grids import HashGrid
 
 
 def hash_grid(draw: Draw) -> HashGrid:
-    """Some levels, the coarse ones dense and the fine ones hashed."""
+    """Draws a grid whose coarse levels are dense and whose fine levels are hashed."""
     base = draw.number("base", 3, 2, 9)
     return HashGrid(
         levels=draw.number("levels", 3, 1, 5),

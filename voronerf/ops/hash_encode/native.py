@@ -1,7 +1,7 @@
 """``hash_encode`` of the compiled module, and its gradients. n points, k tables, e entries, f features of a level.
 
-Sums are float32, and so is the table's gradient until the end. Second derivatives come from the same kernels, further
-ones from the reference formula.
+Sums are float32; the table's gradient is cast to the table's dtype at the end. Second derivatives use the same kernels,
+higher derivatives the reference formula.
 """
 
 from __future__ import annotations
@@ -18,42 +18,42 @@ from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed, HashedGra
 
 
 def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor | None = None) -> Tensor:
-    """Features of points [n, levels * f] from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
+    """Returns the features [n, levels * f] of points; see ``voronerf.ops.hash_encode``."""
     encoded: Tensor = _encode(positions.float(), table, None, cells, grid.text)
     return encoded
 
 
 @custom_op("hash_encode_native", Hashed.result)
-def _encode(given: Hashed, out: Tensor) -> None:
+def _encode(arguments: Hashed, out: Tensor) -> None:
     on_huge_pages(out)
-    native.compiled.hash_encode(_inputs(given), compiled_grid(given.grid), out, native.machine(out))
+    native.compiled.hash_encode(_inputs(arguments), compiled_grid(arguments.grid), out, native.machine(out))
 
 
 @custom_op("hash_encode_native_backward", HashedGradient.results)
-def _backward(arriving: HashedGradient, found: list[Tensor]) -> None:
-    (gradient, given, to_positions, to_table), (of_positions, of_table) = arriving, found
+def _backward(arriving: HashedGradient, gradients: list[Tensor]) -> None:
+    (gradient, arguments, to_positions, to_table), (of_positions, of_table) = arriving, gradients
     on_huge_pages(of_table)
     if to_table:
-        native.refuse_where_deterministic("hash_encode", given.positions)
+        native.refuse_where_deterministic("hash_encode", arguments.positions)
     native.compiled.hash_encode_backward(
-        _inputs(given),
-        compiled_grid(given.grid),
+        _inputs(arguments),
+        compiled_grid(arguments.grid),
         native.aligned(gradient),
         of_table if to_table else None,
         of_positions if to_positions else None,
-        native.machine(given.positions),
+        native.machine(arguments.positions),
     )
 
 
-def _inputs(given: Hashed) -> native.compiled.HashInputs:
-    table, cells = given.table, given.cells
+def _inputs(arguments: Hashed) -> native.compiled.HashInputs:
+    table, cells = arguments.table, arguments.cells
     return native.compiled.HashInputs(
-        positions=given.positions,
-        direction=given.direction,
+        positions=arguments.positions,
+        direction=arguments.direction,
         table=native.aligned(table),
         type=str(table.dtype).removeprefix("torch."),
         cells=cells,
-        n=given.positions.shape[0],
+        n=arguments.positions.shape[0],
         tables=1 if cells is None else table.shape[0],
         entries=table.shape[-2],
     )
@@ -61,7 +61,7 @@ def _inputs(given: Hashed) -> native.compiled.HashInputs:
 
 @functools.lru_cache(maxsize=256)
 def compiled_grid(text: str) -> native.compiled.HashGrid:
-    """A grid, as its text, as compiled functions take it."""
+    """Returns the compiled module's struct of a grid, from the text of the grid."""
     grid = HashGrid.parse(text)
     return native.compiled.HashGrid(
         levels=[native.compiled.GridLevel(*level) for level in grid.rows],

@@ -14,19 +14,19 @@ _PRIMES = (1, 2654435761, 805459861)
 
 
 def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor | None = None) -> Tensor:
-    """Features of points [n, levels * f] from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
+    """Returns the features [n, levels * f] of points; see ``voronerf.ops.hash_encode``."""
     if cells is not None:
         check_range("hash_encode", "cells", cells, len(table))
     return interpolate(positions, table, grid, cells)
 
 
 def interpolate(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor | None) -> Tensor:
-    """The same, of cells that are known to have a table."""
+    """Returns the features of points, without checking the cells."""
     dtype = torch.promote_types(torch.promote_types(positions.dtype, table.dtype), torch.float32)
     low, high = torch.tensor(grid.box, dtype=dtype, device=positions.device)
     places = ((positions.to(dtype) - low) * (1 / (high - low))).clamp(0, 1)
     start = 0 if cells is None else cells.long() * table.shape[-2]
-    rows = table.reshape(-1, grid.features).to(dtype)  # whose gradient is summed in this dtype
+    rows = table.reshape(-1, grid.features).to(dtype)  # the table's gradient is summed in this dtype
     return torch.cat([_level(places, rows, start, level, grid) for level in grid.rows], dim=1)
 
 
@@ -48,9 +48,9 @@ def _level(places: Tensor, rows: Tensor, start: Tensor | int, level: GridLevel, 
 
 
 def _entry(corner: Tensor, level: GridLevel) -> Tensor:
-    """The entry of corners [n, 3] within their level."""
+    """Returns the entry [n] of corners [n, 3] within their level."""
     if not level.hashed:
         return (corner * corner.new_tensor([1, level.side, level.side**2])).sum(1) % level.entries
-    # Only the lowest bits count, and they are those of unsigned numbers of 32 bits.
+    # Only the lowest bits count; they equal the lowest bits of uint32 arithmetic.
     x, y, z = (corner * corner.new_tensor(_PRIMES)).unbind(1)
     return (x ^ y ^ z) & (level.entries - 1)

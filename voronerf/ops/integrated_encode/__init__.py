@@ -14,7 +14,7 @@ from voronerf.ops._core.declare import declare
     native=Implementation(EVERYWHERE, FLOATS),
     warp=PLAIN,
     smooth=["means", "variances"],
-    sizes={"w": lambda given: 6 * given.octaves},
+    sizes={"w": lambda arguments: 6 * arguments.octaves},
 )
 def integrated_encode(
     means: Annotated[Tensor, "floating [n, 3]"],
@@ -23,16 +23,16 @@ def integrated_encode(
     *,
     backend: str = "auto",
 ) -> Annotated[Tensor, "same [n, w]"]:
-    """Expectation of the frequency encoding over a Gaussian with diagonal covariance.
+    """Returns the expectation of the frequency encoding over Gaussians with diagonal covariance.
 
-    Block l holds ``sin(2^l mu) exp(-4^l var / 2)`` and then ``cos(2^l mu) exp(-4^l var / 2)``, three features each: the
-    layout of ``frequency_encode`` without its input, which it equals for variances of 0. Barron et al. 2021 (mip-NeRF),
-    equations 13 and 14; their code puts all sines before all cosines.
+    Block l holds ``sin(2^l mu) exp(-4^l var / 2)`` and then ``cos(2^l mu) exp(-4^l var / 2)``, three features each. For
+    variances of 0 it equals ``frequency_encode`` without its input. Barron et al. 2021 (mip-NeRF), equations 13 and 14;
+    their code puts all sines before all cosines.
 
     Args:
-        means: of the Gaussians, n < 2**31.
-        variances: at least 0, squared units of the means.
-        octaves: L, at least 0.
+        means: the means of the Gaussians, n < 2**31.
+        variances: the variances, at least 0, in squared units of the means.
+        octaves: the number of octaves L, at least 0.
 
     Returns:
         [n, 6L] in the dtype of the means.

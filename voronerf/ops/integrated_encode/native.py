@@ -9,5 +9,5 @@ integrated_encode = encoding_op(
     "integrated_encode",
     "integrated",
     reference.integrated_encode,
-    lambda given: (given.means, given.variances, 3, given.octaves, False),
+    lambda arguments: (arguments.means, arguments.variances, 3, arguments.octaves, False),
 )

@@ -9,5 +9,5 @@ from voronerf.ops._core.encodings import integrated
 
 
 def integrated_encode(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
-    """Expected encoding of a Gaussian; see ``voronerf.ops.integrated_encode``."""
+    """Returns the expected encoding of Gaussians; see ``voronerf.ops.integrated_encode``."""
     return integrated(torch.cat([means, variances], dim=1), octaves)

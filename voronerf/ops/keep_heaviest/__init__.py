@@ -1,4 +1,4 @@
-"""The heaviest samples of a batch. b batches, q samples kept of each, m samples of the batch, r rays, d coordinates."""
+"""The heaviest samples of each batch. b kept batches of q samples, m samples of the batch, r rays, d coordinates."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.declare import declare
 
 
-def _prepare(given: Any) -> Any:
-    if given.kept_importance.numel() < 1:
-        shape = list(given.kept_importance.shape)
+def _prepare(arguments: Any) -> Any:
+    if arguments.kept_importance.numel() < 1:
+        shape = list(arguments.kept_importance.shape)
         raise ValueError(f"keep_heaviest: kept_importance must have at least one place, got {shape}")
-    if (given.error is None) != (given.ray_index is None):
-        missing = "error" if given.error is None else "ray_index"
+    if (arguments.error is None) != (arguments.ray_index is None):
+        missing = "error" if arguments.error is None else "ray_index"
         raise ValueError(f"keep_heaviest: error and ray_index must be given together, got no {missing}")
-    return given
+    return arguments
 
 
 @declare(
@@ -39,26 +39,26 @@ def keep_heaviest(
     ray_index: Annotated[Tensor | None, "int32 [m]"] = None,
     backend: str = "auto",
 ) -> None:
-    """Keeps the heaviest samples of a batch in place of those of the oldest, in place.
+    """Replaces the oldest kept batch by the heaviest samples of a new batch, in place.
 
-    The importance of a sample is its weight, times the error of its ray where that is given (Elsner et al. 2023,
-    section 3.1). Samples whose importance is not finite and above 0 are left out. The q heaviest of the others, or all,
-    become batch ``added % b``, from the heaviest on; of equal ones the first come first. Where the point of one is not
-    finite, its place stays empty; empty places have importance 0, at 0. Then 1 is added to ``added``. The same on any
-    number of threads. Not differentiable.
+    The importance of a sample is its weight, times the error of its ray if ``error`` is given (Elsner et al. 2023,
+    section 3.1). Samples with an importance that is not finite and positive are ignored. The q most important samples
+    become batch ``added % b``, in descending order; equal importances keep the order of the batch. The remaining slots,
+    and the slots of samples whose point is not finite, are empty: importance 0 and point 0. Then ``added`` is
+    incremented. The result does not depend on the number of threads. Not differentiable.
 
     Args:
-        kept_points: contiguous.
-        kept_importance: contiguous; at least one place.
-        added: batches that were added so far.
-        points: of the batch.
-        weights: of the samples.
-        error: of the rays; None to leave weights as they are.
-        ray_index: the ray of each sample, 0 to r - 1; None where ``error`` is.
+        kept_points: the points of the kept samples, contiguous.
+        kept_importance: the importances of the kept samples, contiguous; at least one slot.
+        added: the number of batches that were added so far.
+        points: the points of the batch.
+        weights: the weights of the samples.
+        error: the errors of the rays; None to take the weights alone.
+        ray_index: the ray of each sample, 0 to r - 1; None if ``error`` is.
 
     Raises:
-        ValueError: what is kept is not contiguous; one of ``error`` and ``ray_index`` alone; on the CPU a ray that is
-            not there.
+        ValueError: ``kept_points`` or ``kept_importance`` that are not contiguous; ``error`` without ``ray_index``, or
+            the reverse; on the CPU a ray out of range.
 
     Examples:
         >>> import torch

@@ -13,7 +13,7 @@ def _make(draw: Draw, n: int) -> Arguments:
     )
     kept: Arguments = {"kept_points": draw.uniform(b, q, d).contiguous(), "added": draw.integers(0, 100, 1).long()}
     kept["kept_importance"] = draw.uniform(b, q).contiguous()
-    # Of few values, so that some are equal.
+    # Integer weights take few values, so some are equal.
     weights = draw.integers(-1, 20, n) / 16 if draw.among("equal", False, True) else draw.uniform(n)
     rays = {"error": draw.uniform(r), "ray_index": draw.integers(0, r, n)}
     return {

@@ -14,8 +14,8 @@ _samples = _OP.inputs(native.compiled.WeighedSamples)
 _kept = _OP.inputs(native.compiled.KeptSamples, points="kept_points", importance="kept_importance")
 
 
-def _workspace(given: Any) -> Tensor:
-    workspace: Tensor = given.added.new_empty(native.compiled.keep_heaviest_workspace(given.q))
+def _workspace(arguments: Any) -> Tensor:
+    workspace: Tensor = arguments.added.new_empty(native.compiled.keep_heaviest_workspace(arguments.q))
     return workspace
 
 

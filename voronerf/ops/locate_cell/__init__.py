@@ -1,5 +1,4 @@
-"""Which leaf of a tree of Voronoi diagrams a point lies in. n points, m centres of all diagrams together, g
-diagrams."""
+"""The leaf of a point in a tree of Voronoi diagrams. n points, m centres of all diagrams together, g diagrams."""
 
 from __future__ import annotations
 
@@ -8,16 +7,21 @@ from typing import Annotated, Any
 from torch import Tensor
 
 from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
-from voronerf.ops._core.checks import of_one_dtype
+from voronerf.ops._core.checks import to_common_dtype
 from voronerf.ops._core.declare import declare
 
 
-def _prepare(given: Any) -> Any:
-    m, g = given.child.shape[0], given.child_offsets.shape[0] - 1
+def _prepare(arguments: Any) -> Any:
+    m, g = arguments.child.shape[0], arguments.child_offsets.shape[0] - 1
     if m < 1 or g < 1:
         count = f"{m} centres in {g} diagrams"
         raise ValueError(f"locate_cell: centres must hold at least one centre of one diagram, got {count}")
-    return (*of_one_dtype(given.points, given.centres), given.child_offsets, given.child, given.depth)
+    return (
+        *to_common_dtype(arguments.points, arguments.centres),
+        arguments.child_offsets,
+        arguments.child,
+        arguments.depth,
+    )
 
 
 @declare(
@@ -34,26 +38,27 @@ def locate_cell(
     depth: Annotated[int, "1.."],
     backend: str = "auto",
 ) -> Annotated[Tensor, "int32 [n]"]:
-    """Leaf of every point in a tree of diagrams: on each level, the nearest centre of the diagram that holds the point.
+    """Returns the leaf of every point in a tree of diagrams.
 
-    Diagram 0 is the root; diagram j owns rows ``child_offsets[j]`` to ``child_offsets[j + 1]`` of ``centres``. Exact,
-    with ties to the lowest index, as ``nearest_centre``; a point that is not finite takes the first centre at every
-    level. Trees may be uneven. Not differentiable.
+    On each level, a point goes to the nearest centre of its diagram. Diagram 0 is the root; diagram j owns rows
+    ``child_offsets[j]`` to ``child_offsets[j + 1]`` of ``centres``. Exact, with ties to the lowest index, like
+    ``nearest_centre``; a point that is not finite takes the first centre on every level. Trees may be uneven. Not
+    differentiable.
 
-    On the CPU it raises for tables that are not a tree of this depth: a diagram without centres, a child that is
-    not a diagram, a path longer than ``depth``. On CUDA that would need a host read. There nothing outside the tables
-    is read, and a point whose path leaves the tables, or does not end at a leaf, gets a negative number.
+    The CPU refuses tables that are not a tree of this depth: a diagram without centres, a child that is not a diagram,
+    a path longer than ``depth``. CUDA does not check the tables, to avoid a host read, but reads nothing outside them.
+    A point whose path leaves the tables, or does not end at a leaf, then gets a negative number.
 
     Args:
         points: n < 2**31. float16 and bfloat16 are compared in float32.
-        centres: finite, m >= 1; every diagram has at least one.
-        child_offsets: g >= 1.
-        child: ``child[c] >= 0``: centre c is refined by diagram ``child[c]``; ``child[c] < 0``: centre c is leaf number
+        centres: finite, m >= 1; every diagram has at least one centre.
+        child_offsets: the first row of each diagram, and m; g >= 1.
+        child: if ``child[c] >= 0``, diagram ``child[c]`` refines centre c; if ``child[c] < 0``, centre c is leaf
             ``-child[c] - 1``.
-        depth: levels of the tree, 1 for a flat diagram.
+        depth: the number of levels of the tree, 1 for a flat diagram.
 
     Returns:
-        leaf int32 [n].
+        int32 [n], the leaf of each point.
 
     Raises:
         ValueError: on the CPU tables that are not a tree.

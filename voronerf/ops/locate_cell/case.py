@@ -6,13 +6,13 @@ import torch
 
 from voronerf.ops._core.cases import Arguments, Case, Draw
 
-# Diagram 0 has three centres, the second and third refined by diagrams 1 and 2, and that again by diagram 3.
+# Diagram 0 has three centres. Diagrams 1 and 2 refine the second and the third, and diagram 3 refines one of diagram 2.
 _OFFSETS = torch.tensor([0, 3, 5, 7, 10], dtype=torch.int32)
 _CHILD = torch.tensor([-1, 1, 2, -2, -3, -4, 3, -5, -6, -7], dtype=torch.int32)
 
 
 def tree(draw: Draw) -> tuple[Arguments, int]:
-    """Tables of a diagram of diagrams, and how many cells it has."""
+    """Draws the tables of a tree of diagrams; returns them and the number of leaves."""
     if not draw.free:
         return {"centres": draw.uniform(10, 3), "child_offsets": _OFFSETS, "child": _CHILD, "depth": 3}, 7
     counts: list[int] = []

@@ -13,9 +13,9 @@ from voronerf.ops._core.rows import rows_of
 
 
 @declared("locate_cell").custom_op()
-def locate_cell(given: Any, leaves: Tensor) -> None:
-    """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
-    points, centres, *tree = given
+def locate_cell(arguments: Any, leaves: Tensor) -> None:
+    """Fills the leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
+    points, centres, *tree = arguments
     find(leaves, points, centres, tree, "locate_cell")
 
 
@@ -27,28 +27,31 @@ def find(
     caller: str,
     rows: Tensor | None = None,
 ) -> None:
-    """Fills ``leaves``, int32 [n], on CUDA with -1 from ``rows`` on; coordinates are of one dtype.
-    ``tree``: child_offsets, child and depth. ``caller``: whom errors name."""
+    """Fills ``leaves``, int32 [n]; on CUDA with -1 from row ``rows`` on.
+
+    Points and centres have one dtype. ``tree`` is child_offsets, child and depth; ``caller`` is the op that errors
+    name.
+    """
     child_offsets, child, depth = tree
     compiled, machine = native.compiled, native.machine(points)
     n, m, g = rows_of(points), centres.shape[0], child_offsets.shape[0] - 1
-    given = points, centres, child_offsets, child
+    arguments = points, centres, child_offsets, child
     if isinstance(machine, compiled.Cuda):
-        compiled.locate_cell(*given, rows, leaves, n, m, g, depth, machine)
+        compiled.locate_cell(*arguments, rows, leaves, n, m, g, depth, machine)
         return
     check_tree(child_offsets, child, m, caller)
     workspace = leaves.new_empty(compiled.locate_cell_workspace(m, machine))
-    if not compiled.locate_cell(*given, leaves, workspace, n, m, depth, machine):
+    if not compiled.locate_cell(*arguments, leaves, workspace, n, m, depth, machine):
         raise too_shallow(depth, caller)
 
 
 def check_tree(child_offsets: Tensor, child: Tensor, m: int, caller: str) -> None:
-    """Raises what is wrong with the tables of a tree on the CPU."""
+    """Raises ValueError for tables on the CPU that are not a tree."""
     fault = native.compiled.locate_cell_fault(child_offsets, child, child_offsets.shape[0] - 1, m)
     if fault is not None:
         raise ValueError(f"{caller}: {fault}")
 
 
 def too_shallow(depth: int, caller: str) -> ValueError:
-    """A point was at no leaf after that many levels."""
+    """Returns the error for a point that has reached no leaf after ``depth`` levels."""
     return ValueError(f"{caller}: depth must be the number of levels of the tree, got {depth}, which is too few")

@@ -1,4 +1,4 @@
-"""The nested query. n points, m centres of all diagrams together, g diagrams."""
+"""The leaf of a point in a tree of diagrams. n points, m centres of all diagrams together, g diagrams."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from voronerf.ops.formulas import in_pieces
 from voronerf.ops.nearest_centre.reference import distances
 
 _PIECE = 1 << 17
+"""The number of distances that are computed at a time."""
 
 
 def check_tree(child_offsets: Tensor, child: Tensor, caller: str) -> None:
@@ -24,15 +25,15 @@ def check_tree(child_offsets: Tensor, child: Tensor, caller: str) -> None:
 
 
 def check_leaves(leaves: Tensor, depth: int, caller: str) -> None:
-    """Raises ValueError on the CPU where a point is at no leaf after that many levels."""
+    """Raises ValueError on the CPU if a point has reached no leaf after ``depth`` levels."""
     if leaves.device.type == "cpu" and not torch.compiler.is_compiling() and (leaves < 0).any():
         raise ValueError(f"{caller}: depth must be the number of levels of the tree, got {depth}, which is too few")
 
 
 def locate_cell(points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int) -> Tensor:
-    """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``.
+    """Returns the leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``.
 
-    Distances to all centres of the tree are taken once; at each level those of other diagrams are put out of reach.
+    Distances to all centres of the tree are computed once; on each level the centres of other diagrams are masked.
     """
     check_tree(child_offsets, child, "locate_cell")
     table = torch.arange(centres.shape[0], dtype=torch.int32, device=centres.device)
@@ -40,7 +41,7 @@ def locate_cell(points: Tensor, centres: Tensor, child_offsets: Tensor, child: T
 
     def run(points: Tensor) -> Tensor:
         far = distances(points, centres)
-        # `state` is the diagram a point is in, or (negative) the leaf it has reached.
+        # `state` is the diagram of a point, or (negative) its leaf.
         state = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
         for _ in range(min(depth, child_offsets.shape[0] - 1)):  # a tree has no more levels than diagrams
             nearest = far.masked_fill(owner[None, :] != state[:, None], torch.inf).argmin(dim=1)

@@ -13,13 +13,13 @@ from voronerf.ops._core.declare import declare
 from voronerf.ops.march_rays.reference import March
 
 
-def _prepare(given: Any) -> Any:
-    if given.seed is not None and given.uniforms is not None:
+def _prepare(arguments: Any) -> Any:
+    if arguments.seed is not None and arguments.uniforms is not None:
         raise ValueError("march_rays: seed must be None where uniforms are given, got both")
-    check_count("march_rays", "samples of all rays", given.origins.shape[0] * given.samples)
-    if given.occupied.numel() < 1:
-        raise ValueError(f"march_rays: occupied must have at least one cell, got {list(given.occupied.shape)}")
-    return given
+    check_count("march_rays", "samples of all rays", arguments.origins.shape[0] * arguments.samples)
+    if arguments.occupied.numel() < 1:
+        raise ValueError(f"march_rays: occupied must have at least one cell, got {list(arguments.occupied.shape)}")
+    return arguments
 
 
 @declare(
@@ -46,44 +46,43 @@ def march_rays(
     contraction: Annotated[Tensor | None, "same [4] or [5, 3]"] = None,
     backend: str = "auto",
 ) -> March:
-    """Stratified samples of rays without those in empty cells of a grid, packed for ``composite``.
+    """Samples rays in strata, skips the empty cells of an occupancy grid, and packs the samples for ``composite``.
 
     Each ray is cut into ``samples`` strata between its near and its far end, with one sample in each, as in
     ``voronerf.nerf.sampling.stratified_depths``. A sample is kept if its cell of the grid is occupied. Space outside
-    the box is empty. If every cell is occupied, the result is the stratified one.
+    the box is empty. If every cell is occupied, all stratified samples in the box are kept.
 
-    With a ``contraction``, rays and their samples are still those of the world, and the grid, its box and the positions
-    are of the contracted space (Barron et al. 2022, "Mip-NeRF 360", equation 10; or Mildenhall et al. 2020, "NeRF",
-    appendix C).
+    With a ``contraction``, rays and distances are in world space; the grid, its box and the positions are in contracted
+    space (Barron et al. 2022, "Mip-NeRF 360", equation 10; or Mildenhall et al. 2020, "NeRF", appendix C).
 
-    Rays can be walked piece by piece, to stop at opaque surfaces: ``most`` samples at a time, with the ``stop`` of one
+    Rays can be marched piece by piece, to stop at opaque surfaces: ``most`` samples at a time, with the ``stop`` of one
     call as the ``start`` of the next.
 
-    The number of samples depends on the values. Without ``capacity`` it is read on the host. With ``capacity`` the
-    result has that many rows: rows beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays that do not fit are
-    cut, which ``stop`` shows. This form can be captured in a CUDA graph and compiled. Not differentiable.
+    The number of samples depends on the values. Without ``capacity`` the host reads it. With ``capacity`` the result
+    has that many rows: rows beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays that do not fit are cut, as
+    ``stop`` shows. This form can be captured in a CUDA graph and compiled. Not differentiable.
 
     Args:
-        origins: of the rays.
-        directions: unit vectors.
-        near: start of the first stratum.
-        far: end of the last stratum; a ray with far <= near has no samples.
-        occupied: which cells of the box are not empty; x, y, z >= 1.
-        box: lowest and highest corner, the second above the first.
-        samples: strata of a ray, s, 1 to 65,535.
-        uniforms: in 0 to 1, the place of each sample in its stratum; None for the middles.
-        seed: in place of ``uniforms``: they are hashes of stratum and seed + number of the ray, the same for every
+        origins: the origins of the rays.
+        directions: the directions of the rays, unit vectors.
+        near: the start of the first stratum.
+        far: the end of the last stratum; a ray with far <= near has no samples.
+        occupied: whether each cell of the box is occupied; x, y, z >= 1.
+        box: the lowest and the highest corner of the grid.
+        samples: the number of strata of a ray, s, 1 to 65,535.
+        uniforms: the relative position of each sample in its stratum, 0 to 1; None for the middles.
+        seed: the seed of ``uniforms`` in place of them: hashes of the stratum and of seed + ray, the same on every
             backend.
-        spacing: of the strata, "linear" or "disparity" (equal steps of 1 / distance).
+        spacing: the spacing of the strata, "linear" or "disparity" (equal steps of 1 / distance).
         start: the first stratum to consider, >= 0; None for 0.
-        most: largest number of samples of a ray, at least 1; None for all.
-        capacity: rows of the result, at least 1; None for the number of samples.
-        contraction: centre and radius of a sphere; or centre, right, up, ahead and (near, a, b) of normalised device
-            coordinates. See ``voronerf.nerf.Contraction`` and ``Perspective``.
+        most: the largest number of samples of a ray, at least 1; None for all.
+        capacity: the number of rows of the result, at least 1; None for the number of samples.
+        contraction: the centre and radius of a sphere; or centre, right, up, ahead and (near, a, b) of normalised
+            device coordinates. See ``voronerf.nerf.Contraction`` and ``Perspective``.
 
     Returns:
-        March(ray_offsets, ray_index, depths, deltas, positions, stop). Floating-point arguments share one dtype, which
-        is that of depths, deltas and positions.
+        March(ray_offsets, ray_index, depths, deltas, positions, stop). Depths, deltas and positions have the dtype of
+        the floating-point arguments, which share one dtype.
 
     Examples:
         >>> import torch

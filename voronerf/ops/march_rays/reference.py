@@ -1,7 +1,7 @@
 """Ray marching through an occupancy grid. r rays, s strata of a ray, m samples of all rays (packed).
 
-Every operation is rounded on its own, and the other backends do the same operations in the same order: which cell a
-sample falls in is then the same everywhere.
+All backends do the same operations in the same order and round each one, so a sample falls in the same cell on all of
+them.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from voronerf.ops.formulas import depth_of
 
 
 class March(NamedTuple):
-    """Samples of rays in occupied cells, packed.
+    """The samples of rays in occupied cells, packed.
 
     Attributes:
         ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
         ray_index: int32 [m], the ray of each sample.
-        depths: [m], distance along the ray, rising along each ray.
-        deltas: [m], length of the stratum of each sample.
-        positions: [m, 3], where the samples are, in the space of the grid.
-        stop: int32 [r], the stratum at which each ray continues: s if the whole ray was walked.
+        depths: [m], the distance of each sample along its ray, ascending.
+        deltas: [m], the length of the stratum of each sample.
+        positions: [m, 3], the positions of the samples in the space of the grid.
+        stop: int32 [r], the stratum at which each ray continues; s at the end of the ray.
 
     Examples:
         >>> import torch
@@ -46,86 +46,87 @@ class March(NamedTuple):
 
 
 def memory(near: Tensor, offsets: Tensor, rows: Any) -> March:
-    """Memory for so many samples, after the offsets of the rays."""
+    """Allocates the tensors of ``rows`` samples, besides the offsets of the rays."""
     index, stop = (new_empty(near, count, dtype=torch.int32) for count in (rows, rows_of(near)))
     return March(offsets, index, new_empty(near, rows), new_empty(near, rows), new_empty(near, rows, 3), stop)
 
 
-def fake(given: Any) -> March:
-    """Without a capacity the number of samples depends on where the rays go."""
-    rows = torch.library.get_ctx().new_dynamic_size() if given.capacity is None else given.capacity
-    offsets = given.near.new_empty(given.near.shape[0] + 1, dtype=torch.int32)
-    return memory(given.near, offsets, rows)
+def fake(arguments: Any) -> March:
+    """Allocates fake results; without a capacity the number of samples is a dynamic size."""
+    rows = torch.library.get_ctx().new_dynamic_size() if arguments.capacity is None else arguments.capacity
+    offsets = arguments.near.new_empty(arguments.near.shape[0] + 1, dtype=torch.int32)
+    return memory(arguments.near, offsets, rows)
 
 
 @torch.no_grad()
-def march_rays(*given: Any) -> March:
-    """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
-    origins, directions, near, far, occupied, box, samples, *options = given
+def march_rays(*arguments: Any) -> March:
+    """Samples each stratum and keeps the samples in occupied cells; see ``voronerf.ops.march_rays``."""
+    origins, directions, near, far, occupied, box, samples, *options = arguments
     uniforms, seed, spacing, start, most, capacity, contraction = options
     most = samples if most is None else most
     r, device = len(near), near.device
     stratum = torch.arange(samples + 1, device=device)
-    # Divisions are by tensors: one by a number may be done as a product with its reciprocal, and round otherwise.
+    # Divisions are by tensors, because PyTorch may replace a division by a number by a product, which rounds
+    # differently.
     count = near.new_full((), samples)
     edges = depth_of(near[:, None], far[:, None], stratum.to(near.dtype) / count, spacing)
     edges = torch.where(stratum < samples, edges, far[:, None])
     if seed is not None:
         uniforms = hashed_uniforms(seed, r, samples).to(near.dtype)
     inside = near.new_full((), 0.5) if uniforms is None else uniforms
-    at = depth_of(near[:, None], far[:, None], (stratum[:-1].to(near.dtype) + inside) / count, spacing)
-    at = torch.minimum(torch.maximum(at, edges[:, :-1]), edges[:, 1:])
+    distances = depth_of(near[:, None], far[:, None], (stratum[:-1].to(near.dtype) + inside) / count, spacing)
+    distances = torch.minimum(torch.maximum(distances, edges[:, :-1]), edges[:, 1:])
 
-    taken = far[:, None] > near[:, None]
-    cell = torch.zeros_like(at, dtype=torch.int64)
-    points = [origins[:, axis, None] + at * directions[:, axis, None] for axis in range(3)]
+    mask = far[:, None] > near[:, None]
+    cell = torch.zeros_like(distances, dtype=torch.int64)
+    points = [origins[:, axis, None] + distances * directions[:, axis, None] for axis in range(3)]
     for axis, (size, place) in enumerate(zip(occupied.shape, contracted(points, contraction))):
         scale = box.new_full((), size) / (box[1, axis] - box[0, axis])
         place = (place - box[0, axis]) * scale
-        taken = taken & (place >= 0) & (place <= size)
-        # NaN has been left out; it may become any integer.
+        mask = mask & (place >= 0) & (place <= size)
+        # NaN guard: samples at NaN are not taken, but NaN may convert to any integer.
         cell = cell * size + place.nan_to_num(0).clamp(0, size).long().clamp(max=size - 1)
-    taken = taken & (occupied.reshape(-1)[cell] != 0)
+    mask = mask & (occupied.reshape(-1)[cell] != 0)
     if start is not None:
-        taken = taken & (stratum[:-1] >= start[:, None])
-    rank = taken.cumsum(dim=1)
-    # Of what a ray could have, what it gets: at most `most`, and no more than fits in all.
+        mask = mask & (stratum[:-1] >= start[:, None])
+    rank = mask.cumsum(dim=1)
+    # A ray wants at most `most` samples, and gets fewer if the capacity is exhausted.
     wanted = rank[:, -1].clamp(max=most)
     offsets = torch.nn.functional.pad(wanted.cumsum(dim=0), (1, 0))
     if capacity is not None:
         offsets = offsets.clamp(max=capacity)
-    got = offsets.diff()
+    counts = offsets.diff()
     rows = int(offsets[-1]) if capacity is None else capacity
-    taken_now = taken & (rank <= got[:, None])
-    # One row more than there are, for the strata that are left out.
-    row = torch.where(taken_now, offsets[:-1, None] + rank - 1, rows).reshape(-1)
+    written = mask & (rank <= counts[:, None])
+    # Strata without a sample are scattered to one additional row.
+    row = torch.where(written, offsets[:-1, None] + rank - 1, rows).reshape(-1)
     ray = torch.arange(r, dtype=torch.int32, device=device)[:, None].expand(r, samples)
     ray_index, depths, deltas = (
         torch.zeros(rows + 1, dtype=values.dtype, device=device).scatter(0, row, values.reshape(-1))[:rows]
-        for values in (ray, at, edges.diff(dim=1))
+        for values in (ray, distances, edges.diff(dim=1))
     )
     positions = depths.new_zeros(rows, 3)
     if r > 0:
         used = torch.arange(rows, device=device) < offsets[-1]
         points = [origins[ray_index, axis] + depths * directions[ray_index, axis] for axis in range(3)]
         positions = torch.where(used[:, None], torch.stack(contracted(points, contraction), dim=-1), 0)
-    last = torch.where(taken_now, stratum[:-1], -1).amax(dim=1)
-    waiting = torch.where(taken & ~taken_now, stratum[:-1], samples).amin(dim=1)
-    # A ray that has got all it may goes on behind its last sample, one that was cut with the sample it did not get.
-    full = (got == wanted) & (wanted == most)
-    stop = torch.where(got < wanted, waiting, torch.where(full, last + 1, samples))
+    last = torch.where(written, stratum[:-1], -1).amax(dim=1)
+    waiting = torch.where(mask & ~written, stratum[:-1], samples).amin(dim=1)
+    # A ray with `most` samples continues after its last sample, a cut ray at the first sample that did not fit.
+    full = (counts == wanted) & (wanted == most)
+    stop = torch.where(counts < wanted, waiting, torch.where(full, last + 1, samples))
     return March(offsets.to(torch.int32), ray_index, depths, deltas, positions, stop.to(torch.int32))
 
 
 def hashed_uniforms(seed: Tensor, r: int, samples: int) -> Tensor:
-    """Numbers in [0, 1), [r, samples], each a hash of its place and of seed, int32 [1]; exact in float32."""
+    """Returns [r, samples] in [0, 1), hashes of ray, stratum and seed int32 [1]; exact in float32."""
     ray, stratum = (torch.arange(count, device=seed.device) for count in (r, samples))
     key = _mixed(ray + seed.long())
     return (_mixed(key[:, None] ^ stratum * 0x9E3779B9) >> 8) / 2**24
 
 
 def _mixed(x: Tensor) -> Tensor:
-    """The last 32 bits of int64, mixed (lowbias32 of Chris Wellons)."""
+    """Hashes the low 32 bits of int64 (lowbias32 by Chris Wellons)."""
     x = x & 0xFFFFFFFF
     x = ((x ^ (x >> 16)) * 0x7FEB352D) & 0xFFFFFFFF
     x = ((x ^ (x >> 15)) * 0x846CA68B) & 0xFFFFFFFF
@@ -133,14 +134,14 @@ def _mixed(x: Tensor) -> Tensor:
 
 
 def contracted(points: list[Tensor], contraction: Tensor | None) -> list[Tensor]:
-    """Three coordinates of points, mapped as ``voronerf.nerf.Contraction`` or ``Perspective`` does it."""
+    """Returns the three coordinates of points, mapped like ``voronerf.nerf.Contraction`` or ``Perspective``."""
     if contraction is None:
         return points
     if contraction.dim() == 1:
         centre, radius = contraction[:3], contraction[3]
         scale = radius.reciprocal()
         x, y, z = ((points[axis] - centre[axis]) * scale for axis in range(3))
-        # The root in float64 rounds as one in float32 should, which that of torch does not.
+        # The float64 root, cast to float32, is correctly rounded; torch's float32 root is not.
         length = (x * x + y * y + z * z).double().sqrt().to(x.dtype).clamp_min(1)
         inverse = length.reciprocal()
         factor = (2 - inverse) * inverse

@@ -1,4 +1,4 @@
-"""Which cell of a Voronoi diagram a point lies in. n points, k centres, d coordinates."""
+"""The cell of a point in a Voronoi diagram. n points, k centres, d coordinates."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ def nearest_centre(
     index: Annotated[Tensor | None, "int32 [w]"] = None,
     backend: str = "auto",
 ) -> Annotated[Tensor, "int32 [n]"]:
-    """Index of the nearest centre of every point: ``argmin_c |x - v_c|``.
+    """Returns the index of the nearest centre of every point: ``argmin_c |x - v_c|``.
 
-    Exact: the direct form of the distance is used, and ties go to the lowest index. A point that is not finite goes to
-    cell 0. Not differentiable.
+    Exact: distances are computed in the direct form, and ties go to the lowest index. A point that is not finite goes
+    to cell 0. Not differentiable.
 
     Args:
         points: n < 2**31, d = 1 to 4. float16 and bfloat16 are compared in float32.
         centres: finite, k >= 1.
-        index: what `index_centres` has made of these centres: the time then grows by log k, and cells are the same.
-            Without one, the CPU makes one for a call in which that pays, from 2,048 centres and 1,024 points on. Plain
-            PyTorch and Warp do without.
+        index: the index of these centres by `index_centres`. The time then grows with log k, and the cells are the
+            same. Without an index, the CPU makes one for the call from 2,048 centres and 1,024 points on. The reference
+            and Warp backends ignore it.
 
     Returns:
-        cells int32 [n], in 0 to k - 1.
+        int32 [n], the cell of each point, 0 to k - 1.
 
     Raises:
-        ValueError: d above 4, or an index of another number, size or dtype of centres, which a GPU does not look at:
-            there all cells are -1.
+        ValueError: d above 4, or an index of centres of another number, size or dtype. (A GPU does not check the index:
+            all cells are then -1.)
 
     Examples:
         >>> import torch
@@ -57,20 +57,20 @@ def nearest_centre(
 
 
 def index_centres(centres: Tensor) -> Tensor | None:
-    """An index of centres, for `nearest_centre`: a tree of boxes that hold 16 others, or up to 16 centres.
+    """Returns an index of centres for `nearest_centre`: a tree of boxes, which hold 16 boxes or up to 16 centres each.
 
-    It pays from some thousand centres on that stay for several calls. It has 18 to 36 bytes a centre in three
-    coordinates of float32. Making it takes about 0.1 us a centre of one core; for a GPU it is made there and copied.
+    It pays from some thousand centres on if several calls use it. It has 18 to 36 bytes per centre for three float32
+    coordinates. Its construction takes about 0.1 us per centre on one core; for a GPU it is made on the CPU and copied.
 
     Args:
         centres: floating [k, d], d = 1 to 4, finite.
 
     Returns:
-        int32 [w], on the device of the centres; None without the compiled module, and of a meta tensor.
+        int32 [w], on the device of the centres; None without the compiled module, and for a meta tensor.
 
     Raises:
-        TypeError: not a floating-point tensor.
-        ValueError: another shape, or no centre.
+        TypeError: centres that are not a floating-point tensor.
+        ValueError: centres of another shape, or no centre.
 
     Examples:
         >>> import torch
@@ -80,22 +80,22 @@ def index_centres(centres: Tensor) -> Tensor | None:
         >>> bool((nearest_centre(points, centres, index=index) == nearest_centre(points, centres)).all())
         True
     """
-    given = Checked("index_centres")
-    given.tensor("centres", centres, FLOATING, "k", "d")
+    arguments = Checked("index_centres")
+    arguments.tensor("centres", centres, FLOATING, "k", "d")
     check_sizes("index_centres", centres)
     native = backends.compiled()
     if native is None or centres.is_meta:
         return None
-    with _disable_current_modes():  # a recorded step has nothing to do with it
-        taken = centres.detach().to("cpu", torch.promote_types(centres.dtype, torch.float32)).contiguous()
-        k, d = taken.shape
-        index = torch.empty(native.compiled.centre_index_words(k, d, taken.itemsize), dtype=torch.int32)
-        native.compiled.index_centres(taken, index, k, d, native.cpu().threads)
+    with _disable_current_modes():  # a recording of a step does not record this
+        rows = centres.detach().to("cpu", torch.promote_types(centres.dtype, torch.float32)).contiguous()
+        k, d = rows.shape
+        index = torch.empty(native.compiled.centre_index_words(k, d, rows.itemsize), dtype=torch.int32)
+        native.compiled.index_centres(rows, index, k, d, native.cpu().threads)
         return index.to(centres.device)
 
 
 def check_sizes(op: str, centres: Tensor) -> None:
-    """Raises ValueError for no centre, or one of too many coordinates."""
+    """Raises ValueError without a centre, or for centres with too many coordinates."""
     k, d = centres.shape
     if not 1 <= d <= 4:
         raise ValueError(f"{op}: centres must have shape [k, d], d = 1 to 4, got {list(centres.shape)}")

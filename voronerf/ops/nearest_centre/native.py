@@ -11,14 +11,14 @@ from voronerf.ops.nearest_centre import check_sizes
 
 
 def _check(centres: Tensor, index: Tensor | None) -> None:
-    """Raises what the compiled function has refused."""
+    """Raises ValueError for arguments that the compiled function has refused."""
     check_sizes("nearest_centre", centres)
     if index is not None:
         check_index("nearest_centre", centres, index)
 
 
 def check_index(op: str, centres: Tensor, index: Tensor) -> None:
-    """Raises ValueError for an index of other centres, by their number, coordinates and dtype."""
+    """Raises ValueError for an index of centres with another number, number of coordinates or dtype."""
     (k, d), size, got = centres.shape, centres.itemsize, f"int32 {list(index.shape)}"
     if len(index) == native.compiled.centre_index_words(k, d, size):
         if index.is_cuda or (head := index[:3].tolist()) == [k, d, size]:
@@ -31,15 +31,15 @@ nearest_centre = declared("nearest_centre").compiled_op(
     "",
     "nearest_centre",
     *("points", "centres", "index", "result", "n", "k", "d", "w"),
-    on_cuda=lambda given, cells, _: find(cells, given.points, given.centres, index=given.index),
-    fault=lambda given: _check(given.centres, given.index),
+    on_cuda=lambda arguments, cells, _: find(cells, arguments.points, arguments.centres, index=arguments.index),
+    fault=lambda arguments: _check(arguments.centres, arguments.index),
 )
 
 
 def find(
     cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None, index: Tensor | None = None
 ) -> None:
-    """Fills ``cells``, int32 [n]; coordinates are of one dtype. On CUDA with -1 from ``rows`` on."""
+    """Fills ``cells``, int32 [n], for points and centres of one dtype; on CUDA with -1 from row ``rows`` on."""
     compiled, machine = native.compiled, native.machine(points)
     n, (k, d), words = rows_of(points), centres.shape, 0 if index is None else len(index)
     if isinstance(machine, compiled.Cuda):

@@ -1,4 +1,4 @@
-"""What rendered samples teach an occupancy grid. x, y, z cells along each axis, m samples."""
+"""The update of an occupancy grid from rendered samples. x, y, z cells along each axis, m samples."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from voronerf.ops._core.backends import EVERYWHERE, Implementation
 from voronerf.ops._core.declare import declare
 
 
-def _prepare(given: Any) -> Any:
-    if given.density.numel() < 1:
-        raise ValueError(f"observe_occupancy: density must have at least one cell, got {list(given.density.shape)}")
-    if (given.deltas is None) != (given.weights is None):
-        missing = "deltas" if given.deltas is None else "weights"
+def _prepare(arguments: Any) -> Any:
+    if arguments.density.numel() < 1:
+        raise ValueError(f"observe_occupancy: density must have at least one cell, got {list(arguments.density.shape)}")
+    if (arguments.deltas is None) != (arguments.weights is None):
+        missing = "deltas" if arguments.deltas is None else "weights"
         raise ValueError(f"observe_occupancy: deltas and weights must be given together, got no {missing}")
-    return given
+    return arguments
 
 
 @declare(
@@ -43,31 +43,32 @@ def observe_occupancy(
     fixed: Annotated[Tensor | None, "bool [x, y, z]"] = None,
     backend: str = "auto",
 ) -> None:
-    """Updates the cells of an occupancy grid that rendered samples lie in, in place.
+    """Updates the cells of an occupancy grid that contain rendered samples, in place.
 
     A cell with samples gets the largest of their densities and ``decay`` times its old density (Mueller et al. 2022,
-    appendix C). A sample that receives less than the share ``hidden`` of the light counts as density 0:
-    ``weights <= hidden * (1 - exp(-sigma * deltas))``. The other cells keep theirs. Not differentiable.
+    appendix C). A sample that receives at most the share ``hidden`` of the light counts as density 0:
+    ``weights <= hidden * (1 - exp(-sigma * deltas))``. Cells without samples keep their density. Not differentiable.
 
-    With a ``contraction`` the grid, its box and the positions are of the contracted space, ``sigma`` and ``deltas`` of
-    the world. A cell then gets densities per unit of contracted length along rays from the centre.
+    With a ``contraction``, the grid, its box and the positions are in contracted space, ``sigma`` and ``deltas`` in
+    world space. The density of a cell is then per unit of contracted length along rays from the centre.
 
     Args:
-        density: >= 0, contiguous.
-        occupied: contiguous: density >= threshold.
-        box: lowest and highest corner.
-        positions: a position outside the box counts for the nearest cell at its border.
-        sigma: densities of the samples; NaN counts as infinite.
-        deltas: lengths of their strata; a sample of length 0 says nothing. None where all light reaches every sample.
-        weights: their contributions to their rays; None where ``deltas`` is.
-        decay: 0 to 1.
-        threshold: density from which a cell counts as occupied.
-        hidden: share of the light, 0 to 1.
-        contraction: of the space of the grid, as for ``march_rays``.
-        fixed: cells that stay as they are; None for none.
+        density: the density of each cell, >= 0, contiguous.
+        occupied: whether the density of each cell is at least ``threshold``; contiguous.
+        box: the lowest and the highest corner.
+        positions: the positions of the samples; a position outside the box is clamped to it.
+        sigma: the densities of the samples; NaN counts as infinite.
+        deltas: the lengths of the samples' strata; a sample of length 0 is ignored. None if all light reaches every
+            sample.
+        weights: the rendering weights of the samples; None if ``deltas`` is.
+        decay: the factor on the old density, 0 to 1.
+        threshold: the density from which a cell counts as occupied.
+        hidden: a share of the light, 0 to 1; samples that receive no more count as density 0.
+        contraction: the contraction of the grid's space, as for ``march_rays``.
+        fixed: whether each cell keeps its values; None to update all cells.
 
     Raises:
-        ValueError: a grid that is not contiguous; one of ``deltas`` and ``weights`` alone.
+        ValueError: a grid that is not contiguous; ``deltas`` without ``weights``, or the reverse.
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Rays through pixels of images, and what a loss needs of them. c images of h x w pixels, b rays."""
+"""Rays through pixels of images, with their colours. c images of h x w pixels, b rays."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from voronerf.ops._core.declare import declare
 from voronerf.ops.pixel_rays.reference import PixelRays
 
 
-def _prepare(given: Any) -> Any:
-    near, far, channels = given.near, given.far, given.images.shape[3]
-    if (given.lens is None) != (given.tables is None):
+def _prepare(arguments: Any) -> Any:
+    near, far, channels = arguments.near, arguments.far, arguments.images.shape[3]
+    if (arguments.lens is None) != (arguments.tables is None):
         raise ValueError("pixel_rays: lens and tables must be given together, got one")
     if channels not in (3, 4):
         raise ValueError(f"pixel_rays: images must have 3 or 4 channels, got {channels}")
@@ -22,7 +22,7 @@ def _prepare(given: Any) -> Any:
         raise ValueError(f"pixel_rays: near and far must satisfy 0 <= near < far, got {near} and {far}")
     if torch.finfo(torch.float32).max < far < float("inf"):
         raise ValueError(f"pixel_rays: far must be at most 3.4e+38 or infinite, got {far}")
-    return given
+    return arguments
 
 
 @declare(native=Implementation(EVERYWHERE, (torch.float32,)), warp=PLAIN, prepare=_prepare)
@@ -40,27 +40,27 @@ def pixel_rays(
     background: Annotated[Tensor | None, "same [3] or [b, 3]"] = None,
     backend: str = "auto",
 ) -> PixelRays:
-    """The rays of a training step: through the centres of pixels, cut to a box, with the colours of the pixels.
+    """Makes the rays of a training step: through the centres of pixels, clipped to a box, with the pixels' colours.
 
-    The box is met by the slab method (Kay and Kajiya 1986). Not differentiable.
+    Rays are intersected with the box by the slab method (Kay and Kajiya 1986). Not differentiable.
 
     Args:
-        poses: camera to world, OpenGL axes.
-        intrinsics: (fx, fy, cx, cy) in pixels.
-        images: with or without an alpha channel, which the colours are not multiplied by.
-        index: the pixels: image * h * w + row * w + column. Others are an error on the CPU; on CUDA, where they are not
-            read before, they count as the nearest.
-        near: nearest distance of interest, >= 0.
-        far: farthest.
-        box: lowest and highest corner; None for all of space.
-        lens: the table of each camera; a number that no table has, such as -1, is a camera without distortion. It comes
-            with tables.
-        tables: for each lens the directions (x, y, z) of its pixels in the camera's axes as stereographic projections
-            (x, -y) / (1 - z), see `voronerf.nerf.lenses.LensTables`; None for no distortion.
-        background: the colour behind images with an alpha channel; None leaves their colours as they are.
+        poses: the camera-to-world matrices, OpenGL axes.
+        intrinsics: (fx, fy, cx, cy) of each camera in pixels.
+        images: the images, with or without an alpha channel; colours are not premultiplied.
+        index: the pixels: image * h * w + row * w + column. The CPU refuses pixels out of range; CUDA clamps them,
+            without a check.
+        near: the nearest distance of interest, >= 0.
+        far: the farthest distance of interest.
+        box: the lowest and the highest corner; None for all of space.
+        lens: the index of each camera's table; without distortion an index out of range, such as -1. Requires
+            ``tables``.
+        tables: the directions (x, y, z) of each lens's pixels in camera axes, as stereographic projections (x, -y) / (1
+            - z), see `voronerf.nerf.lenses.LensTables`; None for no distortion.
+        background: the colour behind images with an alpha channel; None to ignore alpha.
 
     Returns:
-        PixelRays(origins, directions, near, far, colour). A ray that misses the box has far == near.
+        PixelRays(origins, directions, near, far, colour); far == near for a ray that misses the box.
 
     Raises:
         ValueError: on the CPU pixels out of range.

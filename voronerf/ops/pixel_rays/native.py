@@ -15,8 +15,8 @@ _inputs, _outputs = (
 )
 
 
-def _fault(given: Any) -> None:
-    check_range("pixel_rays", "index", given.index, given.c * given.h * given.w)
+def _fault(arguments: Any) -> None:
+    check_range("pixel_rays", "index", arguments.index, arguments.c * arguments.h * arguments.w)
 
 
 pixel_rays = _OP.compiled_op("pixel_rays_native", "pixel_rays", _inputs, _outputs, fault=_fault)

@@ -1,4 +1,4 @@
-"""Rays through pixels of images, and what a loss needs of them. c images of h x w pixels, b rays."""
+"""Rays through pixels of images, with their colours. c images of h x w pixels, b rays."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class PixelRays(NamedTuple):
     """The result of `pixel_rays`.
 
     Attributes:
-        origins: [b, 3].
-        directions: [b, 3], of unit length.
-        near: [b], where each ray enters the box.
-        far: [b], where it leaves the box; `near` if it misses.
-        colour: [b, 3] of the pixels, 0..1.
+        origins: [b, 3], the origins of the rays.
+        directions: [b, 3], unit vectors.
+        near: [b], the distance at which each ray enters the box.
+        far: [b], the distance at which each ray leaves the box; `near` if it misses the box.
+        colour: [b, 3], the colours of the pixels, 0 to 1.
 
     Examples:
         >>> import torch
@@ -39,9 +39,9 @@ class PixelRays(NamedTuple):
 
 
 @torch.no_grad()
-def pixel_rays(*given: Any) -> PixelRays:
-    """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    poses, intrinsics, images, index, near, far, box, lens, tables, background = given
+def pixel_rays(*arguments: Any) -> PixelRays:
+    """Makes rays, intersects them with the box and reads colours; see ``voronerf.ops.pixel_rays``."""
+    poses, intrinsics, images, index, near, far, box, lens, tables, background = arguments
     c, h, w, channels = images.shape
     check_range("pixel_rays", "index", index, c * h * w)
     pixel = index % (h * w)

@@ -1,9 +1,9 @@
-"""Rays that pass through the cells of several ranks. n known samples, m own ones, q runs, r rays, k cells.
+"""Rays through the cells of several ranks. n known samples, m of them in a rank's own cells, q runs, r rays, k cells.
 
-Each rank evaluates the samples in its own cells and sums them over runs, pieces of a ray on which no other rank has a
-sample in between (`own_samples`, `run_sums`). Who has the runs of all ranks puts rays together and says what each run
-must know of its ray (`compose_runs`), from which the gradients follow (`run_gradients`). Together they are
-`render_loss` (Li et al. 2024, NeRF-XL). Nothing is differentiable.
+Each rank evaluates the samples in its own cells and sums them over runs (`own_samples`, `run_sums`). A run is a piece
+of a ray without samples of other ranks in between. The process with the runs of all ranks composes the rays and returns
+to each run the totals of its ray (`compose_runs`), from which each rank computes its gradients (`run_gradients`).
+Together they equal `render_loss` (Li et al. 2024, NeRF-XL). Nothing is differentiable.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _NATIVE = Implementation(("cpu",), (torch.float32,), file="ray_runs")
 _REFERENCE = Implementation(file="ray_runs")
 
 
-def _check_cells(given: Any) -> Any:
-    check_range("own_samples", "cells", given.cells, len(given.own))
-    return given
+def _check_cells(arguments: Any) -> Any:
+    check_range("own_samples", "cells", arguments.cells, len(arguments.own))
+    return arguments
 
 
 @declare(native=_NATIVE, reference=_REFERENCE, prepare=_check_cells)
@@ -40,19 +40,19 @@ def own_samples(
     bent: bool = False,
     backend: str = "auto",
 ) -> OwnSamples:
-    """Keeps the samples in own cells, and finds their runs; other ranks may have samples that are not among them.
+    """Selects the samples in this rank's own cells, and finds their runs.
 
-    No other sample lies between two that are nearer than a stratum is long, nor, since a cell is convex, between two
-    neighbours in one cell.
+    Other ranks may have samples unknown to this rank. None of these lies between two samples that are nearer than the
+    length of a stratum nor, since cells are convex, between two neighbours in one cell.
 
     Args:
-        positions: of all samples that this rank knows, ray after ray, near to far.
-        ray_index: their rays.
-        depths: distances along the rays.
-        deltas: the lengths of their strata.
-        cells: the cell of each, 0 to k - 1.
-        own: the number of each cell among those of this rank, or -1.
-        bent: Whether rays are bent by a contraction, and may leave a cell and come back.
+        positions: the positions of all samples that this rank knows, ray after ray, near to far.
+        ray_index: the ray of each sample.
+        depths: the distance of each sample along its ray.
+        deltas: the length of the stratum of each sample.
+        cells: the cell of each sample, 0 to k - 1.
+        own: the local number of each cell on this rank, or -1 for cells of other ranks.
+        bent: whether rays are curved by a contraction, and may leave a cell and come back.
 
     Returns:
         OwnSamples(positions, ray_index, depths, deltas, cells, run_offsets).
@@ -74,8 +74,8 @@ def own_samples(
 @declare(
     native=_NATIVE,
     reference=_REFERENCE,
-    sizes={"q": lambda given: rows_of(given.samples.run_offsets) - 1},
-    prepare=lambda given: _check_samples("run_sums", given),
+    sizes={"q": lambda arguments: rows_of(arguments.samples.run_offsets) - 1},
+    prepare=lambda arguments: _check_samples("run_sums", arguments),
 )
 def run_sums(
     raw: Annotated[Tensor, "float32|float64 [m, 4]"],
@@ -84,16 +84,16 @@ def run_sums(
     density_scale: Annotated[float, "positive"],
     backend: str = "auto",
 ) -> tuple[Annotated[Tensor, "same [q, 6]"], Annotated[Tensor, "same [m]"]]:
-    """Partial sums of runs, from what the networks put out for their samples.
+    """Returns the partial sums of runs, from the networks' outputs for their samples.
 
     Args:
         raw: colour and density before their activations, as in `render_loss`.
-        samples: Of `own_samples`.
-        density_scale: Factor on the density, > 0.
+        samples: the result of `own_samples`.
+        density_scale: the factor on the density, > 0.
 
     Returns:
-        Sums [q, 6]: colour as if nothing were in front, optical depth, depth of the first sample, number of the ray;
-        and densities [m].
+        Sums [q, 6]: colour as if nothing were in front, optical depth, depth of the first sample, index of the ray; and
+        densities [m].
 
     Examples:
         >>> import torch
@@ -116,22 +116,22 @@ def compose_runs(
     robust: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> tuple[Annotated[Tensor, "same [q, 6]"], Annotated[Tensor, "same []"]]:
-    """Puts rays together from the runs of all ranks, and says what each run must know of its ray.
+    """Composes rays from the runs of all ranks, and returns to each run the totals of its ray.
 
     Args:
-        sums: of `run_sums`, in any order.
-        target: the colours of these rays.
-        background: what is behind them.
-        first: The number of the first of these rays.
-        rays: How many all ranks have.
-        robust: As in `render_loss`.
+        sums: the sums of `run_sums`, in any order.
+        target: the target colours of the rays.
+        background: the colours behind the rays; None is black.
+        first: the index of the first of the r rays.
+        rays: the number of rays of all ranks.
+        robust: the scale of the robust error, as in `render_loss`.
 
     Returns:
-        Answers [q, 6]: the gradient of the loss to the ray's colour, what light from behind the run adds to the loss,
-        the optical depth in front, and the squared error of the ray; and the part [] that these rays have in the loss.
+        Answers [q, 6]: the gradient of the loss to the ray's colour, the loss due to light from behind the run, the
+        optical depth in front, and the squared error of the ray; and the part [] of the loss due to the r rays.
 
     Raises:
-        ValueError: on the CPU runs of other rays.
+        ValueError: on the CPU runs of rays outside ``first`` to ``first + r - 1``.
 
     Examples:
         >>> import torch
@@ -143,11 +143,11 @@ def compose_runs(
     """
 
 
-def _check_answers(given: Any) -> Any:
-    runs = len(_check_samples("run_gradients", given).samples.run_offsets) - 1
-    if len(given.answers) != runs:
-        check_shape("run_gradients", "answers", given.answers, ("q", 6), {"q": runs})
-    return given
+def _check_answers(arguments: Any) -> Any:
+    runs = len(_check_samples("run_gradients", arguments).samples.run_offsets) - 1
+    if len(arguments.answers) != runs:
+        check_shape("run_gradients", "answers", arguments.answers, ("q", 6), {"q": runs})
+    return arguments
 
 
 @declare(native=_NATIVE, reference=_REFERENCE, prepare=_check_answers)
@@ -160,17 +160,17 @@ def run_gradients(
     hidden: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> tuple[Annotated[Tensor, "same [m, 4]"], Annotated[Tensor, "same [m]"]]:
-    """Gradient of the loss to what the networks put out, from what the runs were told of their rays.
+    """Returns the gradient of the loss to the networks' outputs, from the answers to the runs.
 
     Args:
-        raw: as in `run_sums`.
-        samples: Of `own_samples`.
-        answers: of `compose_runs`.
-        density_scale: As in `run_sums`.
-        hidden: Share of the light, in [0, 1): samples that no more than it reaches have no gradient.
+        raw: colour and density before their activations, as in `run_sums`.
+        samples: the result of `own_samples`.
+        answers: the answers of `compose_runs`.
+        density_scale: the factor on the density, as in `run_sums`.
+        hidden: a share of the light, in [0, 1); samples that receive no more have no gradient.
 
     Returns:
-        Gradient [m, 4], and the contributions [m] of the samples to their rays.
+        Gradient [m, 4], and the rendering weights [m] of the samples.
 
     Examples:
         >>> import torch
@@ -190,15 +190,15 @@ def _of_samples(dtype: torch.dtype) -> list[Row]:
     return [Row("raw", (dtype,), ("m", 4)), *of_raw, *rest]
 
 
-def _check_samples(op: str, given: Any) -> Any:
-    raw, samples = given.raw, given.samples
+def _check_samples(op: str, arguments: Any) -> Any:
+    raw, samples = arguments.raw, arguments.samples
     tensors = [raw, samples.deltas, samples.depths, samples.ray_index, samples.run_offsets]
     check_rows(op, _of_samples, tensors, raw.dtype, smooth=False)
     if not raw.is_cpu or torch.compiler.is_compiling():
-        return given
-    m, offsets = len(raw), samples.run_offsets.numpy()  # without a call of torch's, which no recording could replay
+        return arguments
+    m, offsets = len(raw), samples.run_offsets.numpy()  # a torch operation could not be replayed by a recording
     if offsets[0] != 0 or offsets[-1] != m or not (offsets[1:] > offsets[:-1]).all():
         raise ValueError(
             f"{op}: run_offsets must rise from 0 to the {m} samples, a run having one at least, got others"
         )
-    return given
+    return arguments

@@ -9,12 +9,12 @@ from voronerf.ops.ray_runs import compose_runs, own_samples, run_sums
 
 
 def _make_known(draw: Draw, n: int) -> Arguments:
-    """n samples on three rays, in four cells of which two are own ones."""
+    """Draws n samples on three rays, in four cells, two of which are the rank's own."""
     cells = draw.integers(0, 4, n)
     call = {"positions": draw.uniform(n, 3), "ray_index": draw.integers(0, 3, n).sort()[0].int(), "cells": cells}
     depths = torch.linspace(1, 3, n) if n else torch.zeros(0)
     call |= {"depths": depths, "deltas": draw.uniform(n), "own": torch.tensor([0, -1, 1, -1], dtype=torch.int32)}
-    if n > 100:  # so that light reaches the end of a long ray
+    if n > 100:  # short strata, so light reaches the end of a long ray
         call["deltas"] = 0.02 * call["deltas"]
     return {**call, "bent": draw.among("bent", False, True)}
 

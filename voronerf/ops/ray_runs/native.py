@@ -1,6 +1,6 @@
-"""Rays that pass through the cells of several ranks: samples, partial sums, rays put together, gradients, on the CPU.
+"""The ops on rays through the cells of several ranks, by the compiled module on the CPU.
 
-n samples, m own ones, q runs, r rays.
+n samples, m of them in a rank's own cells, q runs, r rays.
 """
 
 from __future__ import annotations
@@ -26,32 +26,34 @@ _outputs = _GRADIENTS.inputs(native.compiled.RenderLossInputs, **_NO_RAYS)
 
 
 @_OWN.custom_op("own_samples_native", devices=("cpu",), fake=OwnSamples.fake)
-def own_samples(given: Any) -> OwnSamples:
-    """Keeps the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
-    found = _OWN.allocate(given)  # of as many samples as there are
-    offsets = found.run_offsets[: native.compiled.own_samples(_known(given), _own(found), native.cpu()) + 1]
+def own_samples(arguments: Any) -> OwnSamples:
+    """Selects the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
+    samples = _OWN.allocate(arguments)  # for all n samples; the unused rows are cut below
+    offsets = samples.run_offsets[: native.compiled.own_samples(_known(arguments), _own(samples), native.cpu()) + 1]
     m = int(offsets[-1])
-    return OwnSamples._make([*(part[:m] for part in found[:5]), offsets])
+    return OwnSamples._make([*(part[:m] for part in samples[:5]), offsets])
 
 
 @_SUMS.custom_op("run_sums_native", devices=("cpu",))
-def run_sums(given: Any, found: tuple[Tensor, Tensor]) -> None:
-    """Partial sums [q, 6] and densities [m]; see ``voronerf.ops.run_sums``."""
-    sums, density = found
-    samples = given.samples
-    native.compiled.run_sums(_outputs_of_sums(given), samples.depths, samples.ray_index, density, sums, native.cpu())
+def run_sums(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
+    """Fills partial sums [q, 6] and densities [m]; see ``voronerf.ops.run_sums``."""
+    sums, density = results
+    samples = arguments.samples
+    native.compiled.run_sums(
+        _outputs_of_sums(arguments), samples.depths, samples.ray_index, density, sums, native.cpu()
+    )
 
 
 @_COMPOSE.custom_op("compose_runs_native", devices=("cpu",))
-def compose_runs(given: Any, found: tuple[Tensor, Tensor]) -> None:
-    """Answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
-    answers, loss = found
-    loss.fill_(native.compiled.compose_runs(_runs(given), answers, native.cpu()))
+def compose_runs(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
+    """Fills answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
+    answers, loss = results
+    loss.fill_(native.compiled.compose_runs(_runs(arguments), answers, native.cpu()))
 
 
 @_GRADIENTS.custom_op("run_gradients_native", devices=("cpu",))
-def run_gradients(given: Any, found: tuple[Tensor, Tensor]) -> None:
-    """Gradient of the loss to the outputs [m, 4], and weights [m]; see ``voronerf.ops.run_gradients``."""
-    gradient, weights = found
-    importance = new_empty(weights, given.m)
-    native.compiled.run_gradients(_outputs(given), given.answers, gradient, weights, importance, native.cpu())
+def run_gradients(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
+    """Fills the gradient [m, 4] to the outputs, and weights [m]; see ``voronerf.ops.run_gradients``."""
+    gradient, weights = results
+    importance = new_empty(weights, arguments.m)
+    native.compiled.run_gradients(_outputs(arguments), arguments.answers, gradient, weights, importance, native.cpu())

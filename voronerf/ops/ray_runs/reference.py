@@ -1,8 +1,8 @@
-"""Partial sums: what a rank knows of a ray that passes through its cells, and how those of all ranks become a colour.
+"""Partial sums of rays through the cells of several ranks, and their composition to colours.
 
-r rays, n known samples, m own ones (packed), q runs, c colours. A run is a piece of a ray on which no other rank has a
-sample between two of its own. With the optical depth tau of the runs before, a ray has the colour ``sum exp(-tau) *
-colour of run`` (NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
+r rays, n known samples, m of them in a rank's own cells (packed), q runs, c colours. A run is a piece of a ray without
+samples of other ranks in between. With the optical depth tau in front of each run, the colour of a ray is
+``sum exp(-tau) * colour of run`` (NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.ops.composite.reference import composite, kept, optical_depth
+from voronerf.ops.composite.reference import composite, optical_depth, saveable
 from voronerf.ops.formulas import activate, along_rays, compose
 from voronerf.ops.render_loss.reference import robust_error
 
 
 class OwnSamples(NamedTuple):
-    """Samples of this rank, ray after ray, near to far.
+    """The samples in this rank's own cells, ray after ray, near to far.
 
     Attributes:
-        positions: [m, 3].
-        ray_index: int32 [m].
-        depths: [m].
-        deltas: [m], the lengths of their strata.
-        cells: int32 [m], among those of this rank.
-        run_offsets: int32 [q + 1], where each run begins, and the end of the last.
+        positions: [m, 3], the positions of the samples.
+        ray_index: int32 [m], the ray of each sample.
+        depths: [m], the distance of each sample along its ray.
+        deltas: [m], the length of the stratum of each sample.
+        cells: int32 [m], the local number of each sample's cell on this rank.
+        run_offsets: int32 [q + 1], the first sample of each run, and m.
 
     Examples:
         >>> import torch
@@ -44,22 +44,22 @@ class OwnSamples(NamedTuple):
     run_offsets: Annotated[Tensor, "int32 [n + 1]"]
 
     @staticmethod
-    def fake(given: Any) -> OwnSamples:
-        """Which samples are own ones, and where runs end, depends on values."""
+    def fake(arguments: Any) -> OwnSamples:
+        """Allocates fake results; the numbers of samples and runs are dynamic sizes."""
         m, ends = (torch.library.get_ctx().new_dynamic_size() for _ in range(2))
-        kept = [part.new_empty((m, *part.shape[1:])) for part in given[:5]]
-        return OwnSamples._make([*kept, given.cells.new_empty(ends)])
+        kept = [part.new_empty((m, *part.shape[1:])) for part in arguments[:5]]
+        return OwnSamples._make([*kept, arguments.cells.new_empty(ends)])
 
 
 class Runs(NamedTuple):
-    """The partial sums of runs. The first two have gradients.
+    """The partial sums of runs. Only colour and optical depth have gradients.
 
     Attributes:
-        colour: [q, c], as if nothing were in front.
-        optical: [q], the optical depth.
-        ray: int64 [q].
-        start: [q], the depth of the first sample.
-        weights: [m], contributions of the samples, as if nothing were in front of their run.
+        colour: [q, c], the colour of each run as if nothing were in front.
+        optical: [q], the optical depth of each run.
+        ray: int64 [q], the ray of each run.
+        start: [q], the depth of the first sample of each run.
+        weights: [m], the rendering weights of the samples as if nothing were in front of their run.
     """
 
     colour: Tensor
@@ -78,11 +78,11 @@ def own_samples(
     own: Tensor,
     bent: bool,
 ) -> OwnSamples:
-    """Keeps the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
+    """Selects the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
     numbers = own[cells.long()]
     kept = (numbers >= 0).nonzero()[:, 0]
     ray, at, length, cell = ray_index[kept], depths[kept], deltas[kept], numbers[kept]
-    near = at.diff() < torch.minimum(length[1:], length[:-1])  # less than the stratum between would be long
+    near = at.diff() < torch.minimum(length[1:], length[:-1])  # no stratum fits in between
     begins = (kept.diff() != 1) | (ray.diff() != 0) | (~near if bent else (cell.diff() != 0) & ~near)
     first = 1 + begins.nonzero()[:, 0]
     ends = torch.tensor([len(kept)], device=kept.device)
@@ -91,18 +91,18 @@ def own_samples(
 
 
 def sum_runs(samples: OwnSamples, colour: Tensor, density: Tensor) -> Runs:
-    """The partial sums of the runs of samples with these colours [m, c] and densities [m]."""
+    """Returns the partial sums of runs from the colours [m, c] and densities [m] of their samples."""
     offsets = samples.run_offsets
     first = offsets[:-1].long()
     run = torch.repeat_interleave(offsets.diff())
-    found = composite(density, colour, samples.depths, samples.deltas, ray_offsets=offsets)
+    composed = composite(density, colour, samples.depths, samples.deltas, ray_offsets=offsets)
     optical = torch.zeros_like(samples.depths[first]).index_add(0, run, optical_depth(density, samples.deltas))
     ray, start = samples.ray_index[first].long(), samples.depths[first]
-    return Runs(found.colour, optical, ray, start, found.weights.detach())
+    return Runs(composed.colour, optical, ray, start, composed.weights.detach())
 
 
 def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Tensor, Tensor]:
-    """Partial sums [q, 6] and densities [m]; see ``voronerf.ops.run_sums``."""
+    """Returns partial sums [q, 6] and densities [m]; see ``voronerf.ops.run_sums``."""
     colour, density = activate(raw, density_scale)
     runs = sum_runs(samples, colour, density)
     return torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1), density
@@ -111,7 +111,7 @@ def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Te
 def compose_runs(
     sums: Tensor, target: Tensor, background: Tensor | None, first: int, rays: int, robust: float
 ) -> tuple[Tensor, Tensor]:
-    """Answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
+    """Returns answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
     number = sums[:, 5].double()
     wrong = number[~((number >= first) & (number < first + len(target)))]
     if len(wrong):
@@ -126,9 +126,9 @@ def compose_runs(
     error = off.square().sum(-1)
     slope = robust / (error + robust**2).sqrt() if robust else torch.ones_like(error)
     slopes, loss = off * (2 / (3 * rays) * slope)[:, None], robust_error(error, robust).sum() / (3 * rays)
-    taken = whole.behind(part, ray, slopes, behind)
-    told = torch.cat((slopes[ray], torch.stack((taken, whole.before, error[ray]), 1)), 1)
-    return torch.empty_like(told).index_copy(0, order, told), loss
+    behind_runs = whole.behind(part, ray, slopes, behind)
+    answers = torch.cat((slopes[ray], torch.stack((behind_runs, whole.before, error[ray]), 1)), 1)
+    return torch.empty_like(answers).index_copy(0, order, answers), loss
 
 
 @torch.inference_mode(False)
@@ -136,9 +136,9 @@ def compose_runs(
 def run_gradients(
     raw: Tensor, samples: OwnSamples, answers: Tensor, density_scale: float, hidden: float
 ) -> tuple[Tensor, Tensor]:
-    """Gradient of the loss to the outputs [m, 4], and weights [m]; see ``voronerf.ops.run_gradients``."""
-    samples, answers = OwnSamples._make(map(kept, samples)), kept(answers)
-    raw = kept(raw.detach()).requires_grad_()
+    """Returns the gradient [m, 4] to the outputs, and weights [m]; see ``voronerf.ops.run_gradients``."""
+    samples, answers = OwnSamples._make(map(saveable, samples)), saveable(answers)
+    raw = saveable(raw.detach()).requires_grad_()
     colour, density = activate(raw, density_scale)
     runs, front = sum_runs(samples, colour, density), torch.exp(-answers[:, 4])
     run = torch.repeat_interleave(samples.run_offsets.diff())

@@ -13,9 +13,9 @@ from voronerf.ops.render_loss.reference import RenderLoss, scaled
 from voronerf.ops.unseen_rays import check_triples
 
 
-def _prepare(op: str, given: Any) -> Any:
-    check_triples(op, given)
-    return scaled(op, given)
+def _prepare(op: str, arguments: Any) -> Any:
+    check_triples(op, arguments)
+    return scaled(op, arguments)
 
 
 @declare(
@@ -23,7 +23,7 @@ def _prepare(op: str, given: Any) -> Any:
     warp=Implementation(EVERYWHERE, FLOATS),
     smooth=["raw"],
     small=["raw"],
-    prepare=lambda given: _prepare("render_loss", given),
+    prepare=lambda arguments: _prepare("render_loss", arguments),
 )
 def render_loss(
     raw: Annotated[Tensor, "floating [m, 4]"],
@@ -39,40 +39,41 @@ def render_loss(
     triples: Annotated[int, "0.."] = 0,
     backend: str = "auto",
 ) -> RenderLoss:
-    """The mean squared or robust error of rendered rays, from what the networks put out for their samples.
+    """Returns the mean squared or robust error of rendered rays, from the networks' outputs for their samples.
 
     The colour of a sample is ``sigmoid(raw[:, :3])``, its density ``density_scale * softplus(raw[:, 3])``. With
-    ``activated`` both are ``raw`` as it is, for networks with other activations. `composite` makes the colours of the
-    rays of them. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020, equations 3 and 6); or with
-    ``robust`` s, where e is the squared error of a ray, summed over its channels, a third of the mean of
-    ``2 s ((e + s^2).sqrt() - s)`` (Charbonnier et al. 1994), which grows with the error of a ray, not with its square,
-    beyond s. The native backend computes loss and gradient in one pass over each ray.
+    ``activated``, colour and density are ``raw`` itself, for networks with other activations. `composite` renders the
+    samples to the colours of rays. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020, equations
+    3 and 6). With ``robust`` s it is a third of the mean of ``2 s ((e + s^2).sqrt() - s)`` over the rays (Charbonnier
+    et al. 1994), where e is the squared error of a ray, summed over its channels. It is quadratic for small errors and
+    linear beyond s. The native backend computes loss and gradient in one pass over each ray.
 
     Args:
-        raw: colour and density before their activations, or ``activated``.
-        deltas: length of the part of its ray that a sample stands for, at least 0.
-        ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none. Other samples have
-            weight 0.
+        raw: colour and density, before their activations unless ``activated``.
+        deltas: the length of the ray segment of each sample, at least 0.
+        ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none. Samples outside all
+            rays have weight 0.
         target: the colours to learn.
-        background: added with weight 1 - opacity.
-        density_scale: factor on the density, > 0; None with ``activated``.
-        activated: whether ``raw`` is the colour and the density themselves, as for `composite`: no sigmoid, softplus or
-            scale comes in between, nothing is clamped, and gradients are to them.
-        hidden: share of the light, in [0, 1). Samples that no more than it reaches have no gradient; they count as all
-            others in those of the samples in front of them.
-        robust: s in [0, 1), the scale of the errors beyond which the loss is not squared; 0 for none.
-        triples: at most r / 3. The last ``3 triples`` rays are `unseen_rays`, which have no colour to learn: their
-            error and the gradients of their samples are 0, and the loss is still divided by the number of all rays.
+        background: a colour added with weight 1 - opacity; None is black.
+        density_scale: the factor on the density, > 0; None with ``activated``.
+        activated: whether ``raw`` is the colour and the density themselves, as for `composite`. They are not clamped,
+            and gradients are to them.
+        hidden: a share of the light, in [0, 1). Samples that receive no more have no gradient, but they contribute to
+            the gradients of the samples in front of them.
+        robust: the scale s of errors beyond which the loss is linear, in [0, 1); 0 for the squared error.
+        triples: the number of triples of `unseen_rays`, at most r / 3. They are the last ``3 triples`` rays and have no
+            target: their error and the gradients of their samples are 0, but the loss is divided by the number of all
+            rays.
 
-    ``deltas``, ``target`` and ``background`` are float32, or float64 where ``raw`` is; so are the results. The loss is
-    differentiable in ``raw``, any number of times. Nothing else has gradients.
+    ``deltas``, ``target``, ``background`` and the results are float32, or float64 if ``raw`` is. The loss has
+    derivatives of every order in ``raw``. Nothing else has gradients.
 
     Returns:
         RenderLoss(loss [], colour [r, 3], weights [m], density [m], error [r]).
 
     Raises:
         ValueError: ``density_scale`` with ``activated``, or neither; more triples than a third of the rays; on the CPU
-            offsets that fall or exceed m.
+            offsets that decrease or exceed m.
 
     Examples:
         >>> import torch
@@ -96,7 +97,7 @@ def render_loss(
     warp=Implementation(EVERYWHERE, (torch.float32,), file="render_loss"),
     reference=Implementation(file="render_loss"),
     small=["raw"],
-    prepare=lambda given: _prepare("render_loss_gradient", given),
+    prepare=lambda arguments: _prepare("render_loss_gradient", arguments),
 )
 def render_loss_gradient(
     raw: Annotated[Tensor, "floating [m, 4]"],
@@ -112,25 +113,27 @@ def render_loss_gradient(
     triples: Annotated[int, "0.."] = 0,
     backend: str = "auto",
 ) -> tuple[RenderLoss, Annotated[Tensor, "same [m, 4]"]]:
-    """`render_loss` and the gradient of its loss to ``raw``, for `forward_with_tape`; nothing is differentiable.
+    """Returns the result of `render_loss` and the gradient of its loss to ``raw``, for `forward_with_tape`.
+
+    Not differentiable.
 
     Args:
-        raw: as in `render_loss`.
-        deltas: as in `render_loss`.
-        ray_offsets: as in `render_loss`.
+        raw: colour and density, as in `render_loss`.
+        deltas: the length of the ray segment of each sample.
+        ray_offsets: the offsets of the rays, as in `render_loss`.
         target: the colours to learn.
-        background: as in `render_loss`.
-        density_scale: factor on the density, > 0; None with ``activated``.
-        activated: whether ``raw`` is the colour and the density themselves, as in `render_loss`. So is the gradient.
-        hidden: share of the light, as in `render_loss`.
-        robust: as in `render_loss`.
-        triples: of unseen rays, as in `render_loss`.
+        background: a colour added with weight 1 - opacity; None is black.
+        density_scale: the factor on the density, > 0; None with ``activated``.
+        activated: whether ``raw`` is the colour and the density themselves, as in `render_loss`.
+        hidden: a share of the light, as in `render_loss`.
+        robust: the scale of the robust error, as in `render_loss`.
+        triples: the number of triples of unseen rays, as in `render_loss`.
 
     Returns:
         (RenderLoss, gradient [m, 4]).
 
     Raises:
-        ValueError: as `render_loss`.
+        ValueError: the arguments that `render_loss` refuses.
 
     Examples:
         >>> import torch

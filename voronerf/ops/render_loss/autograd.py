@@ -1,4 +1,4 @@
-"""The derivatives of the native and the Warp kernel of ``render_loss``, which find the gradient with the loss."""
+"""The derivatives of the native and the Warp kernel of ``render_loss``, which compute the gradient with the loss."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from voronerf.ops.render_loss.reference import render_loss
 
 
 def register(forward: Op) -> None:
-    """Registers the derivatives of an op that gives what ``render_loss_gradient`` does."""
+    """Registers the derivatives of an op with the results of ``render_loss_gradient``."""
     forward.register_autograd(_backward, setup_context=_setup)
 
 
@@ -25,12 +25,12 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> Non
 
 
 def _backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
-    """Scales the gradient; where that is differentiated again, it comes from the reference formula."""
+    """Returns the scaled gradient, or for higher derivatives the gradient of the reference formula."""
     raw, *others, gradient = ctx.saved_tensors
-    found = None
+    gradient_to_raw = None
     if of_loss is not None and torch.is_grad_enabled():
         loss = render_loss(raw, *others, *ctx.rule).loss
-        (found,) = torch.autograd.grad(loss, raw, of_loss, create_graph=True)
+        (gradient_to_raw,) = torch.autograd.grad(loss, raw, of_loss, create_graph=True)
     elif of_loss is not None:
-        found = of_loss * gradient
-    return found, *[None] * 9
+        gradient_to_raw = of_loss * gradient
+    return gradient_to_raw, *[None] * 9

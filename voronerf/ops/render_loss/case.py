@@ -13,7 +13,7 @@ def _make(draw: Draw, n: int) -> Arguments:
     r, dtype = draw.among("rays", 9, 0, 1, 2, 33), draw.dtype()
     wide = torch.promote_types(dtype, torch.float32)
     call: Arguments = {"raw": draw.normal(n, 4, dtype=dtype), "deltas": draw.uniform(n, dtype=wide)}
-    if n > 40 * r:  # so that light reaches the end of a long ray
+    if n > 40 * r:  # short strata, so light reaches the end of a long ray
         call["deltas"] = 0.01 * call["deltas"]
     call |= {"ray_offsets": draw.offsets(n, r), "target": draw.uniform(r, 3, dtype=wide)}
     if draw.among("activated", False, True):

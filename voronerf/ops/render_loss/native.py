@@ -21,6 +21,6 @@ register(render_loss_gradient)
 
 
 def render_loss(raw: Tensor, *others: Any) -> list[Tensor]:
-    """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
+    """Applies activations, compositing and the error; see ``voronerf.ops.render_loss``."""
     *parts, _ = render_loss_gradient(raw.float(), *others)
     return parts

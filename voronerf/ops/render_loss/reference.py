@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from voronerf.ops.composite.reference import check_ray_offsets, composite, kept, optical_depth, packed_light
+from voronerf.ops.composite.reference import check_ray_offsets, composite, optical_depth, packed_light, saveable
 from voronerf.ops.formulas import activate
 
 
@@ -16,10 +16,10 @@ class RenderLoss(NamedTuple):
     """The result of `render_loss`. Only the loss has gradients.
 
     Attributes:
-        loss: [], the mean squared error of the colours, or the robust one.
+        loss: [], the mean squared error of the colours, or the robust error.
         colour: [r, 3], background included.
-        weights: [m], the contribution of each sample.
-        density: [m].
+        weights: [m], the rendering weight of each sample.
+        density: [m], the density of each sample.
         error: [r], the squared error of the colour of each ray, summed over the channels; 0 for unseen rays.
 
     Examples:
@@ -50,7 +50,7 @@ def render_loss(
     robust: float,
     triples: int,
 ) -> RenderLoss:
-    """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
+    """Applies activations, compositing and the error; see ``voronerf.ops.render_loss``."""
     raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
     check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
     first = len(target) - 3 * triples
@@ -58,7 +58,7 @@ def render_loss(
         _, density = activate(raw.detach(), density_scale, activated)
         dark = packed_light(optical_depth(density, deltas), ray_offsets)[0] <= hidden
         raw = torch.where(dark[:, None], raw.detach(), raw)
-    if triples and raw.requires_grad:  # no host reads where the rays begin
+    if triples and raw.requires_grad:  # without a host read of the offset
         unseen = torch.arange(len(raw), device=raw.device) >= ray_offsets[first]
         raw = torch.where(unseen[:, None], raw.detach(), raw)
     colours, density = activate(raw, density_scale, activated)
@@ -71,26 +71,29 @@ def render_loss(
 
 
 def robust_error(error: Tensor, robust: float) -> Tensor:
-    """Squared errors of rays [r], or what the loss takes in their place; see ``voronerf.ops.render_loss``."""
+    """Returns the robust errors [r] for squared errors [r] of rays, unchanged if ``robust`` is 0."""
     return 2 * robust * error / ((error + robust**2).sqrt() + robust) if robust else error
 
 
-def scaled(op: str, given: Any) -> Any:
-    """The arguments with a scale of 1 for activated values; ValueError unless one is given just where it is used."""
-    scale = given.density_scale
-    if not given.activated:
+def scaled(op: str, arguments: Any) -> Any:
+    """Returns the arguments, with a density scale of 1 for activated values.
+
+    Raises ValueError unless exactly one of ``density_scale`` and ``activated`` is set.
+    """
+    scale = arguments.density_scale
+    if not arguments.activated:
         if scale is None:
             raise ValueError(f"{op}: density_scale must be given unless the values are activated, got None")
-        return given
+        return arguments
     if scale is not None:
         raise ValueError(f"{op}: density_scale must not be given for activated values, got {scale}")
-    return given._replace(density_scale=1.0)
+    return arguments._replace(density_scale=1.0)
 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
 def render_loss_gradient(raw: Tensor, *others: Any) -> tuple[Tensor, ...]:
-    """The result of `render_loss`, and the gradient of its loss to ``raw``."""
-    raw = kept(raw.detach()).requires_grad_()
-    found = render_loss(raw, *(kept(value) for value in others))
-    return found.loss.detach(), *found[1:], torch.autograd.grad(found.loss, raw)[0]
+    """Returns the result of `render_loss`, and the gradient of its loss to ``raw``."""
+    raw = saveable(raw.detach()).requires_grad_()
+    result = render_loss(raw, *(saveable(value) for value in others))
+    return result.loss.detach(), *result[1:], torch.autograd.grad(result.loss, raw)[0]

@@ -1,4 +1,4 @@
-"""What rays of a picture see through an occupancy grid. r rays, s strata of a ray."""
+"""The rendering of rays until they are opaque, with an occupancy grid. r rays, s strata of a ray."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
 from voronerf.ops.formulas import RaysSeen
 from voronerf.ops.render_loss.reference import scaled
-from voronerf.ops.routed_program import routed_of
+from voronerf.ops.routed_program import check_network
 
-#: Names of the arguments of `routed_program` that a network has; the others are of samples, or of the backward pass.
+#: The arguments of `routed_program` that belong to the network, rather than to samples or to the backward pass.
 NETWORK = ("program", "parameters", "centres", "child_offsets", "child", "depth", "centre_index")
 
 
-def _prepare(given: Any) -> Any:
-    op, network, occupied = "render_opaque", given.network, given.occupied
-    check_count(op, "samples of all rays", given.near.shape[0] * given.samples)
+def _prepare(arguments: Any) -> Any:
+    op, network, occupied = "render_opaque", arguments.network, arguments.occupied
+    check_count(op, "samples of all rays", arguments.near.shape[0] * arguments.samples)
     if occupied.numel() < 1:
         raise ValueError(f"{op}: occupied must have at least one cell, got {list(occupied.shape)}")
     if not isinstance(network, Mapping) or not {"program", "parameters"} <= network.keys():
@@ -29,16 +29,16 @@ def _prepare(given: Any) -> Any:
         raise ValueError(f"{op}: network must hold program and parameters, got {got:.60}")
     if unknown := [name for name in network if name not in NETWORK]:
         raise TypeError(f"{op}: network must hold {', '.join(NETWORK)} alone, got {', '.join(map(str, unknown))}")
-    # One sample at the origin of each ray has the same rules.
-    origins, reads = given.origins, bool(getattr(network["program"], "rays", ()))
+    # The network is checked with one sample, at the origin, for each ray.
+    origins, reads = arguments.origins, bool(getattr(network["program"], "rays", ()))
     index = torch.arange(len(origins), dtype=torch.int32, device=origins.device) if reads else None
-    inputs = [origins, given.directions] if reads else [origins]
-    routed = routed_of(op, {**network, "inputs": inputs, "ray_index": index})
-    if (dtype := routed.given(op).dtype) is torch.float64 and origins.dtype is not dtype:
+    inputs = [origins, arguments.directions] if reads else [origins]
+    routed = check_network(op, {**network, "inputs": inputs, "ray_index": index})
+    if (dtype := routed.arguments(op).dtype) is torch.float64 and origins.dtype is not dtype:
         raise TypeError(f"{op}: parameters must have dtype {str(origins.dtype)[6:]} or one of 16 bits, got float64")
     if (width := routed.program.outputs[0].width) != 4:
         raise ValueError(f"{op}: program must put out 4 numbers, colour and density, got {width}")
-    return scaled(op, given._replace(network=routed))
+    return scaled(op, arguments._replace(network=routed))
 
 
 @declare(
@@ -64,33 +64,33 @@ def render_opaque(
     heaviest: bool = True,
     backend: str = "auto",
 ) -> RaysSeen:
-    """Renders rays without gradients and without randomness: each is walked until it is opaque.
+    """Renders rays without gradients or randomness; each ray ends when it is opaque.
 
-    Equivalent to ``march_rays``, ``routed_program``, activations as in ``render_loss`` and ``composite`` for a few
-    samples of each ray at a time, of all rays that are not opaque yet. So the networks are asked about little more than
-    what lies in front of the first surface of each ray.
+    Equivalent to ``march_rays``, ``routed_program``, activations as in ``render_loss``, and ``composite``, on waves of
+    a few samples of each ray that is not yet opaque. The networks then evaluate few samples behind the first surface of
+    each ray.
 
     Args:
-        origins: of the rays.
-        directions: unit vectors, which the layers may read, too.
-        near: as in ``march_rays``.
-        far: as in ``march_rays``.
-        occupied: as in ``march_rays``.
-        box: as in ``march_rays``.
-        samples: strata of a ray, s; samples are their middles.
-        network: Arguments of `routed_program` by name: ``program`` and ``parameters``, and where there are any,
-            centres, child_offsets, child and depth. Its inputs are positions [n, 3] and, if read, directions with one
-            row for each ray. It puts out 4 numbers, colour before its sigmoid and density before its softplus, or
-            ``activated``.
-        density_scale: factor on the density, > 0; None with ``activated``.
-        activated: whether the networks put out the colour and the density themselves, as for `composite`: no sigmoid,
-            softplus or scale comes in between, and nothing is clamped.
-        wave: samples of a ray that are evaluated at a time, 1 to 1,024.
-        opaque: a ray ends with a wave behind which no more than this share of the light is left, in [0, 1).
-        spacing: of the strata, "linear" or "disparity".
-        contraction: as in ``march_rays``.
+        origins: the origins of the rays.
+        directions: the directions of the rays, unit vectors; the layers may read them.
+        near: the start of the first stratum.
+        far: the end of the last stratum; a ray with far <= near has no samples.
+        occupied: whether each cell of the box is occupied.
+        box: the lowest and the highest corner of the grid.
+        samples: the number of strata of a ray, s; samples are their middles.
+        network: the arguments of `routed_program` by name: ``program`` and ``parameters``; optionally centres,
+            child_offsets, child, depth and centre_index. Its inputs are positions [n, 3] and, if read, directions with
+            one row for each ray. It has 4 outputs: colour before its sigmoid and density before its softplus, or with
+            ``activated`` the colour and density themselves.
+        density_scale: the factor on the density, > 0; None with ``activated``.
+        activated: whether the networks' outputs are the colour and the density themselves, as for `composite`. They are
+            not clamped.
+        wave: the number of samples of a ray that are evaluated at a time, 1 to 1,024.
+        opaque: a ray ends after a wave if at most this share of the light remains, in [0, 1).
+        spacing: the spacing of the strata, "linear" or "disparity".
+        contraction: the contraction of the grid's space, as in ``march_rays``.
         background: the colour behind everything; None is black.
-        heaviest: whether to find the heaviest sample of each ray; else ``heaviest`` is the far end.
+        heaviest: whether to find the heaviest sample of each ray; if not, the result's ``heaviest`` is the far end.
 
     Returns:
         RaysSeen(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]).

@@ -1,6 +1,6 @@
-"""``render_opaque`` of the compiled module: a wave of some thousand samples goes from grid to colours in the cache.
+"""``render_opaque`` of the compiled module: a wave of some thousand samples stays in the cache from grid to colours.
 
-No custom op, whose arguments could not be a network as it is given, a dictionary.
+It is no custom op, which cannot take the dictionary ``network``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.nearest_centre.native import check_index
 from voronerf.ops.render_opaque import reference
-from voronerf.ops.routed_program.reference import cells_of
+from voronerf.ops.routed_program.reference import count_cells
 
 _OP = declared("render_opaque")
 _rays = _OP.inputs(
@@ -31,31 +31,33 @@ _outputs = _OP.outputs(native.compiled.SeeOutputs)
 
 @torch.no_grad()
 def render_opaque(*flat: Any) -> RaysSeen:
-    """Every ray up to the first surface, in float32; see ``voronerf.ops.render_opaque``."""
-    given = _OP.Inputs._make(flat)
-    routed = given.network
-    none = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
-    taken = Network.of(routed._replace(ray_index=None if routed.ray_index is None else none).given("render_opaque"))
-    (centres, child_offsets, child, depth, *_, index), k = routed.where, cells_of(taken.parameters)
+    """Renders every ray until it is opaque, in float32; see ``voronerf.ops.render_opaque``."""
+    arguments = _OP.Inputs._make(flat)
+    routed = arguments.network
+    none = arguments.near.new_empty(0, dtype=torch.int32)  # a ray index without samples
+    network = Network.of(
+        routed._replace(ray_index=None if routed.ray_index is None else none).arguments("render_opaque")
+    )
+    (centres, child_offsets, child, depth, *_, index), k = routed.routing, count_cells(network.parameters)
     tensors = (*routed.inputs, *routed.parameters, centres)
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in tensors)
     if not plain or torch.is_autocast_enabled("cpu"):
-        composed: RaysSeen = partial(reference.render_opaque, backend="native")(*given)
+        composed: RaysSeen = partial(reference.render_opaque, backend="native")(*arguments)
         return composed
-    rows = taken.rows(torch.zeros(k + 1, dtype=torch.int32))
-    lowered = lower(taken.how.text)
+    rows = network.rows(torch.zeros(k + 1, dtype=torch.int32))
+    lowered = lower(network.options.text)
     if k == 1:
         centres = child_offsets = child = index = None
     if child_offsets is not None:
         check_tree(child_offsets, child, len(centres), "render_opaque")
     if index is not None:
         check_index("render_opaque", centres, index)
-    found: RaysSeen = _OP.allocate(given)
-    outputs, compiled = _outputs(found), native.compiled
+    seen: RaysSeen = _OP.allocate(arguments)
+    outputs, compiled = _outputs(seen), native.compiled
     sound = compiled.render_opaque(
         lowered.program,
         program_inputs(lowered, rows, 0, 0, caller="render_opaque"),
-        _rays(given),
+        _rays(arguments),
         compiled.SeeCells(
             centres=centres,
             child_offsets=child_offsets,
@@ -64,10 +66,10 @@ def render_opaque(*flat: Any) -> RaysSeen:
             m=0 if centres is None else len(centres),
             depth=depth,
         ),
-        _rule(given),
-        outputs if given.heaviest else outputs._replace(heaviest=None),
+        _rule(arguments),
+        outputs if arguments.heaviest else outputs._replace(heaviest=None),
         native.cpu(),
     )
     if not sound:
         raise too_shallow(depth, "render_opaque")
-    return found if given.heaviest else found._replace(heaviest=given.far)
+    return seen if arguments.heaviest else seen._replace(heaviest=arguments.far)

@@ -1,4 +1,4 @@
-"""Gradients to what networks have put out, from those to what rays show. r rays, m samples of all rays (packed)."""
+"""Gradients to the networks' outputs, from gradients to rendered values. r rays, m samples of all rays (packed)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from voronerf.ops._core.declare import declare
 from voronerf.ops.render_loss.reference import scaled
 
 
-def _prepare(given: Any) -> Any:
-    return scaled("rendered_gradient", given)
+def _prepare(arguments: Any) -> Any:
+    return scaled("rendered_gradient", arguments)
 
 
 @declare(
@@ -44,39 +44,39 @@ def rendered_gradient(
     activated: bool = False,
     backend: str = "auto",
 ) -> None:
-    """Adds the gradient of a loss to ``raw``, from its gradients to what rays and samples show, in place.
+    """Adds to ``gradient`` the gradient of a loss to ``raw``, from its gradients to the rendered values, in place.
 
-    A ray shows what `composite` makes of its samples, with weights w, and transmittance T: the colour
-    ``sum w_i c_i + (1 - sum w_i) background``, the opacity ``sum w_i``, the depth ``sum w_i d_i``, which is not divided
-    by it, and the weights. Let v_i be the gradient of the loss to w_i through all of these, ``of_weights_i + of_opacity
-    + of_depth d_i + of_colour (c_i - background)``. Then the gradient to the density is ``of_density_i +
-    delta_i (T_{i+1} v_i - sum over j > i of w_j v_j)``, and to the colour of a sample ``of_rgb_i + w_i of_colour``: the
-    derivatives of Max 1995 and of Mildenhall et al. 2020, equation 3. Those of the activations take both to ``raw``.
-    Nothing is differentiable further.
+    `composite` renders the samples, with weights w and transmittance T, to the colour
+    ``sum w_i c_i + (1 - sum w_i) background``, the opacity ``sum w_i`` and the depth ``sum w_i d_i``, which is not
+    divided by the opacity. Let v_i be the gradient of the loss to w_i through all of these and through the weights,
+    ``of_weights_i + of_opacity + of_depth d_i + of_colour (c_i - background)``. Then the gradient to the density is
+    ``of_density_i + delta_i (T_{i+1} v_i - sum over j > i of w_j v_j)``, and to the colour of a sample
+    ``of_rgb_i + w_i of_colour`` (Max 1995; Mildenhall et al. 2020, equation 3). The chain rule through the activations
+    gives the gradient to ``raw``. Not differentiable.
 
     Args:
-        gradient: contiguous, to the outputs of the networks.
-        raw: colour and density before their activations, or ``activated``, as for `render_loss`.
-        density: of the samples, as `render_loss` gives it for ``raw``.
-        depths: their distances along the rays.
-        deltas: their lengths.
-        weights: their contributions to the rays.
-        ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none. Other samples have
-            no gradient.
-        background: seen with weight 1 - opacity.
-        of_colour: gradient of the loss to the colours of the rays. None is zero, here and below.
-        of_opacity: gradient of the loss to the opacities.
-        of_depth: gradient of the loss to the depths.
-        of_weights: gradient of the loss to the weights of the samples.
-        of_rgb: gradient of the loss to the colours of the samples.
-        of_density: gradient of the loss to their densities.
-        hidden: share of the light; samples that no more than it reaches have no gradient. 0 hides none.
-        density_scale: factor on the density behind its softplus, as for `render_loss`; None with ``activated``.
-        activated: whether ``raw`` is the colour and the density themselves. So is the gradient.
+        gradient: the gradient to the networks' outputs, contiguous.
+        raw: colour and density, before their activations unless ``activated``, as for `render_loss`.
+        density: the densities of the samples, as `render_loss` returns them for ``raw``.
+        depths: the distances of the samples along the rays.
+        deltas: the lengths of the samples' ray segments.
+        weights: the rendering weights of the samples.
+        ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none. Samples outside all
+            rays have no gradient.
+        background: a colour with weight 1 - opacity; None is black.
+        of_colour: the gradient of the loss to the colours of the rays. None is zero, here and below.
+        of_opacity: the gradient of the loss to the opacities.
+        of_depth: the gradient of the loss to the depths.
+        of_weights: the gradient of the loss to the weights of the samples.
+        of_rgb: the gradient of the loss to the colours of the samples.
+        of_density: the gradient of the loss to the densities of the samples.
+        hidden: a share of the light; samples that receive no more have no gradient. 0 hides no sample.
+        density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.
+        activated: whether ``raw`` and ``gradient`` are for the colour and the density themselves.
 
     Raises:
         ValueError: a gradient that is not contiguous; ``density_scale`` with ``activated``, or neither; on the CPU
-            offsets that fall or exceed m.
+            offsets that decrease or exceed m.
 
     Examples:
         >>> import torch

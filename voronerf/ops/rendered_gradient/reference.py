@@ -1,4 +1,4 @@
-"""Gradients to what networks have put out, from those to what rays show. r rays, m samples of all rays (packed)."""
+"""Gradients to the networks' outputs, from gradients to rendered values. r rays, m samples of all rays (packed)."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.ops.composite.reference import check_ray_offsets, composite, kept, optical_depth, packed_light
+from voronerf.ops.composite.reference import check_ray_offsets, composite, optical_depth, packed_light, saveable
 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def rendered_gradient(gradient: Tensor, *given: Any) -> None:
+def rendered_gradient(gradient: Tensor, *arguments: Any) -> None:
     """Adds the gradient; see ``voronerf.ops.rendered_gradient``."""
-    *tensors, hidden, density_scale, activated = (kept(value) for value in given)
+    *tensors, hidden, density_scale, activated = (saveable(value) for value in arguments)
     raw, density, depths, deltas, _, ray_offsets, background, *slopes = tensors
     check_ray_offsets("rendered_gradient", ray_offsets, len(density))
     colours = raw[:, :3] if activated else torch.sigmoid(raw[:, :3])
@@ -28,10 +28,10 @@ def rendered_gradient(gradient: Tensor, *given: Any) -> None:
     of_density, of_rgb = torch.autograd.grad(outputs, leaves, arriving, materialize_grads=True)
     with torch.no_grad():
         if not activated:
-            of_density = of_density * -density_scale * torch.expm1(-density / density_scale)  # of a softplus
+            of_density = of_density * -density_scale * torch.expm1(-density / density_scale)  # softplus' derivative
             of_rgb = of_rgb * rgb * (1 - rgb)
         light, ray = packed_light(optical_depth(density, deltas), ray_offsets)
-        learns = (ray > 0) & (ray < len(ray_offsets))
+        learning = (ray > 0) & (ray < len(ray_offsets))
         if hidden:
-            learns &= ~(light <= hidden)
-        gradient += torch.cat([of_rgb, of_density[:, None]], dim=1).masked_fill(~learns[:, None], 0)
+            learning &= ~(light <= hidden)
+        gradient += torch.cat([of_rgb, of_density[:, None]], dim=1).masked_fill(~learning[:, None], 0)

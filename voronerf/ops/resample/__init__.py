@@ -11,11 +11,11 @@ from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
 
 
-def _prepare(given: Any) -> Any:
-    check_count("resample", "count times the rays", given.weights.shape[0] * given.count)
-    if given.weights.shape[1] < 1:
+def _prepare(arguments: Any) -> Any:
+    check_count("resample", "count times the rays", arguments.weights.shape[0] * arguments.count)
+    if arguments.weights.shape[1] < 1:
         raise ValueError("resample: weights must have at least one bin, got none")
-    return given
+    return arguments
 
 
 @declare(
@@ -32,20 +32,20 @@ def resample(
     uniforms: Annotated[Tensor | None, "same [r, count]"] = None,
     backend: str = "auto",
 ) -> Annotated[Tensor, "same [r, count]"]:
-    """Inverse-CDF sampling: depths from the piecewise constant density with mass ``weights[:, i]`` in bin i of a ray.
+    """Draws depths by inverse-CDF sampling, with mass ``weights[:, i]`` spread evenly over bin i of a ray.
 
     Mildenhall et al. 2020, section 5.2. Weights that are negative or not finite count as 0. If all weights of a ray are
     0, every bin counts the same. Not differentiable: depths carry no gradient to the weights, the edges or the
     uniforms.
 
     Args:
-        weights: s >= 1; need not sum to 1.
-        edges: rising along a ray.
-        count: depths of a ray, at least 1.
-        uniforms: in 0 to 1, in any order; None for the midpoints of ``count`` equal strata, which is deterministic.
+        weights: the masses of the bins, s >= 1; they need not sum to 1.
+        edges: the edges of the bins, ascending along a ray.
+        count: the number of depths of a ray, at least 1.
+        uniforms: 0 to 1, in any order; None for the midpoints of ``count`` equal strata, which is deterministic.
 
     Returns:
-        depths [r, count], rising along a ray, in the dtype of the edges.
+        [r, count], depths in ascending order along a ray, in the dtype of the edges.
 
     Examples:
         >>> import torch

@@ -12,10 +12,10 @@ from voronerf.ops._core.custom_op import in_float32
 from voronerf.ops._core.declare import declared
 
 
-def _on_cuda(given: Any, depths: Tensor, machine: native.compiled.Cuda) -> None:
-    sums = depths.new_empty(given.r, given.s, dtype=torch.float64)
-    tensors = given.weights, given.edges, given.uniforms, depths, sums
-    native.compiled.resample(*tensors, given.r, given.s, given.count, machine)
+def _on_cuda(arguments: Any, depths: Tensor, machine: native.compiled.Cuda) -> None:
+    sums = depths.new_empty(arguments.r, arguments.s, dtype=torch.float64)
+    tensors = arguments.weights, arguments.edges, arguments.uniforms, depths, sums
+    native.compiled.resample(*tensors, arguments.r, arguments.s, arguments.count, machine)
 
 
 resample = in_float32(

@@ -1,5 +1,5 @@
-"""The whole route in one operation. n samples, r rays, k cells, m centres of all diagrams together, g diagrams, p and q
-features of a position and a direction."""
+"""The evaluation of samples by the networks of their cells. n samples, r rays, k cells, m centres of all diagrams
+together, g diagrams, p and q features of a position and a direction."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.grouped_mlp.checks import Layered
 from voronerf.ops.routed_program import run
-from voronerf.ops.routed_program.where import Where
+from voronerf.ops.routed_program.routing import Routing
 
 _OP = backends.declare("routed_mlp", runs="routed_program")
 
@@ -36,42 +36,42 @@ def routed_mlp(
     centre_index: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Evaluates every sample by the network of the cell it lies in; results are in the order of the samples.
+    """Evaluates every sample by the network of its cell; results are in the order of the samples.
 
     Equivalent to ``locate_cell``, ``cell_sort``, permuting the inputs, ``grouped_mlp``, and undoing the permutation.
-    The native CPU implementation gathers and scatters rows inside the tiles of the network: it makes no permuted copy,
-    and keeps only the order (int32) for the backward pass, and of hashed positions their features. Gradients of every
+    The native CPU implementation gathers and scatters rows inside the tiles of the network. It makes no permuted copy,
+    and for the backward pass keeps only the order (int32) and the features of hashed positions. Gradients of every
     order to positions, directions, features, weights and biases; none through the choice of the cell. A sample whose
     coordinates are not finite goes to the first cell, as in ``locate_cell``. A network of one cell (k = 1) needs no
-    tables, and is neither located nor sorted.
+    tables, and its samples are neither located nor sorted.
 
     Args:
         positions: [n, p] floating point, n < 2**31: the input of the layers, as in ``grouped_mlp``.
         weights: one [k, o, i] for each layer, all of one dtype.
         biases: one [k, o] or None for each layer.
         layers: the layer table.
-        centres: [m, 3], the centres of the tree as in ``locate_cell``; without ``child_offsets`` and ``child``, the
-            centres of a flat diagram, [k, 3].
+        centres: [m, 3], the centres of the tree as in ``locate_cell``; or [k, 3], the centres of a flat diagram,
+            without ``child_offsets`` and ``child``.
         child_offsets: int32 [g + 1], or None for a flat diagram.
         child: int32 [m], or None for a flat diagram. The leaves are the cells, 0 to k - 1.
-        depth: levels of the tree.
-        cells: int32 [n], the cell of each sample, 0 to k - 1, instead of the tables: a stochastic assignment, or one
-            that is reused.
+        depth: the number of levels of the tree.
+        cells: int32 [n], the cell of each sample, 0 to k - 1, instead of the tables: a stochastic or a reused
+            assignment.
         coords: [n, 3] floating point, the locations of the samples; None uses the first three features of the
             positions.
-        directions: [n, q], or [r, q] with ``direction_index``; None where no layer reads directions.
+        directions: [n, q], or [r, q] with ``direction_index``; None if no layer reads directions.
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample.
         features: the table of the hash encoding, as in ``grouped_mlp``; None without a grid.
-        frozen: bool [k], the cells whose samples have no gradient to anything, or None. On the CPU they take no part in
-            the backward pass, unless positions or directions have gradients.
-        rows: int32 [1], how many of the samples count; None for all. Those behind them have outputs of 0, no gradient
-            and no cell: -1. On CUDA the host does not wait for the number, which `march_rays` with a capacity gives.
-        centre_index: what `index_centres` has made of the centres of a flat diagram, or None.
-        backend: "auto", "reference", "native" or "warp". If there is no fused implementation, "auto" calls the separate
+        frozen: bool [k], the frozen cells, or None. Samples of frozen cells have no gradients at all. The CPU drops
+            them from the backward pass, unless positions or directions have gradients.
+        rows: int32 [1], the number of samples that count; None for all. Later samples have output 0, no gradient, and
+            cell -1. On CUDA the host does not wait for this number, which `march_rays` with a capacity returns.
+        centre_index: the index of the centres of a flat diagram by `index_centres`, or None.
+        backend: "auto", "reference", "native" or "warp". Without a fused implementation, "auto" calls the separate
             operations, each on the backend it chooses.
 
     Returns:
-        The output [n, layers.out_features] in the dtype of the weights (of autocast, where it is on), and cells int32
+        The output [n, layers.out_features] in the dtype of the weights (of autocast, if it is enabled), and cells int32
         [n].
 
     Raises:
@@ -91,8 +91,8 @@ def routed_mlp(
         >>> out.flatten().round(decimals=4)  # in the order of the positions
         tensor([90.0000,  0.1000, 80.0000])
     """
-    where = Where(centres, child_offsets, child, depth, cells, coords, rows, frozen, centre_index)
+    routing = Routing(centres, child_offsets, child, depth, cells, coords, rows, frozen, centre_index)
     network = Layered(positions, weights, biases, layers, directions, direction_index, features)
-    where = where.at(_OP, positions, network.check(_OP, last=where.to_check(_OP)))
-    (out,), found = run(network.given(_OP), where, backend=backend, op=_OP)
-    return out, found
+    routing = routing.at(_OP, positions, network.check(_OP, last=routing.to_check(_OP)))
+    (out,), result_cells = run(network.arguments(_OP), routing, backend=backend, op=_OP)
+    return out, result_cells

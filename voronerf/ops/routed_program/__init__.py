@@ -13,8 +13,8 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops._core.program import Program
 from voronerf.ops.grouped_program import check_program
-from voronerf.ops.grouped_program.given import Given
-from voronerf.ops.routed_program.where import Where
+from voronerf.ops.grouped_program.arguments import ProgramArguments
+from voronerf.ops.routed_program.routing import Routing
 
 _OP = backends.declare("routed_program", native=Implementation(EVERYWHERE, FLOATS), warp=PLAIN)
 
@@ -38,31 +38,33 @@ def routed_program(
 ) -> tuple[list[Tensor], Tensor]:
     """Runs a program on every sample with the parameters of the cell it lies in.
 
-    Equivalent to ``locate_cell``, ``cell_sort`` and ``grouped_program`` with the order; results are in the order of the
-    samples. Gradients of every order to inputs and parameters; none through the choice of the cell.
+    Equivalent to ``locate_cell``, ``cell_sort`` and ``grouped_program`` with the order of the samples. Results are in
+    the order of the samples. Gradients of every order to inputs and parameters; none through the choice of the cell.
 
     Args:
-        program: of outputs [n, w] alone, without sums; its first input has a row for each sample.
-        inputs: as in ``grouped_program``; the first three columns of the first one locate the samples, unless
-            ``coords`` do.
-        parameters: as in ``grouped_program``; those that all cells share also without the dimension of cells.
-        ray_index: as in ``grouped_program``.
-        centres: as in ``routed_mlp``, and so the further arguments.
+        program: a program with outputs [n, w] only, without sums; its first input has a row for each sample.
+        inputs: the inputs as in ``grouped_program``; the first three columns of the first input locate the samples,
+            unless ``coords`` do.
+        parameters: the parameters as in ``grouped_program``; parameters that all cells share may lack the dimension of
+            cells.
+        ray_index: int32 [n], the ray of each sample as in ``grouped_program``; None without inputs of rays.
+        centres: the centres of the tree as in ``routed_mlp``, like the following arguments.
         child_offsets: int32 [g + 1], or None for a flat diagram.
         child: int32 [m], or None for a flat diagram.
         depth: levels of the tree.
         cells: int32 [n], the cell of each sample, 0 to k - 1, instead of the tables.
         coords: [n, 3], the locations of the samples.
         frozen: bool [k], the cells whose samples have no gradient to anything, or None.
-        rows: int32 [1], how many of the samples count; None for all.
-        centre_index: what `index_centres` has made of the centres of a flat diagram, or None.
+        rows: int32 [1], the number of samples that count; None for all.
+        centre_index: the index of the centres of a flat diagram by `index_centres`, or None.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        [n, w] for each output, in the dtype that ``grouped_program`` gives; and cells int32 [n].
+        [n, w] for each output, in the dtype of ``grouped_program``; and cells int32 [n].
 
     Raises:
-        ValueError: a program with sums, or of rays alone; what ``grouped_program`` and ``routed_mlp`` refuse.
+        ValueError: a program with sums, or with rays as first input; arguments that ``grouped_program`` or
+            ``routed_mlp`` refuse.
 
     Examples:
         >>> import torch
@@ -76,44 +78,44 @@ def routed_program(
         >>> out.flatten(), cells
         (tensor([90.0000,  0.1000]), tensor([1, 0], dtype=torch.int32))
     """
-    where = Where(centres, child_offsets, child, depth, cells, coords, rows, frozen, centre_index)
-    routed = check_routed_program(_OP, False, program, inputs, parameters, ray_index, where)
-    return run(routed.given(_OP), routed.where, backend=backend, op=_OP)
+    routing = Routing(centres, child_offsets, child, depth, cells, coords, rows, frozen, centre_index)
+    routed = check_routed_program(_OP, False, program, inputs, parameters, ray_index, routing)
+    return run(routed.arguments(_OP), routed.routing, backend=backend, op=_OP)
 
 
-def run(given: Given, where: Where, *, backend: str, op: str = _OP) -> tuple[list[Tensor], Tensor]:
-    """The outputs of a program on the samples of cells, in the order of the samples, and the cells."""
-    device = given.inputs[0].device
-    implementation = backends.resolve_composed(op, backend=backend, device=device, dtype=given.dtype)
-    outputs, found = implementation(given, where)
-    if where.frozen is not None:
-        held = of_samples(where.frozen, found)
-        outputs = [hold(out, held) for out in outputs]
-    return outputs, found
+def run(arguments: ProgramArguments, routing: Routing, *, backend: str, op: str = _OP) -> tuple[list[Tensor], Tensor]:
+    """Runs a checked program on samples; returns outputs and cells, in the order of the samples."""
+    device = arguments.inputs[0].device
+    implementation = backends.resolve_composed(op, backend=backend, device=device, dtype=arguments.dtype)
+    outputs, cells = implementation(arguments, routing)
+    if routing.frozen is not None:
+        held = frozen_rows(routing.frozen, cells)
+        outputs = [stop_gradients(out, held) for out in outputs]
+    return outputs, cells
 
 
 class Routed(NamedTuple):
-    """A program, its tensors as they were given, and what tells the cells, all of them checked."""
+    """The checked arguments of `routed_program`."""
 
     program: Program
     inputs: Sequence[Tensor]
     parameters: Sequence[Tensor]
     ray_index: Tensor | None
-    where: Where
+    routing: Routing
 
-    def given(self, caller: str) -> Given:
-        """The program and its tensors, parameters with a dimension of cells."""
+    def arguments(self, caller: str) -> ProgramArguments:
+        """Returns the program and its tensors; parameters get a dimension of cells if they lack it."""
         parameters = with_cells(self.program, self.parameters)
-        return Given.of(caller, self.program.text, self.inputs, parameters, self.ray_index)
+        return ProgramArguments.of(caller, self.program.text, self.inputs, parameters, self.ray_index)
 
 
-def routed_of(op: str, network: Mapping[str, Any]) -> Routed:
-    """The arguments of `routed_program` by name, but for the backend, checked; of a program with one output."""
-    places = {name: network[name] for name in Where._fields if name in network}
-    rest = {name: given for name, given in network.items() if name not in places}
+def check_network(op: str, network: Mapping[str, Any]) -> Routed:
+    """Checks arguments of `routed_program` by name, except the backend, for a program with one output."""
+    routing = {name: network[name] for name in Routing._fields if name in network}
+    rest = {name: value for name, value in network.items() if name not in routing}
     if unknown := rest.keys() - {"program", "inputs", "parameters", "ray_index"}:
         raise TypeError(f"{op}: unknown arguments {', '.join(sorted(unknown))}")
-    return check_routed_program(op, True, **{"ray_index": None, **rest, "where": Where(**places)})
+    return check_routed_program(op, True, **{"ray_index": None, **rest, "routing": Routing(**routing)})
 
 
 def check_routed_program(
@@ -123,38 +125,38 @@ def check_routed_program(
     inputs: Sequence[Tensor],
     parameters: Sequence[Tensor],
     ray_index: Tensor | None,
-    where: Where,
+    routing: Routing,
 ) -> Routed:
-    """The arguments of `routed_program`, checked; ``alone``: whether there may be one output alone."""
-    known = isinstance(program, Program) and isinstance(parameters, Sequence)
-    known = known and all(isinstance(p, Tensor) for p in parameters)
-    shaped = with_cells(program, parameters) if known else parameters  # the others are refused
-    sizes = check_program(op, program, inputs, shaped, ray_index, last=where.to_check(op))
+    """Checks the arguments of `routed_program`; ``alone``: whether the program must have exactly one output."""
+    valid = isinstance(program, Program) and isinstance(parameters, Sequence)
+    valid = valid and all(isinstance(p, Tensor) for p in parameters)
+    shaped = with_cells(program, parameters) if valid else parameters  # `check_program` refuses other types
+    sizes = check_program(op, program, inputs, shaped, ray_index, last=routing.to_check(op))
     several = alone and len(program.outputs) != 1
     if several or not program.outputs or program.sums or program.by_ray or 0 in program.rays:
         rule = "one output [n, w]" if alone else "outputs [n, w]"
         raise ValueError(f"{op}: program must have {rule} and inputs[0] [n, w], got others")
-    return Routed(program, inputs, parameters, ray_index, where.at(op, inputs[0], sizes))
+    return Routed(program, inputs, parameters, ray_index, routing.at(op, inputs[0], sizes))
 
 
 def with_cells(program: Program, parameters: Sequence[Tensor]) -> Sequence[Tensor]:
-    """Parameters [1, ...] in the place of those that have no dimension of cells, since all cells share them."""
+    """Returns the parameters, with shape [1, ...] for shared parameters without a dimension of cells."""
     shapes = program.parameters
     shaped = [p.unsqueeze(0) if p.dim() == len(shape) else p for p, shape in zip(parameters, shapes)]
     return [*shaped, *parameters[len(shapes) :]]
 
 
-def of_samples(frozen: Tensor, cells: Tensor) -> Tensor:
-    """bool [n, 1], whether the cell of each sample is frozen; a sample in no cell, -1, is as the first."""
+def frozen_rows(frozen: Tensor, cells: Tensor) -> Tensor:
+    """Returns bool [n, 1], whether each sample's cell is frozen; a sample in no cell (-1) counts to cell 0."""
     return frozen.index_select(0, cells.clamp(min=0))[:, None]
 
 
-def hold(out: Tensor, rows: Tensor) -> Tensor:
-    """The same values, with gradients of zero in rows bool [n, 1]; rows of zeros leave the backward pass of native."""
-    return _Hold.apply(out, rows) if out.requires_grad else out
+def stop_gradients(out: Tensor, rows: Tensor) -> Tensor:
+    """Returns the same values with zero gradients in rows bool [n, 1]; native's backward pass drops these rows."""
+    return _StopGradients.apply(out, rows) if out.requires_grad else out
 
 
-class _Hold(torch.autograd.Function):
+class _StopGradients(torch.autograd.Function):
     @staticmethod
     def forward(out: Tensor, rows: Tensor) -> Tensor:
         return out.view_as(out)

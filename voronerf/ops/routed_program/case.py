@@ -11,7 +11,7 @@ from voronerf.ops.nearest_centre import index_centres
 
 
 def two_outputs(rays: bool) -> Program:
-    """A layer of positions and directions, and one of it, that cells share."""
+    """Returns a program with two layers: one of positions and directions, and one of its output."""
     b = Builder()
     x, seen = b.input(3), b.input(3, ray=rays)
     hidden = b.linear(x, b.parameter(5, 3), 5, add=b.linear(seen, b.parameter(5, 3), 5))

@@ -1,4 +1,4 @@
-"""How far the depths of neighbours are from a plane where no picture says, with its gradient. r rays, m samples."""
+"""A loss on unseen rays whose neighbouring depths do not lie on a plane, with its gradient. r rays, m samples."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from voronerf.ops.render_loss.reference import scaled
 from voronerf.ops.unseen_rays import check_triples
 
 
-def _prepare(given: Any) -> Any:
-    check_triples("smooth_depth_gradient", given)
-    return scaled("smooth_depth_gradient", given)
+def _prepare(arguments: Any) -> Any:
+    check_triples("smooth_depth_gradient", arguments)
+    return scaled("smooth_depth_gradient", arguments)
 
 
 @declare(
@@ -42,37 +42,37 @@ def smooth_depth_gradient(
     activated: bool = False,
     backend: str = "auto",
 ) -> None:
-    """Adds the loss of bent depths of unseen rays, and its gradient, to those of ``render_loss_gradient``, in place.
+    """Adds a loss on the curvature of unseen rays' disparities, and its gradient, in place.
 
-    The last rays are triples of `unseen_rays`, ``r - 3 triples + i`` between ``r - 2 triples + i`` and
-    ``r - triples + i``. The disparity D of a ray is the sum of its weights over their depths, and light that is left
-    comes from ``far``. Along a line of a picture, the disparity of a plane is linear. To the loss, ``factor`` times the
-    mean over the triples of the robust error of ``log((D' + D'') / 2 D)`` is added, where D is that of the ray in the
-    middle: squares, which count less beyond 0.05, at the edges of surfaces, as ``robust`` ones of `render_loss` do.
-    (Distances along rays make a plane bend by the cosine of the angle between them, 0.005 for 0.1.) Its gradient is
-    added to the last column. With the transmittance T behind a sample and the disparity S from what lies behind it, the
-    derivative of D by its density is ``delta (T / depth - S)``. Surfaces are mostly smooth, fog that explains one view
-    each is not seen from the side (after Niemeyer et al. 2022, "RegNeRF", section 4.1, where neighbours should have one
-    depth). Nothing is differentiable further.
+    The last rays are the triples of `unseen_rays`: ray ``r - 3 triples + i`` lies between rays ``r - 2 triples + i``
+    and ``r - triples + i``. The disparity D of a ray is the sum of its weights divided by their depths; the remaining
+    light comes from ``far``. Along a line of an image, the disparity of a plane is linear. The loss is ``factor`` times
+    the mean over the triples of the robust error of ``log((D' + D'') / 2 D)``, where D belongs to the middle ray. The
+    robust error is as in `render_loss`, with scale 0.05, so that edges of surfaces count less. (Distances along rays
+    differ from depths by the cosine of the angle, by 0.005 for 0.1 radians.) The gradient goes to the last column of
+    ``gradient``. The derivative of D by the density of a sample is ``delta (T / depth - S)``, with the transmittance T
+    and the disparity S of everything behind the sample. The loss favours smooth surfaces over fog that only fits single
+    views (after Niemeyer et al. 2022, "RegNeRF", section 4.1, where neighbours should have equal depths). Not
+    differentiable.
 
     Args:
-        loss: to which the loss is added.
-        gradient: contiguous, to the outputs of the networks.
-        density: of the samples.
-        depths: their distances along the rays, > 0.
-        deltas: their lengths.
-        weights: their contributions to the rays.
+        loss: the loss, to be added to.
+        gradient: the gradient to the networks' outputs, contiguous, to be added to.
+        density: the densities of the samples.
+        depths: the distances of the samples along the rays, > 0.
+        deltas: the lengths of the samples' ray segments.
+        weights: the rendering weights of the samples.
         ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
-        far: > 0, where the rays end.
-        triples: how many, at most r / 3.
-        factor: on the mean.
-        hidden: share of the light; samples that no more than it reaches have no gradient, as for `render_loss`.
-        density_scale: factor on the density behind its softplus, as for `render_loss`; None with ``activated``.
+        far: the far ends of the rays, > 0.
+        triples: the number of triples, at most r / 3.
+        factor: the factor on the mean.
+        hidden: a share of the light; samples that receive no more have no gradient, as for `render_loss`.
+        density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.
         activated: whether the gradient is to the density itself.
 
     Raises:
         ValueError: tensors that are not contiguous; more triples than a third of the rays; ``density_scale`` with
-            ``activated``, or neither; on the CPU offsets that fall or exceed m.
+            ``activated``, or neither; on the CPU offsets that decrease or exceed m.
 
     Examples:
         >>> import torch

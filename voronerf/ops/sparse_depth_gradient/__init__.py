@@ -1,4 +1,4 @@
-"""How little of a ray's light comes from near a known point, with its gradient. s of r rays, m samples (packed)."""
+"""A loss on rays whose light does not come from a known point, with its gradient. s of r rays, m samples (packed)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from voronerf.ops._core.declare import declare
 from voronerf.ops.render_loss.reference import scaled
 
 
-def _prepare(given: Any) -> Any:
-    if given.s > given.r:
-        raise ValueError(f"sparse_depth_gradient: distances must be of at most the {given.r} rays, got {given.s}")
-    return scaled("sparse_depth_gradient", given)
+def _prepare(arguments: Any) -> Any:
+    if arguments.s > arguments.r:
+        raise ValueError(
+            f"sparse_depth_gradient: distances must be of at most the {arguments.r} rays, got {arguments.s}"
+        )
+    return scaled("sparse_depth_gradient", arguments)
 
 
 @declare(
@@ -40,32 +42,32 @@ def sparse_depth_gradient(
     activated: bool = False,
     backend: str = "auto",
 ) -> None:
-    """Adds the loss of rays that end at known points, and its gradient, to those of ``render_loss_gradient``, in place.
+    """Adds a loss on rays that end at known points, and its gradient, in place.
 
-    A sample is near the point if it lies within 0.03 of the distance of the point and its own length of it. The loss of
-    a ray is ``-log`` of the sum of the weights of these samples, at least 0.001: the likelihood of Deng et al. 2022,
-    "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them. With the
-    transmittance T behind a sample and the light S from points that lie behind it, the derivative of the sum by its
-    density is ``delta (T near - S)``. What is added is ``factor`` times the mean of the s losses, and to the last
-    column of the gradient that of it. A weight that is NaN makes the loss NaN if it is near the point, and its ray has
-    no gradient. Nothing is differentiable further.
+    A sample is near the point if it is at most 0.03 times the distance of the point, plus the sample's length, away
+    from it. The loss of a ray is ``-log`` of the sum of the weights of these samples, at least 0.001: the likelihood of
+    Deng et al. 2022, "Depth-supervised NeRF", with a box in place of their Gaussian. Fog in front of the point reduces
+    this sum. The derivative of the sum by the density of a sample is ``delta (T near - S)``, with the transmittance T
+    behind the sample, ``near`` 1 if the sample is near and else 0, and S the part of the sum behind the sample.
+    ``factor`` times the mean of the s losses is added to ``loss``, and its gradient to the last column of ``gradient``.
+    If the weight of a sample near the point is NaN, the loss is NaN, and the ray has no gradient. Not differentiable.
 
     Args:
-        loss: to which the loss is added.
-        gradient: contiguous, to the outputs of the networks.
-        density: of the samples.
-        depths: their distances along the rays.
-        deltas: their lengths.
-        weights: their contributions to the rays.
+        loss: the loss, to be added to.
+        gradient: the gradient to the networks' outputs, contiguous, to be added to.
+        density: the densities of the samples.
+        depths: the distances of the samples along the rays.
+        deltas: the lengths of the samples' ray segments.
+        weights: the rendering weights of the samples.
         ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
-        distances: of the point that each of the first s rays ends at, s <= r; NaN for none.
-        factor: on the mean of the losses.
-        density_scale: factor on the density behind its softplus, as for `render_loss`; None with ``activated``.
+        distances: the distance of the point on each of the first s rays, s <= r; NaN for no point.
+        factor: the factor on the mean of the losses.
+        density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.
         activated: whether the gradient is to the density itself.
 
     Raises:
         ValueError: a gradient that is not contiguous; more distances than rays; ``density_scale`` with ``activated``,
-            or neither; on the CPU offsets that fall or exceed m.
+            or neither; on the CPU offsets that decrease or exceed m.
 
     Examples:
         >>> import torch

@@ -9,7 +9,7 @@ from voronerf.ops.composite.reference import composite
 
 
 def _make(draw: Draw, n: int) -> Arguments:
-    """n samples on five rays, the first three with points, one of which is nowhere."""
+    """Draws n samples on five rays; the first two have points, and the third has distance NaN."""
     call: Arguments = {name: draw.uniform(n) for name in ("density", "depths", "deltas")}
     call |= {"loss": torch.tensor(0.5), "gradient": draw.normal(n, 4).contiguous(), "ray_offsets": draw.offsets(n, 5)}
     along = call["density"], call["density"][:, None], call["depths"], call["deltas"], call["ray_offsets"]

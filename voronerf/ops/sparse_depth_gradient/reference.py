@@ -1,4 +1,4 @@
-"""How little of a ray's light comes from near a known point, with its gradient. s of r rays, m samples (packed)."""
+"""A loss on rays whose light does not come from a known point, with its gradient. s of r rays, m samples (packed)."""
 
 from __future__ import annotations
 
@@ -7,44 +7,44 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.ops.composite.reference import check_ray_offsets, composite, kept
+from voronerf.ops.composite.reference import check_ray_offsets, composite, saveable
 
-#: How far from a surface a point of a sparse model may lie, as a share of its distance from the camera.
+#: The largest distance of a sparse model's point from the surface, as a share of its distance from the camera.
 NEARBY = 0.03
 
 
 def sparse_depth_loss(
     weights: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: Tensor, distances: Tensor
 ) -> Tensor:
-    """The loss [s] of rays that end at known points, differentiable in the weights.
+    """Returns the loss [s] of rays that end at known points, differentiable in the weights.
 
-    Formula and arguments are those of ``voronerf.ops.sparse_depth_gradient``.
+    See ``voronerf.ops.sparse_depth_gradient`` for the formula and the arguments.
     """
-    # Samples before and behind those of the s rays have a place of their own: no host reads where they begin.
+    # Samples outside the s rays go to two additional rays, so the host does not read the offsets.
     sample = torch.arange(len(weights), device=weights.device)
     ray = torch.searchsorted(ray_offsets[: len(distances) + 1].long(), sample, right=True)
-    known = torch.nn.functional.pad(distances, (1, 1), value=torch.nan)
-    near = (depths - known[ray]).abs() <= NEARBY * known[ray] + deltas
-    light = torch.zeros_like(known).index_add(0, ray, torch.where(near, weights, 0))[1:-1]
+    points = torch.nn.functional.pad(distances, (1, 1), value=torch.nan)
+    near = (depths - points[ray]).abs() <= NEARBY * points[ray] + deltas
+    light = torch.zeros_like(points).index_add(0, ray, torch.where(near, weights, 0))[1:-1]
     return -torch.log(light.clamp_min(1e-3))
 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def sparse_depth_gradient(loss: Tensor, gradient: Tensor, *given: Any) -> None:
+def sparse_depth_gradient(loss: Tensor, gradient: Tensor, *arguments: Any) -> None:
     """Adds the mean of the `sparse_depth_loss`, and its gradient; see ``voronerf.ops.sparse_depth_gradient``."""
-    *tensors, factor, density_scale, activated = given
-    density, depths, deltas, weights, ray_offsets, distances = (kept(tensor.detach()) for tensor in tensors)
+    *tensors, factor, density_scale, activated = arguments
+    density, depths, deltas, weights, ray_offsets, distances = (saveable(tensor.detach()) for tensor in tensors)
     check_ray_offsets("sparse_depth_gradient", ray_offsets, len(density))
     density.requires_grad_()
     weights.requires_grad_()
     rgb = density.detach()[:, None]
     composed = composite(density, rgb, depths, deltas, ray_offsets).weights
     of_rays = sparse_depth_loss(weights, depths, deltas, ray_offsets, distances)
-    own = factor * of_rays.sum() / max(len(distances), 1)
-    slope = torch.autograd.grad(composed, density, torch.autograd.grad(own, weights))[0]
+    added = factor * of_rays.sum() / max(len(distances), 1)
+    slope = torch.autograd.grad(composed, density, torch.autograd.grad(added, weights))[0]
     if not activated:
-        slope = slope * -density_scale * torch.expm1(-density / density_scale)  # of a softplus
+        slope = slope * -density_scale * torch.expm1(-density / density_scale)  # derivative of the softplus
     with torch.no_grad():
-        loss += own
+        loss += added
         gradient[:, 3] += slope

@@ -14,21 +14,21 @@ from voronerf.ops._core.declare import declare
     native=Implementation(EVERYWHERE, FLOATS),
     warp=Implementation(EVERYWHERE, FLOATS),
     smooth=["directions"],
-    sizes={"w": lambda given: given.degree**2},
+    sizes={"w": lambda arguments: arguments.degree**2},
 )
 def spherical_harmonics(
     directions: Annotated[Tensor, "floating [n, 3]"], degree: Annotated[int, "1..4"], *, backend: str = "auto"
 ) -> Annotated[Tensor, "same [n, w]"]:
-    """The real spherical harmonics of bands 0 to degree - 1, an orthonormal basis of functions of a direction.
+    """Returns the real spherical harmonics of bands 0 to degree - 1, an orthonormal basis of functions on the sphere.
 
-    Order, signs and constants are those of tiny-cuda-nn's ``SphericalHarmonics`` and torch-ngp's ``SHEncoder`` (Müller
-    et al. 2022 encode view directions so): band after band, of each the orders -l to l, with the phase of Condon and
-    Shortley. As in torch-ngp the input is the direction itself; tiny-cuda-nn takes ``(direction + 1) / 2`` and undoes
-    that. The result is a polynomial in x, y and z, whatever their length. Gradients of every order.
+    Order, signs and constants agree with tiny-cuda-nn's ``SphericalHarmonics`` and torch-ngp's ``SHEncoder`` (Müller et
+    al. 2022 encode view directions by them): band after band, orders -l to l, with the Condon-Shortley phase. As in
+    torch-ngp the input is the direction itself; tiny-cuda-nn takes ``(direction + 1) / 2`` instead. The result is a
+    polynomial in x, y and z, for vectors of any length. Gradients of every order.
 
     Args:
         directions: unit vectors, n < 2**31.
-        degree: number of bands, 1 to 4.
+        degree: the number of bands, 1 to 4.
 
     Returns:
         [n, degree**2] in the dtype of the directions: 1, 4, 9 or 16 values, computed in float32 at least.

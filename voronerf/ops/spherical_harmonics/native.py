@@ -9,5 +9,5 @@ spherical_harmonics = encoding_op(
     "spherical_harmonics",
     "spherical",
     reference.spherical_harmonics,
-    lambda given: (given.directions, None, 3, given.degree, False),
+    lambda arguments: (arguments.directions, None, 3, arguments.degree, False),
 )

@@ -8,5 +8,5 @@ from voronerf.ops._core.encodings import spherical
 
 
 def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """Bands 0 to degree - 1 as polynomials; see ``voronerf.ops.spherical_harmonics``."""
+    """Returns bands 0 to degree - 1, as polynomials; see ``voronerf.ops.spherical_harmonics``."""
     return spherical(directions, degree)

@@ -1,4 +1,4 @@
-"""How far the light of rays is from that of one surface, with its gradient. r rays, m samples of all rays (packed)."""
+"""Losses on rays whose light does not come from one surface, with their gradient. r rays, m samples (packed)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from voronerf.ops._core.declare import declare
 from voronerf.ops.render_loss.reference import scaled
 
 
-def _prepare(given: Any) -> Any:
-    return scaled("surface_gradient", given)
+def _prepare(arguments: Any) -> Any:
+    return scaled("surface_gradient", arguments)
 
 
 @declare(
@@ -43,39 +43,39 @@ def surface_gradient(
 ) -> None:
     """Adds two losses of rays whose light does not come from one surface, and their gradient, in place.
 
-    To the loss of ``render_loss_gradient``, ``distortion`` and ``orientation`` times the means over the r rays of these
-    are added, and to the last column of the gradient that of both, for samples with weights w and opacities a:
+    ``distortion`` and ``orientation`` times the means of these losses over the r rays are added to ``loss``, and their
+    gradient to the last column of ``gradient``. For samples with weights w and opacities a:
 
     - The distortion ``sum over i, j of w_i w_j |s_i - s_j| + sum of w_i^2 l_i / 3`` (Barron et al. 2022, "Mip-NeRF
-      360", equation 15) is least if all light comes from one place. Places go from 0 at ``near`` to 1 at ``far`` in
-      equal steps of disparity, ``s = (1 / near - 1 / depth) / (1 / near - 1 / far)``, and a sample has the length
-      ``l = delta / depth^2 / (1 / near - 1 / far)``. Light that is left counts nowhere.
+      360", equation 15) is least if all light comes from one depth. Normalised depths go from 0 at ``near`` to 1 at
+      ``far`` in equal steps of disparity, ``s = (1 / near - 1 / depth) / (1 / near - 1 / far)``, and a sample has the
+      length ``l = delta / depth^2 / (1 / near - 1 / far)``. The background does not count.
     - The orientation loss ``sum of w_i max(0, a_i - a_{i+1})^2`` (after Verbin et al. 2022, "Ref-NeRF", equation 11,
-      with the fall of the opacity along the ray for the normal) is 0 if what is seen gets no thinner from a sample to
-      the next. That has to lie right behind it: nearer than both are long.
+      with the decrease of the opacity along the ray in place of the normal) is 0 if the opacity does not decrease from
+      a visible sample to the next. The next sample must be adjacent: nearer than the sum of both lengths.
 
-    With the transmittance T behind a sample and the slopes v to the weights, the derivative of a loss through them is
-    ``delta (T v_i - sum over j > i of w_j v_j)``. Nothing is differentiable further.
+    With the transmittance T behind a sample and the gradient v to the weights, the derivative of a loss through the
+    weights is ``delta (T v_i - sum over j > i of w_j v_j)``. Not differentiable.
 
     Args:
-        loss: to which the loss is added.
-        gradient: contiguous, to the outputs of the networks.
-        density: of the samples.
-        depths: their distances along the rays, > 0 and rising.
-        deltas: their lengths.
-        weights: their contributions to the rays.
+        loss: the loss, to be added to.
+        gradient: the gradient to the networks' outputs, contiguous, to be added to.
+        density: the densities of the samples.
+        depths: the distances of the samples along the rays, > 0 and ascending.
+        deltas: the lengths of the samples' ray segments.
+        weights: the rendering weights of the samples.
         ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
-        near: > 0, where the rays begin.
-        far: where they end, beyond ``near``.
-        distortion: factor on the mean of the first loss.
-        orientation: factor on that of the second.
-        hidden: share of the light; samples that no more than it reaches count nowhere, and have no gradient.
-        density_scale: factor on the density behind its softplus, as for `render_loss`; None with ``activated``.
+        near: the near ends of the rays, > 0.
+        far: the far ends of the rays, beyond ``near``.
+        distortion: the factor on the mean of the distortion.
+        orientation: the factor on the mean of the orientation loss.
+        hidden: a share of the light; samples that receive no more do not count, and have no gradient.
+        density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.
         activated: whether the gradient is to the density itself.
 
     Raises:
         ValueError: a gradient that is not contiguous; ``density_scale`` with ``activated``, or neither; on the CPU
-            offsets that fall or exceed m.
+            offsets that decrease or exceed m.
 
     Examples:
         >>> import torch

@@ -9,7 +9,7 @@ from voronerf.ops.composite.reference import composite
 
 
 def _make(draw: Draw, n: int) -> Arguments:
-    """n samples on seven rays."""
+    """Draws n samples on seven rays."""
     call: Arguments = {"loss": torch.tensor(0.5), "gradient": draw.normal(n, 4).contiguous()}
     call["ray_offsets"] = draw.offsets(n, 7)
     call |= {"density": draw.uniform(n), "deltas": draw.uniform(n)}

@@ -1,4 +1,4 @@
-"""Triples of rays from where no camera was. r rays."""
+"""Triples of neighbouring rays from positions without a camera. r rays."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.declare import declare
 
 
-def check_triples(op: str, given: Any) -> None:
-    """ValueError for more triples than r rays have."""
-    if 3 * given.triples > given.r:
-        raise ValueError(f"{op}: triples must be at most a third of the {given.r} rays, got {given.triples}")
+def check_triples(op: str, arguments: Any) -> None:
+    """Raises ValueError for more triples than fit in r rays."""
+    if 3 * arguments.triples > arguments.r:
+        raise ValueError(f"{op}: triples must be at most a third of the {arguments.r} rays, got {arguments.triples}")
 
 
-def _prepare(given: Any) -> Any:
-    check_triples("unseen_rays", given)
-    return given
+def _prepare(arguments: Any) -> Any:
+    check_triples("unseen_rays", arguments)
+    return arguments
 
 
 @declare(
@@ -38,20 +38,20 @@ def unseen_rays(
     tilt: Annotated[float, "positive"],
     backend: str = "auto",
 ) -> None:
-    """Makes the last rays of a batch triples of neighbours from where no camera was, in place.
+    """Replaces the last rays of a batch by triples of neighbouring rays from positions without a camera, in place.
 
     Ray ``r - 3 triples + i`` keeps its direction d, and its origin moves at random, along each axis by at most
-    ``move``. Rays ``r - 2 triples + i`` and ``r - triples + i`` begin there too, on both sides of it: in the directions
-    ``d + t`` and ``d - t``, normalised, with t across d. Along each axis t is at most ``tilt`` times ``2 ** -4u``, with
-    a random number u in 0..1, so that neighbours are as often close as far. Not differentiable.
+    ``move``. Rays ``r - 2 triples + i`` and ``r - triples + i`` get the same origin and the directions ``d + t`` and
+    ``d - t``, normalised, with t orthogonal to d. Along each axis t is at most ``tilt`` times ``2 ** -4u``, with a
+    random number u in 0 to 1: the angles to the neighbours are spread evenly over four octaves. Not differentiable.
 
     Args:
-        origins: contiguous.
-        directions: contiguous unit vectors.
-        seed: each number is a hash of it and of the ray.
-        triples: how many, at most r / 3.
-        move: of an origin along an axis, at most.
-        tilt: of a direction along an axis, at most.
+        origins: the origins of the rays, contiguous.
+        directions: the directions of the rays, contiguous unit vectors.
+        seed: the seed; each random number is a hash of the seed and of the ray.
+        triples: the number of triples, at most r / 3.
+        move: the largest move of an origin along an axis.
+        tilt: the largest change of a direction along an axis.
 
     Raises:
         ValueError: more triples than a third of the rays; tensors that are not contiguous.

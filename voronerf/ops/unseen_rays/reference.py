@@ -1,4 +1,4 @@
-"""Triples of rays from where no camera was. r rays."""
+"""Triples of neighbouring rays from positions without a camera. r rays."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from torch import Tensor
 
 from voronerf.ops.march_rays.reference import hashed_uniforms
 
-#: Numbers of a ray that `draw_pixels` makes of the same seed, and octaves of the distances between neighbours.
+#: The hashes per ray that `draw_pixels` makes from the same seed, and the octaves of angles between neighbours.
 BEFORE, OCTAVES = 5, 4.0
 
 
 @torch.no_grad()
 def unseen_rays(origins: Tensor, directions: Tensor, seed: Tensor, triples: int, move: float, tilt: float) -> None:
-    """Moves the last rays; see ``voronerf.ops.unseen_rays``."""
+    """Replaces the last rays; see ``voronerf.ops.unseen_rays``."""
     begin = len(origins) - 3 * triples
     middle, one, other = (slice(begin + i * triples, begin + (i + 1) * triples) for i in range(3))
     numbers = hashed_uniforms(seed, len(origins), BEFORE + 7)[middle, BEFORE:].to(origins)

@@ -1,12 +1,11 @@
-"""The compiled module: finds torch's OpenMP for it, loads it, chooses an instruction set, and says how it was built.
+"""The loader of the compiled module: it binds torch's OpenMP, chooses an instruction set, and describes the build.
 
-Importing this package raises ``BackendUnavailable`` where the
-extension is missing or was built for other sources than these.
+Importing this package raises ``BackendUnavailable`` if the extension is missing or was built from other sources.
 
 OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch
-has loaded. Linking it would not do: torch's wheels bring a libgomp of their own, named ``libgomp.so.1`` (CPU wheels;
-the loader would share it) or with a hash, such as ``libgomp-a34b3233.so.1`` (the loader would add the system's, a
-second pool of threads that competes with torch's, or fail where the system has none).
+has loaded. Linking libgomp would not do, because torch's wheels include a libgomp. The loader shares it if it is named
+``libgomp.so.1`` (CPU wheels). If its name has a hash, such as ``libgomp-a34b3233.so.1``, the loader would add the
+system's libgomp, whose thread pool competes with torch's, or fail if the system has none.
 """
 
 from __future__ import annotations
@@ -32,20 +31,20 @@ from voronerf.ops._core.custom_op import LISTENERS, Op
 
 
 def _bind_openmp() -> None:
-    """Make the symbols of torch's OpenMP runtime visible to libraries loaded from now on."""
+    """Makes the symbols of torch's OpenMP runtime visible to libraries loaded later."""
     if not sys.platform.startswith("linux"):
         return
     with open("/proc/self/maps") as maps:
         mapped = [line.split(maxsplit=5)[5].strip() for line in maps if line.count("/") > 0]
     names = ("libgomp", "libiomp5", "libomp")
     loaded = [path for path in dict.fromkeys(mapped) if os.path.basename(path).startswith(names)]
-    # torch comes first: another package's runtime may be there too.
+    # torch comes first: another package may have loaded a runtime too.
     loaded.sort(key=lambda path: "torch" not in path.split(os.sep))
     ctypes.CDLL(loaded[0] if loaded else "libgomp.so.1", mode=ctypes.RTLD_GLOBAL)
 
 
 def _interface() -> int | None:
-    """Checksum of all signatures that the sources bind, which the module has of those it was built with."""
+    """Returns the checksum of all signatures that the sources bind; the built module must have the same."""
     file = Path(__file__).resolve().parent.parent / "interface.txt"
     return int(file.read_text()) if file.exists() else None
 
@@ -54,10 +53,10 @@ def _why_missing(error: ImportError | OSError) -> str:
     """Returns one line: the folder of these sources, why their compiled module cannot be loaded, and the remedy."""
     here = Path(__file__).resolve().parents[4]
     others = [place for place in sys.path if Path(place).resolve() != here]  # where a wheel may be installed
-    found = PathFinder.find_spec("_C", [os.path.join(place, "voronerf", "ops", "_core") for place in others])
+    spec = PathFinder.find_spec("_C", [os.path.join(place, "voronerf", "ops", "_core") for place in others])
     remedy = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
-    if found is not None and found.origin is not None:
-        installed = Path(found.origin).parents[3]
+    if spec is not None and spec.origin is not None:
+        installed = Path(spec.origin).parents[3]
         remedy = f"run Python in another folder to import that of {installed}, or build it with `pip install -e .`"
     return f"voronerf in {here} cannot load its compiled module ({error}); {remedy}"
 
@@ -82,32 +81,32 @@ DTYPES = {
     "uint8": torch.uint8,
     "bool": torch.bool,
 }
-"""By the names that the compiled module has for them."""
+"""The dtypes, by name in the compiled module."""
 
 
 def know_torch(module: Any) -> None:
-    """Hands a compiled module the objects of torch that it knows by name alone."""
-    exchange = getattr(Tensor, "__dlpack_c_exchange_api__", None)  # from torch 2.10 on
+    """Passes a compiled module the torch objects that it needs."""
+    exchange = getattr(Tensor, "__dlpack_c_exchange_api__", None)  # exists from torch 2.10 on
     module.know_torch(DTYPES, (Tensor, torch.nn.Parameter), exchange)
 
 
 know_torch(compiled)
 
 signature, Rules, alike, adam_step = compiled.signature, compiled.Rules, compiled.alike, compiled.adam_step
-"""They check arguments and make calls (csrc/bindings/signature.h); of this module, also where tests put another one."""
+"""The functions that check arguments and make calls (csrc/bindings/signature.h), also if tests replace `compiled`."""
 
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
 LEAST_GAIN = 1.25
-"""Of bfloat16 products over float32 ones, for networks to use them: rounding and pairing operands costs some."""
+"""The least speed-up of bfloat16 over float32 products for networks to use them: rounding and pairing have a cost."""
 _bfloat16_gain = compiled.bfloat16_gain()
 
 
 def _choose_isa() -> str:
-    """Best instruction set of this processor, or the one of VORONERF_ISA.
+    """Returns the best instruction set of this processor, or the value of VORONERF_ISA.
 
-    avx512_bf16 is not the best where its bfloat16 products are slower than float32 ones. The gain is far from
-    `LEAST_GAIN` on all known processors, so that every process on a machine chooses the same.
+    avx512_bf16 counts only if its bfloat16 products are faster than float32 products by `LEAST_GAIN`. The measured gain
+    is far from this limit on all known processors, so all processes on a machine make the same choice.
     """
     best = [isa for isa in SUPPORTED_ISAS if isa != "avx512_bf16" or _bfloat16_gain >= LEAST_GAIN]
     wanted = os.environ.get("VORONERF_ISA") or best[-1]
@@ -123,68 +122,67 @@ _isa = _choose_isa()
 
 @contextmanager
 def using_isa(isa: str) -> Iterator[None]:
-    """Ops run with this instruction set, one of ``SUPPORTED_ISAS``, while the context lasts."""
+    """Runs ops with an instruction set, one of ``SUPPORTED_ISAS``, within the context."""
     global _isa
     if isa not in SUPPORTED_ISAS:
         raise ValueError(f"using_isa: isa must be one of {', '.join(SUPPORTED_ISAS)}, got {isa!r}")
-    before, _isa = _isa, isa
+    previous, _isa = _isa, isa
     try:
         yield
     finally:
-        _isa = before
+        _isa = previous
 
 
 def on_cuda(tensor: Tensor) -> bool:
-    """Whether the CUDA half of the module is to work on a tensor."""
+    """Returns whether the module's CUDA functions handle a tensor."""
     return tensor.is_cuda
 
 
 def stream(tensor: Tensor) -> tuple[int, int]:
-    """Device and current stream of a CUDA tensor."""
+    """Returns the device and the current stream of a CUDA tensor."""
     index = tensor.device.index
     return index, torch.cuda.current_stream(index).cuda_stream
 
 
 def isa() -> str:
-    """The instruction set in use."""
+    """Returns the instruction set in use."""
     return _isa
 
 
 def cpu() -> compiled.Cpu:
-    """The processor as compiled functions take it: instruction set and threads."""
+    """Returns the CPU argument of compiled functions: instruction set and threads."""
     return _cpu(_isa, backends.threads())
 
 
 def machine(tensor: Tensor) -> compiled.Cpu | compiled.Cuda:
-    """Where the compiled function for a tensor runs."""
+    """Returns the machine argument of a compiled function on a tensor: the CPU, or the GPU and its stream."""
     return compiled.Cuda(*stream(tensor)) if on_cuda(tensor) else cpu()
 
 
 def aligned(tensor: Tensor) -> Tensor:
-    """A tensor whose memory begins at a multiple of 16 bytes, as CUDA kernels want what they read in pieces."""
+    """Returns the tensor, or a copy aligned to 16 bytes for the vector loads of CUDA kernels."""
     return tensor.clone() if on_cuda(tensor) and tensor.data_ptr() % 16 else tensor
 
 
 def refuse_where_deterministic(op: str, tensor: Tensor) -> None:
-    """Says that atomic operations on CUDA add up the gradient of a table in any order, if deterministic algorithms are
-    asked for (``torch.use_deterministic_algorithms``).
+    """Refuses a table's gradient on CUDA under ``torch.use_deterministic_algorithms``: atomic sums have no fixed order.
 
     Args:
-        op: Name of the op, for the message.
-        tensor: Of the op; on the CPU nothing is refused.
+        op: The name of the op, for the message.
+        tensor: A tensor of the op; CPU tensors are never refused.
 
     Raises:
-        RuntimeError: Deterministic algorithms are asked for, and not only with a warning.
+        RuntimeError: Deterministic algorithms are required. With ``warn_only`` a warning takes its place.
     """
     if not (on_cuda(tensor) and torch.are_deterministic_algorithms_enabled()):
         return
-    said = (
+    message = (
         f"{op}: the gradient of a hash grid's table has no deterministic CUDA kernel, got "
         "torch.use_deterministic_algorithms(True); use backend='reference' or warn_only=True"
     )
     if not torch.is_deterministic_algorithms_warn_only_enabled():
-        raise RuntimeError(said)
-    warnings.warn(said, stacklevel=2)
+        raise RuntimeError(message)
+    warnings.warn(message, stacklevel=2)
 
 
 compiled.know_calls(
@@ -194,7 +192,7 @@ compiled.know_calls(
         "listeners": LISTENERS,
         "torch": vars(torch),
         "threads": torch.get_num_threads,
-        "kept": backends._kept,
+        "kept": backends._override,
         "native": globals(),
         "choose": backends._choose_once,
         "dtypes": DTYPES,
@@ -209,7 +207,7 @@ def _cpu(isa: str, threads: int) -> compiled.Cpu:
 
 
 def missing(device: torch.device) -> str | None:
-    """Reason, with the remedy, why this build cannot run on a device; None if it can. CUDA: a device is present."""
+    """Returns why this build cannot run on a device, with the remedy; None if it can. A CUDA device must be present."""
     if device.type != "cuda":
         return None
     if not compiled.cuda:
@@ -231,7 +229,7 @@ def missing(device: torch.device) -> str | None:
 
 @functools.cache
 def _driver_major() -> int:
-    """Major version of CUDA that the driver has; its minor version may be older than that of the toolkit."""
+    """Returns the driver's major CUDA version; its minor version may be older than the toolkit's."""
     version = ctypes.c_int()
     library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     status = library.cuDriverGetVersion(ctypes.byref(version))
@@ -241,10 +239,10 @@ def _driver_major() -> int:
 
 
 def _runs_on(architectures: list[str], capability: int) -> bool:
-    """Whether code for these architectures, and PTX of the last, runs on a device (86 for compute capability 8.6).
+    """Returns whether code for these architectures, and PTX of the last, runs on a device (86: compute capability 8.6).
 
-    Machine code runs on later minor versions of its major one, PTX on everything from its version on; those of an
-    architecture-specific target such as 90a on that version alone.
+    Machine code runs on its version and on later minor versions of the same major version. PTX runs on its version and
+    all later ones. Code for an architecture-specific target such as 90a runs on that version alone.
     """
     for position, architecture in enumerate(architectures):
         number = int(architecture.rstrip("af"))
@@ -257,7 +255,7 @@ def _runs_on(architectures: list[str], capability: int) -> bool:
 
 
 def describe() -> dict[str, Any]:
-    """How the module was built and what it uses."""
+    """Describes how the module was built, and its instruction set."""
     return {
         "instruction set": _isa,
         "bfloat16 products": _bfloat16_products(),
@@ -269,7 +267,7 @@ def describe() -> dict[str, Any]:
 
 
 def _bfloat16_products() -> str:
-    """What bfloat16 is multiplied in on the CPU, and why."""
+    """Describes the arithmetic of bfloat16 products on the CPU, with the reason."""
     if _bfloat16_gain == 0:
         return "in float32: this processor, or this build, has none"
     if _isa == "amx":
@@ -279,16 +277,16 @@ def _bfloat16_products() -> str:
 
 
 def measure_peak(kind: str, *, isa: str | None = None, threads: int | None = None) -> float:
-    """What the machine can do at best, as the yardstick of benchmarks; takes 0.1 to 0.2 s.
+    """Measures the machine's peak throughput, the reference of benchmarks; takes 0.1 to 0.2 s.
 
     Args:
-        kind: "float32" (multiply-adds) or "bfloat16" (dot products), in floating-point operations a second, operands
-            in registers; or "copy", in bytes a second, read and written, of memory that fits no cache.
-        isa: one of ``ISAS``; by default the one in use.
-        threads: by default torch's number.
+        kind: "float32" (multiply-adds) or "bfloat16" (dot products), with operands in registers, in floating-point
+            operations a second; or "copy" of memory larger than the caches, in bytes read and written a second.
+        isa: the instruction set, one of ``ISAS``; by default the one in use.
+        threads: the number of threads; by default torch's number.
 
     Raises:
-        ValueError: an unknown kind or instruction set, one that this processor or build does not have, or no threads.
+        ValueError: ``kind`` or ``isa`` is unknown or unsupported by this processor or build, or ``threads`` is below 1.
     """
     if kind not in compiled.Peak:
         raise ValueError(f"measure_peak: kind must be one of {', '.join(compiled.Peak)}, got {kind!r}")

@@ -1,7 +1,7 @@
-"""Calls that are one program: what runs is known from the first call of their kind, for all that are like it.
+"""A cache of calls that are one program: the first call of a kind stores how later calls of this kind run.
 
-n samples, k cells, d coordinates. A later call neither describes its arguments nor sorts its samples beforehand: two
-operations find the cells and compute the results.
+n samples, k cells, d coordinates. A later call neither analyses its arguments nor sorts its samples: two operations
+find the cells and compute the results.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.checks import MAX_COUNT
-from voronerf.router.fused import HALF, Fused, Whole
+from voronerf.router.fused import HALF, Fused, WholeProgram
 from voronerf.router.grouping import Grouping
 from voronerf.router.labels import Labels
 from voronerf.router.layout import SAMPLE, Call, rebuild, tensors_of
@@ -25,53 +25,59 @@ from voronerf.router.plan import CallPlan
 _VALUES = {type(None), bool, int, float, str}
 
 
-def kind_of(method: str, training: bool, args: Sequence[Any], kwargs: dict[str, Any], coords: Any) -> Any:
-    """What calls that run alike have in common, all but the number of samples; None for what is not told in short."""
-    kind: list[Any] = [method, training, torch.is_grad_enabled(), *kwargs]
+def call_key(method: str, training: bool, args: Sequence[Any], kwargs: dict[str, Any], coords: Any) -> Any:
+    """Returns the cache key of a call, without the number of samples; None if the call has no compact key."""
+    key: list[Any] = [method, training, torch.is_grad_enabled(), *kwargs]
     device = None
     for value in (*args, *kwargs.values(), coords):
         value = value.cells if type(value) is Labels else value
-        of = type(value)
-        if of is Tensor or of is nn.Parameter or (isinstance(value, Tensor) and torch.compiler.is_exporting()):
+        value_type = type(value)
+        if (
+            value_type is Tensor
+            or value_type is nn.Parameter
+            or (isinstance(value, Tensor) and torch.compiler.is_exporting())
+        ):
             device = value.device
-            kind += (value.shape[1:], value.dtype, device, value.layout, value.requires_grad)
-        elif of in _VALUES:
-            kind += (of, value)
+            key += (value.shape[1:], value.dtype, device, value.layout, value.requires_grad)
+        elif value_type in _VALUES:
+            key += (value_type, value)
         else:
             return None
     if device is None:
         return None
     if torch.is_autocast_enabled(device.type):
-        kind.append(torch.get_autocast_dtype(device.type))
-    return tuple(kind)
+        key.append(torch.get_autocast_dtype(device.type))
+    return tuple(key)
 
 
-class KnownCall:
-    """What is known of the calls of one kind, from the first of them and its plan.
+class CachedCall:
+    """The cached form of calls of one kind, made from the first of them and its plan.
 
     Attributes:
-        unchanged: Whether the module is as it was then.
+        unchanged: A guard that tells whether the module is as it was at the first call.
     """
 
     unchanged: Any
 
-    def __init__(self, plan: CallPlan, fused: Fused, whole: Whole, call: Call, grouping: Grouping) -> None:
-        from voronerf.ops.routed_program.native import How, run_known
+    def __init__(
+        self, plan: CallPlan, fused: Fused, whole_program: WholeProgram, call: Call, grouping: Grouping
+    ) -> None:
+        from voronerf.ops.routed_program.native import RunOptions, run_checked
 
-        (program, reads, results), arguments = whole, (*call.args, *call.kwargs.values())
+        (program, reads, results), arguments = whole_program, (*call.args, *call.kwargs.values())
         self._tensors = [i for i, value in enumerate(arguments) if isinstance(value, Tensor)]
         self._reads = [self._tensors[number] for number in reads]
         self._learns = torch.is_grad_enabled() and any(arguments[i].requires_grad for i in self._reads)
         self.module = call.module
-        self.plan, self._method, self._run = plan, call.method, run_known
-        self._how = How(program.text, caller="routed_program")
+        self.plan, self._method, self._run = plan, call.method, run_checked
+        self._options = RunOptions(program.text, caller="routed_program")
         self._leading, device = len(call.layout.lead), grouping.device
         half = torch.is_autocast_enabled(device.type) or any(arguments[i].dtype in HALF for i in self._tensors)
         ones = 0 if call.layout.flat else self._leading - 1
         self._results = [(shape[ones:], dtype if half and dtype in HALF else torch.float32) for shape, dtype in results]
-        plain = all(len(tail) == 1 and dtype is torch.float32 for tail, dtype in self._results)
-        self._as_they_are = self._leading == 1 and plain
-        self._parameters, self._shapes, self._in_graphs = fused.parameters, program.parameters, not fused.computes
+        is_plain = all(len(tail) == 1 and dtype is torch.float32 for tail, dtype in self._results)
+        self._is_plain = self._leading == 1 and is_plain
+        self._parameters, self._shapes, self._is_compilable = fused.parameters, program.parameters, not fused.computes
         parameters = fused.parameters(grouping.k, device, grouping.backend)
         self._shares = any(p.dim() == len(size) for p, size in zip(parameters, self._shapes, strict=True))
         value = fused.result
@@ -82,32 +88,31 @@ class KnownCall:
             self._value = type(value)
 
     @staticmethod
-    def of(plan: CallPlan, call: Call, grouping: Grouping) -> KnownCall | None:
-        """What is known of calls like this one; None where more is needed than one program of the compiled module."""
+    def of(plan: CallPlan, call: Call, grouping: Grouping) -> CachedCall | None:
+        """Makes the cached form of a call; None if the call is more than one program of the compiled module."""
         fused, layout, device = plan.fused, call.layout, grouping.device
-        whole = "" if fused is None else fused.whole
-        if fused is None or isinstance(whole, str) or fused.module is not call.module:
+        whole_program = "" if fused is None else fused.whole_program
+        if fused is None or isinstance(whole_program, str) or fused.module is not call.module:
             return None
         if not layout.n or fused.inputs.sources or set(call.kinds.values()) != {SAMPLE}:
             return None
         ones = (1,) * (0 if layout.flat else len(layout.lead) - 1)
-        flat = all(shape[: len(ones)] == ones for shape, _ in whole.results)
-        if not flat or any(x.dtype not in (torch.float32, *HALF) for x in tensors_of((call.args, call.kwargs))):
+        is_flat = all(shape[: len(ones)] == ones for shape, _ in whole_program.results)
+        if not is_flat or any(x.dtype not in (torch.float32, *HALF) for x in tensors_of((call.args, call.kwargs))):
             return None
         chosen = backends.chosen("grouped_program", device, torch.float32, backend=grouping.backend)
-        return KnownCall(plan, fused, whole, call, grouping) if chosen == "native" else None
+        return CachedCall(plan, fused, whole_program, call, grouping) if chosen == "native" else None
 
     def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None) -> Any:
-        """The results of a call of a router, None where it is unlike the others after all; coords are those
-        that it was given, or labels."""
+        """Returns the results of a call of a router; None if this call cannot run in the cached form."""
         arguments = (*args, *kwargs.values()) if kwargs else args
         compiles = torch.compiler.is_compiling()
-        if coords is None and type(router.coords) is str:  # as when the kind was found
+        if coords is None and type(router.coords) is str:  # the router's own rule, as in the first call
             positions, d = arguments[self._tensors[0]], router._d
             shape = positions.shape
             positions = positions if shape[-1] == d else positions[..., :d]
-            if router._unseen and not compiles:
-                router._look_at(positions, args, kwargs, coords)
+            if router._positions_unchecked and not compiles:
+                router._check_positions(positions, args, kwargs, coords)
         else:
             positions = router._positions(args, kwargs, coords)
             shape = positions.shape
@@ -115,11 +120,11 @@ class KnownCall:
         n = lead[0] if len(lead) == 1 else math.prod(lead)
         if len(lead) != self._leading or not 0 < n <= MAX_COUNT or router._modules["module"] is not self.module:
             return None
-        if self._learns and router.frozen_cells is not None:  # whose samples take no part in the backward pass
+        if self._learns and router.frozen_cells is not None:  # samples of frozen cells need no backward pass
             return None
         if compiles:
             drawn = router.assignment == "stochastic" and router.training
-            if drawn or router.methods or not self._in_graphs:
+            if drawn or router.methods or not self._is_compilable:
                 return None
         elif not self.plan.takes_first(n, k):
             return None
@@ -131,12 +136,12 @@ class KnownCall:
         for i in self._reads:
             x = arguments[i] if arguments[i].dim() == 2 else arguments[i].reshape(n, -1)
             x = x if x.dtype is torch.float32 else x.float()
-            # Of views the engine knows whether their gradients are asked for, of leaves it does not.
+            # Autograd can tell whether the gradient of a view is needed, but not for a leaf tensor.
             rows.append(x.view_as(x) if x.requires_grad and self._learns else x)
         parameters = self._parameters(k, rows[0].device, router.backend)
         if self._shares:
             parameters = [p.unsqueeze(0) if p.dim() == len(size) else p for p, size in zip(parameters, self._shapes)]
-        results = self._run(self._how, rows, parameters, k, **router._places_of(self._method, positions))
-        if not self._as_they_are:
+        results = self._run(self._options, rows, parameters, k, **router._places_of(self._method, positions))
+        if not self._is_plain:
             results = [rows.reshape(*lead, *tail).to(dtype) for rows, (tail, dtype) in zip(results, self._results)]
         return self._value(results)

@@ -1,4 +1,4 @@
-"""The command line that was meant, where words do not fit a command."""
+"""Suggestions ("did you mean ...?") for command lines that do not parse."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from typing import Any, get_args, get_type_hints
 from voronerf.app.wording import either, nearest
 
 
-def meant(name: str, command: Callable[..., int], words: list[str], error: str) -> str:
-    """Returns "; did you mean ...?" for words of a command that its parser refuses with an error; "" for no idea."""
-    arguments, options, paths = named(command)
+def suggest(name: str, command: Callable[..., int], words: list[str], error: str) -> str:
+    """Returns "; did you mean ...?" for a command line that the parser rejected with `error`, or "" without an idea."""
+    arguments, options, paths = argument_names(command)
     line = list(words)
     for word in filter(re.compile("--?[a-zA-Z]").match, words):
         flag, _, value = word.partition("=")
         option = flag.removeprefix("--").replace("_", "-")
         paths = [path for path in paths if path != option]
         if option not in options:
-            near, at = nearest(option, [*arguments, *options]), line.index(word)
-            if near not in arguments[: at + 1] or not (value or line[at + 1 :]):  # the order of arguments counts
+            near, place = nearest(option, [*arguments, *options]), line.index(word)
+            if near not in arguments[: place + 1] or not (value or line[place + 1 :]):  # arguments have an order
                 return f"; did you mean --{near}?" if near in options else ""
-            line[at : at + 1] = [value] if value else []
-    alone = error.removeprefix("Unrecognized options: ")
-    if re.fullmatch("help|[0-9.]+|.*=.*", alone):
+            line[place : place + 1] = [value] if value else []
+    rejected = error.removeprefix("Unrecognized options: ")
+    if re.fullmatch("help|[0-9.]+|.*=.*", rejected):
         paths = []
-    # A word after an option is no path but what somebody gave to a switch.
-    if paths and alone in line and not re.match("--[^=]*$", [name, *line][line.index(alone)]):
+    # A word right after an option is a value given to a switch, not a path.
+    if paths and rejected in line and not re.match("--[^=]*$", [name, *line][line.index(rejected)]):
         if arguments and len(paths) > 1:
             return f"; did you mean {either([f'--{path}' for path in paths])}?"
-        line.insert(line.index(alone), f"--{paths[0]}")
+        line.insert(line.index(rejected), f"--{paths[0]}")
     return "" if line == words else f"; did you mean {shlex.join(['voronerf', name, *line])}?"
 
 
-def named(command: Callable[..., int]) -> tuple[list[str], list[str], list[str]]:
-    """Returns the names of the arguments without an option, of the options, and of the options that take a path."""
+def argument_names(command: Callable[..., int]) -> tuple[list[str], list[str], list[str]]:
+    """Returns the names of the positional arguments, of the options, and of the options that take a path."""
     arguments: list[str] = []
     options: dict[str, Any] = {"help": bool}
     hints = get_type_hints(command, include_extras=True)

@@ -1,4 +1,4 @@
-"""A program and its tensors, as every implementation takes them. n rows, r rays, k cells, w columns."""
+"""The arguments of every implementation of a program. n rows, r rays, k cells, w columns."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.program import Ahead, Program, encoded_ahead
 
 
-class Given(NamedTuple):
-    """A program that has been checked, and its tensors.
+class ProgramArguments(NamedTuple):
+    """A checked program and its tensors.
 
     Attributes:
-        text: of the program.
+        text: the text of the program.
         inputs: [n, w] each, or [r, w] with a row for each ray; of any floating dtypes.
-        parameters: [k, ...] each, or [1, ...] where all cells share it.
+        parameters: [k, ...] each, or [1, ...] if all cells share the parameter.
         ray_index: int32 [n], or None without rays.
-        dtype: of the results: that of the layers, or autocast's where it is on; of a program without layers that of its
-            first input. float16 and bfloat16 are what products may round to; all else is float32 at least.
+        dtype: the dtype of the results: the layers' dtype, or autocast's if it is enabled; without layers, the first
+            input's dtype. With float16 and bfloat16, operands of products may be rounded; all other values are float32
+            at least.
         caller: the op that errors name.
     """
 
@@ -37,8 +38,8 @@ class Given(NamedTuple):
     @staticmethod
     def of(
         caller: str, text: str, inputs: Sequence[Tensor], parameters: Sequence[Tensor], ray_index: Tensor | None
-    ) -> Given:
-        """Takes a program by its text, and encodes float64 inputs where the results have another dtype."""
+    ) -> ProgramArguments:
+        """Returns the arguments of a program; float64 inputs are encoded here if the results have another dtype."""
         dtype, kind = inputs[0].dtype, inputs[0].device.type
         if (first := _first_layer(text)) is not None:
             dtype = parameters[first].dtype
@@ -52,25 +53,25 @@ class Given(NamedTuple):
                 for i, start, width, name, size in ahead:
                     further.append(ENCODINGS[name].formula(inputs[i][:, start : start + width], size))
                 inputs = [*inputs, *further]
-        return Given(text, inputs, parameters, ray_index, dtype, caller)
+        return ProgramArguments(text, inputs, parameters, ray_index, dtype, caller)
 
     def run(
         self, offsets: Tensor, order: Tensor | None = None, *, backend: str, op: str = "grouped_program"
     ) -> list[Tensor]:
-        """The results for rows of cells by offsets int32 [k + 1], and an order int32 [n] unless they are sorted."""
+        """Returns the results for rows with offsets int32 [k + 1] and an order int32 [n], or None for sorted rows."""
         run = backends.resolve(op, backend=backend, device=self.inputs[0].device, dtype=self.dtype)
         results: list[Tensor] = run(self, offsets, order)
         return results
 
 
 def index_name(caller: str) -> str:
-    """The argument of an op that ``ray_index`` is."""
+    """Returns the name of an op's argument that becomes ``ray_index``."""
     return "direction_index" if caller.endswith("_mlp") else "ray_index"
 
 
 @constant_result
 def _first_layer(text: str) -> int | None:
-    """The first parameter that is no table of a hash grid, whose dtype may be another."""
+    """Returns the number of the first parameter of a layer, or None; tables of hash grids may have another dtype."""
     program = Program.parse(text)
     return next((i for i in range(len(program.parameters)) if i not in program.tables), None)
 

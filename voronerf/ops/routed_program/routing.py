@@ -1,4 +1,4 @@
-"""The arguments that tell the cells of samples: centres, the tables of a tree, or the cells themselves.
+"""The arguments that route samples to cells: centres, the tables of a tree, or the cells themselves.
 
 n samples, k cells, m centres of all diagrams together, g diagrams.
 """
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.checks import FLOATING, INDEX, Others, Row, check_integer, of_one_dtype
+from voronerf.ops._core.checks import FLOATING, INDEX, Others, Row, check_integer, to_common_dtype
 
 _ROWS = {
     "cells": Row("cells", INDEX, ("n",)),
@@ -25,9 +25,8 @@ _ROWS = {
 _ROWS_OF_A_TREE = {**_ROWS, "centres": Row("centres", FLOATING, ("m", 3))}
 
 
-class Where(NamedTuple):
-    """The arguments that tell the cells, which of these are frozen and how many samples count, as
-    ``voronerf.ops.routed_mlp`` takes them."""
+class Routing(NamedTuple):
+    """The arguments of `routed_mlp` that determine the cells, the frozen cells and the number of samples that count."""
 
     centres: Tensor | None = None
     child_offsets: Tensor | None = None
@@ -40,10 +39,10 @@ class Where(NamedTuple):
     centre_index: Tensor | None = None
 
     def to_check(self, op: str) -> Others:
-        """The rows of the tensors, and these, once it is clear that they may come together."""
+        """Returns the rules of the tensors and the tensors, after checking their combination."""
         if self.centres is None:
-            for name, given in (("child_offsets", self.child_offsets), ("child", self.child)):
-                if given is not None:
+            for name, tensor in (("child_offsets", self.child_offsets), ("child", self.child)):
+                if tensor is not None:
                     raise ValueError(f"{op}: {name} must come with centres, got no centres")
             if self.coords is not None:
                 raise ValueError(f"{op}: coords must come with centres, got none to compare them with")
@@ -61,12 +60,17 @@ class Where(NamedTuple):
             if self.child is None and self.depth != 1:
                 raise ValueError(f"{op}: depth must be 1 for a flat diagram, got {self.depth}")
         rows: dict[str, Row] = _ROWS if self.child is None else _ROWS_OF_A_TREE
-        there = [name for name in rows if getattr(self, name) is not None]
-        return [rows[name] for name in there], [getattr(self, name) for name in there]
+        names = [name for name in rows if getattr(self, name) is not None]
+        return [rows[name] for name in names], [getattr(self, name) for name in names]
 
-    def at(self, op: str, positions: Tensor, sizes: dict[str, int]) -> Where:
-        """The same with the locations of samples at positions [n, p], in the dtype of the centres they are compared
-        with; ``sizes``: what the letters stand for, once the tensors are checked."""
+    def at(self, op: str, positions: Tensor, sizes: dict[str, int]) -> Routing:
+        """Returns the routing with the coordinates of the samples, in a common dtype with the centres.
+
+        Args:
+            op: the operation that errors name.
+            positions: [n, p]; the first three columns are the coordinates, unless ``coords`` are given.
+            sizes: the sizes that the letters of the checked shapes stand for.
+        """
         if self.centres is None:
             if self.cells is None and sizes["k"] != 1:
                 raise ValueError(f"{op}: centres or cells must be given for {sizes['k']} cells, got neither")
@@ -77,6 +81,6 @@ class Where(NamedTuple):
         p = positions.shape[1]
         if self.coords is None and p < 3:
             raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {p}")
-        coords, centres = of_one_dtype(positions[:, :3] if self.coords is None else self.coords, self.centres)
+        coords, centres = to_common_dtype(positions[:, :3] if self.coords is None else self.coords, self.centres)
         index = self.centre_index if centres is self.centres else None
         return self._replace(coords=coords, centres=centres, centre_index=index)
