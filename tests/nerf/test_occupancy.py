@@ -1,4 +1,4 @@
-"""The grid, and rendering through it: what is left out must not be seen."""
+"""The occupancy grid, and rendering through it: skipped space must not be visible."""
 
 import math
 
@@ -32,7 +32,7 @@ WHITE = torch.ones(3)
 
 
 class Ball:
-    """A coloured ball of radius 0.5 in empty space; counts what it is asked."""
+    """A coloured ball of radius 0.5 in empty space, which counts the queried positions."""
 
     def __init__(self, density=60.0):
         self.density, self.asked = density, 0
@@ -56,7 +56,7 @@ def grid_of(field, resolution=8, looks=3):
 
 
 def tight_grid(resolution=24):
-    """All cells that the ball reaches into, however little, and few others."""
+    """Returns a grid with all cells that the ball reaches into, however little, and few others."""
     grid = OccupancyGrid(BOX, resolution, threshold=0.1)
     middles = grid.points(torch.arange(resolution**3)).norm(dim=-1)
     grid.occupied = (middles < 0.5 + 3**0.5 / resolution).reshape(grid.occupied.shape)
@@ -100,7 +100,7 @@ def test_a_visit_raises_what_it_meets_and_leaves_the_rest():
     other = OccupancyGrid(BOX, 4, threshold=0.1, remembered=1.0)
     other.revisit(ball, 2000, seed, fixed=fixed)
     assert torch.equal(grid.density, other.density)
-    # What is not a number counts as dense.
+    # A NaN density counts as dense.
     grid.revisit(lambda p, d, i: (p, torch.full((len(p),), torch.nan)), 2000, seed)
     assert bool((grid.density == torch.inf).all())
 
@@ -113,9 +113,9 @@ def test_voxels_of_a_sampler_stay_empty():
     rays = Rays(torch.tensor([[0.0, 0, -3]]).expand(50, 3), torch.tensor([[0.0, 0, 1]]).expand(50, 3))
     for step in range(sampler.settling_steps, sampler.settling_steps + GROUP):
         sampler.step_pre_backward(ball, step, random)
-        found = render_rays(ball, rays, 0.0, 6.0, samples=sampler, jitter=True, generator=random)
+        result = render_rays(ball, rays, 0.0, 6.0, samples=sampler, jitter=True, generator=random)
         none = torch.zeros(())
-        sampler.step_post_backward(RenderOutput(none, none, found.weights, found.density, found.samples, none))
+        sampler.step_post_backward(RenderOutput(none, none, result.weights, result.density, result.samples, none))
         assert not bool(sampler.grid.occupied[empty].any()) and not bool(sampler.grid.density[empty].any())
     assert ball.asked > 64 and bool(sampler.grid.occupied[~empty].any())
 
@@ -139,7 +139,7 @@ def test_the_density_of_a_router_is_found_without_its_colour(field):
     every, alone = (sum(step.op == "linear" for step in part.steps) for part in (networks.program, networks.density))
     assert alone < every and not networks.density.rays
     grids = [OccupancyGrid(box, 6, threshold=1e-6) for _ in range(2)]
-    for grid, asked in zip(grids, (router, lambda *given: router(*given))):
+    for grid, asked in zip(grids, (router, lambda *arguments: router(*arguments))):
         grid.update(asked, generator=torch.Generator().manual_seed(2))
     torch.testing.assert_close(grids[0].density, grids[1].density)
     assert len(grids[0].density.unique()) > 10
@@ -159,7 +159,7 @@ def test_points_lie_in_their_cells():
 
 
 def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
-    """Rays from all around a ball: its shell stays, the air around it and the inside that no light reaches fade."""
+    """Rays from all around a ball keep its shell; the air around it and the dark inside fade."""
     grid, ball = OccupancyGrid(BOX, 16, threshold=0.1), Ball(200.0)
     random = seeded(0)
     for _ in range(60):
@@ -167,33 +167,35 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
         towards = torch.rand(300, 3, generator=random) * 1.6 - 0.8
         rays = Rays(origins, torch.nn.functional.normalize(towards - origins, dim=1))
         near, far, hit = intersect_box(rays.origins, rays.directions, BOX, 0.0, 9.0)
-        given = {"samples": Occupancy(grid, 64), "jitter": True, "generator": random}
-        seen = render_rays(ball, rays[hit], near[hit], far[hit], **given)
+        arguments = {"samples": Occupancy(grid, 64), "jitter": True, "generator": random}
+        seen = render_rays(ball, rays[hit], near[hit], far[hit], **arguments)
         grid.observe(seen.samples.positions, seen.density, seen.samples.deltas, seen.weights, decay=0.8)
     distance = grid.points(torch.arange(16**3)).norm(dim=-1).reshape(16, 16, 16)
     half = 3**0.5 / 16
     corners = grid.points(torch.arange(16**3)).abs().amax(-1).reshape(16, 16, 16) > 0.8
     assert not bool(grid.occupied[(distance > 0.5 + half) & ~corners].any())
-    # A ray that slips through a corner of the shell brings single cells behind it back.
+    # A ray that slips through a corner of the shell brings back single cells behind it.
     assert float(grid.occupied[distance < 0.5 - 2.5 * half].float().mean()) < 0.2
     options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 64, "background": WHITE}
-    plain, quick = (render_image(ball, cameras(), 0, occupancy=each, **options).colour for each in (None, grid))
+    plain, quick = (
+        render_image(ball, cameras(), 0, occupancy=occupancy, **options).colour for occupancy in (None, grid)
+    )
     assert float((plain - quick).abs().mean()) < 2e-3
     before = ball.asked
     render_rays(ball, rays[hit], near[hit], far[hit], samples=Occupancy(grid, 64))
     assert (ball.asked - before) * 5 < 64 * int(hit.sum())
-    # A cell comes back when a look finds something there, and fades no further by it.
+    # A look that finds density brings a cell back, and does not fade it further.
     inside = grid.voxels(torch.zeros(1, 3))
     grid.update(ball, inside, decay=1.0)
     assert float(grid.density.reshape(-1)[inside]) == 200.0
-    # What is not a number counts as dense.
+    # A NaN density counts as dense.
     grid.observe(torch.full((1, 3), 0.95), torch.tensor([torch.nan]), torch.ones(1), torch.ones(1), decay=0.0)
     assert bool(grid.occupied[15, 15, 15])
     refuses("observe: decay must lie in 0..1, got -1", grid.observe, torch.zeros(1, 3), *[torch.zeros(1)] * 3, decay=-1)
 
 
 def test_holes_in_a_surface_are_filled_where_the_field_is_dense():
-    """A cell in the middle of a ball comes back; what stands alone, what is thin and what is air stay empty."""
+    """A cell in the middle of a ball comes back; lone cells, thin parts and air stay empty."""
     radius = torch.stack(torch.meshgrid(*[torch.linspace(-15 / 16, 15 / 16, 16)] * 3, indexing="ij")).norm(dim=0)
 
     def emptied(density, contraction=None):
@@ -216,9 +218,22 @@ def test_holes_in_a_surface_are_filled_where_the_field_is_dense():
     assert bool(filled[8, 8, 8]) and bool(filled[10, 8, 8]) and float(grid.density[8, 8, 8]) == 2.0
     assert bool((radius[filled] < 0.5 + 3**0.5 / 16).all())
     assert not bool(emptied(1.5)[1].any())  # thinner than two thresholds
-    # In contracted space densities count by its own units, which are longer ones of the world off the centre.
+    # In contracted space, densities count per contracted unit, which is longer in the world off the centre.
     contracted = emptied(1.5, Contraction(torch.zeros(3), 0.2))[1]
     assert bool(contracted[10, 8, 8]) and not bool(contracted[8, 8, 8])
+
+
+def test_specks_are_dropped_and_thin_things_stay():
+    """One voxel or two that touch, by a corner too, are dust; a line of three is a rope."""
+    grid = OccupancyGrid(BOX, 12, threshold=1.0)
+    grid.occupied = torch.zeros(12, 12, 12, dtype=torch.bool)
+    kept = [(0, 0, 0), (1, 1, 1), (2, 2, 2), *((8, y, z) for y in (4, 5, 6) for z in (4, 5))]
+    for voxel in [*kept, (0, 11, 11), (5, 9, 1), (6, 10, 2), (11, 0, 5)]:
+        grid.occupied[voxel] = True
+    grid.density = 3.0 * grid.occupied
+    grid.drop_specks()
+    assert sorted(map(tuple, grid.occupied.nonzero().tolist())) == sorted(kept)
+    assert torch.equal(grid.density, 3.0 * grid.occupied)
 
 
 def test_images_are_the_same_with_a_fraction_of_the_samples():
@@ -249,7 +264,7 @@ def test_images_are_the_same_with_a_fraction_of_the_samples():
     ],
 )
 def test_the_empty_space_of_a_contracted_scene_is_skipped(space):
-    """A ball before a far wall that is as thin as fog: the grid learns both, and pictures lose nothing."""
+    """A far wall as thin as fog stands behind a ball: the grid learns both, and pictures lose nothing."""
     asked, random = [0], seeded(0)
 
     def scene(positions, directions, ray_index):
@@ -278,7 +293,7 @@ def test_the_empty_space_of_a_contracted_scene_is_skipped(space):
     assert counts[1] * 3 < counts[0]
     plain, quick = pictures
     torch.testing.assert_close(quick.colour, plain.colour, atol=2e-2, rtol=0)
-    assert bool((plain.opacity > 0.95).all())  # by the ball or the wall
+    assert bool((plain.opacity > 0.95).all())  # the ball or the wall is opaque
     torch.testing.assert_close(quick.heaviest[12, 12], plain.heaviest[12, 12], atol=1e-5, rtol=0)
     same = OccupancyGrid.from_state(grid.state_dict(), contraction=space)
     again = renderer_of({"field": scene}, contraction=space, occupancy=same, **options)
@@ -296,7 +311,7 @@ def test_a_translucent_field_is_walked_to_its_end():
 
 
 def test_a_ray_that_ends_has_the_colour_before_its_end():
-    """Through fog of one colour it is that colour, although the last of the light never reached the background."""
+    """A ray that ends in fog of one colour has that colour, although its last light never reached the background."""
     asked = [0]
 
     def fog(positions, directions, ray_index):
@@ -307,10 +322,10 @@ def test_a_ray_that_ends_has_the_colour_before_its_end():
     sampler = Occupancy(OccupancyGrid(BOX, 4, threshold=0.1), 200, picture_samples=200)
     ends = torch.zeros(2), torch.tensor([2.0, 0.1])
     seen = sampler.see(fog, rays, *ends, background=WHITE, heaviest=True)
-    left = math.exp(-0.8)  # of the second ray, which does not end
+    left = math.exp(-0.8)  # light behind the second ray, which does not end
     torch.testing.assert_close(seen.colour[:, 0], torch.tensor([0.25, 0.25 * (1 - left) + left]))
     torch.testing.assert_close(seen.opacity, torch.tensor([1.0, 1 - left]))
-    # 1 - exp(-8 t) is 0.98 at t = 0.49; the mean distance of what is seen of the fog until there
+    # 1 - exp(-8 t) is 0.98 at t = 0.49; the depth is the mean distance of the fog until there
     assert asked[0] < 200 + 64 and 0.1 < float(seen.depth[0]) < 0.125
 
 
@@ -321,15 +336,15 @@ def test_training_samples_and_gradients_are_those_of_the_dense_form(backend):
     rays, near, far = rays[hit], near[hit], far[hit]
     background = torch.rand(len(rays), 3)
     grid = OccupancyGrid(BOX * 1.01, 6, threshold=0.1)
-    found = []
+    results = []
     for sampler in (Stratified(20, backend=backend), Occupancy(grid, 20, backend=backend)):
         scale = torch.tensor(2.0, requires_grad=True)
         field = lambda p, d, i, scale=scale: ((p * scale).sigmoid(), p.square().sum(-1) * scale)  # noqa: E731
         result = render_rays(field, rays, near, far, samples=sampler, background=background)
         result.colour.square().sum().backward()
-        found.append((result.colour, result.opacity, result.depth, result.weights, scale.grad))
+        results.append((result.colour, result.opacity, result.depth, result.weights, scale.grad))
         assert result.samples.positions.shape == (20 * len(rays), 3)
-    for a, b in zip(*found):
+    for a, b in zip(*results):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
 
 
@@ -356,11 +371,11 @@ def test_state_goes_round():
     other = OccupancyGrid.from_state(grid.state_dict())
     for name, value in grid.state_dict().items():
         assert torch.equal(value, other.state_dict()[name])
-    # A grid's own tensors change in place, and leave those that it was made of.
-    given = grid.state_dict()
-    other = OccupancyGrid.from_state(given)
+    # A grid changes its own tensors in place, but not the tensors that it was made from.
+    arguments = grid.state_dict()
+    other = OccupancyGrid.from_state(arguments)
     other.observe(torch.zeros(1, 3), *(torch.ones(1) for _ in range(3)), decay=0.5)
-    assert torch.equal(given["density"], grid.density) and not torch.equal(other.density, grid.density)
+    assert torch.equal(arguments["density"], grid.density) and not torch.equal(other.density, grid.density)
     state = grid.state_dict()
     del state["density"]
     rule = "OccupancyGrid: state must hold density, got box, occupied, threshold"
@@ -378,7 +393,7 @@ def test_refuses_what_is_no_grid():
         (BOX, 8, {"remembered": 0.5}, "remembered must be at least 1 and finite, got 0.5"),
     ):
         refuses(message, OccupancyGrid, box, resolution, **{"threshold": 1, **options})
-    # 2**32 would be cell 0 in the lowest 32 bits.
+    # In 32 bits, 2**32 would be cell 0.
     update = OccupancyGrid(BOX, 4, threshold=0.1).update
     for cell in (-1, 64, 2**32):
         refuses("voxels must lie in 0 to 63, got", update, Ball(), torch.tensor([cell]))
@@ -386,10 +401,10 @@ def test_refuses_what_is_no_grid():
 
 
 def test_pictures_have_samples_of_their_own():
-    given = {"near": 1.0, "far": 5.0, "box": BOX, "background": WHITE}
+    arguments = {"near": 1.0, "far": 5.0, "box": BOX, "background": WHITE}
     pictures = [
         renderer_of({"field": Ball()}, samples=samples, picture_samples=own, occupancy=tight_grid()).image(
-            cameras(), 0, **given
+            cameras(), 0, **arguments
         )
         for samples, own in ((48, None), (24, 48), (24, None))
     ]
@@ -406,7 +421,7 @@ def ends(rays):
 )
 @pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
 def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse_depth, robust):
-    """With the loss on points that the last rays end at, before, in and behind the grid."""
+    """The loss includes points at which the last rays end, before, in and behind the grid."""
     grid = tight_grid()
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
     rays = cameras().image_rays(0)
@@ -419,28 +434,30 @@ def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse
     def compare(renderer):
         batch = Batch(rays, *ends(rays), target, background, seen)
         loss = RayLoss(renderer, terms=[SparseDepth(sparse_depth)], robust=robust)
-        found = loss(batch, torch.Generator().manual_seed(3))
-        return found, torch.autograd.grad(found.loss, list(router.parameters()))
+        results = loss(batch, torch.Generator().manual_seed(3))
+        return results, torch.autograd.grad(results.loss, list(router.parameters()))
 
-    found, gradients = compare(renderer)
-    plain = renderer_of({"field": lambda *given: router(*given)}, **options)  # a field without a table
+    results, gradients = compare(renderer)
+    plain = renderer_of({"field": lambda *arguments: router(*arguments)}, **options)  # a field without a table
     expected, same = compare(plain)
-    assert len(found.weights) > 0 and torch.equal(found.samples.positions, expected.samples.positions)
-    for part, other in zip((*found[:4], found.importance(), *gradients), (*expected[:4], expected.importance(), *same)):
+    assert len(results.weights) > 0 and torch.equal(results.samples.positions, expected.samples.positions)
+    for part, other in zip(
+        (*results[:4], results.importance(), *gradients), (*expected[:4], expected.importance(), *same)
+    ):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-6)
 
 
 def test_samples_that_no_light_reaches_have_no_gradient():
-    """Those behind the surface of a solid field; what is left is the gradient to a thousandth."""
+    """Samples behind the surface of a solid field have no gradient; the others give the gradient to a thousandth."""
     field = HashGridField(width=16, levels=2, log2_entries=10)
     torch.nn.init.constant_(field.density.bias, 10.0)
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **field.router_options)
     rays, gradients = cameras().image_rays(0), []
-    for of in (router, lambda *given: router(*given)):  # the second is a field without a table
+    for of in (router, lambda *arguments: router(*arguments)):  # the second is a field without a table
         renderer = renderer_of({"field": of}, samples=96, occupancy=tight_grid())
         batch = Batch(rays, *ends(rays), torch.zeros(len(rays), 3))
-        found = RayLoss(renderer)(batch, torch.Generator().manual_seed(3))
-        gradients.append(torch.autograd.grad(found.loss, router.module.features)[0])
+        result = RayLoss(renderer)(batch, torch.Generator().manual_seed(3))
+        gradients.append(torch.autograd.grad(result.loss, router.module.features)[0])
     some, every = gradients
     assert 0 < some.count_nonzero() < every.count_nonzero()
     assert (some - every).norm() < 1e-3 * every.norm()

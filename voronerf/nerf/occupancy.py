@@ -277,7 +277,7 @@ class OccupancyGrid:
             field: The trained field, which is called without gradients.
             generator: Random generator of the points, on any device.
         """
-        neighbours = torch.nn.functional.avg_pool3d(self.occupied[None].float(), 3, 1, 1, divisor_override=1)[0]
+        neighbours = self._neighbours()
         holes = ((neighbours >= HOLE_NEIGHBOURS) & ~self.occupied).view(-1).nonzero()[:, 0]
         minimum = HOLE_DENSITY * self.threshold
         for _ in range(HOLE_POINTS):
@@ -291,6 +291,18 @@ class OccupancyGrid:
             holes = torch.cat(dense)
         self.density.view(-1)[holes] = minimum
         self.occupied.view(-1)[holes] = True
+
+    def drop_specks(self) -> None:
+        """Empties groups of one or two occupied voxels that touch no other occupied voxel; they look like dust."""
+        neighbours = (self._neighbours() * self.occupied)[None]
+        most = torch.nn.functional.max_pool3d(neighbours, 3, 1, 1)[0]
+        specks = self.occupied & (most <= 2)
+        self.density[specks] = 0
+        self.occupied[specks] = False
+
+    def _neighbours(self) -> Tensor:
+        """Returns float32 [x, y, z], the number of occupied voxels among the 27 around and in each voxel."""
+        return torch.nn.functional.avg_pool3d(self.occupied[None].float(), 3, 1, 1, divisor_override=1)[0]
 
     def _enter(self, *samples: Tensor, **rule: Any) -> None:
         """Enters samples, with densities in world units, into the grid; see `voronerf.ops.observe_occupancy`."""

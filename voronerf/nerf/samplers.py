@@ -456,15 +456,17 @@ class Occupancy(Sampler):
             self.grid.observe(*values, decay=DECAY, fixed=self.empty, backend=self.backend)
 
     def finish(self, field: Field, seed: int) -> None:
-        """Fills holes in the surfaces of the grid; see `OccupancyGrid.fill_holes`.
+        """Removes specks from the grid of a box, and fills holes in surfaces of a contracted sphere.
 
-        Only grids of a contracted sphere are filled: objects in a box and forward-facing scenes gain nothing by it.
+        See `OccupancyGrid.drop_specks` and `OccupancyGrid.fill_holes`. Other grids gain nothing by either.
 
         Args:
             field: The trained field.
             seed: Seed of the points at which the field is evaluated.
         """
-        if isinstance(self.grid.contraction, Contraction):
+        if self.grid.contraction is None:
+            self.grid.drop_specks()
+        elif isinstance(self.grid.contraction, Contraction):
             with evaluating(field):
                 self.grid.fill_holes(field, generator=torch.Generator().manual_seed(seed))
             self._leave_empty()
