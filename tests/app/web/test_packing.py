@@ -1,4 +1,4 @@
-"""What a page holds, without a browser."""
+"""Tests of a page's packed data, without a browser."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from random_runs import KINDS, random_run
 from voronerf import NeRF, VoronoiRouter
 from voronerf.app.web import CannotDraw, export_web, pack, page_of
 from voronerf.app.web import packing as packing_file
+from voronerf.app.web.page import wide_enough
 from voronerf.app.web.shader import BLOCK, Layout, fours, networks_text
-from voronerf.nerf import Stratified
+from voronerf.nerf import Stratified, orbit_cameras
 from voronerf.nerf.fields import MipNeRF
 from voronerf.nerf.radiance import radiance_of
 from voronerf.ops import locate_cell
@@ -28,7 +29,7 @@ HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)> {{scri
 
 
 class Page(HTMLParser):
-    """The elements of a page, and the text of its scripts by their ids."""
+    """A parser of a page's elements and of its scripts' texts by id."""
 
     def __init__(self, text):
         super().__init__()
@@ -55,11 +56,11 @@ def part(packed, name, dtype):
 @pytest.mark.parametrize("kind", KINDS)
 def test_parameters_are_read_back_as_the_shader_reads_them(runs, kind):
     run = runs(kind)
-    known, packed, layout = radiance_of(run.router, examples()), pack(run), Layout()
-    networks_text(known.networks, layout)
-    own = part(packed, "parameters", "<f2").reshape(-1)[: run.diagram.num_cells * layout.size]
-    own = own.reshape(run.diagram.num_cells, layout.size).astype(np.float64)
-    parameters = [parameter.detach().numpy() for parameter in known.cells.parameters]
+    field, packed, layout = radiance_of(run.router, examples()), pack(run), Layout()
+    networks_text(field.networks, layout)
+    values = part(packed, "parameters", "<f2").reshape(-1)[: run.diagram.num_cells * layout.size]
+    values = values.reshape(run.diagram.num_cells, layout.size).astype(np.float64)
+    parameters = [parameter.detach().numpy() for parameter in field.cells.parameters]
     read = set()
     for number, start, o, i, place in layout.matrices:
         for cell in (0, run.diagram.num_cells - 1):
@@ -67,16 +68,16 @@ def test_parameters_are_read_back_as_the_shader_reads_them(runs, kind):
             for row in range(fours(o)):
                 for column in range(fours(i)):
                     at = place + (row * fours(i) + column) * BLOCK
-                    block = own[cell, at : at + BLOCK].reshape(4, 4).T  # the columns of a mat4x4f
+                    block = values[cell, at : at + BLOCK].reshape(4, 4).T  # mat4x4f is column-major
                     y[4 * row : 4 * row + 4] += block @ x[4 * column : 4 * column + 4]
             wanted = parameters[number][cell][:, start : start + i] @ x[:i]
             assert np.abs(y[:o] - wanted).max() < 2e-3 * (1 + np.abs(wanted).max()) and not y[o:].any()
         read.add(number)
     for number, start, width, place in layout.vectors:
-        wanted = parameters[number].reshape(len(own), -1)[:, start : start + width]
-        assert np.abs(own[:, place : place + width] - wanted).max() < 1e-2
+        wanted = parameters[number].reshape(len(values), -1)[:, start : start + width]
+        assert np.abs(values[:, place : place + width] - wanted).max() < 1e-2
         read.add(number)
-    tables = known.networks.program.tables
+    tables = field.networks.program.tables
     assert read | set(tables) == set(range(len(parameters)))
     for table in tables:
         assert np.array_equal(part(packed, "table", "<f2"), parameters[table].astype("<f2").reshape(-1))
@@ -102,7 +103,7 @@ def test_grid_cells_and_cameras_are_read_back(runs):
     assert torch.equal(cells, run.diagram.locate(points))
     places = np.array(packed.scene["cameras"])[:, [3, 7, 11]]
     apart = np.abs(places[:, None] - run.scene.train.cameras.origins.numpy()).max(-1)
-    assert (apart.min(0) < 1e-5).all() and (apart.min(1) < 1e-5).all()  # each of them, in another order
+    assert (apart.min(0) < 1e-5).all() and (apart.min(1) < 1e-5).all()  # a permutation
 
 
 def test_a_page_is_one_file_that_loads_nothing(runs, tmp_path):
@@ -164,8 +165,8 @@ def test_what_cannot_be_drawn_is_refused_in_a_line(runs, tmp_path):
             self.layer = torch.nn.Linear(6, 4)
 
         def forward(self, positions, directions):
-            found = self.layer(torch.cat([positions, directions], -1))
-            return found[:, :3].sigmoid(), torch.erf(found[:, 3])
+            raw = self.layer(torch.cat([positions, directions], -1))
+            return raw[:, :3].sigmoid(), torch.erf(raw[:, 3])
 
     odd = VoronoiRouter(Odd(), centres, coords="first3", fuse=True)
     refused("its networks have a step function erf", changed(run, odd))
@@ -197,3 +198,20 @@ def test_the_shader_is_that_of_the_field(runs):
     assert "linear, 33 to 18, relu" in text and "const STRATA = 70u;" in text
     assert re.findall(r"octave < (\d+)u", text) == ["5", "4"]
     assert "struct Level" not in text and "struct Level" in pack(runs("hash grid")).shader
+
+
+@pytest.mark.parametrize(("size", "factor"), [(0.1, 1.0), (0.6, None), (1.5, 2.0)])
+def test_the_turntable_shows_all_of_an_object(size, factor):
+    """Cameras that cut it see wider, by a factor of two at the most."""
+    cameras = orbit_cameras(5, radius=3.0, elevation=20.0, width=60, height=40, focal=70.0)
+    points = (torch.rand(500, 3) - 0.5) * 2 * size
+    wide = wide_enough(cameras, points)
+    factors = cameras.intrinsics[:, :2] / wide.intrinsics[:, :2]
+    assert (factors == (factor or factors[0, 0])).all() and torch.equal(
+        wide.intrinsics[:, 2:], cameras.intrinsics[:, 2:]
+    )
+    if factor is None:
+        seen = torch.stack([wide.project(points, index)[0] for index in range(5)])
+        assert 1 < factors[0, 0] < 2
+        assert seen.min() >= -1e-3 and seen[..., 0].max() <= 60.001 and seen[..., 1].max() <= 40.001
+        assert min(seen.min(), 60 - seen[..., 0].max(), 40 - seen[..., 1].max()) < 0.01  # no wider than needed

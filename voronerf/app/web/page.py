@@ -9,16 +9,20 @@ import io
 import json
 import re
 import zlib
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
+import torch
 from PIL import Image
+from torch import Tensor
 
 from voronerf.app.evaluate.panels import picture_of_colour
 from voronerf.app.files import write_bytes
 from voronerf.app.render.paths import capture_path, resized
 from voronerf.app.run import Run
 from voronerf.app.web.packing import Packed, pack
+from voronerf.nerf.cameras import Cameras
 
 SUFFIXES = (".html",)
 #: The turntable: number of frames, milliseconds per frame, and pixels along the longer side.
@@ -91,6 +95,9 @@ def turntable(run: Run, frames: int = FRAMES) -> bytes:
     around = capture_path(cameras, frames, near=scene.near, far=scene.far)
     scale = SIDE / max(around.width, around.height)
     around = resized(around, (max(1, round(scale * around.width)), max(1, round(scale * around.height))))
+    grid = run.renderer.occupancy
+    if grid is not None and grid.contraction is None:
+        around = wide_enough(around, grid.points(grid.occupied.view(-1).nonzero()[:, 0]).cpu())
     first, *others = (
         Image.fromarray(picture_of_colour(run.render(around, number, heaviest=False).colour).numpy())
         for number in range(frames)
@@ -98,6 +105,16 @@ def turntable(run: Run, frames: int = FRAMES) -> bytes:
     file = io.BytesIO()
     first.save(file, "WEBP", save_all=True, append_images=others, duration=FRAME, loop=0, quality=60)
     return file.getvalue()
+
+
+def wide_enough(cameras: Cameras, points: Tensor) -> Cameras:
+    """Returns the cameras with a focal length short enough to show all points [n, 3], but at least half of theirs."""
+    x, y, z = ((points - cameras.origins[:, None]) @ cameras.poses[:, :3, :3]).unbind(-1)  # [frames, n] each
+    fx, fy, cx, cy = cameras.intrinsics[:, :, None].unbind(1)
+    share = torch.where(z < 0, torch.maximum(x.abs() * fx / cx, y.abs() * fy / cy) / -z, 0).amax()
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[:, :2] /= share.clamp(1, 2)
+    return replace(cameras, intrinsics=intrinsics)
 
 
 def _file(name: str) -> str:
