@@ -13,7 +13,7 @@ pytestmark = pytest.mark.op("nearest_centre")
 
 
 def slow(points, centres):
-    """One point and one centre at a time, in float64."""
+    """Compares one point with one centre at a time, in float64."""
     cells = []
     for point in points.double().tolist():
         distances = [sum((a - b) ** 2 for a, b in zip(point, centre)) for centre in centres.double().tolist()]
@@ -69,16 +69,16 @@ def test_is_not_differentiable(device, backend):
 
 
 def some_centres(kind, k, d, dtype):
-    """k centres: anywhere, on a lattice with many at one place, most of them close together, all at one
-    place, or on a line that is gone along four times."""
-    found = torch.randn(k, d, dtype=torch.float64)
+    """Returns k centres: normal, on a lattice with duplicates, with a dense middle, all at one place, or on a line that
+    they traverse four times."""
+    centres = torch.randn(k, d, dtype=torch.float64)
     if kind == "in turns":
-        found = torch.linspace(0, 1, k // 4 + 1, dtype=torch.float64).repeat(4)[:k, None].expand(k, d)
+        centres = torch.linspace(0, 1, k // 4 + 1, dtype=torch.float64).repeat(4)[:k, None].expand(k, d)
     if kind == "lattice":
-        found = torch.randint(-4, 5, (k, d)).double()
+        centres = torch.randint(-4, 5, (k, d)).double()
     if kind == "heavy-tailed":
-        found = found * torch.rand(k, 1, dtype=torch.float64).pow(-2)
-    return (found * (kind != "one place")).to(dtype)
+        centres = centres * torch.rand(k, 1, dtype=torch.float64).pow(-2)
+    return (centres * (kind != "one place")).to(dtype)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -87,25 +87,27 @@ def some_centres(kind, k, d, dtype):
 def test_an_index_finds_the_same_centres(device, backend, kind, d, dtype):
     for k in (1, 16, 17, 33, 300, 4097):
         centres = some_centres(kind, k, d, dtype)
-        points = torch.cat(
-            [some_centres(kind, 150, d, dtype), torch.randint(-9, 10, (150, d)).to(dtype) / 2, centres[:9]]
-        )
-        points[7], points[70, 0], points[71, 0], points[72] = 1e30, torch.nan, -torch.inf, 1e-42
+        n = 15 if kind == "one place" else 150  # at one place, each point is compared with all centres
+        points = torch.cat([some_centres(kind, n, d, dtype), torch.randint(-9, 10, (n, d)).to(dtype) / 2, centres[:9]])
+        points[7], points[10, 0], points[11, 0], points[12] = 1e30, torch.nan, -torch.inf, 1e-42
         expected = nearest_centre(points, centres, backend="reference")
         for index in (None, index_centres(centres.to(device))):
-            given = points.to(device), centres.to(device)
-            assert torch.equal(nearest_centre(*given, index=index, backend=backend).cpu(), expected), (k, index is None)
+            arguments = points.to(device), centres.to(device)
+            assert torch.equal(nearest_centre(*arguments, index=index, backend=backend).cpu(), expected), (
+                k,
+                index is None,
+            )
 
 
 def test_many_centres_and_points_without_an_index(device, backend):
-    """The call makes one for itself, on the CPU."""
+    """The call makes an index for itself, on the CPU."""
     points, centres = torch.rand(1500, 3), torch.rand(3000, 3)
-    found = nearest_centre(points.to(device), centres.to(device), backend=backend)
-    assert torch.equal(found.cpu(), nearest_centre(points, centres, backend="reference"))
+    result = nearest_centre(points.to(device), centres.to(device), backend=backend)
+    assert torch.equal(result.cpu(), nearest_centre(points, centres, backend="reference"))
 
 
 def test_centres_in_turns_take_as_long_as_others():
-    """A sample at equal distances would see one part of each turn alone."""
+    """Samples at equal distances would see only one part of each traversal."""
     seconds = []
     for centres in (torch.rand(200_000, 1), torch.linspace(0, 1, 20_000).repeat(10)[:, None]):
         begin = time.process_time()
@@ -118,8 +120,8 @@ def test_an_index_of_centres_that_are_no_numbers_harms_nothing():
     centres = torch.rand(500, 3)
     centres[::3] = torch.nan
     centres[1::9, 1] = torch.inf
-    found = nearest_centre(torch.rand(99, 3), centres, index=index_centres(centres))
-    assert centres[found.long()].isfinite().all()
+    result = nearest_centre(torch.rand(99, 3), centres, index=index_centres(centres))
+    assert centres[result.long()].isfinite().all()
 
 
 def test_errors():
@@ -136,7 +138,7 @@ def test_errors():
         refuses("index must be of these centres, float32 [25, 3], got one of float32 [20, 3]", index=other, **many)
         double = {"points": points.double(), "centres": centres.double()}
         refuses("index must be of these centres, float64 [2, 3], got int32 [64]", index=other[:64], **double)
-    for kind, given, message in (
+    for kind, arguments, message in (
         (ValueError, torch.rand(0, 3), "index_centres: centres must hold at least one centre, got none"),
         (ValueError, torch.rand(3), "index_centres: centres must have shape"),
         (ValueError, torch.rand(3, 5), "index_centres: centres must have shape"),
@@ -144,7 +146,7 @@ def test_errors():
         (TypeError, [1.0], "index_centres: centres must be a tensor, got list"),
     ):
         with pytest.raises(kind) as caught:
-            index_centres(given)
+            index_centres(arguments)
         assert str(caught.value).startswith(message)
     with pytest.raises((ValueError, BackendUnavailable), match="nearest_centre: backend"):
         nearest_centre(points, centres, backend="fastest")

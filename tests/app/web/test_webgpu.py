@@ -1,4 +1,4 @@
-"""Pages in a real browser, whose WebGPU runs on the CPU: what it draws is what `Run.render` renders."""
+"""Tests in a real browser, whose WebGPU runs on the CPU, that pages draw the pictures that `Run.render` renders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from voronerf.app.web import export_web
 pytestmark = pytest.mark.slow
 pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 
-#: Small, since a CPU draws all of it.
+#: The window size in pixels, small since the CPU draws it.
 WINDOW = 32, 32
 PICTURE = """
 const [camera, done] = arguments;
@@ -49,7 +49,7 @@ def resize(browser, width, height, **phone):
 
 @contextlib.contextmanager
 def resized(browser, width, height, **phone):
-    """The window in another size, for a while."""
+    """Resizes the window within the context."""
     resize(browser, width, height, **phone)
     try:
         yield
@@ -59,7 +59,7 @@ def resized(browser, width, height, **phone):
 
 @pytest.fixture(scope="module")
 def page(browser, runs, tmp_path_factory):
-    """Opens the page of a run."""
+    """A function that opens the page of a run and returns the browser."""
     folder, written = tmp_path_factory.mktemp("pages"), {}
 
     def opened(run, fragment=""):
@@ -74,14 +74,14 @@ def page(browser, runs, tmp_path_factory):
 
 
 def picture(browser, cameras, index):
-    """What the page draws by a camera, uint8 [h, w, 3]."""
+    """Returns the page's picture from a camera, uint8 [h, w, 3]."""
     width, height = cameras.size(index)
     fx, fy, cx, cy = cameras.intrinsics[index].tolist()
     pose = cameras.poses[index, :3].flatten().tolist()
     camera = {"pose": pose, "focal": [fx, fy], "centre": [cx, cy], "width": width, "height": height}
-    found = browser.execute_async_script(PICTURE, camera)
-    assert not found.startswith("error"), found
-    return np.frombuffer(base64.b64decode(found), np.uint8).reshape(height, width, 4)[..., :3]
+    encoded = browser.execute_async_script(PICTURE, camera)
+    assert not encoded.startswith("error"), encoded
+    return np.frombuffer(base64.b64decode(encoded), np.uint8).reshape(height, width, 4)[..., :3]
 
 
 def rendered(run, cameras, index):
@@ -93,12 +93,12 @@ def psnr(a, b):
 
 
 def quiet(browser):
-    """Whether the page has complained about nothing."""
+    """Returns whether the page has logged no error."""
     return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
 
 
 def still(browser):
-    """Waits for the sharp picture; its fragment."""
+    """Waits for the sharp picture; returns the page's URL fragment."""
     until(lambda: " x " in browser.find_element("id", "speed").text, 60)
     return browser.execute_script("return location.hash")
 
@@ -118,7 +118,7 @@ def test_a_trained_run_looks_as_it_is_rendered(page, tmp_path):
 
 @pytest.mark.parametrize("kind", ["nerf", "traced"])
 def test_a_field_is_drawn(page, runs, kind):
-    """The shaders of all kinds are tried as C++ (test_shader.py)."""
+    """A page draws the rendered picture (test_shader.py tests the shaders of all kinds as C++)."""
     run = runs(kind)
     browser, cameras = page(run), run.scene.test.cameras
     wanted = rendered(run, cameras, 3)
@@ -137,7 +137,7 @@ def test_the_lens_and_the_size_are_those_that_are_asked_for(page, runs):
 
 @pytest.fixture
 def tall(browser):
-    """The window is so high that the page's header leaves its middle free."""
+    """A window so high that the page's header does not cover its middle."""
     with resized(browser, 64, 112):
         yield
 
@@ -152,7 +152,7 @@ def test_a_click_hides_a_cell_and_another_shows_it(tall, page, runs):
     cell = browser.execute_script(middle)["cell"]
     assert 0 <= cell < run.diagram.num_cells
     canvas.click()
-    picked = browser.find_element("id", "picked")  # in the panel, which is folded here
+    picked = browser.find_element("id", "picked")  # in the folded panel
     until(lambda: f"Cell {cell} of {run.diagram.num_cells}." in picked.get_attribute("textContent"))
     canvas.send_keys("c")
     assert browser.find_element("id", "cells").get_attribute("aria-pressed") == "true"
@@ -168,7 +168,7 @@ def test_a_click_hides_a_cell_and_another_shows_it(tall, page, runs):
 
 
 def still_after(browser):
-    """The fragment of the sharp picture that is drawn after a change."""
+    """Waits for the sharp picture after a change; returns the page's URL fragment."""
     until(lambda: browser.execute_script("return drawn === version"), 60)
     return still(browser)
 
@@ -177,20 +177,20 @@ def test_a_view_is_in_the_address(page, runs):
     run = runs("hash grid")
     browser = page(run)
     first = still(browser)
-    browser.find_element("id", "canvas").send_keys("\ue014+")  # the right arrow, and nearer
+    browser.find_element("id", "canvas").send_keys("\ue014+")  # the right arrow key, then zoom in
     browser.execute_script("element('axis').value = 2; element('axis').dispatchEvent(new Event('change'))")
     moved = still_after(browser)
     assert moved != first and "cut=2,0.5" in moved
     shown = seen(browser)
     page(run, moved)
     assert still(browser) == moved
-    assert np.abs(seen(browser) - shown).max() <= 4  # six digits of the camera
+    assert np.abs(seen(browser) - shown).max() <= 4  # the fragment keeps six digits
     page(run, "#v=1,2,NaN,0,0,0,1,1,1&hide=-1,1e9,x&cut=9,9&back=%3Cb%3E&cells=2")
     assert still(browser) == first and quiet(browser)
 
 
 def seen(browser):
-    """What the page's own camera sees, RGBA [20 * 30 * 4]."""
+    """Returns the picture of the page's own camera, RGBA [20 * 30 * 4]."""
     camera = browser.execute_script("return {...cameraOf(state.view, 30, 20), width: 30, height: 20}")
     return np.frombuffer(base64.b64decode(browser.execute_async_script(PICTURE, camera)), np.uint8).astype(int)
 
@@ -200,7 +200,7 @@ def test_a_cut_shows_what_is_behind_it_alone(page, runs):
     browser = page(run)
     whole = seen(browser)
     browser.execute_script("Object.assign(state, {axis: 2, cut: 0})")
-    assert set(seen(browser)) == {255}  # white
+    assert set(seen(browser)) == {255}  # all white
     browser.execute_script("Object.assign(state, {axis: 2, cut: 1})")
     assert np.array_equal(seen(browser), whole)
     browser.execute_script("Object.assign(state, {axis: 2, cut: 0.5})")
@@ -254,7 +254,7 @@ def test_without_webgpu_the_page_says_so_and_turns_a_picture(browser, page, runs
     gone = {"source": "Object.defineProperty(Navigator.prototype, 'gpu', {value: undefined})"}
     script = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", gone)
     try:
-        with resized(browser, 160, 160):  # there is space beneath the text
+        with resized(browser, 160, 160):  # leaves space beneath the text
             page(runs("hash grid"))
             until(lambda: "This browser has no WebGPU." in browser.find_element("id", "note").text)
             still_picture = browser.find_element("css selector", "#still img")
@@ -263,18 +263,16 @@ def test_without_webgpu_the_page_says_so_and_turns_a_picture(browser, page, runs
         browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
 
 
-def test_a_lost_device_is_replaced_twice_within_a_minute(browser, page, runs):
-    with resized(browser, 160, 160):
-        page(runs("hash grid"))
-        still(browser)
-        browser.execute_script("hide(3, true)")
-        fragment = still_after(browser)
-        shown = seen(browser)
-        lose = "const lost = renderer; setTimeout(() => lost.device.destroy()); window.lost = lost;"
-        for _ in range(2):
-            browser.execute_script(lose)
-            until(lambda: browser.execute_script("return renderer !== lost && drawn === version"), 60)
-            assert still(browser) == fragment and np.array_equal(seen(browser), shown)
+def test_a_lost_device_is_replaced_twice_within_a_minute(page, runs):
+    browser = page(runs("hash grid"))
+    still(browser)
+    browser.execute_script("hide(3, true)")
+    fragment, shown = still_after(browser), seen(browser)
+    lose = "window.lost = renderer; renderer.device.destroy()"
+    for _ in range(2):
         browser.execute_script(lose)
-        until(lambda: "took the GPU away 3 times in a minute" in browser.find_element("id", "note").text)
-        assert browser.find_element("css selector", "#still img").is_displayed()
+        until(lambda: browser.execute_script("return renderer !== lost && drawn === version"), 60)
+        assert still(browser) == fragment and np.array_equal(seen(browser), shown)
+    browser.execute_script(lose)
+    note = "return element('still').hidden ? '' : text('note')"
+    until(lambda: "took the GPU away 3 times in a minute" in browser.execute_script(note))
