@@ -317,7 +317,7 @@ def test_the_wheel_does_the_main_job_in_a_new_environment(installed):
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
     for command in settings["tool"]["cibuildwheel"]["test-command"]:
         said = installed(*command.split())
-        assert "built with" in said or not command.endswith("info")  # with or without CUDA
+        assert "built with" in said or not command.endswith("info")  # built with or without CUDA
     assert "Building" not in installed("pip", "install", "--no-index", "voronerf[viewer]")
     installed("python", "-c", "import voronerf.app.viewer, sys; assert '.venv' not in voronerf.__file__")
 

@@ -77,7 +77,9 @@ def in_region(part, points):
     """Returns which points of the scene lie in all solids of a part, bool [n]."""
     local = part.frame.inverse.points(points)
     return (
-        torch.stack([solid.holds(local) for solid in part.region]).all(0) if part.region else torch.ones(len(local)).bool()
+        torch.stack([solid.holds(local) for solid in part.region]).all(0)
+        if part.region
+        else torch.ones(len(local)).bool()
     )
 
 

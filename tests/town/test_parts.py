@@ -23,7 +23,7 @@ def torch_seed():
 
 
 def hashed(k: int, shift: float = 0.0, width: int = 8) -> VoronoiRouter:
-    """Returns a router whose cells differ and share one hash table."""
+    """Returns a router with different cells on one shared hash table."""
     router = VoronoiRouter(
         HashGridField(width=width, log2_entries=10, levels=2),
         torch.rand(k, 3) + torch.tensor([shift, 0, 0]),

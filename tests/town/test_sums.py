@@ -78,7 +78,9 @@ def test_partial_sums_are_one_loss(ranks, robust, backend):
     kept = [(cells == rank).nonzero()[:, 0] for rank in range(ranks)]
     samples = [keep_own(positions, index, depths, deltas, cells, numbers, **options) for numbers in numbers_by_rank]
     assert all(mine.positions.equal(positions[rows]) for mine, rows in zip(samples, kept, strict=True))
-    sums = [run_sums(raw[rows], mine, density_scale=2.0, **options)[0] for mine, rows in zip(samples, kept, strict=True)]
+    sums = [
+        run_sums(raw[rows], mine, density_scale=2.0, **options)[0] for mine, rows in zip(samples, kept, strict=True)
+    ]
     shown = {"background": background, "first": 0, "rays": rays, "robust": robust}
     answers, loss = compose_runs(torch.cat(sums), target, **shown, **options)
     assert torch.allclose(loss, expected.loss, rtol=1e-6)

@@ -127,7 +127,12 @@ def run(territories, batches):
         member.step.batches.batch = batches.get(number, none)
     rays = {number: len(member.step.batches.batch.near) for number, member in territories.items()}
     return step_together(
-        Group(torch.device("cpu")), territories, [0] * len(territories), line(len(territories)).boxes, rays, dict.fromkeys(territories, 1)
+        Group(torch.device("cpu")),
+        territories,
+        [0] * len(territories),
+        line(len(territories)).boxes,
+        rays,
+        dict.fromkeys(territories, 1),
     )
 
 

@@ -194,7 +194,7 @@ def test_settings_that_territories_do_not_support(tmp_path, more, said):
 
 def test_ranks_that_differ(tmp_path):
     arguments = [(command(tmp_path / "run"),), (command(tmp_path / "run", "--seed", "1"),)]
-    codes, texts = on_ranks(main, folder=tmp_path, each=arguments)
+    codes, texts = on_ranks(main, folder=tmp_path, arguments=arguments)
     assert codes == [1, 1] and not (tmp_path / "run").exists()
     assert complaints(texts) == ["voronerf: error: --seed must be the same on all ranks, got 0 on 0 and 1 on 1"]
 

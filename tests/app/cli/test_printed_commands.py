@@ -99,7 +99,7 @@ MESSAGES = sorted({command for path in (ROOT / "voronerf").rglob("*.py") for com
 EVERY = sorted({command for found in (*COLLECTED.values(), MESSAGES) for command in found})
 
 
-def given(command):
+def arguments_of(command):
     """Returns the arguments of a `voronerf` command as a list of words, or None for another program."""
     parts = shlex.split(command.replace("...", ""), comments=True)
     if parts[0] == "torchrun":
@@ -108,13 +108,13 @@ def given(command):
 
 
 def test_there_are_commands_to_look_at():
-    named = {parts[0] for command in EVERY if (parts := given(command)) and parts[0] in COMMANDS}
+    named = {parts[0] for command in EVERY if (parts := arguments_of(command)) and parts[0] in COMMANDS}
     assert named == set(COMMANDS) and len(EVERY) > 80
 
 
 @pytest.mark.parametrize("command", EVERY)
 def test_a_printed_command_is_one(command, capsys):
-    arguments, (program, *rest) = given(command), shlex.split(command)
+    arguments, (program, *rest) = arguments_of(command), shlex.split(command)
     if arguments is not None:
         (name, *others) = arguments or ["--help"]
         assert name in COMMANDS or name.startswith("--"), f"voronerf has no command {name}"
@@ -168,7 +168,9 @@ def shortened(name, parts):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [*(page for page, found in COLLECTED.items() if any(map(given, found))), "messages"])
+@pytest.mark.parametrize(
+    "page", [*(page for page, commands in COLLECTED.items() if any(map(arguments_of, commands))), "messages"]
+)
 def test_printed_commands_run(page, small_run, tmp_path, monkeypatch, capsys):
     """The commands of a page run in order in one folder, which starts as a copy of the small run's folder."""
     pytest.importorskip("trimesh", reason="trimesh is not installed")
@@ -177,7 +179,7 @@ def test_printed_commands_run(page, small_run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(small_run, tmp_path, dirs_exist_ok=True)
     for number, command in enumerate(MESSAGES if page == "messages" else COLLECTED[page]):
-        name, *parts = given(command) or [""]
+        name, *parts = arguments_of(command) or [""]
         if name not in COMMANDS or name in ELSEWHERE or (not parts and name != "info"):
             continue
         if "cuda" in parts and not torch.cuda.is_available():

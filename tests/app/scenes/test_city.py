@@ -1,4 +1,4 @@
-"""Tests of the built-in city: what grows with its size, what stays, and that rays hit the nearest solid."""
+"""Tests of the built-in city: its growth, its views, and that rays hit the nearest solid."""
 
 import numpy as np
 import pytest

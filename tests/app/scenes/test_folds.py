@@ -59,17 +59,17 @@ def matches():
 
 
 def test_a_background_that_stands_still_is_seen_in_pairs_that_differ_by_a_shift():
-    simulated = matches()
-    assert still_pairs(simulated) == (0, len(simulated.pairs))
+    data = matches()
+    assert still_pairs(data) == (0, len(data.pairs))
     generator = np.random.default_rng(0)
     background = generator.uniform((0, 0), (WIDTH, HEIGHT), (250, 2))
-    for name, places in simulated.features.items():  # the background shifts in each image
-        simulated.features[name] = np.concatenate((places, background + generator.uniform(-30, 30, 2)))
+    for name, places in data.features.items():  # the background shifts in each image
+        data.features[name] = np.concatenate((places, background + generator.uniform(-30, 30, 2)))
     behind = np.arange(200, 450)[:, None].repeat(2, 1)
-    moved = {pair: np.concatenate((rows, behind)) for pair, rows in simulated.pairs.items()}
-    assert still_pairs(Matches(simulated.features, moved)) == (len(moved), len(moved))
+    moved = {pair: np.concatenate((rows, behind)) for pair, rows in data.pairs.items()}
+    assert still_pairs(Matches(data.features, moved)) == (len(moved), len(moved))
     few = {pair: rows[: WIDE_MATCHES - 1] for pair, rows in moved.items()}
-    assert still_pairs(Matches(simulated.features, few)) == (0, 0)
+    assert still_pairs(Matches(data.features, few)) == (0, 0)
 
 
 def neighbours():
@@ -77,10 +77,10 @@ def neighbours():
 
 
 def test_pairs_that_match_over_much_of_both_images_are_wide():
-    simulated = matches()
-    assert set(wide_pairs(simulated, spreads(simulated))) == neighbours()
-    few = {pair: rows[:29] if pair == (NAMES[0], NAMES[1]) else rows for pair, rows in simulated.pairs.items()}
-    assert set(wide_pairs(Matches(simulated.features, few), spreads(simulated))) == neighbours() - {(NAMES[0], NAMES[1])}
+    data = matches()
+    assert set(wide_pairs(data, spreads(data))) == neighbours()
+    few = {pair: rows[:29] if pair == (NAMES[0], NAMES[1]) else rows for pair, rows in data.pairs.items()}
+    assert set(wide_pairs(Matches(data.features, few), spreads(data))) == neighbours() - {(NAMES[0], NAMES[1])}
     bare = {"a": np.zeros((0, 2)), "b": np.ones((40, 2))}
     assert spreads(Matches(bare, {("a", "b"): np.zeros((0, 2), dtype=np.int64)})) == {("a", "b"): 0}
 
@@ -95,21 +95,21 @@ def test_an_image_without_strong_pairs_keeps_its_best_pairs():
         ("b", "c"): (90, 0.03),
         ("d", "e"): (29, 0.1),
     }
-    simulated = Matches(dict.fromkeys("abcdef"), {pair: np.zeros((n, 2)) for pair, (n, _) in pairs.items()})
+    data = Matches(dict.fromkeys("abcdef"), {pair: np.zeros((n, 2)) for pair, (n, _) in pairs.items()})
     spread = {pair: share for pair, (_, share) in pairs.items()}
-    wide = wide_pairs(simulated, spread)
-    assert wide == [("a", "b"), ("a", "c"), ("b", "d")] and strong_pairs(simulated, wide) == wide[:2]
-    assert trusted_pairs(simulated, spread) == {*wide, ("c", "d"), ("a", "d")}
+    wide = wide_pairs(data, spread)
+    assert wide == [("a", "b"), ("a", "c"), ("b", "d")] and strong_pairs(data, wide) == wide[:2]
+    assert trusted_pairs(data, spread) == {*wide, ("c", "d"), ("a", "d")}
 
 
 def test_a_model_contradicts_the_pairs_that_a_fold_tears_apart():
-    simulated = matches()
-    strong = strong_pairs(simulated, wide_pairs(simulated, spreads(simulated)))
-    assert contradicted_pairs(simulated, strong, images()) == (0, COUNT)
+    data = matches()
+    strong = strong_pairs(data, wide_pairs(data, spreads(data)))
+    assert contradicted_pairs(data, strong, images()) == (0, COUNT)
     folded = images(turned=range(3, 9))
-    assert contradicted_pairs(simulated, strong, folded) == (2, COUNT)  # at both ends of the turned arc
-    assert contradicted_pairs(simulated, strong, folded[:6]) == (1, 5)
-    assert contradicted_pairs(simulated, strong, []) == (0, 0)
+    assert contradicted_pairs(data, strong, folded) == (2, COUNT)  # at both ends of the turned arc
+    assert contradicted_pairs(data, strong, folded[:6]) == (1, 5)
+    assert contradicted_pairs(data, strong, []) == (0, 0)
     assert [is_folded(*counts) for counts in ((2, 12), (3, 12), (3, 300), (4, 300), (0, 0))] == [0, 1, 0, 1, 0]
 
 

@@ -1,7 +1,7 @@
 """Tests of the rays of every COLMAP camera model against pixels by pycolmap 4.2.
 
-OpenCV 5.0 (`projectPoints`, `fisheye.projectPoints`) gives the same pixels to 1e-13 for all models that it has, which
-excludes FOV and THIN_PRISM_FISHEYE.
+OpenCV 5.0 (`projectPoints`, `fisheye.projectPoints`) gives the same pixels to 1e-13 for all models except FOV and
+THIN_PRISM_FISHEYE, which it lacks.
 """
 
 import json
@@ -39,7 +39,7 @@ def test_rays_go_where_colmap_and_opencv_see_the_points(model):
 
 
 def test_each_image_of_a_folder_has_its_own_model(tmp_path):
-    """Each image has its own camera model and size; files are reduced 10 or 20 times against their lens."""
+    """Each image has its own camera model and size: a tenth or a twentieth of its lens's size."""
     names = [name for name, _ in MODELS.values()]
     poses = orbit_cameras(len(names), radius=4, elevation=20, width=1, height=1, focal=1).poses
     write_images(tmp_path, [(64, 48) if index % 3 else (32, 24) for index in range(len(names))])

@@ -163,7 +163,7 @@ def write_database(path, scales, matches=()):
 def models(tmp_path, monkeypatch, pictures, **results):
     """Replaces COLMAP's mappers; returns the list of mappers that were called.
 
-    `found` maps a mapper to its result: camera positions [c, 3], (positions, number of contradicted pairs), None for
+    `results` maps a mapper to its result: camera positions [c, 3], (positions, number of contradicted pairs), None for
     no model, or an exception to raise.
     """
     called = []
@@ -205,7 +205,7 @@ def test_a_model_with_faults_is_not_a_scene(tmp_path, monkeypatch, pictures):
 
 
 def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, monkeypatch, pictures):
-    def found(**of_mappers):
+    def find_best(**of_mappers):
         """Returns (called mappers, messages, best model) for 10 images."""
         called, said = models(tmp_path, monkeypatch, pictures, **of_mappers), []
         stages = process.Stages(pycolmap, tmp_path, pictures, print)
@@ -213,7 +213,7 @@ def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, mon
         return called, said, process._best(candidates, 10)
 
     folded = (circle(10), 4)
-    called, said, best = found(**{"global": folded, "global_again": circle(10)})
+    called, said, best = find_best(**{"global": folded, "global_again": circle(10)})
     assert called == ["global", "global_again"] and best.folder.name == "global_again" and not best.folded
     assert said == [
         "global mapping: 10 of 10 images, points off by 0.50 pixels; contradicts 4 of 50 pairs of images that match "
@@ -221,20 +221,20 @@ def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, mon
         "global mapping by 0 pairs of 0: 10 of 10 images, points off by 0.50 pixels",
     ]
     others = {"incremental": None, "incremental_again": None}
-    called, _, best = found(**{"global": folded, "global_again": circle(4)}, **others)  # too few remain
+    called, _, best = find_best(**{"global": folded, "global_again": circle(4)}, **others)  # too few
     assert called == ["global", "global_again", "incremental"] and best.folder.name == "global"
-    called, _, best = found(**{"global": folded, "global_again": (circle(10), 3)}, **others)
+    called, _, best = find_best(**{"global": folded, "global_again": (circle(10), 3)}, **others)
     assert called == ["global", "global_again", "incremental", "incremental_again"] and best.contradicted == 3
-    called, *_ = found(**{"global": (circle(10), 2)})  # two pairs may be wrong matches
+    called, *_ = find_best(**{"global": (circle(10), 2)})  # two pairs may be wrong matches
     assert called == ["global"]
-    lost = circle(10) * torch.tensor([1.0] * 9 + [90.0])[:, None]  # others may be wrong too
-    called, _, best = found(**{"global": lost, "incremental": circle(9)})
+    lost = circle(10) * torch.tensor([1.0] * 9 + [90.0])[:, None]  # other cameras may be wrong too
+    called, _, best = find_best(**{"global": lost, "incremental": circle(9)})
     assert called == ["global", "incremental"] and best.folder.name == "incremental"
     lost = circle(10) * torch.tensor([1.0] * 8 + [90.0, -200.0])[:, None]
-    _, _, best = found(**{"global": lost, "incremental": circle(7)})  # 8 cameras beat 7
+    _, _, best = find_best(**{"global": lost, "incremental": circle(7)})  # 8 cameras beat 7
     assert best.folder.name == "global" and len(best.images) == 8
     broken = SceneError("cameras.bin: camera 1 must have a focal length")
-    called, said, best = found(**{"global": broken, "incremental": circle(9)})
+    called, said, best = find_best(**{"global": broken, "incremental": circle(9)})
     assert called == ["global", "incremental"] and best.folder.name == "incremental"
     assert said[0] == f"global mapping: no model: {broken}"
 

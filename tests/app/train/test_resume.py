@@ -188,7 +188,13 @@ def test_a_start_that_failed_is_begun_again_and_resumed(tmp_path, scene, monkeyp
     monkeypatch.setattr("voronerf.app.train.start.why_nothing_is_learnt", lambda batch, output: "planted")
     assert_resumes(tmp_path, scene, stop_at, occupancy=True, field="hashgrid", depth=1, split_at=(0.9,))
     stages = read_json(tmp_path / "part" / "summary.json")["stages"]
-    assert [(stage["cells"], stage["started_at_step"]) for stage in stages] == [(1, 0), (1, 5), (1, 10), (1, 15), (4, 22)]
+    assert [(stage["cells"], stage["started_at_step"]) for stage in stages] == [
+        (1, 0),
+        (1, 5),
+        (1, 10),
+        (1, 15),
+        (4, 22),
+    ]
 
 
 def test_averages_are_resumed_and_shown(tmp_path, scene):

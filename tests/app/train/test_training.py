@@ -149,14 +149,14 @@ def test_coarse_and_fine_networks_inherit_alike(scene):
     """After a split every cell of both networks has its parent's parameters and Adam moments."""
     state = started(scene, 12, **HIERARCHICAL)
 
-    def found():
+    def network_state():
         weights = {name: router.module.trunk[0].weight for name, router in state.routers.items()}
         return {n: (w.detach().clone(), state.optimizer.state[w]["exp_avg"].clone()) for n, w in weights.items()}
 
-    before = found()
+    before = network_state()
     assert state.strategy.step_pre_backward(state.optimizer, 0.5, 12) is not None
     assert not torch.equal(before["field"][0], before["coarse"][0])
-    for name, (weight, moment) in found().items():
+    for name, (weight, moment) in network_state().items():
         assert torch.equal(weight, before[name][0].expand_as(weight))
         assert bool(moment.any()) and torch.equal(moment, before[name][1].expand_as(moment))
     assert torch.equal(state.routers["coarse"].diagram.centres, state.router.diagram.centres)
@@ -331,9 +331,9 @@ def test_refused_before_anything_is_written(tmp_path, scene, monkeypatch):
 def test_warp_trains_as_the_reference_does(scene, field):
     """Steps and a split on the Warp backend give the losses of the reference backend."""
     losses = {"reference": [], "warp": []}
-    for backend, found in losses.items():
+    for backend, history in losses.items():
         config = small(backend=backend, field=field, width=17, occupancy=field == "hashgrid", split_at=(8,))
-        steps_of(build(config, scene), 16, Each(lambda state, found=found: found.append(state.loss)))
+        steps_of(build(config, scene), 16, Each(lambda state, history=history: history.append(state.loss)))
     assert len(losses["warp"]) == 16 and losses["warp"] == pytest.approx(losses["reference"], rel=0.02)
 
 

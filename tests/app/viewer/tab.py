@@ -21,7 +21,7 @@ CAMERA |= {"image_height": 48, "image_width": 48, "look_at": [0.0, 0.0, 1.0], "u
 CLICK = {"event_type": "click", "ray_origin": [0.0] * 3, "ray_direction": [0.0, 0.0, 1.0], "modifier": None}
 
 
-def found(value, buffers):
+def resolved(value, buffers):
     """Returns a message's value, or the binary buffer that it refers to."""
     return buffers[value["__binary_index"]] if isinstance(value, dict) and "__binary_index" in value else value
 
@@ -95,7 +95,7 @@ class Tab:
                 buffers.append(data[at : at + size])
                 at += size
             for message in inner["messages"]:
-                self.take({key: found(value, buffers) for key, value in message.items()})
+                self.take({key: resolved(value, buffers) for key, value in message.items()})
 
     def take(self, message) -> None:
         kind, props = message["type"], message.get("props") or {}
