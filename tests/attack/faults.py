@@ -1,6 +1,6 @@
-"""Faults of one line for the tests to find: ``python tests/attack --mutate``.
+"""One-line faults that the tests must detect: ``python tests/attack --mutate``.
 
-Most are wrong only behind a boundary, for one kind of input or on one of several paths: any test sees the others.
+Most faults have an effect only past a boundary, for one kind of input or on one of several paths.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Fault:
-    """A line that is replaced by another.
+    """A replacement of one source line.
 
     Attributes:
-        what: What goes wrong.
-        file: From the root of the repository.
-        line: A part of a line that occurs once in the file.
-        wrong: What takes its place.
-        tests: Arguments of pytest: of the tests of `make test`, those of the part.
+        what: A description of the fault.
+        file: The file's path from the root of the repository.
+        line: The replaced part of a line, which occurs once in the file.
+        wrong: The replacement.
+        tests: Arguments of pytest that select the tests of the part from `make test-all`.
     """
 
     what: str
@@ -28,7 +28,7 @@ class Fault:
 
 
 def _kernel(op: str, what: str, file: str, line: str, wrong: str) -> Fault:
-    """Of an operation, which has tests of its own beside those of all."""
+    """Returns the fault of an operation's kernel, with the operation's tests and the tests of all operations."""
     own = ("tests/town/test_sums.py",) if op in ("own_samples", "compose_runs") else (f"tests/ops/test_{op}.py",)
     words = f"{op} or test_sums" if "town" in own[0] else op
     tests = ("tests/attack/test_blocks.py", *own, "tests/ops/test_every_op.py", "-k", words)

@@ -1,7 +1,7 @@
-"""Plants faults in a copy of the tree, one at a time, and runs the tests that are to find them.
+"""Plants faults in a copy of the tree, one at a time, and runs the tests that should detect them.
 
-The copy has a build folder of its own, in which a fault compiles what it has changed and no more. A fault is found
-where a test fails that passes without it, which is looked at in the end.
+The copy has its own build folder, so that a fault recompiles only the changed files. A fault is detected if a test
+fails with it and passes without it; the latter is checked at the end.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from pathlib import Path
 from faults import FAULTS, Fault
 
 ROOT = Path(__file__).resolve().parents[2]
-SECONDS = 900  # of a fault's tests
+SECONDS = 900  # time limit of a fault's tests
 PYTEST = ("-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider")
 
 
 def plant(words: Sequence[str], results: Path | None = None) -> int:
-    """Plants the faults whose description has one of the words, or all of them; prints what became of each.
+    """Plants the faults whose description has one of the words, or all faults; prints the outcome of each.
 
     Args:
-        words: Of the faults.
-        results: A JSON file, for the outcome of each; those of other faults in it stay.
+        words: Words in the descriptions of the faults; empty for all faults.
+        results: A JSON file for the outcomes; outcomes of other faults in the file stay.
 
     Returns:
         The status of the command: 0 if at most one in fifteen was missed.
@@ -51,16 +51,16 @@ def plant(words: Sequence[str], results: Path | None = None) -> int:
     print(f"{len(rows) - missed} of {len(rows)} faults are found")
     status = int(15 * missed > len(rows))
     if results is not None:
-        metadata = {"machine": platform.machine(), "python": platform.python_version(), "tests": "make test"}
-        known = json.loads(results.read_text())["results"] if results.exists() else []
+        metadata = {"machine": platform.machine(), "python": platform.python_version(), "tests": "make test-all"}
+        stored = json.loads(results.read_text())["results"] if results.exists() else []
         others = {fault.what for fault in FAULTS} - {row["fault"] for row in rows}
-        rows = [row for row in known if row["fault"] in others] + rows
+        rows = [row for row in stored if row["fault"] in others] + rows
         results.write_text(json.dumps({"metadata": metadata, "results": rows}, indent=1) + "\n")
     return status
 
 
 def copied(tree: Path) -> Path:
-    """A copy of what git knows of this tree, with the compiled objects and the times of files."""
+    """Copies this tree's files (tracked and not ignored) and compiled objects, with file times."""
     listed = ["git", "-C", str(ROOT), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     for name in subprocess.run(listed, check=True, capture_output=True, text=True).stdout.split("\0"):
         if name and (ROOT / name).is_file():
@@ -71,7 +71,7 @@ def copied(tree: Path) -> Path:
 
 
 def build(tree: Path) -> None:
-    """Compiles in a copy what has changed."""
+    """Compiles the changed files of a copy."""
     command = [sys.executable, "setup.py", "--quiet", "build_ext", "--inplace"]
     done = subprocess.run(command, cwd=tree, env=environment(tree), capture_output=True, text=True)
     if done.returncode != 0:
@@ -79,27 +79,27 @@ def build(tree: Path) -> None:
 
 
 def environment(tree: Path) -> dict[str, str]:
-    """Of a process that imports the copy."""
+    """Returns the environment of a process that imports the copy."""
     return {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "VORONERF_CUDA": "0"}
 
 
 def tried(tree: Path, fault: Fault) -> str | None:
-    """The test that finds a fault, "the compiler", or None; the file is as before afterwards."""
+    """Plants a fault; returns the test that detects it, "the compiler", or None. Restores the file afterwards."""
     file = tree / fault.file
     text = file.read_text()
     if text.count(fault.line) != 1:
         raise SystemExit(f"mutate: {fault.file} must have the line once, got {text.count(fault.line)}: {fault.line}")
     file.write_text(text.replace(fault.line, fault.wrong))
     try:
-        build(tree)  # and what the fault before has left
+        build(tree)  # also recompiles the file of the last fault
         return first_failure(tree, fault.tests)
     finally:
         file.write_text(text)
 
 
 def first_failure(tree: Path, tests: Sequence[str]) -> str | None:
-    """The name of the first test that fails, or how the process ended; None if all pass."""
-    command = [sys.executable, *PYTEST, "-m", "not slow", *tests]
+    """Returns the name of the first failing test, or how the process ended; None if all tests pass."""
+    command = [sys.executable, *PYTEST, *tests]
     try:
         done = subprocess.run(command, cwd=tree, env=environment(tree), capture_output=True, text=True, timeout=SECONDS)
     except subprocess.TimeoutExpired:
