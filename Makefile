@@ -49,7 +49,7 @@ check: $(VENV)/.built
 	@$(BIN)/ruff format --check
 	@$(BIN)/mypy
 	@$(BIN)/clang-format --dry-run --Werror $$(find csrc -type f)
-	@$(BIN)/pytest -q tests/test_layers.py
+	@$(BIN)/pytest -q tests/test_layers.py tests/test_prose.py
 
 # The documentation with every option and the API reference: open build/site/index.html. Warnings are errors.
 docs: $(VENV)/.built $(VENV)/.docs
