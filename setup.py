@@ -5,12 +5,12 @@ a build.ninja, so it is parallel and rebuilds only files whose sources or header
 ``*_isa.cpp`` are compiled once per instruction set (csrc/common/isa.h), and one is chosen at run time.
 
 Environment:
-    CXX, CXXFLAGS                the C++ compiler and its flags (default c++, else g++, clang++ on Windows, where MSVC
-                                 cannot compile GNU's vectors); "ccache g++" works too
-    VORONERF_OPENMP              0: without OpenMP: operations run on one thread, as always on macOS and Windows. clang
-                                 on Linux needs it, since its OpenMP runtime differs from torch's
-    VORONERF_CUDA                auto (default): with CUDA if nvcc and a GPU are found, for that GPU; 1: for all GPUs,
-                                 also on a machine without one, and fail without nvcc; 0: never
+    CXX, CXXFLAGS                the C++ compiler and its flags (default c++, or else g++; clang++ on Windows, because
+                                 MSVC cannot compile GNU's vectors); "ccache g++" works too
+    VORONERF_OPENMP              0: build without OpenMP; operations then run on one thread, as they always do on macOS
+                                 and Windows. Set 0 for clang on Linux, whose OpenMP runtime differs from torch's
+    VORONERF_CUDA                auto (default): build with CUDA for this machine's GPU, if nvcc and a GPU are found;
+                                 1: for all GPUs, even without a GPU, and fail without nvcc; 0: without CUDA
     VORONERF_CUDA_ARCHITECTURES  such as "80;90": machine code for each, and PTX of the last one for later GPUs
     CUDA_HOME, MAX_JOBS          the folder of the CUDA toolkit; the number of parallel jobs
 """
@@ -83,7 +83,7 @@ def build_folder() -> Path:
 
 
 class Cuda:
-    """The CUDA set-up: nvcc and the architectures, or neither, and the outcome in one line."""
+    """The CUDA set-up: nvcc and the architectures, if CUDA is used, and a line that says what was found."""
 
     def __init__(self, outcome: str, nvcc: Path | None = None, architectures: tuple[str, ...] = ()) -> None:
         self.outcome, self.nvcc, self.architectures = outcome, nvcc, architectures
@@ -145,14 +145,14 @@ def check_compiler() -> None:
     for program in compiler()[: 2 if Path(compiler()[0]).name in LAUNCHERS else 1]:
         if shutil.which(program) is None:
             raise SystemExit(
-                f"voronerf: there must be a C++17 compiler, g++ or clang++, got no {program}: install the package g++ "
-                "(Debian, Ubuntu), gcc-c++ (Fedora), gcc (Arch), cxx-compiler (conda-forge), LLVM (Windows) or, on "
-                "macOS, xcode-select --install; CXX names another"
+                f"voronerf: a C++17 compiler (g++ or clang++) is needed, but {program} was not found: install the "
+                "package g++ (Debian, Ubuntu), gcc-c++ (Fedora), gcc (Arch), cxx-compiler (conda-forge), LLVM "
+                "(Windows) or, on macOS, xcode-select --install; set CXX to use another compiler"
             )
 
 
 def host_compiler() -> list[str]:
-    """Returns nvcc's flags for the C++ compiler: one program without a launcher, and its arguments by -Xcompiler."""
+    """Returns nvcc's flags for the C++ compiler: one program without a launcher, and its arguments with -Xcompiler."""
     words = compiler()
     program, *arguments = words[1:] if Path(words[0]).name in LAUNCHERS and len(words) > 1 else words
     return ["-ccbin", program, *(part for argument in arguments for part in ("-Xcompiler", argument))]
@@ -164,7 +164,7 @@ def openmp() -> bool:
 
 
 def ninja() -> list[str]:
-    """Returns the command of ninja: of the Python package, else of PATH."""
+    """Returns the command of ninja: from the Python package, or else from PATH."""
     try:
         import ninja as package
 
@@ -177,7 +177,7 @@ def isas() -> dict[str, list[str]]:
     """Returns the instruction sets of the compiler's architecture and their flags."""
     target = subprocess.run([*compiler(), "-dumpmachine"], check=True, capture_output=True, text=True).stdout
     architecture = target.split("-")[0].replace("arm64", "aarch64")
-    # Runs on processors without the other instruction sets; -O2 compiles faster.
+    # The portable code runs on processors without the other instruction sets; -O2 compiles faster.
     return {"portable": ["-DVN_ISA=0", "-O2"], **ISAS.get(architecture, {})}
 
 
@@ -186,8 +186,8 @@ def build_info(cuda: Cuda) -> str:
     version = subprocess.run([*compiler(), "--version"], check=True, capture_output=True, text=True).stdout
     if "clang" in version and openmp():
         raise SystemExit(
-            f"voronerf: on Linux the extension runs on torch's OpenMP, GCC's, and needs that compiler: set CXX=g++, or "
-            f"VORONERF_OPENMP=0 for one thread (got {version.splitlines()[0]})"
+            f"voronerf: on Linux the extension uses torch's OpenMP runtime (GCC's) and must be built with GCC: set "
+            f"CXX=g++, or VORONERF_OPENMP=0 for one thread (got {version.splitlines()[0]})"
         )
     values = {
         "VN_COMPILER": f'"{version.splitlines()[0]}"',
@@ -218,11 +218,11 @@ def bindings() -> str:
 def ninja_file(module: Path, cuda: Cuda, folder: Path | None = None) -> str:
     """Returns the text of build.ninja, whose commands run in the build folder or in `folder`.
 
-    Paths are relative to this folder, so that a copy of the tree with its objects needs no rebuild.
+    Paths are relative to the working folder, so that a copy of the tree with its objects needs no rebuild.
     """
     sources = Path(os.path.relpath(SOURCES, folder or build_folder()))
     common = ["-std=c++17", "-O3", *([] if WINDOWS else ["-fPIC"]), "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
-    # Without OpenMP its pragmas are ignored, and the thread counts that they use are unused parameters.
+    # Without OpenMP its pragmas are ignored, and the thread counts in these pragmas are unused parameters.
     threads = ["-fopenmp"] if openmp() else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
     includes = [f"-I{sources.as_posix()}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
     # These flags follow CXXFLAGS: results are defined by separate roundings (csrc/geometry/nearest_centre_math.h) and
@@ -304,7 +304,7 @@ def pybind11_headers() -> str:
 
 
 def stub_of(module: Path) -> str:
-    """Returns the stub of a module, or "" if it does not run on this machine, which leaves the existing files.
+    """Returns the stub of a module, or "" (keep the existing files) if the module does not run on this machine.
 
     A new process imports the module, with any OpenMP runtime instead of torch's.
     """
@@ -319,7 +319,7 @@ print(module.stub, end="")
 """
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     if found.returncode != 0:
-        print(f"voronerf: _C.pyi and interface.txt in voronerf/ops/_core are left as they are: {found.stderr.strip()}")
+        print(f"voronerf: _C.pyi and interface.txt in voronerf/ops/_core were not updated: {found.stderr.strip()}")
     return found.stdout
 
 
@@ -334,7 +334,7 @@ def join(flags: list[str]) -> str:
 
 
 def write_if_changed(path: Path, text: str) -> None:
-    """Writes a file only if its text has changed, so that its modification time stays."""
+    """Writes a file only if its text has changed, to keep its modification time otherwise."""
     if not path.exists() or path.read_text() != text:
         path.write_text(text)
 

@@ -1,14 +1,14 @@
-"""Compiles every .cu for every architecture, warnings as errors, without a GPU: ``cuda_check.py 80 90 ...``.
+"""Compiles every .cu file without a GPU, with warnings as errors: ``cuda_check.py ARCHITECTURE ...``, such as 80 90.
 
 It uses the rules of setup.py and the build folder, so a build for the same architectures reuses the objects. The last
 architecture is compiled to PTX as well.
 
 For every kernel it prints registers, spills, shared memory and the warps that fit a multiprocessor's registers, and
 compares them with the table .ci/cuda_resources.json. A spill that is not in the table is a failure. With the table's
-version of nvcc, so are more registers, more shared memory, fewer warps, and a network's layer that has more
-instructions or is not found (machine_code.py, if cuobjdump is installed). sm_80 is an A100, sm_89 an RTX 4090, sm_90 an
-H200. It is a failure too if a kernel's resources are not reported for every architecture, or if there is no kernel.
-Kernels of the toolkit (CUB) are only counted: their names change with its version.
+version of nvcc, more registers, more shared memory and fewer warps are failures too, and so is a network layer that has
+more instructions or is not found (machine_code.py, if cuobjdump is installed). sm_80 is an A100, sm_89 an RTX 4090,
+sm_90 an H200. The check also fails if a kernel's resources are not reported for every architecture, or if there is no
+kernel. Kernels of the toolkit (CUB) are only counted: their names change with its version.
 
 ``--update`` writes the named architectures to the table and removes kernels that no longer exist. The last line of the
 output is one sentence: what was compiled, and whether it passed.
@@ -38,7 +38,7 @@ NETWORKS = "network/cuda/program_cuda.cu.o"
 """The object file whose kernels contain network layers."""
 FLAGS = "-Werror all-warnings -Xcompiler -Wall,-Wextra,-Werror -Xptxas -v"
 OBJECT = re.compile(r"^\[\d+/\d+\] (?=\S+\.cu\.o$)", re.MULTILINE)
-"""The line of ninja before a compilation's output."""
+"""The line that ninja prints before the output of a compilation."""
 KERNEL = re.compile(
     r"Compiling entry function '(?P<name>\w+)' for '(?P<arch>\w+)'.*?"
     r"(?P<stores>\d+) bytes spill stores, (?P<loads>\d+) bytes spill loads.*?"
@@ -84,7 +84,7 @@ def main(architectures: list[str]) -> int:
             }
     path, counted = CODE["tools"](), (OUT / NETWORKS).is_file() and NETWORKS not in failed
     if path is None:
-        print("cuda-check: no instructions of layers were counted, for want of cuobjdump and nvdisasm.")
+        print("cuda-check: no layer instructions were counted: cuobjdump or nvdisasm is missing.")
     for architecture in architectures if path is not None and counted else ():
         for name, found in CODE["layers"](OUT / NETWORKS, architecture, path).items():
             kernel = f"{Path(NETWORKS).stem}: {demangled(name)}"
@@ -133,7 +133,7 @@ Kernels = dict[str, dict[str, dict[str, int]]]
 
 
 def regressions(version: str, kernels: Kernels) -> list[str]:
-    """Returns a line for each value worse than in the table; kernels and architectures missing there must not spill."""
+    """Returns a line for each value worse than in the table; kernels and architectures that it lacks must not spill."""
     kept = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": "", "kernels": {}}
     compared = ("spilled_bytes", *(("registers", "shared_bytes", "layer") if kept["nvcc"] == version else ()))
     counted = any("layer" in row for rows in kernels.values() for row in rows.values())
@@ -145,14 +145,16 @@ def regressions(version: str, kernels: Kernels) -> list[str]:
                 if key in row and row[key] > known.get(key, row[key]):
                     worse.append(f"{kernel} ({architecture}): {key} {row[key]}, above {known[key]}")
             if counted and "layer" in compared and "layer" in known and "layer" not in row:
-                worse.append(f"{kernel} ({architecture}): no layer was found, of {known['layer']} instructions before")
+                worse.append(
+                    f"{kernel} ({architecture}): no layer was found (the table has {known['layer']} instructions)"
+                )
             if "registers" in compared and row["warps"] < known.get("warps", 0):
                 worse.append(f"{kernel} ({architecture}): warps {row['warps']}, below {known['warps']}")
     return worse
 
 
 def merged(version: str, kernels: Kernels) -> Kernels:
-    """Returns the new rows, and the table's rows of other architectures for these kernels by the same nvcc."""
+    """Returns the new rows and, if nvcc has the same version, these kernels' table rows of other architectures."""
     table = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": ""}
     kept = table["kernels"] if table["nvcc"] == version else {}
     return {
@@ -208,7 +210,7 @@ def demangled(name: str) -> str:
 
 
 def span(values: list[int]) -> str:
-    """Returns one number as text, or the range of several."""
+    """Returns the range of the numbers as text; for equal numbers, the number."""
     return str(values[0]) if min(values) == max(values) else f"{min(values)}-{max(values)}"
 
 

@@ -1,6 +1,6 @@
-"""Counts the instructions of a network's layer in machine code, without a GPU: the shortest loop through its products.
+"""Counts the instructions of a network layer, the shortest loop through its products, in machine code without a GPU.
 
-``layers(object, "90")`` reads an object file with cuobjdump, of the toolkit or of the package nvidia-cuda-cuobjdump.
+``layers(object, "90")`` reads an object file with cuobjdump, from the toolkit or the package nvidia-cuda-cuobjdump.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def tools() -> str | None:
 
 
 def layers(compiled: Path, architecture: str, path: str) -> dict[str, Counter[str]]:
-    """Returns a layer's instruction counts by kind, for each kernel with products, by mangled name."""
+    """Returns, for the mangled name of each kernel with products, the instruction counts of a layer by kind."""
     command = [shutil.which("cuobjdump", path=path) or "cuobjdump", "-arch", f"sm_{architecture}", "-sass", compiled]
     said = subprocess.run(command, capture_output=True, text=True, check=True, env={"PATH": path}).stdout
     kernels = dict[str, Code]()
@@ -46,8 +46,8 @@ def layers(compiled: Path, architecture: str, path: str) -> dict[str, Counter[st
 def layer(code: Code) -> Counter[str]:
     """Counts, by kind, the instructions of the shortest cycle through the basic block with the most products.
 
-    In a chain of layers this cycle is one layer with all code in between. A block that is itself a loop over a product
-    counts once. The result is empty if no block has enough products.
+    In a chain of layers this cycle is one layer and the code between layers. A block that is itself a loop over a
+    product counts once. The result is empty if no block has enough products.
     """
     blocks, ways = _blocks(code)
     kinds = [Counter(kind(text) for _, text in block) for block in blocks]
@@ -77,9 +77,9 @@ def kind(instruction: str) -> str:
 
 
 def _blocks(code: Code) -> tuple[list[Code], list[set[int]]]:
-    """Returns the basic blocks, and for each block the numbers of the blocks that may follow it."""
+    """Returns the basic blocks, and for each block the indices of the blocks that may follow it."""
     places = {address: place for place, (address, _) in enumerate(code)}
-    jumps = dict[int, tuple[int | None, bool]]()  # place -> (target, whether the next instruction may follow)
+    jumps = dict[int, tuple[int | None, bool]]()  # index -> (target, whether the next instruction may follow)
     for place, (_, text) in enumerate(code):
         match = BRANCH.match(text)
         what = match["what"] if match else ""

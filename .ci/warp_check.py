@@ -29,7 +29,7 @@ REGISTERS, FRAME = 0x2F, 0x11  # attributes of a kernel in the section .nv.info 
 
 
 def resources(cubin: bytes) -> dict[str, tuple[int, int]]:
-    """Returns the registers of a thread and the bytes of its stack, for attributes kernel of a cubin (64-bit ELF)."""
+    """Returns the registers and the stack bytes of a thread, for each forward kernel of a cubin (64-bit ELF)."""
     start, count, names_at = *struct.unpack_from("<Q", cubin, 0x28), *struct.unpack_from("<HH", cubin, 0x3C)
     rows = [struct.unpack_from("<IIQQQQIIQQ", cubin, start + 64 * i) for i in range(count)]
     text = lambda table, at: cubin[(begin := rows[table][4] + at) : cubin.index(b"\0", begin)].decode()  # noqa: E731

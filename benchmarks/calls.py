@@ -1,10 +1,10 @@
-"""Times small calls, and a router from few rows to many beside one network, in turns on one thread.
+"""Times small calls of ops, and routers beside a single network, in turns on one thread.
 
     python benchmarks/calls.py --json benchmarks/results/calls.json
 
-An op as it is called, and its compiled function alone; a router with ``fuse=True`` of 16 cells beside one network that
-is no router, and beside routing by hand: argmin, argsort, one padded ``baddbmm`` a layer, scatter; networks of sorted
-rows beside a padded ``baddbmm``. Times are medians of the process, in microseconds.
+Ops: the public call beside its compiled function. Routers: 16 cells with ``fuse=True``, beside one ``nn.Sequential``
+and beside routing by hand (argmin, argsort, one padded ``baddbmm`` per layer, scatter). Networks on sorted rows:
+``grouped_mlp`` beside a padded ``baddbmm``. Times are median wall times in microseconds.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ CELLS, WIDTH = 16, 64
 
 @dataclass(frozen=True)
 class Options:
-    """How long, and where results go."""
+    """The settings of the benchmark."""
 
     seconds: float = 1.0
-    """For each row."""
+    """Seconds of measurement for each contender of a row."""
     json: Path | None = None
-    """A file for the results; default: printed only."""
+    """The JSON file of the results. Default: results are only printed."""
 
 
 def network() -> nn.Sequential:
-    """Three layers."""
+    """Returns a network of three linear layers."""
     return nn.Sequential(nn.Linear(3, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 4))
 
 
 def padded(x: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Layers [k, i, o] and [k, 1, o] on rows [k, n, i]."""
+    """Applies layers of weights [k, i, o] and biases [k, 1, o] to rows [k, n, i], with ReLU between the layers."""
     for place, (weight, bias) in enumerate(layers):
         x = torch.baddbmm(bias, x, weight)
         if place < len(layers) - 1:
@@ -53,7 +53,7 @@ def padded(x: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
 
 
 def by_hand(x: Tensor, centres: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """A router as one writes it."""
+    """Routes rows with plain torch operations, as a user without the library would."""
     cells = torch.cdist(x, centres).argmin(1)
     order = cells.argsort()
     counts = cells.bincount(minlength=len(centres))
@@ -64,34 +64,36 @@ def by_hand(x: Tensor, centres: Tensor, layers: list[tuple[Tensor, Tensor]]) -> 
 
 
 def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
-    """The contenders of each row, by their names."""
-    found: dict[str, dict[str, Callable[[int], Any]]] = {}
+    """Returns the contenders of each row: row name -> contender name -> function."""
+    contenders: dict[str, dict[str, Callable[[int], Any]]] = {}
     points, centres, cells, cpu = torch.rand(8, 3), torch.rand(4, 3), torch.empty(8, dtype=torch.int32), native.cpu()
-    found["nearest_centre, 8 points"] = {
+    contenders["nearest_centre, 8 points"] = {
         "public": lambda _: nearest_centre(points, centres),
         "compiled": lambda _: native.compiled.nearest_centre(points, centres, None, cells, 8, 4, 3, 0, cpu),
     }
     loss, gradient, offsets = torch.zeros(()), torch.zeros(2, 4), torch.tensor([0, 2], dtype=torch.int32)
     along = torch.tensor([6.9, 1e3]), torch.tensor([1.0, 2]), torch.full((2,), 0.1), torch.full((2,), 0.5)
-    given = *along, offsets, torch.tensor([2.0])
-    found["sparse_depth_gradient, 8 tensors"] = {
-        "public": lambda _: sparse_depth_gradient(loss, gradient, *given, factor=1.0, activated=True)
+    arguments = *along, offsets, torch.tensor([2.0])
+    contenders["sparse_depth_gradient, 8 tensors"] = {
+        "public": lambda _: sparse_depth_gradient(loss, gradient, *arguments, factor=1.0, activated=True)
     }
     for n in (16, 256, 4096, 65536):
         plain, x = network(), torch.rand(n, 3)
         router = VoronoiRouter(network(), torch.rand(CELLS, 3), coords="first3", fuse=True)
         linears = [layer for layer in router.module if isinstance(layer, nn.Linear)]
         layers = [
-            (copy.deepcopy(each.weight).mT.detach().requires_grad_(), copy.deepcopy(each.bias)[:, None].detach())
-            for each in linears
+            (copy.deepcopy(linear.weight).mT.detach().requires_grad_(), copy.deepcopy(linear.bias)[:, None].detach())
+            for linear in linears
         ]
         ways: dict[str, Callable[[], Tensor]] = {
             "router": lambda router=router, x=x: router(x),
             "nn.Sequential": lambda plain=plain, x=x: plain(x),
             "by hand": lambda router=router, x=x, layers=layers: by_hand(x, router.diagram.centres, layers),
         }
-        found[f"{n} rows, forward"] = {name: torch.no_grad()(lambda _, way=way: way()) for name, way in ways.items()}
-        found[f"{n} rows, with backward"] = {
+        contenders[f"{n} rows, forward"] = {
+            name: torch.no_grad()(lambda _, way=way: way()) for name, way in ways.items()
+        }
+        contenders[f"{n} rows, with backward"] = {
             name: lambda _, way=way: way().sum().backward() for name, way in ways.items()
         }
     table = MLP((Layer(("positions",), WIDTH, "relu"), Layer((0,), WIDTH, "relu"), Layer((1,), 4)), outputs=(2,))
@@ -99,15 +101,15 @@ def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
     biases: list[Tensor | None] = [torch.zeros(CELLS, layer.width) for layer in table.layers]
     x, ends = torch.rand(1024, 3), torch.arange(0, 1025, 64, dtype=torch.int32)
     turned = [(w.mT.contiguous(), b[:, None]) for w, b in zip(weights, biases) if b is not None]
-    found["1,024 sorted rows"] = {
+    contenders["1,024 sorted rows"] = {
         "grouped_mlp": lambda _: grouped_mlp(x, ends, weights, biases, layers=table),
         "baddbmm": lambda _: padded(x.view(CELLS, 64, 3), turned),
     }
-    return found
+    return contenders
 
 
 def main(options: Options) -> None:
-    """Prints a line for each row, and writes the results."""
+    """Prints a line for each row and writes the results."""
     torch.manual_seed(0)
     results: list[dict[str, Any]] = []
     with threads(1):

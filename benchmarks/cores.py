@@ -1,18 +1,18 @@
-"""What more cores give to a training: steps by the clock on one core and on all, what a region of threads costs, and a
-model of more cores than the machine has.
+"""Scaling of training with CPU cores: measured step times, the cost of a parallel region, and a model for more cores.
 
     OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=1000 python benchmarks/cores.py --data DATA --json FILE
 
-takes three minutes of two quiet cores. DATA holds the scenes lego and bonsai; `voronerf train` sets these variables
-itself (docs/kernels.md). By the clock, trainings of the same steps take turns: on one thread and on all cores, replayed
-(voronerf/nerf/step.py) and as they are, and beside another training in a process of its own. The first quarter of the
-turns, with the split, and the end of a training are left out.
+It takes three minutes on two idle cores. DATA holds the scenes lego and bonsai. `voronerf train` sets these variables
+itself (docs/kernels.md). The measured trainings have the same steps and take turns: on one thread and on all cores,
+replayed (voronerf/nerf/step.py) and eager, and beside a second training in another process. The first quarter of the
+turns, which contains the split, and the end of a training are not counted.
 
-The model is of one thread, by its processor time. Calls of the compiled module are traced in other steps of each turn
-(csrc/common/trace.h): each run of items that threads would share is given to whichever of 2, 8, 16 and 32 would be free
-first. What lies outside of such regions is serial: Python, torch's own operations, and the compiled module's before and
-after its regions. A step on so many cores takes the serial time, what a region costs for each of them, and the longest
-of the threads' times, or the time in which memory moves the step's bytes.
+The model starts from the processor time of one thread. Calls of the compiled module are traced in separate steps of
+each turn (csrc/common/trace.h). Each chunk of items of a parallel region is assigned to the first free one of 2, 8, 16
+or
+32 threads. All time outside parallel regions is serial: Python, torch's operations, and the compiled module's code
+around its regions. The modelled step time is the serial time, plus the fixed cost of each region, plus the larger of
+the busiest thread's time and the time to move the step's bytes through memory.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ TEAMS = (2, 8, 16, 32)
 REST = "Python and torch"
 BANDWIDTHS = {"40": 40e9, "80": 80e9}
 TURN = GROUP, 2 * GROUP, 4 * GROUP
-"""Steps of a turn after which the trace begins, where there is one, the clock, and the next turn: in the first of them
-`train` starts, which takes milliseconds."""
+"""Steps of a turn after which the trace (if any), the timing and the next turn begin. The first steps are not counted,
+because `train` takes milliseconds to start."""
 LINE, SAMPLE_BYTES, ENTRY_BYTES, TAUGHT_BYTES = 16, 450, 8, 24
-"""Entries of a cache line; bytes that a step reads and writes of a sample (positions to gradients), of an entry (its
-gradient, twice), and of one in a line with a gradient (itself and two moments, each read and written)."""
+"""Parameters in a cache line, and the bytes that a step moves: per sample (positions to gradients), per parameter (its
+gradient, twice), and per parameter of a cache line with a gradient (the value and two moments, read and written)."""
 CALLS, SERIAL_US, TRIALS = 100, 40, 5
-"""Regions of a recording; what one thread does before each of them, in microseconds; measurements, of which the least
-disturbed stands."""
+"""Parallel regions in a recording, microseconds of serial work before each region, and measurements; the fastest
+measurement counts."""
 
 
 class Case(NamedTuple):
-    """A training."""
+    """A measured training."""
 
     data: str
     downscale: int
     settings: dict[str, Any]
-    picture: int | None = None  # by what the scene is made smaller for a picture; None for no picture
+    picture: int | None = None  # downscale factor of the rendered picture; None: no picture
 
 
 CASES = {
@@ -70,15 +70,15 @@ QUICK = {"quick": Case("builtin:32", 1, {"steps": TURN[-1] + 2}, 1)}
 
 
 class Way(NamedTuple):
-    """How steps are made."""
+    """A way to run the steps of a training."""
 
     threads: int
     replayed: bool = True
-    beside: int = 0  # threads of another training, at the same time
+    beside: int = 0  # threads of the second training at the same time
 
 
 def ways(cores: int) -> dict[str, Way]:
-    """Those that are compared, by name."""
+    """Returns the compared ways, by name."""
     return {
         "one thread": Way(1),
         "all cores": Way(cores),
@@ -90,7 +90,7 @@ def ways(cores: int) -> dict[str, Way]:
 
 
 class Other(Callback):
-    """Another training, again and again while it is wanted, in a process of its own."""
+    """A second training in another process, repeated while it has threads to run on."""
 
     def __init__(self, case: Case) -> None:
         context = multiprocessing.get_context("spawn")
@@ -100,7 +100,7 @@ class Other(Callback):
         self.work(0)
 
     def work(self, count: int) -> None:
-        """Returns when it trains on so many threads, 0 for not at all."""
+        """Waits until the second training runs on ``count`` threads; 0 pauses it."""
         self.wanted.value = count
         while self.works.value != count:
             if not self.process.is_alive():
@@ -127,7 +127,7 @@ class Other(Callback):
 
 
 class Training(Callback):
-    """A training that is made one way, in turns."""
+    """A training in one of the ways, which runs in turns."""
 
     group = GROUP
 
@@ -138,11 +138,11 @@ class Training(Callback):
         self.ms: list[float] = []
         self.processor_ms: list[float] = []
         self.traced: list[dict[str, list[float]]] = []
-        self._began, self._passed = 0, 0  # the step at which the turn began, and what it has passed of TURN
-        self._since = 0, 0.0, 0.0  # of the last of these: step, and seconds by the clock and of the processor
+        self._began, self._passed = 0, 0  # first step of the turn; passed marks of TURN
+        self._since = 0, 0.0, 0.0  # step, wall and processor seconds at the last mark
 
     def turn(self, other: Other) -> None:
-        """Makes the steps of a turn."""
+        """Runs the steps of a turn."""
         with threads(self.way.threads):
             other.work(self.way.beside)
             self._began, self._passed = self.state.step, 0
@@ -151,7 +151,7 @@ class Training(Callback):
             other.work(0)
 
     def after_step(self, state: State) -> None:
-        """Keeps what a step took by the clock, and what was traced."""
+        """Stores the trace and the times of the turn's steps at the marks of TURN."""
         if state.step - self._began < TURN[self._passed]:
             return
         now = state.step, time.perf_counter(), time.process_time()
@@ -172,35 +172,37 @@ class Training(Callback):
 
 
 def config(case: Case) -> TrainConfig:
-    """The settings of a training."""
+    """Returns the settings of a training."""
     return TrainConfig(data=case.data, downscale=case.downscale, **case.settings)
 
 
 def load(case: Case, downscale: int | None = None) -> Any:
-    """The scene of a training."""
+    """Loads the scene of a training."""
     return load_scene(case.data, downscale=downscale or case.downscale)
 
 
 def parts(seconds: float, calls: list[Any]) -> dict[str, list[float]]:
-    """Of each compiled function and of the rest: seconds, those in regions, how many, and what all takes on TEAMS."""
-    found: dict[str, list[float]] = defaultdict(lambda: [0.0] * (3 + len(TEAMS)))
+    """Returns for each compiled function, and for Python and torch: seconds, seconds in parallel regions, number of
+    regions, and modelled seconds on each of TEAMS."""
+    table: dict[str, list[float]] = defaultdict(lambda: [0.0] * (3 + len(TEAMS)))
     for name, whole, regions, inside, shared in calls:
-        added = whole, inside, regions, *(whole - inside + each for each in shared)
-        found[name] = [a + b for a, b in zip(found[name], added, strict=True)]
-    rest = seconds - sum(each[0] for each in found.values())
-    found[REST] = [rest, 0.0, 0.0, *[rest] * len(TEAMS)]
-    return dict(found)
+        added = whole, inside, regions, *(whole - inside + columns for columns in shared)
+        table[name] = [a + b for a, b in zip(table[name], added, strict=True)]
+    rest = seconds - sum(columns[0] for columns in table.values())
+    table[REST] = [rest, 0.0, 0.0, *[rest] * len(TEAMS)]
+    return dict(table)
 
 
-def model(found: list[dict[str, list[float]]], moved: float, region_us: float) -> dict[str, Any]:
-    """Of medians of the parts over the groups of steps, in microseconds a step; the mean of what most of them do not
-    have, and of Python and torch."""
+def model(groups: list[dict[str, list[float]]], moved: float, region_us: float) -> dict[str, Any]:
+    """Returns the row of the model: speed-ups, and microseconds a step of each part.
+
+    Parts are medians over the groups of steps. Python and torch, and parts that most groups lack, are means."""
     table = {}
-    for name in dict.fromkeys(name for each in found for name in each):
-        own = [each.get(name, [0.0] * (3 + len(TEAMS))) for each in found]
-        seldom = name == REST or 2 * sum(name in each for each in found) < len(found)
+    for name in dict.fromkeys(name for each in groups for name in each):
+        rows = [each.get(name, [0.0] * (3 + len(TEAMS))) for each in groups]
+        seldom = name == REST or 2 * sum(name in each for each in groups) < len(groups)
         middle = statistics.mean if seldom else statistics.median
-        table[name] = [middle(each) for each in zip(*own, strict=True)]
+        table[name] = [middle(each) for each in zip(*rows, strict=True)]
     whole, inside, regions, *on = (sum(column) for column in zip(*table.values(), strict=True))
     serial, cost = whole - inside, 1e-6 * region_us * regions
     times = {}
@@ -217,9 +219,10 @@ def model(found: list[dict[str, list[float]]], moved: float, region_us: float) -
 
 
 def region(cores: int) -> dict[str, Any]:
-    """What a region without work costs, in microseconds, with serial work before it: as a team of its own, woken each
-    time, and in a recording whose team waits for it. A recording that is replayed on one thread has no team, so calls
-    that were recorded for more threads have one each."""
+    """Measures the cost in microseconds of an empty parallel region that follows serial work.
+
+    The thread team is either woken for each region, or kept waiting by the recording. A recording replayed on one
+    thread has no team, so calls recorded for more threads wake their own."""
     points, cells, share = torch.rand(2048, 3), torch.empty(2048, dtype=torch.int32), torch.tensor(0.5)
     pair = [torch.zeros(1), torch.zeros(1)], [torch.zeros(1), torch.zeros(1)]
 
@@ -228,8 +231,8 @@ def region(cores: int) -> dict[str, Any]:
         with threads(count), Recording() as recording:
             n, machine = recording.count(lambda: len(points)), native.cpu()
             for _ in range(CALLS):
-                native.compiled.nearest_centre(points, centres, None, cells, n, k, 3, 0, machine)  # one run of points
-                native.compiled.average(*pair, share, [1, 1], machine)  # two runs of one number
+                native.compiled.nearest_centre(points, centres, None, cells, n, k, 3, 0, machine)  # one region
+                native.compiled.average(*pair, share, [1, 1], machine)  # two regions
         if recording.obstacle is not None:
             raise RuntimeError(recording.obstacle)
         return recording
@@ -244,19 +247,19 @@ def region(cores: int) -> dict[str, Any]:
     k = max(1, round(tried * SERIAL_US / min(microseconds(trial, 1) for _ in range(8))))
     one, several = record(k, 1), record(k, cores)
 
-    found = [[microseconds(one, 1), microseconds(several, 1), microseconds(several, cores)] for _ in range(21)][1:]
-    serial, alone, inside = (statistics.median(column) for column in zip(*found, strict=True))
+    timings = [[microseconds(one, 1), microseconds(several, 1), microseconds(several, cores)] for _ in range(21)][1:]
+    serial, alone, inside = (statistics.median(column) for column in zip(*timings, strict=True))
     shown = {"serial_us": serial, "own_team_us": alone - serial, "in_recording_us": inside - serial}
     return {"case": "a region", "threads": cores, **{name: round(value, 2) for name, value in shown.items()}}
 
 
 def measure(name: str, case: Case, cores: int, region_us: float) -> list[dict[str, Any]]:
-    """The row of a training and, if there is one, of a picture of its field."""
+    """Returns the row of a training and, if the case has a picture, the row of rendering it."""
     scene, other = load(case), Other(case)
     trainings = {way: Training(case, scene, how) for way, how in ways(cores).items()}
     turns = (case.settings["steps"] - 1) // TURN[-1]
     for number in range(turns):
-        if number == turns // 4:  # from here on
+        if number == turns // 4:  # counting starts here
             for training in trainings.values():
                 for kept in (training.ms, training.processor_ms, training.traced):
                     kept.clear()
@@ -277,10 +280,10 @@ def measure(name: str, case: Case, cores: int, region_us: float) -> list[dict[st
     ]
     lines = sum(int((each[: len(each) // LINE * LINE].view(-1, LINE) != 0).any(1).sum()) for each in gradients)
     moved = SAMPLE_BYTES * samples + ENTRY_BYTES * state.parameter_count + TAUGHT_BYTES * LINE * lines
-    known = {"case": name, "scene": Path(case.data).name, "size": scene.train.cameras.size(0), **case.settings}
+    settings = {"case": name, "scene": Path(case.data).name, "size": scene.train.cameras.size(0), **case.settings}
     counts = {"turns": len(one.ms), "rays": state.rays, "samples": samples, "parameters": state.parameter_count}
     row = {
-        **known,
+        **settings,
         **counts,
         "explained": state.training_step.explain(),
         "ms": ms,
@@ -295,24 +298,24 @@ def measure(name: str, case: Case, cores: int, region_us: float) -> list[dict[st
         return [row]
     view = load(case, case.picture).train
     state.renderer.train(False)
-    found = []
+    pictures = []
     with threads(1):
         for _ in range(3):
             native.compiled.trace(True)
             began = time.process_time()
             state.renderer.image(view.cameras, 0, near=scene.near, far=scene.far, box=scene.box, heaviest=False)
-            found.append(parts(time.process_time() - began, native.compiled.trace(False)))
-    return [row, {"case": f"picture, {name}", "size": view.cameras.size(0), **model(found, 0.0, region_us)}]
+            pictures.append(parts(time.process_time() - began, native.compiled.trace(False)))
+    return [row, {"case": f"picture, {name}", "size": view.cameras.size(0), **model(pictures, 0.0, region_us)}]
 
 
 def python_percent(training: Training) -> float:
-    """What a step takes outside of compiled calls, of its processor time without a trace."""
+    """Returns the percentage of a step's processor time outside compiled calls."""
     rest_ms = 1e3 * statistics.mean(each[REST][0] for each in training.traced)
     return round(100 * rest_ms / statistics.median(training.processor_ms), 1)
 
 
 def tables(results: list[dict[str, Any]]) -> str:
-    """Those of docs/performance.md."""
+    """Returns the tables of docs/performance.md as Markdown."""
     names = list(ways(2))
     clock = [f"| by the clock, ms | {' | '.join(names)} | x | x, as it is | Python, % | as it is |"]
     clock.append("|" + "---|" * (len(names) + 5))
@@ -334,12 +337,12 @@ def tables(results: list[dict[str, Any]]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Prints the results, and writes the JSON."""
+    """Prints the results and writes the JSON."""
     parser = Parser("cores", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--data", type=Path, help="the folder of the scenes")
-    parser.add_argument("--case", choices=CASES, action="append", help="of these alone")
+    parser.add_argument("--case", choices=CASES, action="append", help="only these cases")
     parser.add_argument("--quick", action="store_true", help="a few steps of the built-in scene instead")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go as well")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="a JSON file for the results")
     options: argparse.Namespace = parser.parse_args(arguments)
     if options.data is None and not options.quick:
         parser.error("--data must name the folder of the scenes")
@@ -348,22 +351,22 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error("OMP_WAIT_POLICY must be set, to passive with GOMP_SPINCOUNT=1000 as voronerf train has it")
     cores = max(2, torch.get_num_threads())
     trials = [region(cores) for _ in range(TRIALS)]
-    results = [min(trials, key=lambda each: sum(value for name, value in each.items() if name.endswith("_us")))]
+    results = [min(trials, key=lambda row: sum(value for name, value in row.items() if name.endswith("_us")))]
     print(results[0])
     cases = QUICK if options.quick else {name: CASES[name] for name in options.case or CASES}
     for name, case in cases.items():
         if not options.quick:
             case = case._replace(data=str(options.data / case.data))
-        for each in measure(name, case, cores, results[0]["in_recording_us"]):
-            results.append(each)
-            print(*(f"{key} {value}," for key, value in each.items() if key != "parts"), flush=True)
-            for part, took in sorted(each["parts"].items(), key=lambda item: -item[1]["us"]):
+        for row in measure(name, case, cores, results[0]["in_recording_us"]):
+            results.append(row)
+            print(*(f"{key} {value}," for key, value in row.items() if key != "parts"), flush=True)
+            for part, took in sorted(row["parts"].items(), key=lambda item: -item[1]["us"]):
                 print(f"    {part:24} {took['us']:9.0f} us, serial {took['serial_us']:7.0f}")
     print(tables(results))
     if options.json is not None:
         with threads(cores):
-            known = metadata(command="python benchmarks/cores.py --data DATA", benchmark="cores", seed=0, **waiting)
-        write_text(options.json, json.dumps({"metadata": known, "results": results}, indent=2) + "\n")
+            about = metadata(command="python benchmarks/cores.py --data DATA", benchmark="cores", seed=0, **waiting)
+        write_text(options.json, json.dumps({"metadata": about, "results": results}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""How clean silhouettes are in held-out views of a run, how smooth the depth of plain patches is, and what is a hole.
+"""Measures how clean silhouettes are in held-out views of a run, how smooth depth is in plain patches, and holes.
 
     python benchmarks/edges.py RUN
 
-- half: the share of the pixels within 8 of a silhouette that are neither clear nor covered. A silhouette is where
-  disparity, of the depth that half of the light comes from, smoothed by a median of 5 x 5 pixels, changes by a tenth
-  from pixel to pixel. A pixel is covered by the light that comes from before the geometric mean of the nearest and the
-  farthest depth around it; neither, if that is .1 to .9 of it.
-- rough: the root mean square distance of the disparities of a patch of 9 x 9 pixels from a plane, in percent of their
-  mean; the mean over the patches whose colours differ by less than .015, and that are not at a silhouette.
+- half: the share of half-covered pixels within 8 pixels of a silhouette. A silhouette is where the disparity changes by
+  a tenth from pixel to pixel; it is the inverse of the median depth of the light, median-filtered over 5 x 5 pixels.
+  The coverage of a pixel is its light from before the geometric mean of the nearest and farthest depth around the
+  pixel. A pixel with a coverage of 0.1 to 0.9 is half covered.
+- rough: the root mean square distance of disparities from a fitted plane in patches of 9 x 9 pixels, in percent of the
+  mean disparity. It is averaged over the patches away from silhouettes whose colours differ by less than 0.015.
 - holes: the share of pixels with an opacity below one half, in percent.
 """
 
@@ -31,7 +31,7 @@ BESIDE, CHANGE, CLEAR, PATCH, STRIDE, PLAIN, CHUNK = 8, 1.1, 0.1, 9, 5, 0.015, 1
 
 
 class Looked(NamedTuple):
-    """A view: opacity, mean depth and the depth that half of the light comes from, [h, w]; its samples by rays."""
+    """A rendered view: opacity, mean depth and median depth of the light [h, w], and its samples in chunks of rays."""
 
     opacity: Tensor
     mean: Tensor
@@ -39,7 +39,7 @@ class Looked(NamedTuple):
     samples: list[tuple[Tensor, Tensor, Tensor, int]]
 
     def before(self, depth: Tensor) -> Tensor:
-        """The light [h, w] that comes from before depths [h, w]."""
+        """Returns the light [h, w] from before the depths [h, w]."""
         parts, begin, ends = [], 0, depth.reshape(-1)
         for ray, depths, weights, rays in self.samples:
             near = torch.where(depths < ends[begin : begin + rays][ray], weights, 0)
@@ -71,17 +71,17 @@ def look(renderer: Renderer, scene: Scene, index: int) -> Looked:
 
 
 def highest(values: Tensor, size: int) -> Tensor:
-    """The largest of the values [h, w] in a square around each."""
+    """Returns the largest of the values [h, w] in a square around each pixel."""
     return max_pool2d(values[None, None], size, 1, size // 2)[0, 0]
 
 
 def patches(values: Tensor) -> Tensor:
-    """The patches [81, n] of values [h, w]."""
+    """Returns the patches [81, n] of values [h, w]."""
     return unfold(values[None, None], PATCH, stride=STRIDE)[0]
 
 
 def measure(seen: Looked, truth: Tensor) -> dict[str, float]:
-    """The three figures of a view beside its photograph [h, w, 3]; NaN where it has no silhouette or no plain patch."""
+    """Returns the three figures of a view with its photograph [h, w, 3]; NaN without a silhouette or a plain patch."""
     around = unfold(pad(seen.half.reciprocal()[None, None], (2, 2, 2, 2), mode="replicate"), 5)[0]
     disparity = around.median(0).values.view(seen.half.shape)
     silhouette = highest(disparity, 3) > -CHANGE * highest(-disparity, 3)
@@ -102,11 +102,11 @@ def measure(seen: Looked, truth: Tensor) -> dict[str, float]:
 
 
 def measure_views(renderer: Renderer, scene: Scene) -> dict[str, Any]:
-    """The means of the figures over the held-out views that have them."""
+    """Returns the mean of each figure over the held-out views in which it is finite."""
     views = range(len(scene.test.names))
-    found = [measure(look(renderer, scene, view), scene.test.truth(view, None)) for view in views]
-    each = {name: torch.tensor([figures[name] for figures in found]) for name in found[0]}
-    return {name: float(values[values.isfinite()].mean()) for name, values in each.items()}
+    rows = [measure(look(renderer, scene, view), scene.test.truth(view, None)) for view in views]
+    columns = {name: torch.tensor([figures[name] for figures in rows]) for name in rows[0]}
+    return {name: float(values[values.isfinite()].mean()) for name, values in columns.items()}
 
 
 def main() -> None:

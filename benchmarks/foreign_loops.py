@@ -1,7 +1,7 @@
-"""Trains fields of other codebases in their own loops: as they are, routed, and as a loop over masks.
+"""Trains fields of other codebases in their own training loops: unchanged, routed, and as a loop over masks.
 
 Clones of EmilienDupont/coin, Lilac-Lee/Neural_Scene_Flow_Prior and yenchenlin/nerf-pytorch lie in one folder, scenes
-in VORONERF_DATA. A loop ends after so many seconds of processor time; what it imports in vain is replaced.
+in VORONERF_DATA. A loop ends after --seconds of processor time; mocks replace its missing imports.
 
     python benchmarks/foreign_loops.py coin routed CLONES --json FILE [--seconds 60] [--seed 0]
 """
@@ -38,11 +38,11 @@ NERF = """run_nerf --expname x --dataset_type blender --datadir x --use_viewdirs
 
 
 class Done(Exception):
-    """The time is over."""
+    """Raised when the time is over."""
 
 
 class Masks(nn.Module):
-    """A module for each cell, called with the samples of its boolean mask."""
+    """One module per cell, called with the samples in the boolean mask of its cell."""
 
     def __init__(self, cells: list[nn.Module], diagram: VoronoiDiagram) -> None:
         super().__init__()
@@ -53,20 +53,20 @@ class Masks(nn.Module):
         for index, cell in enumerate(self.cells):
             mask = located == index
             if bool(mask.any()):
-                found = cell(x[mask])
-                out = out if len(out) else x.new_zeros(*x.shape[:-1], found.shape[-1])
-                out[mask] = found
+                result = cell(x[mask])
+                out = out if len(out) else x.new_zeros(*x.shape[:-1], result.shape[-1])
+                out[mask] = result
         return out
 
 
 class Run:
-    """One training: what takes the place of the field, and when it ends."""
+    """One training: replaces the field, and ends the loop when the time is over."""
 
     def __init__(self, way: str, seconds: float, clones: Path) -> None:
         self.way, self.seconds, self.clones, self.steps = way, seconds, clones, -1
 
     def field(self, make: Callable[[bool], nn.Module], points: Tensor) -> nn.Module:
-        """The repository's own field, ``make(True)``, or narrow ones in the cells of its samples [..., d]."""
+        """Returns the original field, ``make(True)``, or narrow fields in the cells of its samples [..., d]."""
         net = make(self.way == "plain")
         if self.way in ("masks", "routed"):
             diagram = VoronoiDiagram.from_points(points, CELLS, generator=torch.Generator().manual_seed(0))
@@ -83,7 +83,7 @@ class Run:
 
 
 def coin(run: Run) -> dict[str, float]:
-    """COIN on its Kodak image 15: all pixels in each step, ten layers of 28, learning rate 2e-4, as it comes."""
+    """Trains COIN on Kodak image 15: all pixels in each step, ten layers of width 28, learning rate 2e-4."""
     import siren
     import training
     import util
@@ -97,14 +97,14 @@ def coin(run: Run) -> dict[str, float]:
 
 
 def nearest(x: Tensor, y: Tensor, **_: Any) -> Any:
-    """``pytorch3d.ops.knn_points`` for K = 1: squared distances [1, n, 1] from each of x to the nearest of y."""
+    """Replaces ``pytorch3d.ops.knn_points`` for K = 1: squared distances [1, n, 1] from points x to their nearest y."""
     with torch.no_grad():
         index = torch.cdist(x, y).argmin(2)
     return mock.Mock(dists=(x - y[0][index[0]]).square().sum(-1, keepdim=True), idx=index[..., None])
 
 
 def flow(run: Run) -> dict[str, float]:
-    """Neural Scene Flow Prior, width 128 or 64, between two halves of the bonsai's points, one moved in parts."""
+    """Trains Neural Scene Flow Prior, width 128 or 64, between two halves of bonsai's points, one half deformed."""
     torch.Tensor.cuda = lambda self, *_, **__: self
     sys.modules["pytorch3d.ops.knn"].knn_points = nearest
     sys.modules["pytorch3d.structures.pointclouds"].Pointclouds = type(None)
@@ -134,7 +134,7 @@ def flow(run: Run) -> dict[str, float]:
 
 
 def nerf(run: Run) -> dict[str, float]:
-    """nerf-pytorch's train() on Lego at 100 x 100: one network of width 256, or 64, 256 rays of 64 samples a step."""
+    """Runs nerf-pytorch's train() on Lego at 100 x 100: width 256 or 64, 256 rays of 64 samples a step."""
 
     class Parser(argparse.ArgumentParser):
         def add_argument(self, *names: Any, is_config_file: bool = False, **options: Any) -> Any:
@@ -151,17 +151,17 @@ def nerf(run: Run) -> dict[str, float]:
     rays = [run_nerf.get_rays(size, size, camera, torch.from_numpy(pose[:3, :4])) for pose in poses[:100:10]]
     z = torch.linspace(2, 6, 64)[:, None]
     points = torch.stack([o[::10, ::10, None] + d[::10, ::10, None] * z for o, d in rays])
-    create, own, made = run_nerf.create_nerf, run_nerf.NeRF, list[Any]()
+    create, own, created = run_nerf.create_nerf, run_nerf.NeRF, list[Any]()
     loaded = images, poses, torch.zeros(1, 4, 4), [size, size, focal], (np.arange(100), test, test)
     run_nerf.load_blender_data = lambda *_: loaded
-    run_nerf.NeRF = lambda **given: run.field(lambda wide: own(**{**given, "W": 256 if wide else 64}), points)
-    run_nerf.create_nerf = lambda args: made.append(create(args)) or made[0]
+    run_nerf.NeRF = lambda **keywords: run.field(lambda wide: own(**{**keywords, "W": 256 if wide else 64}), points)
+    run_nerf.create_nerf = lambda args: created.append(create(args)) or created[0]
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(Done):
         sys.argv = [*NERF.split(), folder]
         run_nerf.train()
     truth, c2w = images[test, ..., :3] * images[test, ..., 3:] + 1 - images[test, ..., 3:], torch.from_numpy(poses)
     with torch.no_grad():
-        shown = [run_nerf.render(size, size, camera, c2w=c2w[i, :3, :4], **made[0][1])[0].clamp(0, 1) for i in test]
+        shown = [run_nerf.render(size, size, camera, c2w=c2w[i, :3, :4], **created[0][1])[0].clamp(0, 1) for i in test]
     errors = np.square(torch.stack(shown).numpy() - truth).mean((1, 2, 3))
     return {"loss": float(np.mean(errors)), "psnr": float(np.mean(-10 * np.log10(errors)))}
 
@@ -175,25 +175,25 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, required=True, help="a file of rows, to which this one is added")
-    given = parser.parse_args()
+    options = parser.parse_args()
     for name in [*ABSENT.split(), "data"]:
         for part in (name.rsplit(".", i)[0] for i in range(name.count(".") + 1)):
             sys.modules[part] = mock.MagicMock(__spec__=ModuleSpec(part, None))
-    function, folder = loops[given.loop]
-    sys.path.insert(0, str(given.clones / folder))
-    torch.manual_seed(given.seed)
-    np.random.seed(given.seed)  # noqa: NPY002  which the loops draw from
-    found = function(run := Run(given.way, given.seconds, given.clones))
+    function, folder = loops[options.loop]
+    sys.path.insert(0, str(options.clones / folder))
+    torch.manual_seed(options.seed)
+    np.random.seed(options.seed)  # noqa: NPY002  the loops draw from it
+    scores = function(run := Run(options.way, options.seconds, options.clones))
     row = {
-        "loop": given.loop,
-        "way": given.way,
-        "seconds": given.seconds,
-        "seed": given.seed,
+        "loop": options.loop,
+        "way": options.way,
+        "seconds": options.seconds,
+        "seed": options.seed,
         "steps": run.steps,
-    } | found
+    } | scores
     print(row)
-    known = json.loads(given.json.read_text()) if given.json.exists() else {"metadata": metadata(), "results": []}
-    given.json.write_text(json.dumps({**known, "results": [*known["results"], row]}, indent=1))
+    stored = json.loads(options.json.read_text()) if options.json.exists() else {"metadata": metadata(), "results": []}
+    options.json.write_text(json.dumps({**stored, "results": [*stored["results"], row]}, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Modules of other code in VoronoiRouter: how each runs, and its errors beside a loop over masks.
+"""Runs modules of other codebases in VoronoiRouter: how each runs, and its errors against a loop over masks.
 
-Those of public repositories (``ops/foreign_public.py``) are imported from checkouts, each ``owner+name`` in one folder.
-Without it, small modules in the manner of public code (``ops/foreign_kinds.py``) take their place.
+Modules of public repositories (``ops/foreign_public.py``) are imported from checkouts in one folder, each named
+``owner+name``. Without that folder, small modules in the style of public code (``ops/foreign_kinds.py``) are run.
 
     python benchmarks/foreign_modules.py [--checkouts FOLDER] [--filter kilonerf] [--json FILE]
 """
@@ -30,7 +30,7 @@ STAND_INS = (
 
 
 def public(checkouts: Path, pattern: str) -> Iterator[dict[str, Any]]:
-    """A result for each module of the repositories."""
+    """Yields the result of each module of the repositories."""
     for key, rows in PUBLIC.items():
         path, _, file = key.partition(":")
         owner, name, *inner = path.split("/")
@@ -42,12 +42,12 @@ def public(checkouts: Path, pattern: str) -> Iterator[dict[str, Any]]:
         origin = {"module": "", "repository": f"https://github.com/{owner}/{name}", "commit": head.stdout[:12]}
         for row in chosen:
             with repository(folder.joinpath(*inner)) as load:
-                found = compare(row, load(file))
-            yield origin | found
+                result = compare(row, load(file))
+            yield origin | result
 
 
 def small(pattern: str) -> Iterator[dict[str, Any]]:
-    """A result for each small module."""
+    """Yields the result of each small module."""
     for kind, rows in KINDS.items():
         for row in rows:
             if re.search(pattern, f"{kind} {row.module}"):
@@ -55,7 +55,7 @@ def small(pattern: str) -> Iterator[dict[str, Any]]:
 
 
 def counts(results: list[dict[str, Any]]) -> dict[str, int]:
-    """Counts modules by the way in which they run."""
+    """Counts modules by the way they run."""
     ways = Counter(row["how"] for row in results)
     repositories = {row.get("repository") for row in results}
     classes = {(row.get("repository"), row["class"]) for row in results}
@@ -69,13 +69,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--checkouts", type=Path, help="a folder with the repositories, each as owner+name")
     parser.add_argument("--filter", default="", help="a regular expression of repositories, files and modules")
     parser.add_argument("--json", type=Path)
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     results = []
-    for row in public(given.checkouts, given.filter) if given.checkouts else small(given.filter):
+    for row in public(options.checkouts, options.filter) if options.checkouts else small(options.filter):
         results.append(row)
         print(json.dumps(row), flush=True)
     print(counts(results))
-    if given.json:
+    if options.json:
         head = metadata(
             benchmark="modules of public repositories in VoronoiRouter(fuse=True, way='fused')",
             samples=N,
@@ -85,7 +85,7 @@ def main(arguments: list[str] | None = None) -> None:
             **{"stand-ins": STAND_INS},
             **counts(results),
         )
-        given.json.write_text(json.dumps({"metadata": head, "results": results}, indent=1) + "\n")
+        options.json.write_text(json.dumps({"metadata": head, "results": results}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""One network for each label, on one thread: a router beside ``vmap`` over stacked modules, ``baddbmm`` and a loop.
+"""Times one network per label on one thread: a router, ``vmap`` over stacked modules, ``baddbmm``, and a loop.
 
     python benchmarks/groups.py --json benchmarks/results/groups.json
 
-SIRENs of three layers of 32. Rows are sorted by label, as many for each, so that the others need neither a sort nor
-padding. All compute the same values, which is checked first. A call is forward and backward; the last row is a step
-with Adam on 1,000 images, of which the router is trained further, to the PSNR in the file. Times are medians of the
-processor's time in turns, in milliseconds.
+The networks are SIRENs with three layers of width 32. Rows are sorted by label and equally many per label, so that the
+alternatives need neither a sort nor padding. The benchmark first checks that all ways compute the same values. A call
+is forward and backward. The last row is a step with Adam on 1,000 images; the router then trains on, to the PSNR in
+the file. Times are median processor times in milliseconds; the ways take turns.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ Run = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Options:
-    """How long, and where results go."""
+    """The settings of the benchmark."""
 
     seconds: float = 4.0
-    """For each way of a row."""
+    """Seconds of measurement for each way of a row."""
     steps: int = 500
-    """The training on images has these settings."""
+    """Steps of the training on images."""
     json: Path | None = None
-    """A file for the results; default: printed only."""
+    """The JSON file of the results. Default: results are only printed."""
 
 
 class Siren(nn.Module):
-    """Two coordinates in -1 to 1 to a colour."""
+    """A SIREN from two coordinates in -1..1 to a colour."""
 
     def __init__(self, width: int = 32, frequency: float = 10.0) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class Siren(nn.Module):
         self.last, self.frequency = nn.Linear(width, 3), frequency
 
     def forward(self, x: Tensor) -> Tensor:
-        """[..., 2] -> [..., 3]."""
+        """Returns colours [..., 3] of coordinates [..., 2]."""
         x = x * self.frequency
         for layer in self.layers:
             x = torch.sin(layer(x))
@@ -59,7 +59,7 @@ class Siren(nn.Module):
 
 
 def ways(k: int) -> dict[str, tuple[list[nn.Parameter], Run]]:
-    """The parameters of k networks, the same in each way, and what computes [k, rows, 3] of [k, rows, 2]."""
+    """Returns for each way the parameters of the same k networks, and a function [k, rows, 2] -> [k, rows, 3]."""
     modules = [Siren() for _ in range(k)]
     router = VoronoiRouter.from_modules(modules, fuse=True, way="fused")
     labels = torch.arange(k)[:, None]
@@ -89,7 +89,7 @@ def ways(k: int) -> dict[str, tuple[list[nn.Parameter], Run]]:
 
 
 def pictures() -> Tensor:
-    """Colours [IMAGES, SIDE * SIDE, 3]: smooth, with a disc in front."""
+    """Draws images [IMAGES, SIDE * SIDE, 3]: a smooth background with a disc in front."""
     smooth = nn.functional.interpolate(torch.rand(IMAGES, 3, 6, 6), SIDE, mode="bicubic", align_corners=True)
     centre, size = torch.rand(IMAGES, 1, 2) * 1.2 - 0.6, 0.2 + 0.3 * torch.rand(IMAGES, 1)
     inside = (grid() - centre).norm(dim=-1) < size
@@ -97,27 +97,27 @@ def pictures() -> Tensor:
 
 
 def grid() -> Tensor:
-    """Coordinates [SIDE * SIDE, 2] of pixels."""
+    """Returns the coordinates [SIDE * SIDE, 2] of all pixels."""
     line = torch.linspace(-1, 1, SIDE)
     return torch.cartesian_prod(line, line)
 
 
 def step(run: Run, parameters: list[nn.Parameter], images: Tensor) -> Callable[[int], None]:
-    """A step of Adam on some pixels of each image, by its number."""
+    """Returns a function that runs a step of Adam on random pixels of each image; its argument is the step's number."""
     optimizer, places = torch.optim.Adam(parameters, lr=1e-2, fused=True), grid()
 
     def once(number: int) -> None:
         chosen = torch.randint(SIDE * SIDE, (IMAGES, PIXELS), generator=torch.Generator().manual_seed(number))
-        found, wanted = run(places[chosen]), images.gather(1, chosen[..., None].expand(-1, -1, 3))
+        colours, target = run(places[chosen]), images.gather(1, chosen[..., None].expand(-1, -1, 3))
         optimizer.zero_grad()
-        (found - wanted).square().mean((1, 2)).sum().backward()
+        (colours - target).square().mean((1, 2)).sum().backward()
         optimizer.step()
 
     return once
 
 
 def call(run: Run, parameters: list[nn.Parameter], x: Tensor) -> Callable[[int], None]:
-    """Forward and backward."""
+    """Returns a function that runs forward and backward."""
 
     def once(_: int) -> None:
         run(x).square().sum().backward()
@@ -128,7 +128,7 @@ def call(run: Run, parameters: list[nn.Parameter], x: Tensor) -> Callable[[int],
 
 
 def row(options: Options, k: int, rows: int, images: Tensor | None = None) -> dict[str, Any]:
-    """Measures k networks with so many rows each, or steps with Adam on images."""
+    """Measures k networks with ``rows`` rows each: calls, or steps with Adam if ``images`` are there."""
     contenders, x = ways(k), torch.rand(k, rows, 2) * 2 - 1
     expected = contenders["loop"][1](x)
     for _, run in contenders.values():
@@ -140,20 +140,20 @@ def row(options: Options, k: int, rows: int, images: Tensor | None = None) -> di
     for once in runs.values():
         once(0)
     timings = measure(runs, dict.fromkeys(runs, options.seconds), Stopwatch(torch.device("cpu"), time.process_time))
-    found: dict[str, Any] = {f"{name}_ms": round(timing.median_ms, 2) for name, timing in timings.items()}
+    result: dict[str, Any] = {f"{name}_ms": round(timing.median_ms, 2) for name, timing in timings.items()}
     best = min(timing.median_ms for name, timing in timings.items() if name != "router")
-    found |= {"times_as_fast": round(best / timings["router"].median_ms, 2)}
+    result |= {"times_as_fast": round(best / timings["router"].median_ms, 2)}
     if images is not None:
         for number in range(options.steps):
             runs["router"](number)
         with torch.no_grad():
             error = (contenders["router"][1](grid().expand(k, -1, -1)) - images).square().mean((1, 2))
-        found |= {"steps": options.steps, "psnr": round(float((-10 * error.log10()).mean()), 2)}
-    return {"networks": k, "rows": rows, "step": images is not None, **found}
+        result |= {"steps": options.steps, "psnr": round(float((-10 * error.log10()).mean()), 2)}
+    return {"networks": k, "rows": rows, "step": images is not None, **result}
 
 
 def main(options: Options) -> None:
-    """Prints a line for each row, and writes the results."""
+    """Prints a line for each row and writes the results."""
     torch.manual_seed(0)
     results = []
     with threads(1):

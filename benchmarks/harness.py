@@ -1,7 +1,7 @@
-"""What the benchmarks share: the metadata of a result, and timings that can be compared.
+"""Shared code of the benchmarks: the metadata of a result, and comparable timings.
 
 Every file under results/ says where it was measured. Timings of one table row come from one call of :func:`measure`:
-contenders take turns in one process, each call reads different inputs than the one before, and medians are reported.
+contenders take turns in one process, consecutive calls read different inputs, and medians are reported.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from voronerf import __version__
 from voronerf.app.cli import keep_freed_memory
 from voronerf.ops._core import backends
 
-keep_freed_memory()  # benchmarks are programs, as the command line is one
+keep_freed_memory()  # benchmarks are programs, as the command line is
 
 Run = Callable[[int], Any]
-"""A contender: given the number of the call, runs on the inputs that number stands for. Call 0 is the warm-up."""
+"""A contender: a function of the call's number, which selects the inputs. Call 0 is the warm-up."""
 
 FEWEST = 3
-"""Timings below which a row says that it was capped."""
+"""The number of timings below which a row is reported as capped."""
 MOST = 200
 DISTURBED_PEAK = 0.9
-"""Share of the best measurement of a limit below which another one was disturbed, and the best stands for it."""
+"""A measured peak below this share of the best one counts as disturbed and is replaced by the best one."""
 SLOW = 2
-"""Limits that a single call may take for its contender to get ``FEWEST`` timings."""
+"""A contender whose single call takes longer than this many limits gets one timing instead of ``FEWEST``."""
 TOO_SLOW = 5
-"""Limits that a warm-up may take for its contender to be called again at all."""
+"""A contender whose warm-up takes longer than this many limits is not called again."""
 BATCH_SECONDS = 5e-3
-"""Calls shorter than this are timed several at a time, after one that is not: what ran before has left its own code and
-data in the caches, and its threads spinning."""
+"""Calls shorter than this are timed in batches. An untimed call precedes each batch, because the previous contender
+left its code and data in the caches, and its threads spinning."""
 
 
 FAMILIES = {
@@ -55,18 +55,19 @@ FAMILIES = {
     ("GenuineIntel", 6, (0xCF,)): "Emerald Rapids",
     ("GenuineIntel", 6, (0xAD, 0xAE)): "Granite Rapids",
 }
-"""Names by vendor, family and models; the first that fits. Virtual machines leave them out of the processor's name."""
+"""Names of processor families by vendor, family and models; the first match counts. Virtual machines omit the family
+from the processor's name."""
 
 
 def processor() -> str:
-    """The processor's name, and that of its family where it is known."""
+    """Returns the processor's name, with its family's name or numbers if the system reports them."""
     path = Path("/proc/cpuinfo")
-    known = path.read_text() if path.is_file() else ""
-    found = {name: re.search(rf"^{name}\s*: (.*)$", known, re.MULTILINE) for name in ("model name", *_NUMBERS)}
-    name = found["model name"][1] if found["model name"] else platform.processor() or platform.machine()
-    if not all(found[number] for number in _NUMBERS):
+    text = path.read_text() if path.is_file() else ""
+    matches = {name: re.search(rf"^{name}\s*: (.*)$", text, re.MULTILINE) for name in ("model name", *_NUMBERS)}
+    name = matches["model name"][1] if matches["model name"] else platform.processor() or platform.machine()
+    if not all(matches[number] for number in _NUMBERS):
         return name
-    vendor, family, model = (match[1] for number in _NUMBERS if (match := found[number]))
+    vendor, family, model = (match[1] for number in _NUMBERS if (match := matches[number]))
     families = [n for (v, f, models), n in FAMILIES.items() if (v, f) == (vendor, int(family)) and int(model) in models]
     return f"{name} ({families[0]})" if families else f"{name} (family {family}, model {model})"
 
@@ -75,7 +76,7 @@ _NUMBERS = ("vendor_id", "cpu family", "model")
 
 
 def metadata(**extra: Any) -> dict[str, Any]:
-    """A benchmark's own entries, followed by the versions and the machine; ready for JSON."""
+    """Returns the benchmark's entries, followed by the versions and the machine; ready for JSON."""
     return {
         **extra,
         "voronerf": __version__,
@@ -88,7 +89,7 @@ def metadata(**extra: Any) -> dict[str, Any]:
 
 
 class Parser(argparse.ArgumentParser):
-    """Errors in one line: "PROG: error: MESSAGE"."""
+    """A parser that reports errors in one line: "PROG: error: MESSAGE"."""
 
     def error(self, message: str) -> NoReturn:
         sys.exit(f"{self.prog}: error: {message}")
@@ -96,11 +97,11 @@ class Parser(argparse.ArgumentParser):
 
 @dataclass
 class Timing:
-    """Timings of one contender.
+    """The timings of one contender.
 
     Attributes:
-        seconds: of single calls, or the mean of a batch of short ones.
-        capped: the time limit left fewer than ``FEWEST`` of them.
+        seconds: Seconds of single calls, or mean seconds of a batch of short calls.
+        capped: Whether the time limit allowed fewer than ``FEWEST`` timings.
     """
 
     seconds: list[float] = field(default_factory=list)
@@ -108,12 +109,12 @@ class Timing:
 
     @property
     def median_ms(self) -> float:
-        """Milliseconds of a call."""
+        """The median milliseconds of a call."""
         return statistics.median(self.seconds) * 1e3
 
     @property
     def iqr_ms(self) -> float | None:
-        """Distance between the quartiles; None for fewer than two timings."""
+        """The interquartile range in milliseconds; None for fewer than two timings."""
         if len(self.seconds) < 2:
             return None
         low, _, high = statistics.quantiles(self.seconds, n=4, method="inclusive")
@@ -121,13 +122,13 @@ class Timing:
 
 
 class Stopwatch:
-    """Seconds that calls take: by ``clock`` on the CPU, between events of the stream on CUDA."""
+    """A function that times calls: by ``clock`` on the CPU, by stream events on CUDA."""
 
     def __init__(self, device: torch.device, clock: Callable[[], float] = time.perf_counter) -> None:
         self.cuda, self.clock = device.type == "cuda", clock
 
     def __call__(self, run: Run, first: int, count: int) -> float:
-        """Seconds of calls ``first`` to ``first + count``, together."""
+        """Returns the total seconds of calls ``first`` to ``first + count - 1``."""
         if not self.cuda:
             start = self.clock()
             for call in range(first, first + count):
@@ -149,16 +150,16 @@ def measure(
     stopwatch: Callable[[Run, int, int], float],
     warm: dict[str, float] | None = None,
 ) -> dict[str, Timing]:
-    """Times contenders in turns; each has been called once (call 0) before.
+    """Times contenders in turns. The caller has run call 0 of each contender.
 
     A contender stops when its timings add up to its limit, but not before ``FEWEST`` timings. If a
     single call takes more than ``SLOW`` limits, it is the only timing, and counts as capped.
 
     Args:
-        contenders: what to run, by name, in the order of their turns.
-        limits: seconds for each of them.
-        stopwatch: seconds of calls ``first`` to ``first + count`` of a contender; a :class:`Stopwatch`.
-        warm: seconds of call 0, where known. Above ``TOO_SLOW`` limits it is the timing.
+        contenders: The functions to run, by name, in the order of their turns.
+        limits: Seconds for each contender.
+        stopwatch: A function of (contender, first call, number of calls) that returns seconds; a :class:`Stopwatch`.
+        warm: Seconds of call 0, if known. Above ``TOO_SLOW`` limits they become the contender's only timing.
 
     Returns:
         A timing for each contender.
@@ -197,13 +198,13 @@ def _done(seconds: list[float], batch: int, limit: float) -> bool:
 
 
 class Others:
-    """The load of all other processes since this was made; timings mean little on a busy machine."""
+    """The load of all other processes since its construction; timings mean little on a busy machine."""
 
     def __init__(self) -> None:
         self.start = self._now()
 
     def cores(self) -> float | None:
-        """Cores' worth of time that other processes, or other guests of the host, had; None where that is unknown."""
+        """Returns the mean number of cores that other processes or other guests of the host used; None if unknown."""
         now = self._now()
         if now is None or self.start is None or now[0] <= self.start[0]:
             return None
@@ -212,7 +213,7 @@ class Others:
 
     @staticmethod
     def _now() -> tuple[float, float, float] | None:
-        """Seconds: wall, those of all cores that were not idle, those of this process."""
+        """Returns wall seconds, busy seconds of all cores, and processor seconds of this process."""
         try:
             fields = [int(field) for field in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
         except (OSError, ValueError):
@@ -222,10 +223,10 @@ class Others:
 
 
 class Peaks:
-    """The machine's limits, measured at every query, because the clock of the processor changes.
+    """The peak rates of the machine, measured at every query because the processor's clock rate changes.
 
-    On the CPU by ``voronerf.ops._core.native.measure_peak``; on CUDA by torch's product of large matrices and a large
-    copy, which are what a user can reach rather than the limit itself.
+    The CPU is measured by ``voronerf.ops._core.native.measure_peak``. CUDA is measured by torch's product of large
+    matrices and by a large copy: rates that a user can reach rather than the hardware limit.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -233,9 +234,9 @@ class Peaks:
         self.found: dict[str, float] = {}
 
     def __call__(self, kind: str) -> tuple[str, float] | None:
-        """(what it is, operations or bytes a second) of "float32", "bfloat16" or "copy"; None where it is unknown.
+        """Returns (name, operations or bytes a second) for "float32", "bfloat16" or "copy"; None if unknown.
 
-        A processor without bfloat16 products computes with float32 ones, whose limit then stands for both.
+        A processor without bfloat16 products computes float32 products, so its float32 limit is returned.
         """
         if self.device.type == "cuda":
             return self._keep(f"{kind}, torch", _cuda_peak(kind, self.device))
@@ -280,12 +281,12 @@ def threads(count: int | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def instruction_set(name: str | None) -> Iterator[None]:
-    """Native CPU kernels use this instruction set inside the block; None does not change it.
+    """Sets the instruction set of native CPU kernels inside the block; None does not change it.
 
     VORONERF_ISA does the same for a whole process.
 
     Raises:
-        ValueError: this processor has none of that name.
+        ValueError: This processor lacks the instruction set.
     """
     if name is None:
         yield

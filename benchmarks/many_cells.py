@@ -1,9 +1,10 @@
-"""Trainings of one scene with 1, 16 and very many cells, in the same time: PSNR, and what a step takes a sample.
+"""Trains one scene with 1, 16 and very many cells for the same time: PSNR, and step time per sample.
 
     python benchmarks/many_cells.py --data builtin-city:8x8 --cells 1 16 65536 --seconds 60 --json FILE
 
-All have the same field, rays and learning rate. After the coarse stage, a fifth of the time with one network, its
-samples place the centres (`VoronoiDiagram.from_points`), whose networks begin as copies of it; placing them counts.
+All trainings have the same field, rays and learning rate. The coarse stage trains one network for a fifth of the time.
+Its samples then place the centres (`VoronoiDiagram.from_points`), and the networks of all cells begin as copies of it.
+The placement counts as training time.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from voronerf.nerf import Adam, Occupancy, RayBatches, RayLoss, Renderer, Traini
 from voronerf.nerf.fields import FIELDS
 from voronerf.nerf.schedule import GROUP, learning_rate
 
-COARSE = 0.2  # of the time
+COARSE = 0.2  # share of the time
 
 
 def measure(scene: Scene, cells: int, options: argparse.Namespace) -> dict[str, Any]:
-    """Trains with so many cells."""
+    """Trains with ``cells`` cells and returns the row of results."""
     torch.manual_seed(0)
     kind, generator, space = FIELDS[options.field], torch.Generator().manual_seed(0), scene.space()
     field = kind.build(json.loads(options.options))
@@ -57,13 +58,13 @@ def measure(scene: Scene, cells: int, options: argparse.Namespace) -> dict[str, 
             points, samples, since, spent = [], 0, 0, 0.0
         optimizer.set_learning_rate(learning_rate(options.lr, fraction, step + GROUP // 2, hold=0.25))
         began = time.process_time()
-        made = training_step(options.rays, GROUP, at=step)
-        if since:  # the first is recorded
+        result = training_step(options.rays, GROUP, at=step)
+        if since:  # the first group is recorded and not timed
             spent += time.process_time() - began
-            samples += GROUP * made.samples
+            samples += GROUP * result.samples
         step, since = step + GROUP, since + 1
         if router.num_cells < cells and fraction > COARSE / 2:
-            points.append(made.output.samples.inputs.detach().clone())
+            points.append(result.output.samples.inputs.detach().clone())
     with optimizer.averaged():
         sampler.finish(router, seed=0)
         psnr = mean_scores(evaluate(renderer, scene, views=options.views))["psnr"]
@@ -81,31 +82,33 @@ def measure(scene: Scene, cells: int, options: argparse.Namespace) -> dict[str, 
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Prints the results, and writes the JSON."""
+    """Prints the results and writes the JSON."""
     parser = Parser("many_cells", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--data", default="builtin-city:8x8")
     parser.add_argument("--cells", type=int, nargs="+", default=[1, 16, 65_536])
-    parser.add_argument("--seconds", type=float, default=60.0, help="of processor time, for each")
+    parser.add_argument("--seconds", type=float, default=60.0, help="processor seconds of each training")
     parser.add_argument("--field", default="nerf")
-    parser.add_argument("--options", default='{"width": 16, "depth": 1, "position_octaves": 5}', help="of the field")
-    parser.add_argument("--rays", type=int, default=1024, help="of a step")
+    parser.add_argument(
+        "--options", default='{"width": 16, "depth": 1, "position_octaves": 5}', help="field options as JSON"
+    )
+    parser.add_argument("--rays", type=int, default=1024, help="rays of a step")
     parser.add_argument("--samples", type=int, default=128, help="strata of a ray")
     parser.add_argument("--lr", type=float, default=0.01)
-    parser.add_argument("--views", type=int, default=24, help="that are evaluated")
+    parser.add_argument("--views", type=int, default=24, help="number of evaluated views")
     parser.add_argument("--downscale", type=int, default=2)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go as well")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="a JSON file for the results")
     options = parser.parse_args(arguments)
     scene, results = load_scene(options.data, downscale=options.downscale), []
     print("| cells | PSNR [dB] | steps | step [ms] | samples a step | a sample [us] |\n|---|---|---|---|---|---|")
     for cells in options.cells:
         with threads(1):
-            results.append(each := measure(scene, cells, options))
-        row = f"{each['psnr']:.2f} | {each['steps']} | {each['ms']:.1f} | {each['samples']:,.0f}"
-        print(f"| {each['cells']:,} | {row} | {each['us_a_sample']:.2f} |", flush=True)
+            results.append(result := measure(scene, cells, options))
+        row = f"{result['psnr']:.2f} | {result['steps']} | {result['ms']:.1f} | {result['samples']:,.0f}"
+        print(f"| {result['cells']:,} | {row} | {result['us_a_sample']:.2f} |", flush=True)
     if options.json is not None:
         asked = {name: value for name, value in vars(options).items() if name != "json"}
-        known = metadata(command="python benchmarks/many_cells.py", benchmark="many_cells", seed=0, **asked)
-        write_text(options.json, json.dumps({"metadata": known, "results": results}, indent=2) + "\n")
+        about = metadata(command="python benchmarks/many_cells.py", benchmark="many_cells", seed=0, **asked)
+        write_text(options.json, json.dumps({"metadata": about, "results": results}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""The cost of extending a training step: the examples of docs/extend.md beside the step as it stands.
+"""Measures the cost of extending a training step: the examples of docs/extend.md beside the default step.
 
     OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=1000 python benchmarks/own_parts.py --data DATA --json FILE
 
-Trainings of Lego at 100 x 100 with so many rays of a step, each with one of the examples, make 32 steps in turns, after
-all cells are there. Ratios to the step as it stands are medians over the turns.
+Each training of Lego at 100 x 100 has one of the examples. After the split into cells, the trainings run 32 steps each
+in turns, with 512 or 2,048 rays a step. Ratios to the default step are medians over the turns.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ BEFORE, TURN = 20 * GROUP, 2 * GROUP  # steps
 
 
 def examples() -> dict[str, Any]:
-    """All names that the Python on the page defines."""
-    found: dict[str, Any] = {}
+    """Returns all names that the Python code of the page defines."""
+    names: dict[str, Any] = {}
     for code in re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL):
-        exec(code, found)
-    return found
+        exec(code, names)
+    return names
 
 
 def add_term(name: str, *arguments: float) -> Callable[[State, dict[str, Any]], None]:
-    """Adds one to the loss; with arguments it is made of them."""
+    """Returns a change that adds a term to the loss; ``arguments`` construct it, if it is a class."""
 
     def change(state: State, own: dict[str, Any]) -> None:
         term = own[name](*arguments) if arguments else own[name]
@@ -49,7 +49,7 @@ def add_term(name: str, *arguments: float) -> Callable[[State, dict[str, Any]], 
 
 
 def set_strategy(name: str) -> Callable[[State, dict[str, Any]], None]:
-    """Splits by another one, whose cells are there already."""
+    """Returns a change that replaces the split strategy after the splits."""
 
     def change(state: State, own: dict[str, Any]) -> None:
         state.strategy.__class__ = own[name]
@@ -58,13 +58,13 @@ def set_strategy(name: str) -> Callable[[State, dict[str, Any]], None]:
 
 
 def set_sampler(state: State, own: dict[str, Any]) -> None:
-    """Samples by another one, whose rays have grown to their ends."""
+    """Replaces the sampler by `Annealed` after its last annealing step, when rays have their full length."""
     state.sampler.__class__ = own["Annealed"]
     state.sampler.done = state.sampler.steps
 
 
 def run_as_it_is(state: State, own: dict[str, Any]) -> None:
-    """Records nothing."""
+    """Runs all steps eagerly, without recordings."""
     state.training_step._standing_obstacle = lambda: "it is timed"  # type: ignore[method-assign]
 
 
@@ -81,7 +81,7 @@ WAYS: dict[str, Callable[[State, dict[str, Any]], None]] = {
 
 
 class Until(Callback):
-    """Stops after a number of steps, and keeps the number of rays."""
+    """A callback that stops after a number of steps and fixes the number of rays."""
 
     group = GROUP
 
@@ -89,13 +89,13 @@ class Until(Callback):
         self.rays, self.last = rays, 0
 
     def after_step(self, state: State) -> None:
-        """Looks whether it is reached."""
+        """Stops the training at step ``last``."""
         state.rays = self.rays
         if state.step >= self.last:
             state.stop()
 
     def go_on(self, state: State, steps: int) -> float:
-        """Milliseconds of each of so many further steps."""
+        """Trains for ``steps`` further steps; returns milliseconds a step."""
         state.clear_stop()
         began, self.last, first = time.perf_counter(), state.step + steps, state.step
         train(state, [self])
@@ -103,7 +103,7 @@ class Until(Callback):
 
 
 def measure(scene: Scene, data: str, rays: int, turns: int) -> dict[str, Any]:
-    """Milliseconds of a step each way, the ratios, and what steps say of themselves."""
+    """Returns milliseconds a step of each way, the ratios, and the steps' `explain()` texts."""
     own, states = examples(), dict[str, State]()
     for name, change in WAYS.items():
         torch.manual_seed(0)
@@ -134,11 +134,11 @@ def measure(scene: Scene, data: str, rays: int, turns: int) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Prints the results, and writes the JSON."""
+    """Prints the results and writes the JSON."""
     parser = Parser("own_parts", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="the folder of the scenes")
-    parser.add_argument("--turns", type=int, default=24, help="of each")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go as well")
+    parser.add_argument("--turns", type=int, default=24, help="turns of each training")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="a JSON file for the results")
     options: argparse.Namespace = parser.parse_args(arguments)
     data = str(options.data / "lego")
     scene, results = load_scene(data, downscale=4), []
@@ -147,14 +147,16 @@ def main(arguments: list[str] | None = None) -> None:
             with threads(count):
                 results.append({"threads": count, **measure(scene, data, rays, options.turns)})
             print(json.dumps(results[-1], indent=2), flush=True)
-    columns = [f"{each['threads']} thread{'s' * (each['threads'] > 1)}, {each['rays']:,} rays" for each in results]
+    columns = [
+        f"{result['threads']} thread{'s' * (result['threads'] > 1)}, {result['rays']:,} rays" for result in results
+    ]
     print(f"| x of the step as it stands | {' | '.join(columns)} |")
     for name in WAYS:
-        print(f"| {name} | {' | '.join(format(each['x'][name], '.2f') for each in results)} |")
+        print(f"| {name} | {' | '.join(format(result['x'][name], '.2f') for result in results)} |")
     if options.json is not None:
         waiting = {name: os.environ.get(name) for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
-        known = metadata(command="python benchmarks/own_parts.py --data DATA", benchmark="own_parts", seed=0, **waiting)
-        write_text(options.json, json.dumps({"metadata": known, "results": results}, indent=2) + "\n")
+        about = metadata(command="python benchmarks/own_parts.py --data DATA", benchmark="own_parts", seed=0, **waiting)
+        write_text(options.json, json.dumps({"metadata": about, "results": results}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

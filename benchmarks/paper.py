@@ -1,4 +1,4 @@
-"""Every table and figure of the paper by name: the command. ``paper/main.py`` says what it takes."""
+"""Makes tables and figures of the paper by name. ``paper/main.py`` documents the command line."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ from paper.runs import data_folder
 from voronerf.app.cli.program import EXPECTED
 
 if __name__ == "__main__":
-    # built-in scenes have no folder beside which weights for LPIPS would be found
+    # LPIPS weights are looked up beside the scene's folder, which built-in scenes lack.
     os.environ.setdefault("VORONERF_DATA", str(data_folder()))
     try:
         main()

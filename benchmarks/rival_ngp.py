@@ -1,15 +1,15 @@
-"""The rival: an Instant NGP in pure PyTorch on the CPU, as one would install it today, but faster.
+"""The rival: Instant NGP in pure PyTorch on the CPU, faster than the public implementations.
 
 Written from the published descriptions: the hash grid of nerfstudio's ``HashEncoding(implementation="torch")``; the
 networks, the occupancy grid and the adaptive number of rays of nerfacc's ``train_ngp_nerf_occ.py``; the averaged
-weights of torch-ngp. One network for the whole scene. Images, rays and scores are this library's, its other operations
-are not used.
+weights of torch-ngp. One network covers the whole scene. Only images, rays and scores come from voronerf.
 
-It is as fast as pure PyTorch allows. Of the ways to read a table that were timed (one thread of a Zen 5, forward and
-backward of 8 levels, ns per sample), indexing took 3,950, ``F.embedding`` 8,800 and ``F.embedding_bag`` 4,300;
-``F.embedding_bag`` forward with ``scatter_add_`` backward takes 370.
+It uses the fastest table lookup in pure PyTorch. Forward and backward of 8 levels take, in ns per sample on one thread
+of
+a Zen 5: 3,950 by indexing, 8,800 by ``F.embedding``, 4,300 by ``F.embedding_bag``, and 370 by ``F.embedding_bag``
+forward with ``scatter_add_`` backward.
 
-Letters: n samples that are kept, r rays, s strata of a ray, l levels of the grid.
+Letters: n kept samples, r rays, s strata of a ray, l levels of the grid.
 """
 
 from __future__ import annotations
@@ -34,55 +34,55 @@ from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.sampling import stratified_depths
 
 PRIMES = (1, 2654435761 - 2**32, 805459861)
-#: Rays of an evaluation at a time, and cells of the occupancy grid.
+#: Rays rendered at a time in an evaluation, and cells of the occupancy grid evaluated at a time.
 CHUNK, CELLS_CHUNK = 4096, 1 << 16
 #: Steps between updates of the occupancy grid (nerfacc).
 GRID_EVERY = 16
-#: A cell is occupied if it takes this share of the light on a thousandth of the way through the scene, or more than the
-#: average cell (nerfacc).
+#: A cell is occupied if its opacity over a thousandth of the scene's diagonal exceeds this threshold or the mean
+#: opacity of all cells (nerfacc).
 GRID_OPACITY, GRID_WAY = 1e-2, 1e-3
-#: Steps over which the learning rate rises (nerfacc: 100 of 20,000).
+#: Steps of the learning rate's warm-up (nerfacc: 100 of 20,000).
 RISE = 20
 
 
 @dataclass(frozen=True)
 class RivalConfig:
-    """Settings of the rival. The grid is that of `--field hashgrid`; the others are the best that were tried."""
+    """Settings of the rival. The grid matches `--field hashgrid`; the other defaults are the best of those tried."""
 
     levels: int = 8
-    """Levels of the hash grid."""
+    """The number of levels of the hash grid."""
     level_features: int = 2
-    """Features of a level."""
+    """The number of features of a level."""
     log2_entries: int = 15
-    """The logarithm of a level's entries."""
+    """The base-2 logarithm of the number of entries of a level."""
     base: float = 16
     """The coarsest resolution."""
     finest: float | None = None
-    """The finest resolution; default: half a pixel of the training views."""
+    """The finest resolution. Default: half a pixel of the training views."""
     width: int = 64
-    """Channels of the hidden layers: one for the density, two for the colour."""
+    """The width of the hidden layers: one for the density, two for the colour."""
     samples: int = 64
-    """Strata of a ray."""
+    """The number of strata of a ray."""
     batch: int = 1 << 13
-    """Samples of a step that the number of rays aims at."""
+    """The target number of samples of a step, which adapts the number of rays."""
     resolution: int = 64
-    """Cells of the occupancy grid along each axis."""
+    """The number of cells of the occupancy grid along each axis."""
     grid_warmup: int = 64
-    """Steps during which updates of the occupancy grid evaluate all of its cells."""
+    """The first steps, in which an update of the occupancy grid evaluates all of its cells."""
     grid_decay: float = 0.8
-    """Factor on what the occupancy grid remembers of a cell when it is evaluated again (nerfacc: 0.95)."""
+    """The decay of a cell's stored opacity when the cell is evaluated again (nerfacc: 0.95)."""
     grid_share: float = 1 / 32
-    """Share of the cells that an update evaluates afterwards, half of them among the occupied ones."""
+    """The share of the cells that later updates evaluate, half of them occupied cells."""
     lr: float = 2e-2
-    """Learning rate of Adam at the start (nerfacc: 0.01)."""
+    """The learning rate of Adam at the start (nerfacc: 0.01)."""
     lr_final: float = 0.1
-    """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
+    """The learning rate at the end, as a fraction of --lr; the decay is exponential."""
     average: float = 0.9
-    """Decay of the average of the weights at each step, which evaluation uses (torch-ngp: 0.95)."""
+    """The decay per step of the weights' moving average, which evaluation uses (torch-ngp: 0.95)."""
 
 
 class ReadTable(torch.autograd.Function):
-    """Features [m, f] of m sums of eight weighted entries of a table [entries, f]."""
+    """The weighted sums [m, f] of eight table entries each; the table is [entries, f]."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ class ReadTable(torch.autograd.Function):
 
 
 class TruncatedExp(torch.autograd.Function):
-    """exp with a bounded gradient, the activation of the density in torch-ngp and nerfacc."""
+    """The exponential with a bounded gradient, the activation of the density in torch-ngp and nerfacc."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -115,7 +115,7 @@ class TruncatedExp(torch.autograd.Function):
 
 
 class NGP(nn.Module):
-    """The field: positions in the unit cube and directions to colour and density."""
+    """The field: maps positions in the unit cube and directions to colour and density."""
 
     def __init__(self, config: RivalConfig, finest: float) -> None:
         super().__init__()
@@ -133,7 +133,7 @@ class NGP(nn.Module):
         self.colour = nn.Sequential(_linear(15 + 16, w), nn.ReLU(), _linear(w, w), nn.ReLU(), _linear(w, 3))
 
     def encode(self, positions: Tensor) -> Tensor:
-        """Features [n, levels x features] of positions [n, 3] in 0..1."""
+        """Returns features [n, levels x features] of positions [n, 3] in 0..1."""
         places = positions[:, None] * self.scales
         corner = places.floor()
         above = places - corner
@@ -147,25 +147,25 @@ class NGP(nn.Module):
         return ReadTable.apply(self.table, index.view(-1, 8), weight.view(-1, 8)).view(-1, self.features)
 
     def forward(self, positions: Tensor, seen: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
-        """Colour [n, 3] and density [n] at positions [n, 3] in 0..1, seen along the encoded directions [r, 16]."""
+        """Returns colour [n, 3] and density [n] at positions [n, 3] in 0..1 for encoded ray directions [r, 16]."""
         found = self.geometry(self.encode(positions))
         colour = self.colour(torch.cat((found[:, 1:], seen[ray]), 1)).sigmoid()
         return colour, TruncatedExp.apply(found[:, 0] - 1)
 
     def density(self, positions: Tensor) -> Tensor:
-        """Density [n] alone."""
+        """Returns the density [n] alone."""
         return TruncatedExp.apply(self.geometry(self.encode(positions))[:, 0] - 1)
 
 
 def _linear(inputs: int, outputs: int) -> nn.Linear:
-    """A layer without bias, with the initialisation of nerfacc and tiny-cuda-nn."""
+    """Returns a layer without bias, initialised as in nerfacc and tiny-cuda-nn."""
     layer = nn.Linear(inputs, outputs, bias=False)
     nn.init.xavier_uniform_(layer.weight)
     return layer
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
-    """The first four bands [r, 16] of unit directions [r, 3]."""
+    """Returns the first four bands [r, 16] of unit directions [r, 3]."""
     x, y, z = directions.unbind(-1)
     xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
     return torch.stack(
@@ -183,19 +183,19 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 class Rival:
-    """Trains the rival on a scene; takes turns with a ``turns.Training``, and is evaluated as it is.
+    """A training of the rival on a scene; it takes turns and is evaluated like a ``turns.Training``.
 
     A scene without a box is contracted, as with ``--contraction sphere``, and has no occupancy grid.
 
     Args:
-        config: its settings.
-        scene: to train on.
-        budget: training seconds.
-        evaluations: during the budget, evenly spaced, the last one at the end.
-        eval_views: of each evaluation.
-        seed: of every random choice.
-        clock: counts the training seconds.
-        on_event: called with a line for each evaluation.
+        config: The settings.
+        scene: The scene to train on.
+        budget: The training seconds.
+        evaluations: The number of evaluations during the budget, evenly spaced, the last one at the end.
+        eval_views: The number of test views in each evaluation.
+        seed: The seed of all random choices.
+        clock: A function that returns the time in seconds.
+        on_event: A function that is called with a line of text for each evaluation.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class Rival:
         return {**self.metrics[-1], "steps": self.step, "parameters": parameters, "stages": []}
 
     def train_step(self) -> None:
-        """One step."""
+        """Runs one training step."""
         config, done = self.config, self.seconds / self.budget
         for group in self.optimizer.param_groups:
             group["lr"] = config.lr * min(1, 0.01 + self.step / RISE) * config.lr_final**done
@@ -262,7 +262,7 @@ class Rival:
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
-        # torch-ngp's average; in the first steps it follows faster
+        # torch-ngp's moving average, with less decay in the first steps
         decay = min(config.average, (1 + self.step) / (10 + self.step))
         torch._foreach_lerp_(self.averages, [p.detach() for p in self.field.parameters()], 1 - decay)
         self.step += 1
@@ -271,7 +271,7 @@ class Rival:
     def render(
         self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None, *, jitter: bool
     ) -> tuple[Tensor, int]:
-        """Colours [r, 3] of rays, and how many samples they took."""
+        """Returns the colours [r, 3] of rays and the number of their samples."""
         s = self.config.samples
         generator = self.generator if jitter else None
         depths, deltas, _ = stratified_depths(
@@ -287,7 +287,7 @@ class Rival:
         if self.contraction is not None:
             positions = (self.contraction.points(positions) - self.low) / self.size
         colour, density = self.field(positions.clamp_(0, 1), spherical_harmonics(rays.directions), ray)
-        # Padded to all strata: a cumulative sum over each ray is one operation, as exact as the ray is short.
+        # Rays are padded to all strata, so that one cumsum per ray suffices and rounding errors do not cross rays.
         flat = torch.zeros(depths.numel()).scatter(0, kept, density * deltas.reshape(-1)[kept])
         thickness = flat.view(-1, s)
         before = thickness.cumsum(1) - thickness
@@ -299,7 +299,7 @@ class Rival:
         return result, kept.numel()
 
     def cells_along(self, origins: Tensor, directions: Tensor, depths: Tensor) -> Tensor:
-        """Cells [r, s] of the occupancy grid at depths [r, s] along rays in the unit cube."""
+        """Returns the cells [r, s] of the occupancy grid at depths [r, s] along rays in the unit cube."""
         size, cell = self.config.resolution, None
         for axis in range(3):
             place = torch.addcmul(origins[:, axis, None], directions[:, axis, None], depths)
@@ -310,7 +310,7 @@ class Rival:
 
     @torch.no_grad()
     def update_grid(self) -> None:
-        """Evaluates cells: all of them at first, then some at random and some that are occupied."""
+        """Updates the occupancy grid: evaluates all cells in the first steps, then random cells and occupied cells."""
         config, every = self.config, self.remembered.numel()
         if self.step < config.grid_warmup:
             cells = torch.arange(every)
@@ -330,7 +330,7 @@ class Rival:
 
     @torch.no_grad()
     def evaluate(self) -> None:
-        """Scores of the test views, with the averaged weights."""
+        """Evaluates test views with the averaged weights."""
         parameters = list(self.field.parameters())
         trained = [p.detach().clone() for p in parameters]
         for parameter, average in zip(parameters, self.averages):

@@ -1,9 +1,9 @@
-"""A room drawn from a seed, photographed along a hand-held path, and how wrong the depths of a field in it are.
+"""Writes the capture of a random room along a hand-held path, or measures the depth errors of a run trained on it.
 
-Walls, table and floor have no texture, and floor and table mirror what is behind them: a field is free to explain them
-by any depth. The furniture, colours, textures and the path come from the seed, so that no setting can be tuned to one
-picture. What is written is a capture like any other: PNG files and a COLMAP model, whose points lie where pictures
-have edges, and whose cameras are off by a third of a pixel. `depths.npy` has the distances of the held-out views.
+Walls, table and floor have no texture, and floor and table are mirrors, so that many depths explain the images. The
+seed determines furniture, colours, textures and the path, so that no setting can be tuned to one picture. The capture
+has PNG files and a COLMAP model. The model's points lie on edges of the images, and its cameras are off by a third of a
+pixel. `depths.npy` has the distances in the held-out views.
 
     python benchmarks/room.py FOLDER --seed 1
     voronerf train --data FOLDER --budget 60 --out RUN
@@ -37,25 +37,26 @@ from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.volume import per_ray
 
 FINE = 2  # rays along each side of a pixel
-#: Of light that falls straight and flat on what mirrors (Schlick 1994).
+#: Reflectance of mirrors at normal and at grazing incidence (Schlick 1994).
 MIRROR = 0.05, 0.6
-#: Errors, as of real captures: of pixels, of the directions of the cameras in pixels, of points as a share of distance.
+#: Standard deviations of the errors: pixel values, camera directions in pixels, and points as a share of their
+#: distance.
 NOISE, TURN, OFF = 0.008, 0.3, 0.003
-#: Points that a view adds.
+#: Points that each view adds to the model.
 POINTS = 20
-#: A surface is there from this share of its distance on.
+#: Light from before this share of a surface's distance counts as in front of the surface.
 BEFORE = 0.95
 
 
 def wall(draw: random.Random) -> Texture:
-    """A pale colour that becomes a little darker towards one side."""
+    """Draws a pale colour that becomes a little darker towards one side."""
     colour = np.array(colorsys.hsv_to_rgb(draw.random(), 0.15 * draw.random(), 0.7 + 0.25 * draw.random()))
     slope = np.array([draw.uniform(-0.05, 0.05) for _ in range(3)])
     return lambda points, normals: (colour * (1 + points @ slope)[:, None]).astype(np.float32)
 
 
 def room(draw: random.Random) -> tuple[list[Solid], int]:
-    """The solids, and how many of the first of them mirror: floor and table."""
+    """Draws a room; returns its solids and the number of mirrors, which come first: floor and table."""
     a, b, up = draw.uniform(1.9, 2.5), draw.uniform(1.9, 2.5), 1.6
     top = draw.uniform(0.6, 0.8)
     sides = draw.uniform(0.4, 0.6), draw.uniform(0.35, 0.5)
@@ -72,7 +73,7 @@ def room(draw: random.Random) -> tuple[list[Solid], int]:
         colour = colorsys.hsv_to_rgb(draw.random(), 0.3 + 0.6 * draw.random(), 0.3 + 0.6 * draw.random())
         return draw.choice([plain(colour), checker, diagonals, bricks, globe])
 
-    for i in range(4):  # on the table
+    for i in range(4):  # objects on the table
         angle, size = math.pi / 2 * (i + draw.random()), draw.uniform(0.06, 0.13)
         x, y = 0.28 * math.cos(angle), 0.28 * math.sin(angle)
         spin = rotation("z", draw.uniform(0, 90))
@@ -85,7 +86,7 @@ def room(draw: random.Random) -> tuple[list[Solid], int]:
                 ]
             )
         )
-    for i in range(6):  # along the walls, and a picture on each side of them
+    for i in range(6):  # furniture along the walls, with a picture above each piece
         deep, wide, high = 0.2, draw.uniform(0.25, 0.5), draw.uniform(0.2, 0.8)
         s, along = (-1) ** i, draw.uniform(-0.6, 0.6)
         place = (s * (a - deep), along * b) if i < 3 else (along * a, s * (b - deep))
@@ -100,7 +101,7 @@ def room(draw: random.Random) -> tuple[list[Solid], int]:
 
 
 def path(draw: random.Random, views: int, width: int, height: int) -> Cameras:
-    """Around the table at the height of a head, looking at about the table."""
+    """Returns cameras that circle the table at head height and look roughly at it."""
     t = torch.linspace(0, 1, views)
     waves = [torch.sin(2 * math.pi * (draw.choice([2, 3, 5]) * t + draw.random())) for _ in range(6)]
     angle = 2 * math.pi * draw.random() + draw.uniform(4.0, 5.5) * t + 0.05 * waves[0]
@@ -114,7 +115,7 @@ def path(draw: random.Random, views: int, width: int, height: int) -> Cameras:
 
 
 def meet(caster: Caster, cameras: Cameras, view: int) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Origins and directions [r, 3] of the rays of a view, how far they go [r], and which solids they meet [r]."""
+    """Returns for the rays of a view: origins and directions [r, 3], distances [r], indices of hit solids [r]."""
     rays, size = cameras.image_rays(view), (cameras.width, cameras.height)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
     scale = np.array([[float(cameras.intrinsics[view, 0]), size[0] / 2 - 0.5, size[1] / 2 - 0.5]])
@@ -125,11 +126,11 @@ def meet(caster: Caster, cameras: Cameras, view: int) -> tuple[Array, Array, Arr
 def look(
     caster: Caster, mirrors: int, origins: Array, directions: Array, depth: Array, number: NDArray[np.int64]
 ) -> Array:
-    """Colours [r, 3] of what rays have met, with one reflection."""
+    """Returns the colours [r, 3] that rays see, with one reflection."""
     colour = shaded(origins, directions, depth, number, caster)
     rows = (np.isfinite(depth) & (number < mirrors)).nonzero()[0]
     along = directions[rows]
-    rows, along = rows[along[:, 2] < 0], along[along[:, 2] < 0]  # on top
+    rows, along = rows[along[:, 2] < 0], along[along[:, 2] < 0]  # rays from above
     starts = origins[rows] + depth[rows, None] * along + np.array((0, 0, 1e-3), np.float32)
     bounced = (along * np.array((1, 1, -1))).astype(np.float32)
     solids = np.arange(len(caster.solids))
@@ -141,7 +142,7 @@ def look(
 
 
 def write_room(folder: Path, seed: int, *, views: int = 72, width: int = 200, height: int = 150) -> None:
-    """Writes the capture of a room: images, a COLMAP model, and the distances of held-out views."""
+    """Writes the capture of a room: images, a COLMAP model, and the distances in held-out views."""
     draw = random.Random(seed)
     solids, mirrors = room(draw)
     write_capture(folder, solids, mirrors, path(draw, views, width, height), seed)
@@ -150,7 +151,7 @@ def write_room(folder: Path, seed: int, *, views: int = 72, width: int = 200, he
 def write_capture(
     folder: Path, solids: list[Solid], mirrors: int, cameras: Cameras, seed: int, sky: Sequence[float] = (0, 0, 0)
 ) -> None:
-    """Writes the capture of solids below a sky, of which the first ``mirrors`` mirror; see `write_room`."""
+    """Writes the capture of solids below a sky; the first ``mirrors`` solids are mirrors. See `write_room`."""
     noise, caster = np.random.default_rng(seed), Caster(solids, LIGHT)
     views, width, height = len(cameras), cameras.width, cameras.height
     (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -199,7 +200,7 @@ def write_capture(
 
 
 def quaternion(turn: Array) -> Array:
-    """(w, x, y, z) of a rotation: the eigenvector of the largest eigenvalue (Bar-Itzhack 2000)."""
+    """Returns the quaternion (w, x, y, z) of a rotation matrix by its largest eigenvector (Bar-Itzhack 2000)."""
     (a, b, c), (d, e, f), (g, h, i) = turn.astype(np.float64)
     rows = [
         [a + e + i, h - f, c - g, d - b],
@@ -212,33 +213,33 @@ def quaternion(turn: Array) -> Array:
 
 @torch.no_grad()
 def depth_errors(renderer: Renderer, scene: Scene, folder: Path) -> dict[str, float]:
-    """The median error of depths in held-out views, as a share of the distance, and the share of light before it."""
+    """Returns for held-out views the median relative depth error, and the mean share of light in front of surfaces."""
     assert scene.transform is not None
     scale = float(torch.linalg.det(scene.transform[:3, :3])) ** (1 / 3)
     errors, early = [], []
-    for view, known in enumerate(torch.from_numpy(scale * np.load(folder / "depths.npy")).float()):
-        met = known.isfinite().reshape(-1)
-        found = render_camera(renderer, scene, scene.test.cameras, view, heaviest=False).depth
-        errors.append(((found - known).abs() / known).reshape(-1)[met])
-        rays, known = scene.test.cameras.image_rays(view)[met], known.reshape(-1)[met]
+    for view, true in enumerate(torch.from_numpy(scale * np.load(folder / "depths.npy")).float()):
+        met = true.isfinite().reshape(-1)
+        depth = render_camera(renderer, scene, scene.test.cameras, view, heaviest=False).depth
+        errors.append(((depth - true).abs() / true).reshape(-1)[met])
+        rays, true = scene.test.cameras.image_rays(view)[met], true.reshape(-1)[met]
         last = renderer.render(rays, per_ray(scene.near, rays), per_ray(scene.far, rays))[-1]
-        before = last.samples.depths < BEFORE * known[last.samples.ray_index.long()]
-        early.append(torch.zeros(len(known)).index_add(0, last.samples.ray_index.long(), last.weights * before))
+        before = last.samples.depths < BEFORE * true[last.samples.ray_index.long()]
+        early.append(torch.zeros(len(true)).index_add(0, last.samples.ray_index.long(), last.weights * before))
     return {"depth_error": float(torch.cat(errors).median()), "light_before": float(torch.cat(early).mean())}
 
 
 def main() -> None:
-    """Writes a room, or prints how wrong the depths of a run are that was trained on it."""
+    """Writes a room, or prints the depth errors of a run that was trained on it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--run", type=Path, help="of voronerf train --data FOLDER; nothing is written then")
-    given = parser.parse_args()
-    if given.run is None:
-        write_room(given.folder, given.seed)
+    parser.add_argument("--run", type=Path, help="a run trained on the room: print its depth errors, write nothing")
+    options = parser.parse_args()
+    if options.run is None:
+        write_room(options.folder, options.seed)
     else:
-        run = open_run(given.run)
-        print(depth_errors(run.renderer, run.scene, given.folder))
+        run = open_run(options.run)
+        print(depth_errors(run.renderer, run.scene, options.folder))
 
 
 if __name__ == "__main__":

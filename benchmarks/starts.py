@@ -1,11 +1,11 @@
-"""Whether every training learns, whatever its seed: the first steps of a long one, for several numbers of rays.
+"""Checks that training starts to learn with every seed: the first steps, for several numbers of rays.
 
     python benchmarks/starts.py --data SHIP LEGO --downscale 4 --steps 300 --json benchmarks/results/starts.json
     python benchmarks/starts.py --data BONSAI --downscale 8 --steps 440 --json benchmarks/results/starts.json
 
-A training has failed if its PSNR is less than `ABOVE` dB above that of pictures of one colour, or more than `BELOW` dB
-below the median of its scene's trainings with the fewest rays: more rays a step must not teach less. Seconds are those
-of the processor. To measure an older version, put its folder into PYTHONPATH and give it a ``--label``.
+A training fails if its PSNR is less than `ABOVE` dB above the PSNR of one-colour pictures. It also fails if its PSNR is
+more than `BELOW` dB below the median of its scene's trainings with the fewest rays, because more rays a step must not
+learn less. Seconds are processor time. To measure another version, put its folder into PYTHONPATH and set ``--label``.
 """
 
 from __future__ import annotations
@@ -27,48 +27,48 @@ from voronerf.app.scenes import load_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
 from voronerf.app.train.callbacks import one_colour_psnr
 
-#: Decibels, see above.
+#: Thresholds of a failed training in decibels, see the module's docstring.
 ABOVE, BELOW = 3.0, 4.0
 
 
 @dataclass(frozen=True)
 class Options:
-    """Which trainings."""
+    """The settings of the trainings."""
 
     data: tuple[str, ...] = ("builtin",)
-    """Scene folders or built-in scenes."""
+    """Folders of scenes, or built-in scenes."""
     downscale: int = 1
-    """Factor by which the images are made smaller on load."""
+    """The factor by which the images are downscaled on load."""
     rays: tuple[int, ...] = (512, 1024, 2048, 4096)
-    """Rays of the first step."""
+    """Numbers of rays in the first step."""
     seeds: int = 8
-    """Seeds 0, 1, ... of each."""
+    """The number of seeds (0, 1, ...) for each number of rays."""
     steps: int = 400
-    """Steps that are made."""
+    """The steps to run."""
     planned: int = 6000
-    """Steps of the whole training, on which its settings depend."""
+    """The planned steps of the whole training; its schedules depend on them."""
     eval_views: int = 3
-    """Test views of the evaluation at the end."""
+    """The test views of the final evaluation."""
     label: str = "now"
-    """Of the version that is measured."""
+    """The label of the measured version."""
     json: Path | None = None
-    """Where the results go, beside those of other scenes and labels; default: printed only."""
+    """The JSON file that the results are added to. Default: results are only printed."""
 
 
 class StopAt(Callback):
-    """Ends a training after so many steps."""
+    """A callback that ends a training after ``step`` steps."""
 
     def __init__(self, step: int) -> None:
         self.step = step
 
     def after_step(self, state: State) -> None:
-        """Asks the training to end when it is time."""
+        """Stops the training at the last step."""
         if state.step >= self.step:
             state.stop()
 
 
 def judged(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The failures of the trainings of one scene, and their median PSNR, by the rays of a step."""
+    """Marks failed trainings of one scene in ``rows``; returns failures and median PSNR by number of rays."""
     by_rays: dict[int, list[dict[str, Any]]] = {}
     for row in rows:
         by_rays.setdefault(row["rays"], []).append(row)
@@ -85,21 +85,21 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def write(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Adds the trainings of a scene to a file, in place of those with the same label."""
-    known = json.loads(path.read_text())["results"] if path.is_file() else {"scenes": [], "trainings": []}
+    """Adds the trainings of a scene to a file; replaces its trainings with the same scene and label."""
+    stored = json.loads(path.read_text())["results"] if path.is_file() else {"scenes": [], "trainings": []}
     key = rows[0]["label"], rows[0]["scene"]
-    kept = {name: [r for r in found if (r["label"], r["scene"]) != key] for name, found in known.items()}
+    kept = {name: [r for r in found if (r["label"], r["scene"]) != key] for name, found in stored.items()}
     results = {"scenes": [*kept["scenes"], judged(rows)], "trainings": [*kept["trainings"], *rows]}
     write_text(path, json_text({"metadata": metadata(benchmark="starts"), "results": results}, indent=1) + "\n")
 
 
 def main(options: Options) -> None:
-    """Trains, prints a line for each training and the failures of each number of rays, and writes the results."""
+    """Trains, prints each training and the failures by number of rays, and writes the results."""
     torch.set_num_threads(1)
     for data in options.data:
         scene, rows = load_scene(data, downscale=options.downscale), list[dict[str, Any]]()
-        given = {"label": options.label, "scene": scene.name, "downscale": options.downscale}
-        given |= {"steps": options.steps, "planned": options.planned, "one_colour": one_colour_psnr(scene)}
+        common = {"label": options.label, "scene": scene.name, "downscale": options.downscale}
+        common |= {"steps": options.steps, "planned": options.planned, "one_colour": one_colour_psnr(scene)}
         for rays in sorted(options.rays):
             for seed in range(options.seeds):
                 config = TrainConfig(data=data, steps=options.planned, split_at=(0.9,), rays=rays, seed=seed)
@@ -108,9 +108,9 @@ def main(options: Options) -> None:
                 seconds = time.process_time() - started
                 with state.averaged():
                     psnr = mean_scores(evaluate(state.renderer, scene, views=options.eval_views))["psnr"]
-                found = {"rays": rays, "seed": seed, "samples": state.sampler.samples, "psnr": psnr}
-                found |= {"share": state.sampler.grid.share, "draws": len(state.stages), "cpu_seconds": seconds}
-                rows.append({**given, **found})
+                scores = {"rays": rays, "seed": seed, "samples": state.sampler.samples, "psnr": psnr}
+                scores |= {"share": state.sampler.grid.share, "draws": len(state.stages), "cpu_seconds": seconds}
+                rows.append({**common, **scores})
                 print(f"{scene.name} {rays} rays, seed {seed}: {psnr:.2f} dB, {seconds:.1f} s", flush=True)
         print(f"{scene.name}: failures of {options.seeds} seeds {judged(rows)['failures']}", flush=True)
         if options.json is not None:

@@ -1,7 +1,7 @@
-"""A result of throughput.py as Markdown, so that tables in documents can be made again from the committed JSON.
+"""Prints a result of throughput.py as Markdown, to regenerate tables of the documents from the committed JSON.
 
 python benchmarks/table.py benchmarks/results/throughput.json                    the rows that docs/performance.md shows
-python benchmarks/table.py benchmarks/results/throughput.json --rows '^routed_mlp/'   any others
+python benchmarks/table.py benchmarks/results/throughput.json --rows '^routed_mlp/'   other rows
 python benchmarks/table.py benchmarks/results/foreign_fields.json --foreign      times faster than the loop over masks
 """
 
@@ -29,7 +29,7 @@ SHOWN = (
     r"^composite/dense n=262144/",
     r"^routed_mlp/(w64d4|mlp32) n=262144 k=(16|256)/",
 )
-"""Rows of the table in docs/performance.md, by op/case/dtype/direction."""
+"""Patterns of op/case/dtype/direction for the rows in docs/performance.md."""
 
 
 def fail(message: str) -> NoReturn:
@@ -37,7 +37,7 @@ def fail(message: str) -> NoReturn:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """{metadata, results} of a file."""
+    """Reads {metadata, results} from a file."""
     try:
         outcome = json.loads(path.read_text())
         if outcome["metadata"]["benchmark"] != "throughput":
@@ -52,12 +52,12 @@ def key(row: Row) -> str:
 
 
 def native_rows(outcome: dict[str, Any]) -> list[Row]:
-    """The rows of our own compiled kernels."""
+    """Returns the rows of the native backend."""
     return [row for row in outcome["results"] if row["backend"] == "native"]
 
 
 def best(row: Row) -> tuple[str, float] | None:
-    """Name and milliseconds of the fastest alternative."""
+    """Returns the name and milliseconds of the fastest alternative, or None."""
     times = [(value, name) for name, value in row["alternatives"].items() if value is not None]
     return (min(times)[1], min(times)[0]) if times else None
 
@@ -68,8 +68,8 @@ def milliseconds(value: float) -> str:
 
 
 def markdown(rows: list[Row]) -> list[str]:
-    """The table of some rows, native backend."""
-    found = ["| | dtype | | ms | of the limit | best alternative | ms | x |", "|---|---|---|---|---|---|---|---|"]
+    """Returns the lines of a Markdown table of native rows."""
+    lines = ["| | dtype | | ms | of the limit | best alternative | ms | x |", "|---|---|---|---|---|---|---|---|"]
     for row in rows:
         other = best(row)
         percent = row["percent_of_peak"]
@@ -83,16 +83,16 @@ def markdown(rows: list[Row]) -> list[str]:
             "-" if other is None else milliseconds(other[1]),
             "-" if row["speedup_over_best"] is None else f"**{row['speedup_over_best']:.1f}**",
         ]
-        found.append(f"| {' | '.join(cells)} |")
-    return found
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
 
 
 def foreign_markdown(rows: list[Row]) -> list[str]:
-    """Rows of fields of other codebases: how many times faster than the loop over masks each way is."""
-    known = ("fuse=True", "fused", "masks behind one encoding", "one module")
-    ways = [way for way in known if any(row["alternatives"].get(way) is not None for row in rows)]
+    """Returns the lines of the table of foreign fields: the speed-up of each way over the loop over masks."""
+    order = ("fuse=True", "fused", "masks behind one encoding", "one module")
+    ways = [way for way in order if any(row["alternatives"].get(way) is not None for row in rows)]
     head = ("", "n", "k", "", "masks, ms", "as it comes", *ways)
-    found = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for row in rows:
         times = row["alternatives"]
         masks = times["masks"]
@@ -100,12 +100,12 @@ def foreign_markdown(rows: list[Row]) -> list[str]:
         cells = [name, f"{row['n']:,}", str(row["k"]), row["direction"].replace("+", " + "), milliseconds(masks)]
         cells += [f"**{masks / row['median_ms']:.2f}**"]
         cells += ["-" if times.get(way) is None else f"{masks / times[way]:.2f}" for way in ways]
-        found.append(f"| {' | '.join(cells)} |")
-    return found
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Prints what was asked for."""
+    """Prints the requested table."""
     parser = Parser("table", description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
     parser.add_argument("file", type=Path)
     parser.add_argument(

@@ -1,9 +1,9 @@
-"""The cost of every operation and of the whole route, beside alternatives and the limit of the machine.
+"""Times every operation and the whole route, beside alternatives and the machine's peak rates.
 
     python benchmarks/throughput.py                                   everything, about twelve minutes on two cores
     python benchmarks/throughput.py --quick                           every operation once, under a minute
     python benchmarks/throughput.py --filter '^grouped_mlp/w64d4.*bfloat16'
-    python benchmarks/throughput.py --foreign --filter 'siren .*k=16'  the router around fields of other codebases
+    python benchmarks/throughput.py --foreign --filter 'siren .*k=16'  the router with fields of other codebases
     python benchmarks/throughput.py --json benchmarks/results/throughput.json
     python benchmarks/table.py benchmarks/results/throughput.json     the JSON as Markdown
 
@@ -27,7 +27,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-# The private op caches compiled products by their shapes; its default of 1,024 is too few for a loop over many cells.
+# oneDNN caches compiled products by shape; its default capacity of 1,024 is too small for a loop over many cells.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
 
 import torch
@@ -46,14 +46,14 @@ from voronerf.app.files import write_text
 from voronerf.ops._core import backends
 
 OPTIONAL = {"scipy": "scipy", "warp": "warp-lang", "numba": "numba"}
-"""Packages that are used where they are installed, and what to install."""
+"""Optional packages: module name -> package to install."""
 LIMITS = {"ours": 0.8, "alternative": 0.5}
 QUICK_LIMITS = {"ours": 0.3, "alternative": 0.15}
-"""Seconds of timings of one contender, at three timings or more: see ``harness.measure``."""
+"""Time limits in seconds for one contender, with at least three timings: see ``harness.measure``."""
 DISTURBED = 0.1
-"""Cores that other processes may keep busy before a row's timings are reported as disturbed."""
+"""A row counts as disturbed if other processes keep more cores busy than this."""
 SLOW = ("compile", "F.grouped_mm")
-"""Parts of the names of alternatives that take seconds to compile or to run, which --quick leaves out."""
+"""Parts of the names of slow alternatives, which --quick omits."""
 
 
 def fail(message: str) -> NoReturn:
@@ -61,14 +61,16 @@ def fail(message: str) -> NoReturn:
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The options, checked."""
+    """Parses and checks the options."""
     parser = Parser("throughput", description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
     parser.add_argument("--quick", action="store_true", help="every operation once, under a minute")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go as well")
-    parser.add_argument("--filter", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="a JSON file for the results")
+    parser.add_argument("--filter", metavar="REGEX", help="a pattern of op/case/dtype/direction")
     parser.add_argument("--device", default="cpu", help="cpu or cuda; timings on cuda have not been run yet")
-    parser.add_argument("--backends", nargs="+", default=list(backends.BACKENDS), metavar="NAME", help="rows of these")
-    parser.add_argument("--foreign", action="store_true", help="the rows of fields of other codebases instead")
+    parser.add_argument(
+        "--backends", nargs="+", default=list(backends.BACKENDS), metavar="NAME", help="backends to measure"
+    )
+    parser.add_argument("--foreign", action="store_true", help="measure fields of other codebases instead")
     parser.add_argument("--list", action="store_true", help="print op/case/dtype/direction of the rows and stop")
     options = parser.parse_args(arguments)
     for name in options.backends:
@@ -84,7 +86,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
-    """The cases that the options select."""
+    """Returns the cases that the options select."""
     every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases(), *cases_marching.cases()]
     every += [*cases_hash.cases(), *cases_step.cases()]
     every += cases_any.cases(every)
@@ -104,23 +106,23 @@ def chosen_cases(options: argparse.Namespace) -> list[Case]:
 
 
 def installed() -> tuple[dict[str, str], list[str]]:
-    """Versions of the installed optional packages, and what to install for the others."""
-    found, missing = {}, []
+    """Returns the versions of installed optional packages, and install hints for missing packages."""
+    versions, missing = {}, []
     for module, package in OPTIONAL.items():
         try:
-            found[module] = importlib.metadata.version(package)
+            versions[module] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             missing.append(f"{module} (pip install {package})")
-    return found, missing
+    return versions, missing
 
 
 class Bench:
-    """Measures cases and keeps their rows.
+    """A collector that measures cases and stores their rows.
 
     Args:
-        device: where everything runs.
-        quick: short limits, and no alternative that has to be compiled.
-        wanted: backends whose rows there are.
+        device: The device of all cases.
+        quick: Whether to use short limits and no compiled alternatives.
+        wanted: The backends to measure.
     """
 
     def __init__(self, device: torch.device, *, quick: bool, wanted: list[str]) -> None:
@@ -130,7 +132,7 @@ class Bench:
         self.rows: list[dict[str, Any]] = []
 
     def run(self, case: Case) -> list[dict[str, Any]]:
-        """The rows of a case, one for each backend that can run it."""
+        """Measures a case; returns one row for each backend that can run it."""
         names = [
             name
             for name in case.backends
@@ -178,7 +180,7 @@ class Bench:
         return [{**row, "other_load": disturbed, "first_call_ms": first[row["backend"]] * 1e3} for row in rows]
 
     def _check(self, contender: Contender, work: Work) -> tuple[float, float]:
-        """Calls a contender for the first time: error, seconds."""
+        """Runs call 0 of a contender; returns its error and seconds."""
         start = self.clock()
         result = contender.run(0)
         if torch.cuda.is_available():
@@ -187,13 +189,17 @@ class Bench:
         return work.error(contender.adapt(result)), seconds
 
     def _set_up(self, set_up: Callable[[], Contender], work: Work, warm: dict[str, float], name: str) -> Contender:
-        """An alternative that has been seen to do the work, its first call's seconds in ``warm``; or NotApplicable."""
+        """Returns an alternative after a check of its result; stores the first call's seconds in ``warm``.
+
+        Raises:
+            NotApplicable: The alternative fails or is not exact enough.
+        """
         try:
             contender = set_up()
             error, warm[name] = self._check(contender, work)
         except NotApplicable:
             raise
-        except Exception as failure:  # an alternative may fail in any way, which is a result too
+        except Exception as failure:  # any failure of an alternative is a result too
             first = (str(failure).strip().splitlines() or [""])[0]
             raise NotApplicable(f"{type(failure).__name__}: {first}"[:300]) from failure
         if not error <= work.tolerance:
@@ -249,25 +255,25 @@ HEADER = (
 
 
 def lines(row: dict[str, Any], *, last: bool) -> list[str]:
-    """A row as printed, and below the last backend's the alternatives of all."""
+    """Returns the printed lines of a row; the last backend's row is followed by the alternatives."""
     percent = "-" if row["percent_of_peak"] is None else f"{row['percent_of_peak']:.1f} %"
     ahead = "-" if row["speedup_over_best"] is None else f"{row['speedup_over_best']:.2f}"
     spread = "-" if row["iqr_ms"] is None else f"{row['iqr_ms']:.3f}"
-    found = [
+    printed = [
         f"{row['op']:17} {row['case']:28} {row['dtype']:8} {row['direction']:16} {row['backend']:9}"
         f" {row['median_ms']:7.3f} ms {spread:>8} {row['median_ms'] * 1e6 / row['n']:10.2f}"
         f" {row['throughput']:7.1f} {row['unit']:7} {percent:>8} {ahead:>7} {row['max_error']:8.1e}"
     ]
     if last:
-        found += [
+        printed += [
             f"    {name:42} {'' if value is None else f'{value:10.3f} ms'} {row['notes'].get(name, '')}".rstrip()
             for name, value in row["alternatives"].items()
         ]
-    return found
+    return printed
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measures, prints and stores."""
+    """Measures the rows, prints them and writes the JSON."""
     options = parse(arguments)
     cases = chosen_cases(options)
     if options.list:
@@ -279,7 +285,7 @@ def main(arguments: list[str] | None = None) -> None:
         except OSError as error:
             fail(f"--json: {error}")
     if not options.quick:
-        # Compilation is part of the cost of a first call; an old cache would hide it.
+        # The first call includes compilation, so it needs an empty cache.
         folder = tempfile.mkdtemp(prefix="voronerf-warp-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         os.environ["WARP_CACHE_PATH"] = folder

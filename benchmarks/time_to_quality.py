@@ -1,4 +1,4 @@
-"""PSNR over training seconds, and seconds until 26, 28, 30 and 32 dB, of settings of `voronerf train` and a rival.
+"""Compares PSNR over training seconds, and seconds to 26, 28, 30 and 32 dB, between settings and with Instant NGP.
 
     python benchmarks/time_to_quality.py --data builtin --budget 60
     python benchmarks/time_to_quality.py --data LEGO --downscale 4 --seeds 3 --common="--field hashgrid --occupancy"
@@ -6,7 +6,8 @@
         --sides "hash grid: --field hashgrid --occupancy" "4 cells, wide: --cells 4 --width 128" "rival: ngp"
 
 All sides train one scene for the same time. They take turns of a few seconds in one process, so that the noise of a
-shared machine falls on all of them alike. All are evaluated at the same times on the same views, which does not count.
+shared machine affects all sides alike. All sides are evaluated at the same times on the same views. Evaluation does not
+count as training time.
 """
 
 from __future__ import annotations
@@ -34,51 +35,51 @@ from voronerf.app.files import write_text
 from voronerf.app.scenes import Scene, load_scene
 from voronerf.app.train.config import ConfigError, TrainConfig
 
-#: The first word of the side that is the rival.
+#: The first word of a side that trains the rival, Instant NGP.
 RIVAL = "ngp"
-#: Settings of `voronerf train` that this benchmark gives to all sides.
+#: The settings of `voronerf train` that this benchmark sets for all sides.
 GIVEN = ("data", "downscale", "out", "seed", "steps", "budget", "evaluations", "eval_views")
-#: The PSNRs in dB whose times are printed.
+#: The qualities (PSNR in dB) whose training times are printed.
 QUALITIES = (26, 28, 30, 32)
 
 
 @dataclass(frozen=True)
 class Options:
-    """What to compare, on which scene, for how long."""
+    """The compared sides, their scene and their training time."""
 
     data: str = "builtin"
-    """Scene folder or a built-in scene."""
+    """A scene folder or a built-in scene."""
     downscale: int = 1
-    """Factor by which the images are made smaller on load."""
+    """The factor by which the images are downscaled on load."""
     sides: tuple[str, ...] = ("cells:", "one network: --cells", "regular grid: --centres uniform", f"rival: {RIVAL}")
-    """What is compared, each as "NAME: OPTIONS" with options of `voronerf train`, or "NAME: ngp OPTIONS" for Instant
+    """The compared sides. Each is "NAME: OPTIONS" with options of `voronerf train`, or "NAME: ngp OPTIONS" for Instant
     NGP in pure PyTorch, with options of `rival_ngp.py`."""
     common: str = ""
-    """Options of `voronerf train` for all sides but the rival, where they do not say otherwise: --common="OPTIONS"."""
+    """Default options of `voronerf train` for all sides but the rival: --common="OPTIONS"."""
     budget: float = 60.0
     """Training seconds of every side."""
     clock: Literal["wall", "cpu"] = "wall"
-    """What counts as a second: wall time, or where others use the machine too, process CPU time / threads."""
+    """The clock of the training time: wall time or, on a shared machine, process CPU time divided by threads."""
     seeds: int = 1
-    """Runs of every side, seeds 0, 1, ..."""
+    """The runs of each side, with seeds 0, 1, ..."""
     turn: float = 5.0
-    """Seconds that a side trains before the next one has its turn."""
+    """The seconds of a turn, after which the next side trains."""
     evaluations: int = 12
-    """Evaluations during the budget, evenly spaced."""
+    """The number of evaluations during the budget, evenly spaced."""
     eval_views: int = 20
-    """Test views of each evaluation."""
+    """The number of test views in each evaluation."""
     json: Path | None = None
-    """Where the results go; default: printed only."""
+    """The JSON file of the results. Default: results are only printed."""
     plot: Path | None = None
-    """Where the plot goes."""
+    """The file of the plot."""
 
 
 def parse_side(text: str, common: str) -> tuple[str, TrainConfig | RivalConfig]:
-    """Name and settings that an entry of ``--sides`` stands for.
+    """Returns the name and the settings of an entry of ``--sides``.
 
     Raises:
-        ConfigError: for an entry without a name, or one with a setting that is the same for all sides.
-        SystemExit: for an option that does not exist; the parser has said which.
+        ConfigError: The entry has no name, or sets an option that is the same for all sides.
+        SystemExit: The entry has an unknown option, which the parser reports.
     """
     name, colon, words = text.partition(":")
     if not colon or not name.strip():
@@ -102,7 +103,7 @@ def parse_side(text: str, common: str) -> tuple[str, TrainConfig | RivalConfig]:
 def make_training(
     name: str, config: TrainConfig | RivalConfig, options: Options, scene: Scene, seed: int, out: Path
 ) -> Training | Rival:
-    """The training of one side with one seed."""
+    """Builds the training of one side with one seed."""
     clock = CLOCKS[options.clock]
     say: Callable[[str], None] = lambda line: print(f"{name:14} {line}", flush=True)  # noqa: E731
     if isinstance(config, RivalConfig):
@@ -140,7 +141,7 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
             curve, settings = training.scores.metrics, training.state.config.to_values()
         else:
             curve, settings = training.metrics, dataclasses.asdict(training.config)
-        settings |= {"data": Path(options.data).name, "out": None}  # paths of a machine mean nothing elsewhere
+        settings |= {"data": Path(options.data).name, "out": None}  # paths are meaningless on other machines
         results.append(
             {
                 "side": name,
@@ -158,9 +159,9 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
 
 
 def seconds_to(quality: float, curve: Sequence[dict[str, Any]]) -> float | None:
-    """Training seconds at which a curve first reaches a PSNR, on the line between two evaluations.
+    """Returns the training seconds at which a curve first reaches a PSNR, interpolated between evaluations.
 
-    At the earliest the time of the first evaluation; None if it is never reached.
+    The earliest result is the time of the first evaluation. None if the curve never reaches the PSNR.
     """
     before = None
     for now in curve:
@@ -174,7 +175,10 @@ def seconds_to(quality: float, curve: Sequence[dict[str, Any]]) -> float | None:
 
 
 def table(outcome: dict[str, Any]) -> str:
-    """PSNR at every evaluation and seconds to the qualities, as Markdown: a side a line, medians of its seeds."""
+    """Returns a Markdown table with a row for each side: PSNR at each evaluation and seconds to the qualities.
+
+    Each cell is the median over the seeds.
+    """
     about, runs = outcome["metadata"], {}
     for result in outcome["results"]:
         runs.setdefault(result["side"], []).append(result)
@@ -184,7 +188,7 @@ def table(outcome: dict[str, Any]) -> str:
     for side, found in runs.items():
         row = [side, *(f"{statistics.median(r[name] for r in found):,.0f}" for name in ("steps", "parameters"))]
         for t in times:
-            # a step that is longer than the time between two evaluations skips one
+            # A step longer than the time between two evaluations skips an evaluation.
             near = [[m["psnr"] for m in r["curve"] if abs(m["seconds"] - t) < times[0] / 2] for r in found]
             row.append(f"{statistics.median(values[0] for values in near):.2f}" if all(near) else "-")
         for quality in QUALITIES:
@@ -196,7 +200,7 @@ def table(outcome: dict[str, Any]) -> str:
 
 
 def main(options: Options) -> None:
-    """Runs the comparison and writes what was asked for."""
+    """Runs the comparison, prints the table, and writes the requested files."""
     with tempfile.TemporaryDirectory() as folder:
         outcome = compare(options, Path(folder))
     print(table(outcome))

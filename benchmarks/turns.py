@@ -1,4 +1,4 @@
-"""Several trainings in one process, in turns of a few seconds, so that the noise of the machine affects all alike."""
+"""Runs several trainings in one process, in turns of a few seconds, so that machine noise affects all alike."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from voronerf.app.train import (
     train,
 )
 
-#: What counts as a second: wall time, or process CPU time for each thread.
+#: Clocks of the training time: wall time, or process CPU time divided by the number of threads.
 CLOCKS: dict[str, Callable[[], float]] = {
     "wall": time.perf_counter,
     "cpu": lambda: time.process_time() / torch.get_num_threads(),
@@ -36,21 +36,21 @@ class TakesTurns(Protocol):
 
     @property
     def seconds(self) -> float:
-        """Of training so far."""
+        """The training seconds so far."""
 
     def advance(self, until: float) -> Any:
         """Trains until ``until`` training seconds or the end of the budget, whichever comes first."""
 
 
 class Training:
-    """A training as of `voronerf train`, in parts, which writes checkpoints only when told to and at the end.
+    """A training of `voronerf train` that runs in turns; it writes checkpoints at the end and on :meth:`save`.
 
     Args:
-        config: its settings; ``out`` is the run directory.
-        scene: the scene.
-        clock: counts seconds.
-        on_event: called with a line for what happens.
-        resume: go on from the last checkpoint.
+        config: The settings; ``out`` is the run directory.
+        scene: The scene.
+        clock: A function that returns the time in seconds.
+        on_event: A function that is called with a line of text for each event.
+        resume: Whether to continue from the last checkpoint.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Training:
 
     @property
     def seconds(self) -> float:
-        """Of training so far."""
+        """The training seconds so far."""
         return self.state.seconds
 
     def advance(self, until: float = math.inf) -> None:
@@ -88,7 +88,7 @@ class Training:
         self.checkpoints.writer.wait()
 
     def run(self) -> dict[str, Any]:
-        """Trains to the end, scores and saves; returns the summary."""
+        """Trains to the end, evaluates and saves; returns the summary."""
         self.advance()
         for callback in self.callbacks:
             callback.on_end(self.state)
@@ -108,16 +108,17 @@ def take_turns(
     after_turn: Callable[[T], None] = lambda training: None,
     on_failure: Callable[[T, Exception], None] | None = None,
 ) -> None:
-    """Trains all of them for the same time; the time of the callbacks does not count.
+    """Trains all trainings for the same time; the time of the callbacks does not count.
 
     Args:
-        trainings: at any point of their run; the ones that are ahead wait for the others.
-        budget: training seconds of each.
-        turn: seconds until the next one has its turn.
-        stops: for each the training seconds at which ``on_stop`` is called, rising.
-        on_stop: called with a training and the stop that it has reached.
-        after_turn: called with a training after each of its turns.
-        on_failure: called with a training that failed and its error; the others go on. None: the error ends all.
+        trainings: The trainings, at any point of their run; trainings that are ahead wait for the rest.
+        budget: Training seconds of each training.
+        turn: Seconds of a turn.
+        stops: A function that returns the training seconds at which ``on_stop`` is called for a training, rising.
+        on_stop: A function of a training and the stop that it has reached.
+        after_turn: A function that is called with a training after each of its turns.
+        on_failure: A function of a failed training and its error; the other trainings continue. None: the error ends
+            all trainings.
 
     Raises:
         ConfigError: When ``turn`` is not positive.
@@ -126,12 +127,12 @@ def take_turns(
     if not turn > 0:
         raise ConfigError(f"--turn must be positive, got {turn}")
     trainings = list(trainings)
-    # those that go on begin with a whole turn: what was due in it may have been passed, but not looked at
+    # Resumed trainings begin with a full turn, because its stops may have been passed without a call of on_stop.
     done = turn * math.floor(min((training.seconds for training in trainings), default=budget) / turn)
     while done < budget:
         before, done = done, min(done + turn, budget)
         for training in list(trainings):
-            # a long step may have passed a stop in the turn before: what is due in this one is looked at all the same
+            # A long step of the last turn may have passed a stop of this turn; on_stop is still called for it.
             due = [second for second in stops(training) if before < second <= done]
             if training.seconds >= done and not due:
                 continue

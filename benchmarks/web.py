@@ -1,10 +1,10 @@
-"""Pages of trained runs beside what `Run.render` gives: in Chromium, whose WebGPU runs on the CPU.
+"""Compares web pages of trained runs, in Chromium with WebGPU on the CPU, with the pictures of `Run.render`.
 
     python benchmarks/web.py --runs runs/lego runs/bonsai runs/demo --pixels 100 --json benchmarks/results/web.json
 
-It needs Debian's packages chromium and chromium-driver, and selenium. Speed on a GPU is a model: the operations that
-the shader asks for in a frame, divided by what a GPU does in a second. They are counted from the steps of the networks,
-and from the strata and samples of the rays of five views, by `COSTS`.
+It needs Debian's packages chromium and chromium-driver, and selenium. The speed on a GPU is modelled: the shader's
+operations in a frame, divided by the GPU's operations a second. Operations are counted by `COSTS` from the steps of the
+networks, and from the strata and samples of the rays of five views.
 """
 
 from __future__ import annotations
@@ -47,35 +47,35 @@ voronerf.started.then(() => voronerf.picture(camera)).then(
   (bytes) => done(btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""))),
   (error) => done(`error: ${error}`));
 """
-#: Pixels along the sides of a frame, and every how many of them a ray is counted.
+#: Pixels along each side of a frame, and the distance in pixels between counted rays.
 FRAME, APART = 800, 5
 VIEWS = 5
-#: Of the page while pictures are asked for, so that what it draws itself takes no time.
+#: The page's window while pictures are requested: so small that its own drawing takes no time.
 SMALL = {"width": 40, "height": 40, "deviceScaleFactor": 1, "mobile": False}
-#: Operations of the shader, beside products of matrices: of a block of 4 x 4 its 8 conversions from float16; of a
-#: corner of a hash grid its weight, its number and the sum; of a centre; of a stratum of a ray, with a contraction;
-#: of a sample its colour and its weight; of a sine or cosine.
+#: Operations of the shader besides matrix products: a 4 x 4 block (8 conversions from float16), a corner of a hash grid
+#: (weight, index and sum), a centre, a stratum of a ray, a contraction, a sample (colour and weight), and a sine or
+#: cosine.
 COSTS = {"block": 8, "corner": 18, "centre": 9, "stratum": 45, "contraction": 20, "sample": 60, "wave": 12}
 RATES = (1, 5, 20)  # TFLOP/s
 
 
 @dataclass(frozen=True)
 class Options:
-    """Which runs."""
+    """The runs and their settings."""
 
     runs: tuple[Path, ...]
-    """Run directories; the name of a row is that of the directory."""
+    """Run directories. A row is named after its directory."""
     data: str | None = None
-    """Scene folder; default as in training."""
+    """The scene folder. Default: as in training."""
     pixels: int = 100
-    """Pixels along the longer side of the pictures that are compared, at most."""
+    """The largest number of pixels along the longer side of the compared pictures."""
     json: Path | None = None
-    """Where the results go, beside those of other runs; default: printed only."""
+    """The JSON file that the results are added to. Default: results are only printed."""
 
 
 @contextmanager
 def browser() -> Iterator[Any]:
-    """Chromium with a profile of its own."""
+    """Opens Chromium with an empty profile."""
     with tempfile.TemporaryDirectory() as profile:
         options = webdriver.ChromeOptions()
         options.binary_location = shutil.which("chromium") or ""
@@ -90,7 +90,7 @@ def browser() -> Iterator[Any]:
 
 
 def first_picture(driver: Any, page: Path) -> float:
-    """Seconds until a page shows its scene."""
+    """Opens a page; returns the seconds until it shows its scene."""
     started = time.perf_counter()
     driver.get(page.resolve().as_uri())
     while not driver.execute_script("return document.getElementById('still').hidden"):
@@ -99,19 +99,19 @@ def first_picture(driver: Any, page: Path) -> float:
 
 
 def drawn(driver: Any, cameras: Cameras, index: int) -> NDArray[np.float64]:
-    """What the page draws by a camera, [h, w, 3] in 0..1."""
+    """Returns the page's picture [h, w, 3] in 0..1 for a camera."""
     width, height = cameras.size(index)
     fx, fy, cx, cy = cameras.intrinsics[index].tolist()
     pose = cameras.poses[index, :3].flatten().tolist()
     camera = {"pose": pose, "focal": [fx, fy], "centre": [cx, cy], "width": width, "height": height}
-    found = driver.execute_async_script(PICTURE, camera)
-    if found.startswith("error"):
-        raise RuntimeError(found)
-    return np.frombuffer(base64.b64decode(found), np.uint8).reshape(height, width, 4)[..., :3] / 255
+    encoded = driver.execute_async_script(PICTURE, camera)
+    if encoded.startswith("error"):
+        raise RuntimeError(encoded)
+    return np.frombuffer(base64.b64decode(encoded), np.uint8).reshape(height, width, 4)[..., :3] / 255
 
 
 def photograph(run: Run, index: int, pinhole: Cameras) -> tuple[Tensor, Tensor]:
-    """A held-out photograph as a camera without distortion would see it, [h, w, 3], and where it does, [h, w]."""
+    """Returns a held-out photograph [h, w, 3] undistorted to a pinhole camera, and the mask [h, w] of valid pixels."""
     cameras, truth = run.scene.test.cameras, run.scene.test.truth(index, run.scene.background_colour())
     directions = pinhole.image_rays(index).directions
     places, _ = cameras.project(cameras.origins[index] + directions, index)
@@ -124,12 +124,12 @@ def photograph(run: Run, index: int, pinhole: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def psnr(a: Any, b: Any, where: Any = slice(None)) -> float:
-    """Decibels."""
+    """Returns the PSNR in decibels."""
     return float(-10 * np.log10(max(np.square(np.asarray(a) - np.asarray(b))[where].mean(), 1e-12)))
 
 
 def compared(run: Run, driver: Any, pixels: int) -> dict[str, Any]:
-    """The page's pictures beside rendered ones and photographs."""
+    """Compares the page's pictures with rendered pictures and photographs."""
     cameras = run.scene.test.cameras
     pinhole = replace(cameras, distortion=None, models=None)
     pinhole = pinhole.downscaled(max(1, -(-max(cameras.width, cameras.height) // pixels)))
@@ -152,7 +152,7 @@ def compared(run: Run, driver: Any, pixels: int) -> dict[str, Any]:
 
 
 def walked(run: Run, view: int) -> tuple[int, int]:
-    """Strata and samples of a frame's rays, of which every `APART`th along both sides is walked."""
+    """Returns strata and samples of a frame, from every `APART`th ray along both sides."""
     sampler, scene, cameras = run.renderer.sampler, run.scene, run.scene.test.cameras
     assert isinstance(sampler, Occupancy)
     side, (width, height) = FRAME // APART, cameras.size(view)
@@ -180,12 +180,12 @@ def walked(run: Run, view: int) -> tuple[int, int]:
 
 
 def counted(run: Run) -> dict[str, Any]:
-    """Strata, samples, operations and bytes of a frame, in the mean of some views."""
-    known = radiance_of(run.renderer.field)
-    assert isinstance(known, Radiance)
+    """Returns strata, samples, operations and bytes of a frame, averaged over `VIEWS` views."""
+    radiance = radiance_of(run.renderer.field)
+    assert isinstance(radiance, Radiance)
     views = np.linspace(0, len(run.scene.test.cameras) - 1, VIEWS).round().astype(int).tolist()
     strata, samples = np.mean([walked(run, view) for view in views], axis=0)
-    of_sample, bytes_of_sample = costs(run, known)
+    of_sample, bytes_of_sample = costs(run, radiance)
     of_stratum = COSTS["stratum"] + (COSTS["contraction"] if run.renderer.contraction is not None else 0)
     operations = strata * of_stratum + samples * of_sample
     rates = {f"frames_per_second_{rate}_tflops": rate * 1e12 / operations for rate in RATES}
@@ -199,9 +199,9 @@ def counted(run: Run) -> dict[str, Any]:
     }
 
 
-def costs(run: Run, known: Radiance) -> tuple[int, int]:
-    """Operations of a sample, and the bytes that it asks for, most of which are in a cache."""
-    operations, read, program = COSTS["sample"], 0, known.networks.program
+def costs(run: Run, radiance: Radiance) -> tuple[int, int]:
+    """Returns the operations of a sample and the bytes that it reads, mostly from a cache."""
+    operations, read, program = COSTS["sample"], 0, radiance.networks.program
     for step in program.steps:
         if step.op == "linear":
             blocks = fours(step.width) * fours(step.operands[0].width)
@@ -223,8 +223,8 @@ def costs(run: Run, known: Radiance) -> tuple[int, int]:
 
 def main(options: Options) -> None:
     """Measures and prints each run."""
-    known = read_json(options.json)["results"] if options.json is not None and options.json.is_file() else []
-    results = {row["run"]: row for row in known}
+    stored = read_json(options.json)["results"] if options.json is not None and options.json.is_file() else []
+    results = {row["run"]: row for row in stored}
     with tempfile.TemporaryDirectory() as folder:
         for path in options.runs:
             run, page = Opening(data=options.data).open(path), Path(folder) / f"{path.name}.html"

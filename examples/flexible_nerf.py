@@ -1,7 +1,7 @@
 """The network of krrish94/nerf-pytorch: `FlexibleNeRFModel.forward(x)` maps encoded inputs [..., 66] to [..., 4].
 
-The inputs have 39 columns of the position and 27 of the direction. Any leading shape works, so rays and samples need
-not be flattened: [rays, samples, 66] becomes [rays, samples, 4].
+The first 39 columns encode the position, the other 27 the direction. Any leading dimensions work, so rays and samples
+need not be flattened: [rays, samples, 66] becomes [rays, samples, 4].
 """
 
 import torch
@@ -55,11 +55,11 @@ def main() -> None:
     points, views = torch.rand(40, 32, 3) * 2 - 1, torch.randn(40, 1, 3).expand(40, 32, 3)
     x = torch.cat([encode(points, 6), encode(views, 4)], -1)
 
-    # before
+    # Before: one network.
     model = FlexibleNeRFModel(num_layers=6, hidden_size=64)
     radiance_field = model(x)
 
-    # after
+    # After: one network per cell.
     model = VoronoiRouter(model, torch.rand(16, 3) * 2 - 1, coords="first3", fuse=True)
     routed = model(x)
 

@@ -1,4 +1,4 @@
-"""An image in the weights of one SIREN per cell (as in COIN), or in one network: dB after equal time.
+"""Fits an image with one SIREN per cell, or with one large SIREN (as in COIN), and prints the PSNR after a given time.
 
 python examples/image.py PHOTO.jpg --seconds 40             # 16 cells of width 32
 python examples/image.py PHOTO.jpg --seconds 40 --one       # one network of width 128
@@ -54,7 +54,7 @@ def main() -> None:
     axes = torch.linspace(-1, 1, h), torch.linspace(-w / h, w / h, w)  # square pixels, so cells are round
     x, y = torch.cartesian_prod(*axes), colours.reshape(-1, 3)
 
-    # The four lines that add cells.
+    # These four lines add the cells.
     net: nn.Module = Siren(128)
     if not options.one:
         diagram = VoronoiDiagram.from_points(x, 16)

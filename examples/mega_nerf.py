@@ -1,7 +1,8 @@
 """The networks of cmusatyalab/mega-nerf: k modules, one per centroid, become one router with the same outputs.
 
 `NeRF.forward(x, sigma_only=False, sigma_noise=None)` takes [m, 7]: position, direction and the image's index, which
-selects an appearance vector. `MegaNeRF` loops over its sub-modules with a mask for each; the router runs all at once.
+selects an appearance vector. `MegaNeRF` loops over its sub-modules with a mask for each; the router evaluates all of
+them at once.
 """
 
 import copy
@@ -62,7 +63,7 @@ class NeRF(nn.Module):
 
 
 class MegaNeRF(nn.Module):
-    """A stand-in for `mega_nerf.models.mega_nerf.MegaNeRF` with `boundary_margin=1`: a mask and module per centroid."""
+    """A stand-in for `mega_nerf.models.mega_nerf.MegaNeRF` with `boundary_margin=1`: a mask for each module."""
 
     def __init__(self, sub_modules: list[nn.Module], centroids: Tensor) -> None:
         super().__init__()
@@ -96,7 +97,7 @@ def main() -> None:
     torch.testing.assert_close(routed, out)
     torch.testing.assert_close(routed_sigma, sigma)
 
-    # And back: extracts a sub-module from its cell, and loads a retrained sub-module into its cell.
+    # The reverse: `cell` extracts a sub-module, and `load_cell` loads a retrained one into its cell.
     for name, value in router.cell(3).state_dict().items():
         assert torch.equal(value, sub_modules[3].state_dict()[name])
     retrained = copy.deepcopy(sub_modules[3])

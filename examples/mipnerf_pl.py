@@ -1,6 +1,6 @@
 """The network of hjxwhy/mipnerf_pl: `MLP.forward(x, view_direction=None)` returns (rgb, density).
 
-Its inputs are [rays, samples, 96] and [rays, 27]. An integrated encoding holds no position, so each call passes the
+The inputs are [rays, samples, 96] and [rays, 27]. An integrated encoding holds no position, so each call passes the
 means of the frustums as `coords=`; without them the router raises an error. The view directions have one row for each
 ray, so `per_ray=` names their argument.
 """
@@ -19,7 +19,7 @@ def encode(x: Tensor, octaves: int) -> Tensor:
 
 
 def integrated_encode(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
-    """A stand-in for `models.mip.integrated_pos_enc`: means and variances [..., 3] to an encoding [..., 6 octaves]."""
+    """A stand-in for `models.mip.integrated_pos_enc`: encodes means and variances [..., 3] as [..., 6 octaves]."""
     scaled = torch.cat([2**i * means for i in range(octaves)], dim=-1)
     fading = torch.exp(-0.5 * torch.cat([4**i * variances for i in range(octaves)], dim=-1))
     return torch.cat([torch.sin(scaled) * fading, torch.cos(scaled) * fading], dim=-1)
@@ -62,11 +62,11 @@ def main() -> None:
     samples_enc = integrated_encode(means, variances, 16)
     viewdirs_enc = encode(F.normalize(torch.randn(40, 3), dim=-1), 4)
 
-    # before
+    # Before: one network.
     mlp = MLP(net_depth=8, net_width=64, net_width_condition=32)
     raw_rgb, raw_density = mlp(samples_enc, viewdirs_enc)
 
-    # after
+    # After: one network per cell.
     mlp = VoronoiRouter(mlp, torch.rand(16, 3) * 2 - 1, per_ray=["view_direction"], fuse=True)
     routed_rgb, routed_density = mlp(samples_enc, viewdirs_enc, coords=means)
 

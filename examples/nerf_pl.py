@@ -54,11 +54,11 @@ def main() -> None:
     xyz = encode(points, 10)
     x = torch.cat([xyz, encode(directions, 4)], -1)
 
-    # before
+    # Before: one network.
     nerf = NeRF(D=8, W=64)
     out, sigma = nerf(x), nerf(xyz, sigma_only=True)
 
-    # after
+    # After: one network per cell.
     nerf = VoronoiRouter(nerf, torch.rand(16, 3) * 2 - 1, coords="first3", fuse=True)
     routed, routed_sigma = nerf(x), nerf(xyz, sigma_only=True)
 

@@ -64,7 +64,7 @@ def main() -> None:
     viewdirs = F.normalize(torch.randn(50, 3), dim=-1)
     centres = torch.rand(16, 3) * 2 - 1
 
-    # before
+    # Before: one network.
     model = NeRF(D=8, W=64, input_ch=63, input_ch_views=27, use_viewdirs=True)
     raw = run_network(points, viewdirs, model)
 
@@ -80,7 +80,7 @@ def main() -> None:
         loss.backward()
         optimizer.step()
 
-    # A split, and a run that resumes after it: build the router and its optimiser, and load both states.
+    # Splits the cells. To resume such a run, build the router and its optimiser, and load both states.
     flat = points.reshape(-1, 3)
     router.subdivide(4, optimizer=optimizer, points=flat, weights=torch.ones(len(flat)), min_samples=100)
     resumed = VoronoiRouter(model, centres[:1], coords="first3", fuse=True)

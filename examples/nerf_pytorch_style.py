@@ -4,8 +4,8 @@
     python examples/nerf_pytorch_style.py SCENE --downscale 4 --seconds 480 --width 64
     python examples/nerf_pytorch_style.py SCENE --downscale 4 --seconds 480 --width 64 --voronoi
 
-`--voronoi` enables the lines marked `changed`; all other lines, the learning rate and its schedule are the same. The
-seconds count training only, not evaluation. As in the original, encoding is outside the network, samples are
+`--voronoi` enables the lines marked `changed`; everything else stays the same, also the learning rate and its schedule.
+`--seconds` counts training only, not evaluation. As in the original, the encoding is outside the network, samples are
 stratified, and compositing is plain PyTorch. The density is a softplus (mip-NeRF), which suits short runs.
 """
 
@@ -22,7 +22,7 @@ from voronerf.app.scenes import load_scene
 
 
 def render(model: nn.Module, rays: Tensor, near: float, far: float, samples: int, jitter: bool) -> tuple[Tensor, ...]:
-    """Renders rays [r, 6] over white; returns colours [r, 3], points [r, s, 3] and their weights [r, s]."""
+    """Renders rays [r, 6] on a white background; returns colours [r, 3], points [r, s, 3] and their weights [r, s]."""
     origins, directions = rays[:, :3], rays[:, 3:]
     strata = torch.arange(samples) + (torch.rand(len(rays), samples) if jitter else 0.5)
     depths = (near + (far - near) / samples * strata).expand(len(rays), samples)

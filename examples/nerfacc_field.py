@@ -1,7 +1,7 @@
 """The field of nerfacc's examples: `VanillaNeRFRadianceField.forward(x, condition=None)` and `query_density(x)`.
 
 The inputs are raw positions, [n, 3] from the packed sampler or [rays, samples, 3]; the field encodes them. The
-estimator calls `query_density`, so it is routed as well. The condition has a row for each sample or for each ray.
+estimator calls `query_density`, so it is routed as well. The condition has one row per sample or per ray.
 """
 
 import torch
@@ -81,12 +81,12 @@ def main() -> None:
     torch.manual_seed(0)
     positions, directions = torch.rand(3000, 3) * 2 - 1, F.normalize(torch.randn(3000, 3), dim=-1)
 
-    # before
+    # Before: one network.
     radiance_field = VanillaNeRFRadianceField(net_width=64, net_width_condition=32)
     rgb, sigma = radiance_field(positions, directions)
     density = radiance_field.query_density(positions)
 
-    # after
+    # After: one network per cell.
     centres = torch.rand(16, 3) * 2 - 1
     radiance_field = VoronoiRouter(
         radiance_field, centres, coords="first3", methods=["query_density", "query_opacity"], fuse=True

@@ -1,6 +1,6 @@
 """A field of nerfstudio: `Field.forward(ray_samples)` returns a dictionary whose keys are an Enum.
 
-`RaySamples` holds the positions, so a function gets them from the arguments. Models also call `get_density` and
+`RaySamples` holds the positions, so `positions_of` reads them from the arguments. Models also call `get_density` and
 `get_outputs` directly, and occupancy grids call `density_fn(positions)`. All of these methods are routed.
 """
 
@@ -146,7 +146,7 @@ def positions_of(argument: RaySamples | Tensor, *_: object, **__: object) -> Ten
 
 
 def ray_samples_of(rays: int, samples: int) -> RaySamples:
-    """Returns random ray samples like a sampler of nerfstudio, broadcast from rays to samples."""
+    """Returns random ray samples in the layout of nerfstudio: tensors per ray are broadcast to samples."""
     edges = torch.linspace(0.5, 2.5, samples + 1)[:, None].expand(rays, samples + 1, 1)
     frustums = Frustums(
         origins=torch.rand(rays, 1, 3) - 0.5,
@@ -168,11 +168,11 @@ def main() -> None:
     torch.manual_seed(0)
     ray_samples = ray_samples_of(40, 32)
 
-    # before
+    # Before: one network.
     field = AppearanceField(torch.tensor([[-2.0, -2, -2], [2, 2, 2]]), num_images=5)
     outputs = field(ray_samples)
 
-    # after
+    # After: one network per cell.
     field = VoronoiRouter(
         field, torch.randn(16, 3), coords=positions_of, methods=["get_density", "get_outputs", "density_fn"]
     )

@@ -1,8 +1,9 @@
-"""A Poisson equation solved by one network per cell: -div grad u = f in the unit square, u = 0 at the border.
+"""Solves a Poisson equation with one network per cell: -div grad u = f in the unit square, u = 0 at the border.
 
-The networks of two cells need not agree at their face. With the equation and the border alone, each cell gets its own
-solution, which has a small loss but is wrong. Conditions on faces join the cells, as in XPINNs (Jagtap and Karniadakis
-2020): values, and derivatives across the face, are equal on both sides. ``--alone`` omits the conditions.
+The networks of two cells need not agree at their face. If the loss covers only the equation and the border, each cell
+finds its own solution, which is wrong in spite of a small loss. Further conditions, as in XPINNs (Jagtap and
+Karniadakis 2020), make values and normal derivatives equal on both sides of each face. ``--alone`` omits the
+conditions.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def points_on_faces(centres: Tensor, count: int, generator: torch.Generator) -> 
     near = torch.cdist(x, centres).topk(2, largest=False).indices
     a, b = centres[near[:, 0]], centres[near[:, 1]]
     normal = nn.functional.normalize(b - a, dim=1)
-    x = x + (((a + b) / 2 - x) * normal).sum(1, keepdim=True) * normal  # projection onto the plane between both centres
+    x = x + (((a + b) / 2 - x) * normal).sum(1, keepdim=True) * normal  # projection onto the bisecting plane
     distances = torch.cdist(x, centres)
     on_face = distances.amin(1) > (x - a).norm(dim=1) - 1e-6  # no third centre is nearer
     inside = ((x > 0) & (x < 1)).all(1)
@@ -78,7 +79,7 @@ def solve(*, cells: int = 6, steps: int = 2000, joined: bool = True, seed: int =
 
 
 def solution(x: Tensor) -> Tensor:
-    """Returns the exact solution u [n] at points [n, 2], whose Laplacian is -2 pi^2 u."""
+    """Returns the exact solution u [n] at points [n, 2]; its Laplacian is -2 pi^2 u."""
     return torch.sin(math.pi * x).prod(1)
 
 

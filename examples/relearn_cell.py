@@ -1,4 +1,4 @@
-"""A retraining of one cell of a trained router; all other cells keep their parameters and results to the bit."""
+"""Retrains one cell of a trained router; the parameters and results of all other cells stay the same, bit for bit."""
 
 import torch
 from torch import Tensor, nn
@@ -7,7 +7,7 @@ from voronerf import VoronoiRouter
 
 
 def colour(x: Tensor) -> Tensor:
-    """Returns the colours [n, 3] to learn, a smooth pattern of positions [n, 3] in -1..1."""
+    """Returns the target colours [n, 3], a smooth function of the positions [n, 3] in -1..1."""
     return 0.5 + 0.5 * torch.sin(3 * x + x.roll(1, dims=1))
 
 

@@ -1,8 +1,8 @@
 """The network of ashawkey/torch-ngp: `NeRFNetwork.forward(x, d)` returns sigma [n] and rgb [n, 3].
 
 The renderer also calls `density` to update its occupancy grid, so this method is routed as well. All cells share the
-hash grid, and each cell has its own networks behind it. The stand-in replaces the compiled hash grid by PyTorch, and
-the spherical harmonics by a frequency encoding.
+hash grid; each cell has its own networks after it. The stand-in replaces the compiled hash grid by PyTorch, and the
+spherical harmonics by a frequency encoding.
 """
 
 import itertools
@@ -36,7 +36,7 @@ class TruncExp(torch.autograd.Function):
 
 
 class GridEncoder(nn.Module):
-    """A stand-in for `gridencoder.GridEncoder`, which hashes the corners of levels that do not fit into the table."""
+    """A stand-in for `gridencoder.GridEncoder`, which hashes the corners on levels larger than the table."""
 
     def __init__(self, num_levels=8, level_dim=2, base_resolution=16, log2_hashmap_size=14, desired_resolution=512):
         super().__init__()
@@ -110,12 +110,12 @@ def main() -> None:
     torch.manual_seed(0)
     x, d = torch.rand(3000, 3) * 2 - 1, F.normalize(torch.randn(3000, 3), dim=-1)
 
-    # before
+    # Before: one network.
     model = NeRFNetwork()
     sigma, rgb = model(x, d)
     density = model.density(x)
 
-    # after
+    # After: one network per cell.
     centres = torch.rand(16, 3) * 2 - 1
     options = {"methods": ["density"], "share": ["encoder.*"], "fuse": True, "way": "fused"}
     model = VoronoiRouter(model, centres, coords="first3", **options)

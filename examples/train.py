@@ -1,4 +1,4 @@
-"""A training with the library's parts: python examples/train.py SCENE SECONDS"""
+"""Trains a field with the parts of the library: python examples/train.py SCENE SECONDS"""
 
 import sys
 import time

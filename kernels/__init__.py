@@ -57,7 +57,7 @@ def _without_driver_warning() -> Iterator[None]:
 
 
 # Silence the banner and the notes on compilation, unless the user has changed the log level. Older releases have
-# `quiet`.
+# `quiet` instead.
 if not hasattr(wp.config, "log_level"):
     wp.config.quiet = True
 elif wp.config.log_level == wp.LOG_INFO:

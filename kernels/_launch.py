@@ -14,13 +14,13 @@ from torch import Tensor
 def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float32) -> Any:
     """Returns a Warp view of a tensor, with its strides and without a copy.
 
-    For None it is an empty array of `dtype` on the device of `like`: kernels do not read it, but Warp needs an array.
+    For None, returns an empty array of `dtype` on the device of `like`, which kernels do not read but Warp needs.
     """
     if tensor is None:
         tensor = like.new_empty(0, dtype=dtype)
     if tensor.dtype == torch.bool:
         tensor = tensor.view(torch.uint8)
-    # Ops that take lists of tensors receive them with an unresolved negative bit.
+    # Tensors in lists reach ops with an unresolved negative bit.
     return wp.from_torch(tensor.detach().resolve_neg())
 
 
@@ -32,7 +32,7 @@ def filled(struct: Any, **fields: Any) -> Any:
 
 
 def of_both_dtypes(kernel: Any) -> None:
-    """Registers float32 and float64 overloads of a kernel of points and centres, which compile with its file."""
+    """Registers float32 and float64 overloads of a kernel of points and centres, to compile them with its file."""
     for scalar in (wp.float32, wp.float64):
         wp.overload(kernel, dict.fromkeys(("points", "centres"), wp.array2d(dtype=scalar)))
 

@@ -19,8 +19,8 @@ def _keys_kernel(
     cells: wp.array(dtype=wp.int32), k: wp.int32, keys: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32)
 ) -> None:
     i = wp.tid()
-    # Cells out of range (possible if values are not checked) sort before cell 0, whose key is 1, or behind the last
-    # cell.
+    # Cells out of range (possible if values are not checked) are sorted before cell 0, whose key is 1, or after the
+    # last cell.
     keys[i] = wp.clamp(cells[i], -1, k) + 1
     order[i] = i
 

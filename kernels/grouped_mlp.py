@@ -10,11 +10,12 @@ network with skips, branches and any widths is a list of products::
     column o of the layers = bias o + sum over the products p of o: activation(column source[p]) @ block p ^T
 
 One kernel runs any list of products, so a new network compiles no code. A block of threads runs the whole list for one
-tile. The columns of a tile hold sums before the activation, which each reader applies. They lie in global memory: they
-do not all fit in shared memory, and a block's recent writes are in the cache. No other block accesses them.
+tile. The columns of a tile hold sums before the activation, which each reader applies. The columns lie in global
+memory: they do not all fit in shared memory, and a block's recent writes are in the cache. No other block accesses
+them.
 
-Padding has weight 0 and changes no result. Encodings are launched before. Sums and columns are float32. If weights are
-float16 or bfloat16, the operands of products are rounded to this dtype for the tensor cores.
+Padding has weight 0 and changes no result. The encodings run in earlier launches. Sums and columns are float32. If
+weights are float16 or bfloat16, the operands of products are rounded to this dtype for the tensor cores.
 """
 # mypy: disable-error-code="arg-type, operator"
 
@@ -146,8 +147,8 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
         """Runs the products in reverse, each once for its weights and once for the column that it reads.
 
         ``gradients`` holds the gradients of the sums, initially of the outputs alone. A column's gradient is complete
-        when its turn comes, since all readers of the column come later in the list. Columns below ``lowest`` need no
-        gradient. The tiles of a cell sum the gradients of its weights by atomics, in any order on a GPU.
+        when the loop reaches it, since all readers of the column come later in the list. Columns below ``lowest`` need
+        no gradient. The tiles of a cell sum the gradients of its weights by atomics, in any order on a GPU.
         """
         tile = wp.tid()
         cell = cells[tile]
@@ -249,7 +250,7 @@ def _run_backward(arriving: _TilesGradient, results: list[Tensor]) -> None:
 
 
 def _formula(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, plan: str) -> Tensor:
-    """Computes the same in plain PyTorch, for second derivatives."""
+    """Computes the output columns in plain PyTorch, for second derivatives."""
     first, source, activation, outputs = json.loads(plan)
     columns = list(x.view(len(cells), ROWS, -1).split(WIDTH, dim=2))
     has_cell, cell = (cells >= 0)[:, None, None], cells.clamp(min=0)
@@ -361,7 +362,7 @@ def grouped_linear(
 
 
 def _tiles(offsets: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns the cell of each tile, int32 [t], each sample's row in the tiles, [n], and whether it has a cell, [n].
+    """Returns each tile's cell, int32 [t], each sample's row in the tiles, [n], and whether the sample has a cell, [n].
 
     t is an upper bound, so that the host reads no values. The last tile has no cell and takes samples without a cell.
     """

@@ -1,6 +1,6 @@
-"""Programs that are chains of layers: the layers run in one Warp kernel, the later steps in plain PyTorch.
+"""Runs programs that are chains of layers: the layers in one Warp kernel, the later steps in plain PyTorch.
 
-n rows, w columns. Any other program runs in PyTorch.
+n rows, w columns. All other programs run in plain PyTorch.
 """
 
 from __future__ import annotations
@@ -114,15 +114,15 @@ class _Layer(NamedTuple):
 
 
 class _Reader:
-    """A converter of a program's steps to a layer table; it raises LookupError if they are no chain."""
+    """A converter of a program's steps to a layer table; it raises LookupError if the steps are no chain."""
 
     def __init__(self, program: Program) -> None:
         self.program, self.steps = program, {step.out: step for step in program.steps}
         operands = [c for step in program.steps for c in step.operands]
         self.read = Counter(c.index for c in (*operands, *program.outputs) if c.of == VALUE)
-        self.sources: dict[int, int | str] = {}  # the source that each value is for layers
+        self.sources: dict[int, int | str] = {}  # value -> the source that layers read
         self.encodings: dict[str, Step] = {}
-        self.started: dict[int, _Layer] = {}  # by the value of the sum so far
+        self.started: dict[int, _Layer] = {}  # value of the sum so far -> the layer
         self.layers: list[Layer] = []
         self.finished: list[_Layer] = []
 
@@ -206,7 +206,7 @@ class _Reader:
         self.layers.append(Layer(layer.inputs, self.program.parameters[layer.weight][0], activation))
 
     def _source(self, columns: Columns) -> int | str:
-        """Returns the layer source that a whole value is."""
+        """Returns the layer source of a whole value."""
         if not self._is_whole(columns):
             raise LookupError
         if columns.index in self.started:

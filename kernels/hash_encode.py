@@ -45,7 +45,7 @@ class Grid:
 
 @wp.struct
 class Place:
-    """A point on a level: its lower corner, and on each axis the upper corner's weight with two derivatives."""
+    """A point on a level: its lower corner, and on each axis the upper corner's weight and two derivatives of it."""
 
     x: wp.int32
     y: wp.int32
@@ -108,7 +108,7 @@ def _entry(place: Place, corner: wp.int32, level: wp.int32, grid: Grid) -> wp.in
 def _of_corner(upper: wp.vec3, corner: wp.int32, one: wp.float32) -> wp.vec3:
     """Returns a corner's weights on each axis from the weights w of the upper corner.
 
-    On an axis where the corner is the lower one they are ``one - w``; ``one`` is 0 for derivatives.
+    On an axis where the corner is the lower one, its weight is ``one - w``; ``one`` is 0 for derivatives.
     """
     weights = upper
     for axis in range(3):

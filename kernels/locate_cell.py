@@ -1,4 +1,4 @@
-"""The nested query as a Warp kernel. n points, m centres in all diagrams, g diagrams.
+"""``locate_cell`` as a Warp kernel. n points, m centres in all diagrams, g diagrams.
 
 One thread moves one point down the tree. Distances are float64, each operation rounded separately, as in the reference.
 Nothing outside the tables is read; a walk that leads out of them or reaches no leaf gives a negative number.

@@ -101,7 +101,10 @@ def _cell(point: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) 
 
 @wp.struct
 class Inputs:
-    """The rays and the grid; ``space`` is [0, 0] for world space, [1, 4] for a sphere, [5, 3] for a perspective."""
+    """The rays and the grid.
+
+    ``space`` has shape [0, 0] for world space, [1, 4] for a sphere, [5, 3] for a perspective.
+    """
 
     origins: wp.array2d(dtype=wp.float32)
     directions: wp.array2d(dtype=wp.float32)
@@ -123,7 +126,7 @@ class Inputs:
 
 @wp.struct
 class Samples:
-    """The rays' numbers of samples, or the samples."""
+    """The outputs: ``counts``, the rays' numbers of samples, in the first walk; the samples in the second."""
 
     counts: wp.array(dtype=wp.int32)
     ray_index: wp.array(dtype=wp.int32)

@@ -2,9 +2,10 @@
 
 One thread handles one ray, whose samples are adjacent. Let o_i = sigma_i delta_i be the optical depth of sample i and
 F_i the sum of the optical depths in front of it. Its weight is exp(-F_i) (1 - exp(-o_i)), and the background's weight
-is exp(-F) over the whole ray. F is summed in float64, other values are float32. With G_i the gradient of weight i, the
-gradient of o_i is ``G_i exp(-F_i - o_i) - sum over j > i of G_j w_j``. A first sweep computes the colour of the ray and
-stores F_i in the memory of the density's gradient; a second sweep runs back with the sum over samples behind.
+is exp(-F), with the sum F over the whole ray. F is summed in float64, other values are float32. With G_i the gradient
+of weight i, the gradient of o_i is ``G_i exp(-F_i - o_i) - sum over j > i of G_j w_j``. A first sweep computes the
+colour of the ray and stores F_i in the memory of the density's gradient; a second sweep runs from far to near with the
+sum over the samples behind.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from voronerf.ops.render_loss.reference import robust_error
 wp.set_module_options({"enable_backward": False})
 
 _OPAQUE = wp.constant(wp.float32(1.0e30))
-"""The substitute for infinite density: just as opaque over any length but 0, and 0 times it is 0."""
+"""The finite substitute for infinite density: opaque over any length except 0, where the product is 0."""
 
 
 @wp.func
@@ -70,7 +71,8 @@ def softplus(x: wp.float32) -> wp.float32:
 class Inputs:
     """The networks' outputs for the samples, and the targets of the rays.
 
-    ``activated``: the outputs are colour and density themselves. ``seen``: the number of rays with a target colour.
+    ``activated``: whether the outputs are colour and density themselves. ``seen``: the number of rays with a target
+    colour.
     """
 
     raw: wp.array2d(dtype=wp.float32)

@@ -40,7 +40,7 @@ def until(done, seconds=30.0):
     """Calls ``done`` until its value is true and returns it; fails after ``seconds``."""
     end = time.monotonic() + seconds
     while not (value := done()):
-        assert time.monotonic() < end, f"waited {seconds} s in vain"
+        assert time.monotonic() < end, f"timed out after {seconds} s"
         time.sleep(0.1)
     return value
 

@@ -46,7 +46,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "op(name): run on the backends that implement this op")
-    config.addinivalue_line("markers", "measures: a router of this test measures its ways")
+    config.addinivalue_line("markers", "measures: this test's router times its execution paths")
     unknown = _required(config) - set(PARTS)
     if unknown:
         raise pytest.UsageError(f"--require takes {','.join(PARTS)}, got {','.join(sorted(unknown))}")
@@ -114,7 +114,7 @@ def poisoned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.Tensor]]:
     yield guards
     for guard in guards:
         whole = guard.isnan() if guard.is_floating_point() else guard == (0 if guard.dtype == torch.bool else 121)
-        assert whole.all(), "something was written outside of a tensor"
+        assert whole.all(), "a kernel wrote outside of a tensor"
 
 
 @pytest.fixture(autouse=True)

@@ -64,7 +64,7 @@ def same(first, second):
 def anonymous_memory():
     """Returns this process's anonymous memory (pages of no file) in bytes; skips the test except on Linux."""
     if sys.platform != "linux":
-        pytest.skip("asks Linux what memory holds")
+        pytest.skip("reads /proc, which only Linux has")
     return 1024 * int(re.search(r"RssAnon:\s+(\d+)", Path("/proc/self/status").read_text())[1])
 
 
@@ -78,7 +78,7 @@ def on_any_number_of_threads(run, counts=(1, 2, 3)):
     finally:
         torch.set_num_threads(before)
     for count, other in zip(counts, results):
-        assert same(results[0], other), f"{count} threads give other bits than {counts[0]}"
+        assert same(results[0], other), f"results differ between {count} and {counts[0]} threads"
     return results[0]
 
 

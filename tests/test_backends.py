@@ -142,11 +142,12 @@ def test_sources_without_their_compiled_module_say_where_it_is(tmp_path: Path, m
     monkeypatch.setattr(sys, "path", [str(here), str(tmp_path)])
     (folder := tmp_path / "voronerf/ops/_core").mkdir(parents=True)
     for remedy in (
-        "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)",
-        f"run Python in another folder to import that of {tmp_path}, or build it with `pip install -e .`",
+        "install a wheel, or build the module with `pip install -e .` (needs a C++17 compiler)",
+        f"run Python in another folder to use the installation in {tmp_path}, or build the module with "
+        "`pip install -e .`",
     ):
         said = rf"voronerf in {here} cannot load its compiled module \(.*_C.*\); {re.escape(remedy)}"
-        with pytest.warns(RuntimeWarning, match=rf"^{said}. Until then plain PyTorch runs in its place") as told:
+        with pytest.warns(RuntimeWarning, match=rf"^{said}. Until then the much slower plain PyTorch is used") as told:
             reasons = {backends.missing("native", CPU) for _ in range(3)}
         assert len(told) == 1 and re.fullmatch(said, *reasons)
         (folder / f"_C{EXTENSION_SUFFIXES[0]}").touch()
@@ -181,10 +182,10 @@ from voronerf.ops._core import backends
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     reasons = [backends.missing("native", torch.device("cpu")) for _ in range(3)]
-assert len(told) == 1 and str(told[0].message).startswith("the compiled module is of another version"), told
+assert len(told) == 1 and str(told[0].message).startswith("the compiled module was built from another version"), told
 reason = reasons[0]
-assert reason is not None and reason.startswith("the compiled module is of another version of voronerf"), reason
-assert reason.endswith("build it again with `pip install -e .`"), reason
+assert reason is not None and reason.startswith("the compiled module was built from another version"), reason
+assert reason.endswith("rebuild it with `pip install -e .`"), reason
 points = torch.zeros(2, 3)
 run = backends.resolve("nearest_centre", backend="auto", device=points.device, dtype=points.dtype)
 assert run.__module__ == "voronerf.ops.nearest_centre.reference", run

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 def build(monkeypatch):
     """The globals of setup.py, which runs without its call of `setup`."""
     if not (ROOT / "setup.py").is_file():
-        pytest.skip("setup.py is not there: the tests are not in the source tree")
+        pytest.skip("setup.py is missing: the tests need the source tree")
     pytest.importorskip("pybind11")
     setuptools = pytest.importorskip("setuptools")
     monkeypatch.setattr(setuptools, "setup", lambda **_: None)
@@ -139,7 +139,9 @@ def test_without_a_compiler_a_line_says_what_to_install(build, monkeypatch, tmp_
     program(tmp_path / "ccache")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("CXX", cxx)
-    wanted = r"there must be a C\+\+17 compiler, g\+\+ or clang\+\+, got no nocompiler: install the package g\+\+ "
+    wanted = (
+        r"a C\+\+17 compiler \(g\+\+ or clang\+\+\) is needed, but nocompiler was not found: install the package g\+\+ "
+    )
     with pytest.raises(SystemExit, match=wanted) as stop:
         build["check_compiler"]()
     assert "\n" not in stop.value.code
@@ -171,7 +173,7 @@ def check(monkeypatch, tmp_path):
     """The module cuda_check.py, which writes into the test's folder."""
     path = ROOT / ".ci" / "cuda_check.py"
     if not path.is_file():
-        pytest.skip(".ci/cuda_check.py is not there: the tests are not in the source tree")
+        pytest.skip(".ci/cuda_check.py is missing: the tests need the source tree")
     spec = importlib.util.spec_from_file_location("cuda_check", path)
     check = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(check)
@@ -342,7 +344,7 @@ SASS = """\
 def code():
     path = ROOT / ".ci" / "machine_code.py"
     if not path.is_file():
-        pytest.skip(".ci/machine_code.py is not there: the tests are not in the source tree")
+        pytest.skip(".ci/machine_code.py is missing: the tests need the source tree")
     return runpy.run_path(str(path))
 
 
@@ -369,7 +371,7 @@ def test_cuda_check_tells_of_more_instructions_of_a_layer(check, monkeypatch, tm
     check.TABLE.write_text(check.as_text("V13", kept))
     assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []  # without cuobjdump nothing is counted
     kernels = {"kernel": {"sm_80": row}, "other": {"sm_80": {**row, "layer": 9}}}
-    assert check.regressions("V13", kernels) == ["kernel (sm_80): no layer was found, of 200 instructions before"]
+    assert check.regressions("V13", kernels) == ["kernel (sm_80): no layer was found (the table has 200 instructions)"]
     assert check.regressions("V14", kernels) == []
     assert check.regressions("V13", {"kernel": {"sm_80": {**row, "layer": 201}}}) == [
         "kernel (sm_80): layer 201, above 200"

@@ -1,6 +1,6 @@
 """Many small networks, one per Voronoi cell of space, as cheap to run and to train as one."""
 
-# Functions are named as their modules.
+# Some functions have the name of their module.
 # mypy: disable-error-code="no-redef"
 
 __version__ = "0.1.0"

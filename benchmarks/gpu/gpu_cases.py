@@ -1,4 +1,4 @@
-"""Cases of ``gpu_parts.py``: every operation once against float64, and steps in CUDA graphs."""
+"""Cases of ``gpu_parts.py``: every operation against float64, and training steps in CUDA graphs."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ CHECKED = (
     *("grouped_mlp wide tf32", "grouped_mlp skips bfloat16 forward", "unaligned views"),
     "grouped_mlp of a hash grid for each cell bfloat16",
 )
-"""Small cases for memcheck, which reach nearly all kernels."""
+"""Small cases for memcheck, which run nearly all kernels."""
 RACING = (
     *("cell_sort 5000 3 by counting", "cell_sort 4200 1022 by counting", "composite packed", "march_rays", "resample"),
     *("render_loss", "grouped_mlp branched bfloat16", "grouped_mlp wide tf32", "grouped_mlp broad float32"),
     *("routed_mlp", "nearest_centre k=700", "nearest_centre k=700, indexed=True", "spherical_harmonics", "adam"),
 )
-"""Small cases for racecheck and synccheck: every kernel whose threads share memory."""
+"""Small cases for racecheck and synccheck, which run every kernel with shared memory."""
 
 STEPS: dict[str, tuple[int, str, bool, int]] = {
     "width 64": (64, "float32", False, 8),
@@ -38,18 +38,18 @@ STEPS: dict[str, tuple[int, str, bool, int]] = {
     "width 300, bfloat16, directions by an index": (300, "bfloat16", True, 8),
     "many cells, sorted by radix": (16, "float32", False, 1030),
 }
-"""Steps to capture: the width, the type of the weights, whether there are directions, and the number of cells."""
+"""Steps to capture: width, type of the weights, whether there are directions, and number of cells."""
 
 
 def near(one: Any, other: Any, allowed: float = 1e-5, absolute: float = 1e-6) -> None:
-    """Raises AssertionError unless a tensor is near another by the norm of the difference; NaN is not."""
+    """Raises AssertionError unless two tensors are close by the norm of their difference; NaN is never close."""
     difference, size = float((one.double() - other.double()).norm()), float(other.double().norm())
     if not difference <= allowed * size + absolute:
         raise AssertionError(f"{list(one.shape)}: off by {difference:.1e} of {size:.1e}, allowed {allowed:.0e}")
 
 
 def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
-    """Names and checks, which raise."""
+    """Returns the names of the cases and their check functions, which raise on errors."""
     import torch
     from emulated_networks import (
         ALLOWED,
@@ -79,7 +79,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     where, cases_of_ops = torch.device(device), every_case()
 
     def of_case(op: str, pins: dict[str, Any]) -> None:
-        """A call that the op's case makes beside the reference, which takes float64 where the op has gradients."""
+        """Compares a call of the op's declared case with the reference, in float64 if the op has gradients."""
         case, outcomes = cases_of_ops[op], []
         made = case.make(Draw(1, **pins), 200)
         for backend in ("native", "reference"):
@@ -103,7 +103,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
                 torch.testing.assert_close(one, other, rtol=1e-5, atol=2e-6, equal_nan=True)
 
     def sort(n: int, k: int, way: str) -> None:
-        # Some numbers that are not cells: they go to the ends.
+        # Some indices are not cells; they are sorted to the ends.
         cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32, device=where)
         expected = specified(cells.cpu().clamp(-1, k) + 1, k + 2)
         order, offsets = torch.full_like(cells, -7), cells.new_full((k + 1,), -7)
@@ -111,7 +111,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         assert torch.equal(order.cpu(), expected[0]) and torch.equal(offsets.cpu(), expected[1][1:-1])
 
     def close(run: Callable[..., Any], leaves: list[Any]) -> None:
-        """Results and gradients against the reference in float64."""
+        """Compares results and gradients with the reference in float64."""
         outcomes = []
         for backend, dtype in (("native", torch.float32), ("reference", torch.float64)):
             given = [leaf.to(where, dtype).requires_grad_() for leaf in leaves]
@@ -125,7 +125,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             near(part, exact)
 
     def shifted(tensor: Any) -> Any:
-        """The same numbers, beginning four bytes (eight in float64) into their memory: nothing wider is aligned."""
+        """Returns a copy that starts one element into its memory, so that vector loads are misaligned."""
         return torch.cat([tensor.new_zeros(1), tensor.flatten()])[1:].view(tensor.shape)
 
     def route(view: Callable[[Any], Any] = lambda tensor: tensor) -> None:
@@ -141,7 +141,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         close(run, [torch.rand(300, 3), *(torch.randn(5, o, i) / i**0.5 for o, i in shapes)])
 
     def hashed(precision: str, own: bool) -> None:
-        """A hash grid inside the network."""
+        """Checks a network with a hash grid."""
         grid = voronerf.HashGrid(levels=8, features=2, log2_entries=11, finest=60)
         rest = MLP((Layer((POSITIONS,), 32, "relu"), Layer((0,), 4)), (1,))
         layers = replace(rest, position_encoding="hash", grid=grid)
@@ -162,7 +162,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             near(one, other, size, 0.0)
 
     def views() -> None:
-        """Of every other operation that takes floating-point numbers."""
+        """Checks misaligned views in all other operations with floating-point inputs."""
         close(lambda x, b: voronerf.frequency_encode(shifted(x[0]), 10, backend=b), [torch.rand(90, 3)])
         close(
             lambda x, b: tuple(voronerf.composite(*map(shifted, x), backend=b)),
@@ -173,12 +173,12 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         assert all(torch.equal(a, b) for a, b in zip(found, expected))
 
     def beyond_float16() -> None:
-        """Values that layers read are cut off where float16 ends; gradients are not, for a GradScaler to see."""
+        """Checks that layer inputs are clamped to float16's range, while gradients overflow for a GradScaler to see."""
         layers = MLP((Layer((POSITIONS,), 16, "relu"), Layer((0,), 16, "relu"), Layer((1,), 3)), (2, 0))
         sizes = layers.weight_shapes(3)
         leaves = [torch.ones(40, 3), *(torch.randn(2, o, i) / (1 if i == 3 else 64) for o, i in sizes)]
         leaves[0][::8] = 1e6
-        leaves[1][:, ::2] = leaves[1][:, ::2].abs()  # some sums are large, whatever the signs of the others
+        leaves[1][:, ::2] = leaves[1][:, ::2].abs()  # some sums are large for any signs of the other weights
         leaves = [leaf.to(where).requires_grad_() for leaf in leaves]
         offsets = torch.tensor([0, 23, 40], dtype=torch.int32, device=where)
         halves = [leaf.half() for leaf in leaves[1:]]
@@ -253,7 +253,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
 
 
 def captured_steps(device: str, n: int = 4096, replays: int = 3) -> list[tuple[str, Callable[[], None]]]:
-    """Names and checks: replays of a step find what it finds, which is right."""
+    """Returns names and checks: replayed steps give the results of the eager step, which match the reference."""
     return [(name, functools.partial(_replay, settings, device, n, replays)) for name, settings in STEPS.items()]
 
 
@@ -265,7 +265,7 @@ def _replay(settings: tuple[int, str, bool, int], device: str, n: int, replays: 
 
     step = _step(*settings, device, n)
     expected = [part.clone() for part in step()]
-    # Rounding moves samples across kinks of ReLU: by up to 3e-4 in float32, on a CPU too.
+    # Rounding switches ReLU units, which changes gradients by up to 3e-4 in float32, on a CPU too.
     allowed = 1e-3 if settings[1] == "float32" else 8e-2
     for part, exact in zip(expected, step("reference", torch.float64), strict=True):
         near(part, exact, allowed, 1e-7)
@@ -282,7 +282,7 @@ def _replay(settings: tuple[int, str, bool, int], device: str, n: int, replays: 
 
 
 def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -> Callable[..., list[Any]]:
-    """Nearest centre, sort, networks and the gradients of their parameters."""
+    """Returns a step: nearest centre, sort, networks, and the gradients of their parameters."""
     import torch
 
     import voronerf
@@ -301,7 +301,7 @@ def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -
         options["direction_index"] = torch.randint(0, 16, (n,), dtype=torch.int32).to(device)
 
     def step(backend: str = "native", dtype: Any = None) -> list[Any]:
-        """The gradients, with everything in another type where one is given."""
+        """Returns the gradients; ``dtype`` converts all inputs."""
 
         def cast(value: Any) -> Any:
             return value.to(dtype) if isinstance(value, torch.Tensor) and value.is_floating_point() else value
@@ -318,7 +318,7 @@ def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -
 
 
 def captured_trainings(device: str, count: int = 20, **small: Any) -> list[tuple[str, Callable[[], str]]]:
-    """Names and trainings: steps that are replayed as a graph find what steps as they are do."""
+    """Returns names and checks: trainings with replayed graphs give the results of eager trainings."""
     whole: dict[str, Any] = {"cells": (), "split_at": ()}
     kinds = {"training": whole, "training of a nerf": {**whole, "field": "nerf"}, "training before a split": {}}
     kinds["training in bfloat16"] = {"precision": "bf16"}
@@ -326,7 +326,7 @@ def captured_trainings(device: str, count: int = 20, **small: Any) -> list[tuple
 
 
 def _train_both(options: dict[str, Any], device: str, count: int) -> str:
-    """Within a hundredth, since atomic operations add up the gradients of a hash grid's table in any order."""
+    """Compares both trainings to within 1 %, since atomic sums of hash grid gradients have no fixed order."""
     import torch
     from gpu_journal import settling
 
@@ -340,7 +340,7 @@ def _train_both(options: dict[str, Any], device: str, count: int) -> str:
         step, losses, begin = state.training_step, list[torch.Tensor](), 0.0
         if as_it_is:
             step.__dict__["_standing_obstacle"] = lambda: "it is asked to"
-        for number in range(3 + count):  # one that prepares, one that is captured, and a first replay
+        for number in range(3 + count):  # a warm-up step, a captured step, and a first replay
             if number == 3:
                 settle()
                 begin = time.perf_counter()

@@ -1,24 +1,25 @@
-"""Everything to be learnt from fifteen minutes of a GPU, in two calls: ``gpu_check.py {first,second} --out DIR``.
+"""Runs all GPU checks in fifteen minutes of a GPU, in two calls: ``gpu_check.py {first,second} --out DIR``.
 
-For a bare machine: torch with CUDA, nvcc, ninja, no network. The parts of a call run one after another. One that fails
-or that its time ends is reported with its last lines, and the next one begins; what a part leaves of its time is the
-next ones'.
+It runs on a bare machine with torch for CUDA, nvcc and ninja, without network. The parts of a call run one after
+another.
+A failed or timed-out part is reported with its last lines, and the next part begins. The next parts inherit a part's
+unused time.
 
     first, 390 s    build      links the objects of --prebuilt (prebuilt.py), else compiles
                     cases      gpu_parts.py: every operation, networks at 2^22 samples, steps in CUDA graphs, rows of
                                timings, a step by torch.profiler, two trainings
-                    counters   ncu over six launches, where it is installed
-                    memcheck   compute-sanitizer over 21 of the small cases, where it is installed
+                    counters   ncu over six launches, if ncu is installed
+                    memcheck   compute-sanitizer over 21 of the small cases, if it is installed
     second, 240 s   build      as above
-                    cases      those of --cases, such as the ones that were wrong, and the rows again
+                    cases      the cases of --cases, such as wrong cases of the first call, and the rows again
                     tests      tests/ops on CUDA, a process for each file
                     racecheck, synccheck   compute-sanitizer over 14 of the small cases
 
-DIR gets two files: summary-CALL.json, with the command, the outcome and the findings of every part, and
-parts-CALL.tar.gz, with what each said. The last lines printed are the verdict, fewer than 11,000 characters; the exit
-status counts failures. ``--emulated`` tries the call on a machine without a GPU, with small cases.
+DIR gets two files: summary-CALL.json with the command, the outcome and the findings of every part, and
+parts-CALL.tar.gz with their outputs. The last printed lines are the verdict, fewer than 11,000 characters. The exit
+status is the number of failures. ``--emulated`` tries the call with small cases on a machine without a GPU.
 
-Nothing here changes the settings of the card: ncu leaves its clocks alone.
+The program does not change the settings of the card: ncu keeps its clocks.
 """
 
 from __future__ import annotations
@@ -47,15 +48,15 @@ from gpu_journal import unfinished
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = sys.executable
 TAIL = 30
-"""Lines of a failure that are printed."""
+"""The number of printed lines of a failed part."""
 SHORTEST = 5.0
-"""Seconds for which a part is not begun."""
+"""A part does not begin with fewer seconds left."""
 LINE, WRONG, VERDICT = 100, 160, 10_900
-"""Characters of a line of the verdict, of one that says what is wrong, and of all of it."""
+"""Most characters of a line of the verdict, of a line about a failure, and of the whole verdict."""
 MOST_WRONG = 30
-"""Lines that say what is wrong."""
+"""Most lines about failures."""
 KERNELS = 10
-"""Kernels of a profiled step that are told."""
+"""The number of reported kernels of a profiled step."""
 CALLS = ("first", "second")
 SANITIZER_SAYS = (
     "Invalid ",
@@ -67,7 +68,7 @@ SANITIZER_SAYS = (
     "ERROR SUMMARY",
 )
 WORDY = ("void ", "voronerf::", "(anonymous namespace)::", "<unnamed>::", "at::native::")
-"""Parts of the names of kernels that are not told."""
+"""Parts that are removed from the names of kernels."""
 COUNTED = {
     "ms": ("gpu__time_duration.sum", 1e-6),
     "M instructions": ("smsp__inst_executed.sum", 1e-6),
@@ -76,11 +77,11 @@ COUNTED = {
     "issued %": ("smsp__issue_active.avg.per_cycle_active", 100.0),
     "warps %": ("sm__warps_active.avg.pct_of_peak_sustained_active", 1.0),
 }
-"""Metrics of ncu that are told, by their names there, and factors."""
+"""Reported metrics of ncu: label -> (name in ncu, factor)."""
 STALLED = "smsp__average_warps_issue_stalled_", "_per_issue_active.ratio"
-"""Name of a stall's metric, before and after its reason."""
+"""Prefix and suffix of the metric of a stall; its reason stands between them."""
 KEPT = (STALLED[0], "launch__", "l1tex__t_sector_hit", "lts__t_sector_hit", "dram__bytes.sum")
-"""Beginnings of the names of other metrics that are kept: there are 700 of a launch."""
+"""Prefixes of the other stored metrics; a launch has 700 metrics."""
 SECTIONS = (
     *("SpeedOfLight", "WarpStateStats", "SchedulerStats", "MemoryWorkloadAnalysis", "ComputeWorkloadAnalysis"),
     *("InstructionStats", "Occupancy", "LaunchStats"),
@@ -89,8 +90,11 @@ SECTIONS = (
 
 @dataclass(frozen=True)
 class Part:
-    """One part: its commands, of which the next runs where one fails, or why it is left out; the seconds of the call
-    after which it is ended; and the file that it leaves."""
+    """One part of a call.
+
+    Its commands are alternatives: the next one runs if one fails. A text instead is the reason to omit the part. The
+    part is stopped at second ``until`` of the call. ``found`` is the file of its findings.
+    """
 
     commands: list[list[str]] | str
     until: float
@@ -99,38 +103,38 @@ class Part:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the parts and return the number of those that failed."""
+    """Runs the parts; returns the number of failed parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("call", choices=CALLS, help="which of the two calls")
     parser.add_argument("--out", type=Path, required=True, help="folder for the summary and the archive")
-    parser.add_argument("--cases", nargs="+", default=[], help="of the second call: names, in which * may stand")
+    parser.add_argument("--cases", nargs="+", default=[], help="cases of the second call, with * as a wildcard")
     parser.add_argument("--parts", nargs="+", help="some of the parts, in this order")
     parser.add_argument("--prebuilt", type=Path, default=ROOT / "build/prebuilt", help="objects that are carried")
     parser.add_argument("--emulated", action="store_true", help="small cases on the emulated device of the tests")
-    given = parser.parse_args(arguments)
-    given.out = given.out.resolve()  # the parts run elsewhere
-    given.out.mkdir(parents=True, exist_ok=True)
+    options = parser.parse_args(arguments)
+    options.out = options.out.resolve()  # parts run in other folders
+    options.out.mkdir(parents=True, exist_ok=True)
     begin = time.perf_counter()
-    device()  # later the driver may not answer, beside a kernel that hangs
+    device()  # a hanging kernel may block the driver later
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         scratch = Path(folder)
-        known = parts(given.call, scratch, given.prebuilt.resolve(), given.cases, emulated=given.emulated)
-        chosen = given.parts or list(known)
-        if unknown := [name for name in chosen if name not in known]:
-            parser.error(f"--parts takes {', '.join(known)}, got {', '.join(unknown)}")
+        available = parts(options.call, scratch, options.prebuilt.resolve(), options.cases, emulated=options.emulated)
+        chosen = options.parts or list(available)
+        if unknown := [name for name in chosen if name not in available]:
+            parser.error(f"--parts takes {', '.join(available)}, got {', '.join(unknown)}")
         results: dict[str, Any] = {}
         for name in chosen:
-            results[name] = run(name, known[name], scratch, known[name].until - time.perf_counter() + begin)
-            # Kept after every part, should this be stopped from outside.
+            results[name] = run(name, available[name], scratch, available[name].until - time.perf_counter() + begin)
+            # Written after every part, in case the process is killed.
             said = json.dumps({"device": device(), "call": arguments, "parts": results}, indent=1) + "\n"
-            (given.out / f"summary-{given.call}.json").write_text(said)
-            pack(scratch, given.out / f"parts-{given.call}.tar.gz")
-    print(verdict(given.call, results))
+            (options.out / f"summary-{options.call}.json").write_text(said)
+            pack(scratch, options.out / f"parts-{options.call}.tar.gz")
+    print(verdict(options.call, results))
     return sum(result["outcome"] == "failed" for result in results.values())
 
 
 def pack(folder: Path, archive: Path) -> None:
-    """Keep what the parts have said and found, but not the runs of trainings."""
+    """Packs the outputs and findings of the parts, without the run directories of trainings."""
     with tarfile.open(archive, "w:gz") as tar:
         for path in sorted(folder.rglob("*")):
             if path.suffix in (".txt", ".json", ".csv"):
@@ -138,11 +142,11 @@ def pack(folder: Path, archive: Path) -> None:
 
 
 def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: bool) -> dict[str, Part]:
-    """Make the parts of a call, by name; ``out`` is for what they leave."""
+    """Makes the parts of a call, by name; ``out`` is the folder of their files."""
     places = os.environ.get("PATH", "") + ":/usr/local/cuda/bin"
     places += "".join(f":{path.parent}" for path in Path("/opt/nvidia/nsight-compute").glob("*/ncu"))
     sanitizer, profiler = shutil.which("compute-sanitizer", path=places), shutil.which("ncu", path=places)
-    # nvcc optimises the kernels of a file in parallel, where it can.
+    # nvcc optimises the kernels of a file in parallel, if it can.
     built = (("VORONERF_CUDA", "1"), ("NVCC_APPEND_FLAGS", "--split-compile=0"))
     built += (("VORONERF_CUDA_ARCHITECTURES", capability() or "90"),)
     program, small = [PYTHON, str(ROOT / "benchmarks/gpu/gpu_parts.py")], ["--emulated", "--patience", "10"] * emulated
@@ -151,15 +155,15 @@ def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: b
         return Part([[*program, "cases", str(out), *rest, *small]], until, (), out / "cases.json")
 
     def on_gpu(until: float, command: list[str] | None, found: Path, **environment: str) -> Part:
-        """A part that no emulation has, by a program that may be missing."""
+        """Makes a part that needs a GPU and an optional program; ``command`` is None if the program is missing."""
         if emulated or command is None:
             return Part("no GPU" if emulated else "not installed", until)
         return Part([command], until, tuple(environment.items()), found)
 
     def sanitized(tool: str, until: float, names: str, **environment: str) -> Part:
-        # Of torch's kernels nothing is checked: their instrumentation would take minutes.
+        # torch's kernels are not checked, because their instrumentation would take minutes.
         options = ["--tool", tool, "--kernel-name", "kns=voronerf", "--error-exitcode", "9", "--print-limit", "20"]
-        # An error ends its kernel alone, and what torch asks of the driver in vain is none.
+        # An error ends only its kernel; failed driver calls of torch are not errors.
         options += ["--destroy-on-device-error", "kernel", "--report-api-errors", "no", "--show-backtrace", "device"]
         checked = [*program, "cases", str(out / tool), "--parts", "small", "--names", names, "--patience", "4"]
         command = None if sanitizer is None else [sanitizer, *options, *checked]
@@ -168,16 +172,16 @@ def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: b
     linked = [PYTHON, str(ROOT / "benchmarks/gpu/prebuilt.py"), "try" if emulated else "link", str(prebuilt)]
     compiled = [[PYTHON, "setup.py", "build_ext", "--inplace"]] if not emulated else []
     first = call == "first"
-    # Linking takes some ten seconds; compiling takes longer, at the expense of what follows.
+    # Linking takes about ten seconds; compiling takes longer, at the expense of later parts.
     common = {"build": Part([linked, *compiled], 150 if first else 100, built)}
     if first:
-        # ncu would lock the clocks of the card, which others may share.
+        # By default ncu locks the clocks of the card, which may be shared.
         options = ["--clock-control", "none", "--profile-from-start", "off", "--launch-count", "6"]
         options += ["--kernel-name-base", "function", "--kernel-name", "regex:program_kernel|hash_encode"]
         options += [each for section in SECTIONS for each in ("--section", section)]
         options += ["--csv", "--page", "raw", "--print-units", "base", "--log-file", str(out / "counters.csv")]
         counted = None if profiler is None else [profiler, *options, *program, "counted", str(out)]
-        # Each allocation for itself, so that what reads or writes beyond one leaves all of them.
+        # Separate allocations, so that an access out of bounds does not hit another tensor.
         return common | {
             "cases": tried(285),
             "counters": on_gpu(330, counted, out / "counters.csv"),
@@ -192,7 +196,7 @@ def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: b
 
 
 def run(name: str, part: Part, out: Path, limit: float) -> dict[str, Any]:
-    """Run a part, and give its outcome, seconds and last line; what it says goes to a file."""
+    """Runs a part with its output in a file; returns its outcome, seconds and last line."""
     if isinstance(part.commands, str):
         return {"outcome": "left out", "seconds": 0.0, "last": part.commands}
     if limit < SHORTEST:
@@ -201,7 +205,7 @@ def run(name: str, part: Part, out: Path, limit: float) -> dict[str, Any]:
     paths = os.pathsep.join(path for path in (str(ROOT), os.environ.get("PYTHONPATH")) if path)
     environment = {**os.environ, **dict(part.environment), "PYTHONPATH": paths}
     if part.found is not None:
-        part.found.unlink(missing_ok=True)  # an earlier run's
+        part.found.unlink(missing_ok=True)  # of an earlier run
     begin = time.perf_counter()
     with (out / f"{name}.txt").open("w+", errors="replace") as log:
         status: int | str = 0
@@ -230,11 +234,11 @@ def run(name: str, part: Part, out: Path, limit: float) -> dict[str, Any]:
 def go_on(
     command: list[str], status: int | str, found: Path, environment: dict[str, str], log: TextIO, limit: float
 ) -> int | str:
-    """Start cases again as often as one of them ends its process, and give the last status."""
+    """Restarts the cases whenever a case ends their process; returns the last status."""
     end, before = time.perf_counter() + limit, -1
     while isinstance(status, int):
         number = unfinished(found, status)
-        if number is None or number == before:  # it did not get to any case, such as for want of a device
+        if number is None or number == before:  # it reached no case, for example without a device
             break
         before = number
         status = run_group([*command, "--start", str(number)], environment, log, end - time.perf_counter())
@@ -242,16 +246,16 @@ def go_on(
 
 
 def sanitizer_says(lines: list[str]) -> list[str]:
-    """Select what a sanitizer says of errors, each with the place in a kernel that follows it."""
-    own, found = [line.removeprefix("========= ") for line in lines if line.startswith("=========")], list[str]()
+    """Selects a sanitizer's lines about errors, each with the following line that names the place in a kernel."""
+    own, selected = [line.removeprefix("========= ") for line in lines if line.startswith("=========")], list[str]()
     for line, after in itertools.pairwise([*own, ""]):
         if any(each in line for each in SANITIZER_SAYS):
-            found.append(f"{line}, {after.strip()}" if after.strip().startswith("at ") else line)
-    return found[:20]
+            selected.append(f"{line}, {after.strip()}" if after.strip().startswith("at ") else line)
+    return selected[:20]
 
 
 def read(path: Path | None) -> Any:
-    """Read what a part has left; a text says why it cannot be read, as after an end in the middle of a line."""
+    """Reads the findings of a part; returns a text with the reason if the file is missing or damaged."""
     if path is None or not path.exists():
         return None
     text = path.read_text()
@@ -265,9 +269,9 @@ def read(path: Path | None) -> Any:
 
 
 def counters(text: str) -> dict[str, Any] | None:
-    """Parse ncu's raw page: a line of names, one of units, and one of values for each launch. None without launches."""
-    rows = [row for row in csv.reader(text.splitlines()) if len(row) > 20]  # lines of ncu's own are among them
-    found, told = [], {name for name, _ in COUNTED.values()}
+    """Parses ncu's raw page: names, units, and a line of values per launch. Returns None without launches."""
+    rows = [row for row in csv.reader(text.splitlines()) if len(row) > 20]  # skips ncu's messages
+    launches, told = [], {name for name, _ in COUNTED.values()}
     for row in rows[2:]:
         values = {}
         for name, value in zip(rows[0], row, strict=False):
@@ -275,24 +279,24 @@ def counters(text: str) -> dict[str, Any] | None:
                 with contextlib.suppress(ValueError):
                     values[name] = float(value.replace(",", ""))
         kernel = dict(zip(rows[0], row, strict=False)).get("Kernel Name", "")
-        found.append({"kernel": kernel, "values": values})
-    return {"launches": found} if found else None
+        launches.append({"kernel": kernel, "values": values})
+    return {"launches": launches} if launches else None
 
 
 def verdict(call: str, results: dict[str, Any]) -> str:
-    """Tell what was found, the most telling first, in as many characters as come back."""
-    found = {name: result.get("found") for name, result in results.items()}
+    """Returns the findings, the most important first, within ``VERDICT`` characters."""
+    findings = {name: result.get("found") for name, result in results.items()}
     lines = [f"gpu-check {call} on {device()}:"]
     for name, result in results.items():
         lines.append(f"  {name:10} {result['outcome']:8} {result['seconds']:6.1f} s  {result['last']}")
-    if took := _took(found):
+    if took := _took(findings):
         lines.append(f"  of cases: {', '.join(f'{part} {seconds:.1f} s' for part, seconds in took.items())}")
-    for part, value in found.items():
+    for part, value in findings.items():
         lines += [f"TORN {part}: {value}"] * isinstance(value, str)
-    lines += _wrong(found)
+    lines += _wrong(findings)
     for name, result in results.items():
         lines += [f"{name}: {line}" for line in result.get("sanitizer", ())[:6] if "SUMMARY: 0" not in line]
-    cases = _cases(found)
+    cases = _cases(findings)
     told = [row for row in cases if row["part"] in ("captured", "training") and row["said"]]
     lines += [f"{row['part']} {row['name']}: {row['said']}" for row in told]
     for row in cases:
@@ -315,7 +319,7 @@ def verdict(call: str, results: dict[str, Any]) -> str:
 
 
 def cut(lines: Iterable[str]) -> str:
-    """Lines of their length at most, as many as there is space for."""
+    """Truncates each line to its maximum length, and drops the lines that exceed the length of the report."""
     kept, size = list[str](), 0
     for line in lines:
         kept.append(line[: WRONG if line.startswith(("WRONG", "memcheck", "racecheck", "synccheck")) else LINE])
@@ -326,30 +330,30 @@ def cut(lines: Iterable[str]) -> str:
 
 
 def brief(kernel: str) -> str:
-    """A kernel's name without what all have."""
-    for each in WORDY:
-        kernel = kernel.replace(each, "")
+    """Returns a kernel's name without common parts."""
+    for word in WORDY:
+        kernel = kernel.replace(word, "")
     return kernel
 
 
-def _cases(found: dict[str, Any]) -> list[dict[str, Any]]:
-    cases = found.get("cases")
+def _cases(findings: dict[str, Any]) -> list[dict[str, Any]]:
+    cases = findings.get("cases")
     kept = cases.get("cases", []) if isinstance(cases, dict) else []
     return [row for row in kept if row["right"]]
 
 
-def _took(found: dict[str, Any]) -> dict[str, float]:
-    """Seconds of each part of the cases."""
-    cases, seconds = found.get("cases"), dict[str, float]()
+def _took(findings: dict[str, Any]) -> dict[str, float]:
+    """Returns the seconds of each part of the cases."""
+    cases, seconds = findings.get("cases"), dict[str, float]()
     for row in cases.get("cases", ()) if isinstance(cases, dict) else ():
         seconds[row["part"]] = seconds.get(row["part"], 0.0) + row.get("took", 0.0)
     return seconds
 
 
-def _wrong(found: dict[str, Any]) -> list[str]:
-    """Cases that are wrong, and how many were left out."""
+def _wrong(findings: dict[str, Any]) -> list[str]:
+    """Lists wrong cases, and the number of omitted cases."""
     lines, left_out = [], 0
-    for part, value in found.items():
+    for part, value in findings.items():
         if isinstance(value, dict):
             for row in value.get("cases", ()):
                 if not row["right"]:
@@ -362,7 +366,7 @@ def _wrong(found: dict[str, Any]) -> list[str]:
 
 
 def _beside(cases: list[dict[str, Any]]) -> list[str]:
-    """Compare rows with those of the same name by something else."""
+    """Compares rows with the rows of the same name by alternatives."""
     times = {row["name"]: row["seconds"] for row in cases if "share" in row}
     lines = []
     for name, seconds in times.items():
@@ -375,9 +379,9 @@ def _beside(cases: list[dict[str, Any]]) -> list[str]:
 
 
 def _counted(result: dict[str, Any]) -> list[str]:
-    """Tell a launch in two lines: what it is, and its counters, with the two reasons for which warps wait longest."""
-    found, (before, after), lines = result.get("found"), STALLED, []
-    launches = found["launches"] if isinstance(found, dict) else []
+    """Describes a launch in two lines: its name, and its counters with the two main stall reasons."""
+    findings, (before, after), lines = result.get("found"), STALLED, []
+    launches = findings["launches"] if isinstance(findings, dict) else []
     names = [*result.get("counted", ()), *["?"] * len(launches)]
     for name, launch in zip(names, launches, strict=False):
         values = launch["values"]
@@ -393,7 +397,7 @@ def _counted(result: dict[str, Any]) -> list[str]:
 
 
 def run_group(command: list[str], environment: dict[str, str], log: TextIO, limit: float) -> int | str:
-    """Exit status of a command, or what became of it: past ``limit`` seconds, all that it started is ended with it."""
+    """Runs a command; returns its exit status or a text. After ``limit`` seconds its process group is killed."""
     try:
         process = subprocess.Popen(
             command, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
@@ -405,17 +409,17 @@ def run_group(command: list[str], environment: dict[str, str], log: TextIO, limi
     except subprocess.TimeoutExpired:
         return f"stopped after {limit:.0f} s"
     finally:
-        # Of a command that has ended, what it left behind; nothing more is to run beside the next part.
+        # Also kills processes that an ended command left running, so that nothing disturbs the next part.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        # A process that waits inside of the driver may not end.
+        # A process that waits inside the driver may never end.
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(10)
 
 
 @functools.cache
 def asked_of_the_driver(what: str) -> str | None:
-    """Ask nvidia-smi of the first GPU, once; None without one. torch would take seconds to import."""
+    """Queries nvidia-smi about the first GPU, once; None without a GPU. Importing torch would take seconds."""
     try:
         command = ["nvidia-smi", f"--query-gpu={what}", "--format=csv,noheader"]
         said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout
@@ -425,13 +429,13 @@ def asked_of_the_driver(what: str) -> str | None:
 
 
 def capability() -> str | None:
-    """Compute capability of the GPU, such as "90"; None without one."""
+    """Returns the compute capability of the GPU, such as "90"; None without a GPU."""
     said = asked_of_the_driver("compute_cap")
     return said.replace(".", "") if said else None
 
 
 def device() -> str:
-    """The GPU and its driver."""
+    """Returns the names of the GPU and its driver."""
     return asked_of_the_driver("name,driver_version") or "no GPU"
 
 

@@ -1,7 +1,7 @@
-"""Cases that are tried one by one, and the journal of what they have found.
+"""Runs cases one by one, and records their findings in a journal.
 
-A CUDA error of a kernel ends all that its process could still do, and so do a kernel that does not end and a crash. The
-program then ends, and its caller starts it again with the case that :func:`unfinished` tells.
+After a CUDA error in a kernel, a hanging kernel or a crash, a process can run no further case. It then ends, and its
+caller restarts it with the case that :func:`unfinished` returns.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 BROKEN = 101
-"""Exit status of a process that has to be started again; others count the cases that failed."""
+"""Exit status of a process that must be restarted; other values are the number of failed cases."""
 
 
 class Journal:
-    """The findings so far, kept in a file after every case; a process that goes on finds them there."""
+    """The findings so far, written to a file after every case and read again by a restarted process."""
 
     def __init__(self, path: Path, *, begun: bool = False) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -30,11 +30,11 @@ class Journal:
         self.found: dict[str, Any] = json.loads(path.read_text()) if begun and path.exists() else {}
 
     def add(self, kind: str, row: dict[str, Any]) -> None:
-        """Append a row to those of a kind."""
+        """Appends a row to the rows of a kind."""
         self.put(kind, [*self.found.get(kind, []), row])
 
     def put(self, kind: str, value: Any) -> None:
-        """Set an entry; the file is whole whenever the process is killed."""
+        """Sets an entry; the file is replaced atomically, so that a kill cannot damage it."""
         self.found[kind] = value
         new = self.path.with_suffix(".new")
         new.write_text(json.dumps(self.found, indent=1) + "\n")
@@ -43,13 +43,14 @@ class Journal:
 
 @dataclass(frozen=True)
 class Case:
-    """One thing to try.
+    """A case to run.
 
     Attributes:
-        part: which of the parts it belongs to.
-        name: of the case.
-        run: raises, or returns what is kept of it: values by name, of which ``said`` is printed, or that alone.
-        seconds: after which it is said to hang.
+        part: The name of its part.
+        name: The name of the case.
+        run: A function that raises on errors. It returns a dict for the journal, whose ``said`` is printed, or
+            ``said``.
+        seconds: Seconds after which it counts as hanging.
     """
 
     part: str
@@ -59,12 +60,12 @@ class Case:
 
 
 def settling(device: str) -> Callable[[], None]:
-    """A function that waits for a device, and raises where the device or torch's generator is of no use any more."""
+    """Returns a function that waits for a device, and raises if the device or torch's generator is unusable."""
     import torch
 
     def settle() -> None:
         torch.cuda.synchronize()
-        torch.rand(1, device=device)  # a capture that went wrong leaves the generator unusable, and nothing else
+        torch.rand(1, device=device)  # a failed capture leaves only the generator unusable
 
     return settle if device == "cuda" else lambda: None
 
@@ -72,15 +73,15 @@ def settling(device: str) -> Callable[[], None]:
 def one_by_one(
     cases: list[Case], budgets: dict[str, float], settle: Callable[[], None], journal: Journal, start: int = 0
 ) -> int:
-    """Try every case for itself; a case that leaves the device unusable, or does not end, ends the process.
+    """Runs every case separately; a case that hangs or leaves the device unusable ends the process.
 
     Args:
-        cases: in their order.
-        budgets: seconds of each part, in the order of the parts. What one leaves is the next ones'; of a part whose
-            time is over the other cases are left out.
-        settle: waits for the device, and raises where it is of no use any more.
-        journal: gets a row of ``cases`` for each.
-        start: the case to begin with.
+        cases: The cases, in their order.
+        budgets: Seconds of each part, in the order of the parts. Later parts inherit unused time; when the time of a
+            part is over, its remaining cases are skipped.
+        settle: A function that waits for the device, and raises if the device is unusable.
+        journal: The journal, which gets a row of ``cases`` for each case.
+        start: The index of the first case.
 
     Returns:
         The number of cases that failed, or ``BROKEN``.
@@ -91,12 +92,12 @@ def one_by_one(
             ends[part] = end = end + seconds
         journal.put("ends", ends)
 
-    def keep(number: int, right: bool, found: dict[str, Any]) -> None:
-        """Print a line and keep a row."""
-        case, said = cases[number], found.get("said", "")
+    def keep(number: int, right: bool, values: dict[str, Any]) -> None:
+        """Prints a line and records a row."""
+        case, said = cases[number], values.get("said", "")
         print(f"{'right' if right else 'WRONG'}  {case.part}: {case.name}{f': {said}' * bool(said)}", flush=True)
         row = {"number": number, "part": case.part, "name": case.name, "right": right, "said": said}
-        journal.add("cases", {**found, **row, "took": time.perf_counter() - begin})
+        journal.add("cases", {**values, **row, "took": time.perf_counter() - begin})
 
     def hangs(number: int) -> None:
         keep(number, False, {"said": f"hangs, stopped after {cases[number].seconds:g} s"})
@@ -112,9 +113,9 @@ def one_by_one(
         watch.daemon = True
         watch.start()
         try:
-            found = case.run()
+            values = case.run()
             settle()
-            keep(number, True, {"said": found} if isinstance(found, str) else found or {})
+            keep(number, True, {"said": values} if isinstance(values, str) else values or {})
         except Exception as error:
             keep(number, False, {"said": f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"})
             traceback.print_exc(file=sys.stdout)
@@ -134,9 +135,9 @@ def one_by_one(
 
 
 def unfinished(path: Path, status: int | str) -> int | None:
-    """The case with which a program goes on that has ended before its last one; None where it has not.
+    """Returns the case with which an interrupted program continues; None if it ran all cases.
 
-    A case that ended the process, such as by a crash, is noted as wrong.
+    A case that ended the process, for example by a crash, is recorded as wrong.
     """
     journal = Journal(path, begun=True)
     at = journal.found.get("at")

@@ -1,7 +1,7 @@
-"""Networks at full size against the reference on some rows, and their gradients in 16 bits against those in float32.
+"""Checks networks at full size: some rows against the reference, and 16-bit gradients against float32 gradients.
 
-The small cases are one tile of rows a task on a device with 132 multiprocessors. Here a task walks over many tiles, the
-last of them short, and sums are added up over tiles and tasks.
+With 132 multiprocessors, the small cases give each task one tile of rows. Here a task loops over many tiles, the last
+one partial, and sums run over tiles and tasks.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from dataclasses import replace
 from typing import Any
 
 N = 1 << 22
-"""Samples, at which every loop of the kernels is walked several times."""
+"""The number of samples, at which every loop of the kernels runs several times."""
 SUBSET = 1 << 12
-"""Rows of each cell, at most, that the reference computes in float64."""
+"""The most rows per cell that the reference computes in float64."""
 ALLOWED = {"bfloat16": (2e-2, 0.25), "float32": (2e-4, 3e-2)}
-"""Norm of a difference in norms of what is right, of outputs and of gradients: a rounding beside a kink of ReLU matters
-to these, .12 in bfloat16 and .011 behind a hash grid on a CPU."""
+"""Allowed relative errors (by norm) of outputs and of gradients. ReLU units that rounding switches change gradients: by
+0.12 in bfloat16, and by 0.011 with a hash grid, on a CPU."""
 
 
 def large_cases(device: str, n: int = N) -> list[tuple[str, Callable[[], str]]]:
-    """Names and checks, which raise, or say how far results are from what is right."""
+    """Returns names and checks, which raise or return a text with the relative errors."""
     return [
         (f"{name} {precision}", functools.partial(compare, device, name, precision, n))
         for precision in ALLOWED
@@ -30,21 +30,20 @@ def large_cases(device: str, n: int = N) -> list[tuple[str, Callable[[], str]]]:
 
 
 def compare(device: str, name: str, precision: str, n: int) -> str:
-    """Outputs beside those in float64; gradients beside those of products in float32, and those of float32 of some rows
-    beside float64."""
+    """Compares outputs with float64, gradients with float32, and float32 gradients of some rows with float64."""
     import torch
 
-    given = batch(device, name, precision, n)
-    found = evaluate(given)
-    assert all(bool(part.isfinite().all()) for part in found), "not finite"
-    exact, rows = in_float64(given)
-    pairs = [(found[0][rows], exact[0])]
+    inputs = batch(device, name, precision, n)
+    results = evaluate(inputs)
+    assert all(bool(part.isfinite().all()) for part in results), "not finite"
+    exact, rows = in_float64(inputs)
+    pairs = [(results[0][rows], exact[0])]
     if precision == "float32":
-        seen = torch.zeros_like(given["gradient"]).index_copy_(0, rows, given["gradient"][rows])
-        pairs += zip(evaluate({**given, "gradient": seen})[1:], exact[1:], strict=True)
+        seen = torch.zeros_like(inputs["gradient"]).index_copy_(0, rows, inputs["gradient"][rows])
+        pairs += zip(evaluate({**inputs, "gradient": seen})[1:], exact[1:], strict=True)
     else:
-        wide = [weight.detach().float().requires_grad_() for weight in given["weights"]]
-        pairs += zip(found[1:], evaluate({**given, "weights": wide})[1:], strict=True)
+        wide = [weight.detach().float().requires_grad_() for weight in inputs["weights"]]
+        pairs += zip(results[1:], evaluate({**inputs, "weights": wide})[1:], strict=True)
     apart = [distance(*pair) for pair in pairs]
     of_outputs, of_gradients = ALLOWED[precision]
     assert apart[0] <= of_outputs, f"outputs are {apart[0]:.1e} from float64"
@@ -56,20 +55,20 @@ def compare(device: str, name: str, precision: str, n: int) -> str:
 
 
 def distance(one: Any, other: Any) -> float:
-    """Norm of the difference, in norms of the second."""
+    """Returns the norm of the difference, relative to the norm of the second tensor."""
     one, other = one.double(), other.double()
     return float((one - other).norm() / other.norm().clamp_min(1e-30))
 
 
 def batch(device: str, name: str, precision: str, n: int) -> dict[str, Any]:
-    """Samples of nine cells: the first has half of them, one has none and one a single sample."""
+    """Draws samples of nine cells: the first has half of the samples, one is empty and one has a single sample."""
     import torch
     from ops.networks import NETS
 
     import voronerf
     from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 
-    generator = torch.Generator(device).manual_seed(0)  # the processor would draw for seconds
+    generator = torch.Generator(device).manual_seed(0)  # drawing on the CPU would take seconds
     layers = NETS.get(name)
     if layers is None:
         rest = MLP((Layer((POSITIONS,), 32, "relu"), Layer((0,), 32, "relu"), Layer((1,), 4)), (2,))
@@ -98,58 +97,59 @@ def batch(device: str, name: str, precision: str, n: int) -> dict[str, Any]:
     }
 
 
-def call(given: dict[str, Any], positions: Any, offsets: Any, index: Any, weights: Any, **rest: Any) -> Any:
-    """The network on some of the rows."""
+def call(inputs: dict[str, Any], positions: Any, offsets: Any, index: Any, weights: Any, **rest: Any) -> Any:
+    """Runs the network on some rows."""
     import voronerf
 
-    directed = given["directions"] is not None
+    directed = inputs["directions"] is not None
     return voronerf.grouped_mlp(
         positions,
         offsets,
         weights,
         [None] * len(weights),
-        layers=given["layers"],
-        directions=rest.pop("directions", given["directions"]),
+        layers=inputs["layers"],
+        directions=rest.pop("directions", inputs["directions"]),
         direction_index=index if directed else None,
         **rest,
     )
 
 
-def evaluate(given: dict[str, Any]) -> list[Any]:
-    """Outputs, and gradients of all parameters."""
+def evaluate(inputs: dict[str, Any]) -> list[Any]:
+    """Returns outputs and the gradients of all parameters."""
     import torch
 
-    weights, table = given["weights"], given["features"]
-    arguments = given["positions"], given["offsets"], given["index"], weights
-    out = call(given, *arguments, features=table, backend="native")
+    weights, table = inputs["weights"], inputs["features"]
+    arguments = inputs["positions"], inputs["offsets"], inputs["index"], weights
+    out = call(inputs, *arguments, features=table, backend="native")
     leaves = [*weights, *([] if table is None else [table])]
-    return [out.detach(), *torch.autograd.grad(out, leaves, given["gradient"].to(out.dtype))]
+    return [out.detach(), *torch.autograd.grad(out, leaves, inputs["gradient"].to(out.dtype))]
 
 
-def in_float64(given: dict[str, Any]) -> tuple[list[Any], Any]:
-    """Outputs of rows all over every cell, its last one included, by the reference; the gradients that these rows make;
-    and which rows they are."""
+def in_float64(inputs: dict[str, Any]) -> tuple[list[Any], Any]:
+    """Returns the reference's outputs for some rows, their gradients, and the rows' indices.
+
+    The rows are spread over every cell and include its last row."""
     import torch
 
     rows, counts, begin = [], [], 0
-    for count in given["counts"]:
+    for count in inputs["counts"]:
         counts.append(min(count, SUBSET))
         rows.append(begin + (torch.arange(counts[-1]) + 1) * count // max(counts[-1], 1) - 1)
         begin += count
-    chosen = torch.cat(rows).to(given["positions"].device)
+    chosen = torch.cat(rows).to(inputs["positions"].device)
     offsets = torch.tensor([0, *counts], dtype=torch.int32).cumsum(0).int().to(chosen.device)
-    directions = given["directions"]
-    weights = [weight.detach().double().requires_grad_() for weight in given["weights"]]
-    table = None if given["features"] is None else given["features"].detach().double().requires_grad_()
+    directions = inputs["directions"]
+    weights = [weight.detach().double().requires_grad_() for weight in inputs["weights"]]
+    table = None if inputs["features"] is None else inputs["features"].detach().double().requires_grad_()
     out = call(
-        given,
-        given["positions"][chosen].double(),
+        inputs,
+        inputs["positions"][chosen].double(),
         offsets,
-        given["index"][chosen],
+        inputs["index"][chosen],
         weights,
         features=table,
         directions=None if directions is None else directions.double(),
         backend="reference",
     )
     leaves = [*weights, *([] if table is None else [table])]
-    return [out.detach(), *torch.autograd.grad(out, leaves, given["gradient"][chosen].double())], chosen
+    return [out.detach(), *torch.autograd.grad(out, leaves, inputs["gradient"][chosen].double())], chosen

@@ -1,18 +1,18 @@
-"""Programs of ``gpu_check.py``: ``gpu_parts.py PROGRAM OUT``.
+"""The programs of ``gpu_check.py``: ``gpu_parts.py PROGRAM OUT``.
 
-    cases     the parts of --parts in one process, each case for itself
-                  small      every operation once, forward and backward, against float64
+    cases     the parts of --parts in one process, each case separately
+                  small      every operation, forward and backward, against float64
                   large      networks at 2^22 samples, with gradients
                   captured   steps of the route, and of trainings, in CUDA graphs
-                  rows       networks, look-ups and sorts at full size, beside the machine's limits and torch's products
+                  rows networks, lookups and sorts at full size, beside the machine's peak rates and torch's products
                   training   short trainings, with PSNR
-                  profile    a default step: launches, waits of the host, the kernels that take longest
+                  profile    a default step: launches, waits of the host, the slowest kernels
     counted   six launches between cudaProfilerStart and cudaProfilerStop, for ncu
     tests     tests/ops on CUDA, a process for each file
 
-What it finds is kept in OUT/PROGRAM.json after every case; after a case that ends the process, ``--start`` goes on
-with another one. ``--emulated`` runs small versions of the cases on the emulated device of the tests, so that a slip of
-theirs is not found on a GPU.
+Findings are written to OUT/PROGRAM.json after every case. After a case that ends the process, ``--start`` continues
+with a later case. ``--emulated`` runs small versions of the cases on the emulated device of the tests, to find mistakes
+in the cases without a GPU.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ from gpu_large import large_cases  # noqa: E402
 from gpu_timings import counted, profile, rows  # noqa: E402
 
 BUDGETS = {"small": 60.0, "large": 25.0, "captured": 35.0, "rows": 65.0, "training": 35.0, "profile": 30.0}
-"""Seconds of each part, in their order. What one leaves is the next ones'."""
+"""Seconds of each part, in their order. Later parts inherit unused time."""
 TRAININGS: dict[str, dict[str, Any]] = {"default": {}, "4,096 rays, bf16": {"rays": 4096, "precision": "bf16"}}
 FILE_SECONDS = 90.0
-"""Limit of one file of the tests."""
+"""The time limit of one test file."""
 PROCESSES = 12
-"""Tests at a time: most of theirs goes into imports and contexts."""
+"""Test processes at a time; imports and contexts take most of their time."""
 CHOICE = "cuda and not reference-cuda and not compiles and not opcheck"
-"""Which tests: those of this project's kernels; torch traces the same on every device."""
+"""The selection of tests: only this project's kernels, since torch traces alike on every device."""
 LISTS = {"@checked": CHECKED, "@racing": RACING}
-"""Several cases by one name."""
+"""Names of lists of cases."""
 STEP: dict[str, Any] = {"width": 16, "samples": (8,), "rays": 16, "cells": (), "split_at": ()}
 LITTLE: dict[str, dict[str, Any]] = {
     "large": {"n": 150},
@@ -59,11 +59,11 @@ LITTLE: dict[str, dict[str, Any]] = {
     "profile": {"seconds": 0.05, **STEP},
     "training": {"budget": 0.1, **STEP},
 }
-"""Options of each part that the emulated device can make."""
+"""Options of each part that are small enough for the emulated device."""
 
 
 def cases_of(parts: list[str], device: str, journal: Journal, *, emulated: bool = False) -> list[Case]:
-    """The cases of some parts."""
+    """Returns the cases of some parts."""
     import torch
 
     from voronerf.app.scenes import builtin_scene, load_scene
@@ -75,45 +75,45 @@ def cases_of(parts: list[str], device: str, journal: Journal, *, emulated: bool 
     if {"profile", "training"}.intersection(parts):
         scene = builtin_scene(12) if emulated else load_scene("builtin")
     small: dict[str, dict[str, Any]] = LITTLE if emulated else {}
-    found: list[Case] = []
+    cases: list[Case] = []
     for part in parts:
         options = small.get(part, {})
         if part == "small":
-            found += [Case(part, *case) for case in small_cases(device)]
+            cases += [Case(part, *case) for case in small_cases(device)]
         elif part == "large":
-            found += [Case(part, *case, 20.0) for case in large_cases(device, **options)]
+            cases += [Case(part, *case, 20.0) for case in large_cases(device, **options)]
         elif part == "captured":
-            found += [Case(part, *case) for case in captured_steps(device, **options)]
-            found += [Case(part, *case, 30.0) for case in captured_trainings(device, **small.get("trainings", {}))]
+            cases += [Case(part, *case) for case in captured_steps(device, **options)]
+            cases += [Case(part, *case, 30.0) for case in captured_trainings(device, **small.get("trainings", {}))]
         elif part == "rows":
-            found += rows(device, journal, **options)
+            cases += rows(device, journal, **options)
         elif part == "profile":
-            found += profile(scene, device, **options)
+            cases += profile(scene, device, **options)
         else:
-            for name, given in TRAININGS.items():
-                run = functools.partial(train, scene, device, {**given, **options})
-                found.append(Case(part, name, run, 60.0))
-    return [dataclasses.replace(case, run=functools.partial(seeded, case.run)) for case in found]
+            for name, settings in TRAININGS.items():
+                run = functools.partial(train, scene, device, {**settings, **options})
+                cases.append(Case(part, name, run, 60.0))
+    return [dataclasses.replace(case, run=functools.partial(seeded, case.run)) for case in cases]
 
 
 def chosen(cases: list[Case], names: list[str]) -> list[Case]:
-    """The cases of some names or parts, in which * may stand; one that fails for each name that there is not."""
+    """Returns the cases of some names or parts, with * as a wildcard; an unknown name gives a failing case."""
 
     def absent() -> None:
         raise LookupError("there is no case of this name")
 
-    found = [case for case in cases if any(fnmatch.filter((case.name, case.part), name) for name in names)]
-    known = {name for case in found for name in names if fnmatch.filter((case.name, case.part), name)}
-    return [*(Case(cases[0].part, name, absent) for name in names if name not in known), *found]
+    selected = [case for case in cases if any(fnmatch.filter((case.name, case.part), name) for name in names)]
+    matched = {name for case in selected for name in names if fnmatch.filter((case.name, case.part), name)}
+    return [*(Case(cases[0].part, name, absent) for name in names if name not in matched), *selected]
 
 
 def train(scene: Any, device: str, options: dict[str, Any]) -> dict[str, Any]:
-    """A training of 12 seconds: milliseconds of a step, and PSNR."""
+    """Trains for 12 seconds; returns milliseconds of a step, and PSNR."""
     from voronerf.app.train import Scores, TrainConfig, build, run
 
-    given: dict[str, Any] = {"budget": 12.0, "cells": (12,), "evaluations": 4, "eval_views": 5, **options}
+    settings: dict[str, Any] = {"budget": 12.0, "cells": (12,), "evaluations": 4, "eval_views": 5, **options}
     scores = Scores(None)
-    run(build(TrainConfig(device=device, **given), scene), [scores])
+    run(build(TrainConfig(device=device, **settings), scene), [scores])
     summary = scores.summary
     milliseconds = 1e3 * summary["seconds"] / summary["steps"]
     said = f"{summary['steps']} steps of {milliseconds:.2f} ms, PSNR {summary['psnr']:.2f}"
@@ -122,7 +122,7 @@ def train(scene: Any, device: str, options: dict[str, Any]) -> dict[str, Any]:
 
 
 def about() -> dict[str, Any]:
-    """The machine, its versions, and what the library says of itself."""
+    """Returns the machine, its versions, and the library's description of its backends."""
     import torch
 
     from voronerf.ops._core import backends
@@ -132,12 +132,12 @@ def about() -> dict[str, Any]:
 
 
 def run_counted(device: str) -> None:
-    """Every launch once before it is counted."""
+    """Runs every counted launch, after a warm-up."""
     import torch
 
     settle = settling(device)
-    made = counted(device, **({} if device == "cuda" else {"n": 256}))
-    for name, before, launch in made:
+    launches = counted(device, **({} if device == "cuda" else {"n": 256}))
+    for name, before, launch in launches:
         before()
         launch()
         before()
@@ -149,7 +149,7 @@ def run_counted(device: str) -> None:
 
 
 def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECONDS) -> int:
-    """Every file of tests/ops, several at a time; its output goes to ``out``."""
+    """Runs the files of tests/ops, several at a time, with their output in ``out``; returns the number of failures."""
     journal = Journal(out / "tests.json")
     files = files or sorted((ROOT / "tests" / "ops").glob("test_*.py"))
     options = ["-q", "-p", "no:cacheprovider", "--tb=short", "-k", CHOICE, "--require", "native,cuda"]
@@ -159,7 +159,7 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
         with (out / f"{file.stem}.txt").open("w+", errors="replace") as log:
             status: int | str
             try:
-                # gpu_check.py ends the whole group, of which this is a part, when the time of all is over.
+                # When the total time is over, gpu_check.py kills this process group.
                 status = subprocess.run(command, cwd=ROOT, stdout=log, stderr=log, timeout=seconds).returncode
             except subprocess.TimeoutExpired:
                 status = f"stopped after {seconds:g} s"
@@ -170,7 +170,7 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
     with ThreadPoolExecutor(PROCESSES) as pool:
         for done in as_completed([pool.submit(run, file) for file in files]):
             file, status, lines = done.result()
-            # 5: no test of this file is for CUDA.
+            # Status 5: the file has no test for CUDA.
             failed += status not in (0, 5)
             said = "; ".join([status] * isinstance(status, str) + lines[-1:])
             print(f"{'passed' if status in (0, 5) else 'FAILED'}  {file.name}: {said}", flush=True)
@@ -183,7 +183,7 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
 
 @contextlib.contextmanager
 def on_the_emulated_device() -> Iterator[None]:
-    """Tensors of the processor say that they are of a GPU, and the emulation is the GPU."""
+    """Runs the block on the emulated GPU: tensors on the CPU report a CUDA device."""
     import torch
     from emulated import emulated
     from graphs import graphs
@@ -193,34 +193,34 @@ def on_the_emulated_device() -> Iterator[None]:
 
 
 def main(arguments: list[str]) -> int:
-    """Run one program."""
+    """Runs one program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("program", choices=("cases", "counted", "tests"))
     parser.add_argument("out", type=Path, help="folder for what it finds")
     parser.add_argument("--parts", nargs="+", choices=tuple(BUDGETS), default=list(BUDGETS))
-    parser.add_argument("--names", nargs="+", help="some cases: names, in which * may stand, parts, @checked, @racing")
+    parser.add_argument("--names", nargs="+", help="cases to run: names (* is a wildcard), parts, @checked, @racing")
     parser.add_argument("--patience", type=float, default=1.0, help="times the seconds of a case")
     parser.add_argument("--emulated", action="store_true")
     parser.add_argument("--start", type=int, default=0, help="the case to go on with")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     faulthandler.enable()
-    device = "cpu" if given.emulated else "cuda"
-    with on_the_emulated_device() if given.emulated else contextlib.nullcontext():
-        if given.program == "counted":
+    device = "cpu" if options.emulated else "cuda"
+    with on_the_emulated_device() if options.emulated else contextlib.nullcontext():
+        if options.program == "counted":
             run_counted(device)
             return 0
-        if given.program == "tests":
-            return tests(given.out)
-        journal = Journal(given.out / "cases.json", begun=given.start > 0)
-        if not given.start:
+        if options.program == "tests":
+            return tests(options.out)
+        journal = Journal(options.out / "cases.json", begun=options.start > 0)
+        if not options.start:
             journal.put("about", about())
-        cases = cases_of(given.parts, device, journal, emulated=given.emulated)
-        if given.names:
-            cases = chosen(cases, [name for each in given.names for name in LISTS.get(each, (each,))])
-        cases = [dataclasses.replace(case, seconds=given.patience * case.seconds) for case in cases]
-        budgets, settle = {part: BUDGETS[part] for part in given.parts}, settling(device)
-        settle()  # makes the context, in the time of no case
-        return one_by_one(cases, budgets, settle, journal, given.start)
+        cases = cases_of(options.parts, device, journal, emulated=options.emulated)
+        if options.names:
+            cases = chosen(cases, [name for each in options.names for name in LISTS.get(each, (each,))])
+        cases = [dataclasses.replace(case, seconds=options.patience * case.seconds) for case in cases]
+        budgets, settle = {part: BUDGETS[part] for part in options.parts}, settling(device)
+        settle()  # creates the CUDA context outside the time of any case
+        return one_by_one(cases, budgets, settle, journal, options.start)
 
 
 if __name__ == "__main__":

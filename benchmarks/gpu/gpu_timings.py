@@ -1,4 +1,4 @@
-"""Timings of ``gpu_parts.py``: kernels at full size, beside the machine's own limits and torch's products."""
+"""Timings of ``gpu_parts.py``: kernels at full size, beside the machine's peak rates and torch's products."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from typing import Any
 from gpu_journal import Case, Journal, settling
 
 SECONDS = 1.5
-"""The time of a row, but for a call that takes longer."""
+"""The seconds of a row; a single slow call may take longer."""
 MOST_CALLS, MOST_REPEATS = 8, 30
-"""Calls in a graph, and timings of a row."""
+"""Most calls in a graph, and most timings of a row."""
 LIMITS = ("bfloat16", "float32", "copy")
 SETS = 4
-"""Inputs of look-ups that take turns, and a quarter of those of sorts: more than the caches of a GPU hold."""
+"""Input sets of lookups that take turns; sorts have four times as many. All sets together exceed a GPU's caches."""
 HOPPER = {"bfloat16": 989e12, "float32": 67e12, "copy": 3.35e12, "issue": 4 * 132 * 1.98e9}
-"""Limits by the data sheet of an H100, which the emulated device is held against: operations, bytes, and instructions
-of warps a second."""
+"""Peak rates of an H100 by its data sheet, used for the emulated device: operations, bytes, and warp instructions a
+second."""
 
 Run = Callable[[], Any]
 Work = dict[str, float]
-"""Amounts of a call, operations or bytes, by the limit of the machine that they are held against."""
+"""The operations or bytes of a call, by the name of the peak rate that they are compared with."""
 
 
 def clock(run: Run, device: Any, seconds: float) -> dict[str, Any]:
-    """Seconds of a call on the device, several replayed as one graph, and of one that the host launches.
+    """Returns the seconds of a call on the device, both in a replayed graph of several calls and launched by the host.
 
-    A kernel of some microseconds waits longer for the host than it takes. Medians of as many as there is time for;
-    a call that is slow, or that cannot be captured, is launched.
+    A short kernel runs faster than the host launches it, hence the graph. Slow calls, and calls that cannot be
+    captured, are only launched. Times are medians of the timings within ``seconds``.
     """
     import torch
     from harness import Stopwatch
@@ -49,23 +49,23 @@ def clock(run: Run, device: Any, seconds: float) -> dict[str, Any]:
             times.append(stopwatch(lambda _: work(), 0, 1))
         return statistics.median(times) / calls, len(times)
 
-    run()  # what is compiled or loaded at a first call
+    run()  # the first call compiles and loads kernels
     launched, repeats = middle(run, 1, seconds / 3)
-    found: dict[str, Any] = {"seconds": launched, "launched": launched, "repeats": repeats}
+    timing: dict[str, Any] = {"seconds": launched, "launched": launched, "repeats": repeats}
     calls = min(MOST_CALLS, int(seconds / 12 / launched))
     if calls < 1:
-        return found
+        return timing
     graph = Capture(device, torch.Generator(device))
     graph.warm_up(run)
     if graph.obstacle is not None:
-        return {**found, "graph": graph.obstacle}
+        return {**timing, "graph": graph.obstacle}
     graph.capture(lambda: [run() for _ in range(calls)])
     replayed, repeats = middle(lambda: graph.replay(1), calls, seconds / 2)
-    return {**found, "seconds": replayed, "repeats": repeats, "graph": f"{calls} calls"}
+    return {**timing, "seconds": replayed, "repeats": repeats, "graph": f"{calls} calls"}
 
 
 def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, seconds: float = SECONDS) -> list[Case]:
-    """The machine's limits, then the rows, the largest first: networks, look-ups and sorts, and what surrounds them."""
+    """Returns the cases, the largest first: peak rates, networks, lookups, sorts, and the other ops of a step."""
     import torch
     from harness import _cuda_peak
     from ops.case import BACKWARD, FORWARD
@@ -80,17 +80,17 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
     where, cases = torch.device(device), list[Case]()
 
     def limits() -> str:
-        """Operations and bytes a second that torch reaches, and the instructions that all warps may issue."""
-        found = dict(HOPPER)
+        """Measures operations and bytes a second in torch, and computes the peak rate of warp instructions."""
+        rates = dict(HOPPER)
         if device == "cuda":
             card = torch.cuda.get_device_properties(where)
-            found = {kind: _cuda_peak(kind, where) for kind in LIMITS}
-            found["issue"] = 4 * card.multi_processor_count * 1e3 * card.clock_rate
-        journal.put("limits", found)
-        return ", ".join(f"{kind} {value / 1e12:.2f} T/s" for kind, value in found.items())
+            rates = {kind: _cuda_peak(kind, where) for kind in LIMITS}
+            rates["issue"] = 4 * card.multi_processor_count * 1e3 * card.clock_rate
+        journal.put("limits", rates)
+        return ", ".join(f"{kind} {value / 1e12:.2f} T/s" for kind, value in rates.items())
 
     def row(name: str, prepare: Callable[[], tuple[Run, Work]], counted: Work | None = None) -> None:
-        """Add a row; ``counted`` are the instructions that warps issue, or bytes that the code as it is moves."""
+        """Adds a row; ``counted`` is the number of warp instructions, or of bytes that the kernels actually move."""
 
         def case() -> dict[str, Any]:
             if device == "cuda":
@@ -116,31 +116,31 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
         kind = torch.float32 if precision == "tf32" else getattr(torch, precision)
         batch, price = make_batch(NETS[name], m, k, kind, BACKWARD, where), cost(NETS[name])
         options = {"layers": batch.net, "directions": batch.directions, "direction_index": batch.direction_index}
-        given = batch.positions[0], batch.offsets, batch.weights, batch.biases
+        arguments = batch.positions[0], batch.offsets, batch.weights, batch.biases
 
         def run() -> None:
             before = torch.backends.cuda.matmul.fp32_precision
             torch.backends.cuda.matmul.fp32_precision = "tf32" if precision == "tf32" else "ieee"
             try:
                 with torch.set_grad_enabled(backward):
-                    result = voronerf.grouped_mlp(*given, **options, backend="native")
+                    result = voronerf.grouped_mlp(*arguments, **options, backend="native")
                     if backward:
                         torch.autograd.grad(result, batch.parameters, batch.gradients[1].to(result.dtype))
             finally:
                 torch.backends.cuda.matmul.fp32_precision = before
 
-        # Tensor cores multiply tf32 half as fast as 16 bits.
+        # Tensor cores multiply tf32 at half the rate of 16 bits.
         operations = (price.forward + price.backward * backward) * m * (2 if precision == "tf32" else 1)
         moved = m * (12.0 + batch.net.out_features * kind.itemsize) * (1 + backward)
         return run, {"float32" if precision == "float32" else "bfloat16": operations, "copy": moved}
 
     def products(k: int, m: int, grouped: bool) -> tuple[Run, Work]:
-        """The layers of w64d4 over cells of one size, which need neither a sort nor offsets, nor an encoding."""
+        """Returns torch's products for w64d4 on cells of equal size, without sort, offsets or encoding."""
         # Multiples of 16, for _grouped_mm.
         shapes = [(i + -i % 16, o + -o % 16) for o, i in NETS["w64d4"].weight_shapes(3)]
-        given: dict[str, Any] = {"dtype": torch.bfloat16, "device": where}
-        weights = [torch.randn(k, *shape, **given) / shape[0] ** 0.5 for shape in shapes]
-        first = torch.rand(k, m // k, shapes[0][0], **given)
+        options: dict[str, Any] = {"dtype": torch.bfloat16, "device": where}
+        weights = [torch.randn(k, *shape, **options) / shape[0] ** 0.5 for shape in shapes]
+        first = torch.rand(k, m // k, shapes[0][0], **options)
         ends = torch.arange(1, k + 1, dtype=torch.int32, device=where) * (m // k)
 
         def run() -> Any:
@@ -149,7 +149,7 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
                 x = (torch._grouped_mm(x, weight, offs=ends) if grouped else torch.bmm(x, weight)).relu_()
             return x
 
-        # What every layer reads and writes: nothing stays on the chip between them.
+        # Every layer reads and writes its activations in memory.
         return run, {"bfloat16": cost(NETS["w64d4"]).forward * m, "copy": 2.0 * m * sum(map(sum, shapes))}
 
     def find(k: int, m: int, indexed: bool) -> tuple[Run, Work]:
@@ -162,8 +162,8 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
     def sort(k: int, way: str) -> tuple[Run, Work]:
         sets = [torch.randint(0, k, (n,), dtype=torch.int32, device=where) for _ in range(4 * SETS)]
         order, offsets = torch.empty_like(sets[0]), sets[0].new_empty(k + 1)
-        given = itertools.cycle(sets)
-        return lambda: sort_cells(next(given), order, offsets, "cell_sort", way), {"copy": 8.0 * n}
+        turns = itertools.cycle(sets)
+        return lambda: sort_cells(next(turns), order, offsets, "cell_sort", way), {"copy": 8.0 * n}
 
     def prepared(build: Callable[[torch.device], Prepared]) -> tuple[Run, Work]:
         made, calls = build(where), itertools.count()
@@ -177,20 +177,20 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
         row(f"{title} + backward", functools.partial(network, name, k, m, precision, True))
 
     def tiles(m: int) -> Work:
-        """w64d4 in 16 bits: by machine code a warp issues some 2,600 instructions for 32 samples."""
+        """Returns the warp instructions of w64d4 in 16 bits: about 2,600 for 32 samples, by the machine code."""
         return {"issue": 2600.0 * m / 32}
 
     cases.append(Case("rows", "limits", limits, 30.0))
     networks("w64d4", 16, n, "bfloat16", tiles(n))
     row(f"w64d4 bfloat16 k=16 n={n} by torch.bmm", functools.partial(products, 16, n, False))
     for k in (512, 16):
-        # For 2 points and 4 centres a warp issues 101 instructions in the loop, and some 60 for a point around it.
+        # A warp issues 101 instructions for 2 points and 4 centres in the loop, and about 60 per point outside it.
         row(f"nearest_centre k={k} n={n}", functools.partial(find, k, n, False), {"issue": (k * 101 / 8 + 60) * n / 32})
     for k in (4096, 65_536):
         row(f"nearest_centre k={k} n={fewer}", functools.partial(find, k, fewer, False))
         row(f"nearest_centre k={k} n={fewer} by index", functools.partial(find, k, fewer, True))
-    # By counting, cells are read twice and rows written; by radix, keys of 2 bytes and rows are written first, keys are
-    # read for counts, and both are moved once for each 8 bits.
+    # Counting sort reads cells twice and writes rows. Radix sort first writes keys of 2 bytes and rows, reads keys for
+    # the counts, and moves both once for each 8 bits.
     for k, way, moved in ((16, "counting", 12), (16, "radix", 24), (4096, "radix", 36)):
         row(f"cell_sort k={k} n={n} by {way}", functools.partial(sort, k, way), {"copy": float(moved * n)})
     networks("w64d4", 16, fewer, "bfloat16", tiles(fewer))
@@ -214,7 +214,7 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
 
 
 def counted(device: str, n: int = 1 << 18) -> list[tuple[str, Run, Run]]:
-    """Launches that ncu counts, one of a kernel each: a name, a function that prepares it, and the launch."""
+    """Returns launches for ncu, one kernel each: a name, a function that prepares the launch, and the launch."""
     import torch
     from ops.case import BACKWARD
     from ops.networks import NETS, make_batch
@@ -225,20 +225,20 @@ def counted(device: str, n: int = 1 << 18) -> list[tuple[str, Run, Run]]:
     grid = voronerf.HashGrid(levels=8, features=2, log2_entries=19, base=16, finest=256)
     x = torch.rand(n, 3, device=where)
     table = torch.randn(grid.table_shape, device=where).requires_grad_()
-    found: list[tuple[str, Run, Run]] = []
+    launches: list[tuple[str, Run, Run]] = []
     kinds = (("w64d4", torch.bfloat16, True), ("nerf64", torch.bfloat16, False), ("w64d4", torch.float32, False))
     for name, precision, backward in kinds:
         batch = make_batch(NETS[name], n, 16, precision, BACKWARD, where)
         options = {"layers": batch.net, "directions": batch.directions, "direction_index": batch.direction_index}
-        given = batch.positions[0], batch.offsets, batch.weights, batch.biases
-        forward = functools.partial(voronerf.grouped_mlp, *given, **options, backend="native")
-        found += _pair(f"{name} {precision}".replace("torch.", ""), forward, batch.parameters, backward)
-    found += _pair("hash_encode", lambda: voronerf.hash_encode(x, table, grid, backend="native"), [table], True)
-    return found
+        arguments = batch.positions[0], batch.offsets, batch.weights, batch.biases
+        forward = functools.partial(voronerf.grouped_mlp, *arguments, **options, backend="native")
+        launches += _pair(f"{name} {precision}".replace("torch.", ""), forward, batch.parameters, backward)
+    launches += _pair("hash_encode", lambda: voronerf.hash_encode(x, table, grid, backend="native"), [table], True)
+    return launches
 
 
 def _pair(name: str, forward: Run, leaves: list[Any], backward: bool) -> list[tuple[str, Run, Run]]:
-    """A forward pass, and a backward pass behind another forward pass."""
+    """Returns the launches of a forward pass, and of a backward pass prepared by another forward pass."""
     import torch
 
     held = list[Any]()
@@ -253,8 +253,7 @@ def _pair(name: str, forward: Run, leaves: list[Any], backward: bool) -> list[tu
 
 
 def profile(scene: Any, device: str, seconds: float = 0.5, **small: Any) -> list[Case]:
-    """Launches of a step, the share of the time in which the device works, how often the host waits, and the kernels
-    that take longest: of the steps that are made in so many seconds."""
+    """Returns the case that profiles training: launches, device utilisation, host waits, and the slowest kernels."""
     kinds: dict[str, dict[str, Any]] = {"default": {}, "4,096 rays, bf16": {"rays": 4096, "precision": "bf16"}}
     return [
         Case("profile", name, functools.partial(_profile, scene, device, seconds, {**options, **small}), 30.0)
@@ -271,20 +270,20 @@ def _profile(scene: Any, device: str, seconds: float, options: dict[str, Any]) -
     from voronerf.nerf.schedule import WARMUP_STEPS
 
     cuda, settle = device == "cuda", settling(device)
-    given: dict[str, Any] = {"steps": 100_000, "cells": (16,), "split_at": (WARMUP_STEPS + 16,), "evaluations": 1}
-    state = build(TrainConfig(device=device, **{**given, **options}), scene)
+    settings: dict[str, Any] = {"steps": 100_000, "cells": (16,), "split_at": (WARMUP_STEPS + 16,), "evaluations": 1}
+    state = build(TrainConfig(device=device, **{**settings, **options}), scene)
 
     def more() -> tuple[float, int]:
-        """Seconds of a step, and the steps."""
+        """Trains on; returns the seconds of a step and the number of steps."""
         begin, before = time.perf_counter(), state.step
         train(state, until=state.seconds + seconds)
         settle()
         made = state.step - before
         return (time.perf_counter() - begin) / made, made
 
-    while state.step < (WARMUP_STEPS + 64 if cuda else 1):  # until the grid learns, and the cells are split
+    while state.step < (WARMUP_STEPS + 64 if cuda else 1):  # until the occupancy grid learns and the cells are split
         more()
-    each = more()[0]
+    seconds_a_step = more()[0]
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         torch.cuda.set_sync_debug_mode("warn")
@@ -293,7 +292,8 @@ def _profile(scene: Any, device: str, seconds: float, options: dict[str, Any]) -
         finally:
             torch.cuda.set_sync_debug_mode("default")
     activities = [ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]
-    # The profiler watches torch's operations in its own thread, where a step would run as it is; and all of the device.
+    # Steps run in a second thread: the profiler would make them run eagerly in its own thread, but sees the whole
+    # device.
     with profiled(activities=activities) as seen, ThreadPoolExecutor(1) as beside:
         steps = beside.submit(more).result()[1]
     times, counts = Counter[str](), Counter[str]()
@@ -302,13 +302,17 @@ def _profile(scene: Any, device: str, seconds: float, options: dict[str, Any]) -
             times[event.name] += event.device_time
             counts[event.name] += 1
     waits = sum("synchroniz" in str(warning.message) for warning in told) / watched
-    launches, busy = counts.total() / steps, sum(times.values()) / 1e6 / steps / each
-    said = f"{1e3 * each:.3f} ms, {launches:.1f} launches, {waits:.2f} waits, busy {100 * busy:.0f} %"
+    launches, busy = counts.total() / steps, sum(times.values()) / 1e6 / steps / seconds_a_step
+    said = f"{1e3 * seconds_a_step:.3f} ms, {launches:.1f} launches, {waits:.2f} waits, busy {100 * busy:.0f} %"
     how = state.training_step.explain()
     kernels = [
         {"name": name, "microseconds": spent / steps, "launches": counts[name] / steps}
         for name, spent in times.most_common()
     ]
-    found = {"seconds": each, "samples": state.rays * state.config.samples[0], "cells": state.router.num_cells}
+    found = {
+        "seconds": seconds_a_step,
+        "samples": state.rays * state.config.samples[0],
+        "cells": state.router.num_cells,
+    }
     found |= {"launches": launches, "waits": waits, "busy": busy, "kernels": kernels}
     return {**found, "explained": how, "said": f"{said}, {state.router.num_cells} cells, {how}"}

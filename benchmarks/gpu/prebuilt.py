@@ -1,11 +1,11 @@
-"""The extension without a compilation where time is short: its objects are compiled here and linked there.
+"""Prebuilds the extension: compiles its objects on one machine and links them on another, to save time there.
 
-    prebuilt.py make FOLDER [ARCHITECTURE]    every object but that of bindings.cpp, the only file that needs Python
-    prebuilt.py link FOLDER                   compiles bindings.cpp, links, and puts the module where it is imported
-    prebuilt.py try FOLDER                    links, looks whether the module loads, and leaves nothing
+    prebuilt.py make FOLDER [ARCHITECTURE]    compiles all objects but bindings.cpp, the only file that needs Python
+    prebuilt.py link FOLDER                   compiles bindings.cpp, links, and installs the module into the package
+    prebuilt.py try FOLDER                    links, checks that the module loads, and removes its files
 
-Both machines must be Linux on x86-64; the one that links needs a C++ compiler, nvcc, ninja and Python's headers, and a
-C library no older than the other's. It refuses objects of other sources or for another GPU.
+Both machines must run Linux on x86-64. The linking machine needs a C++ compiler, nvcc, ninja, Python's headers, and a C
+library at least as new as the compiling machine's. Linking refuses objects of other sources or for another GPU.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ OBJECT_OF_BINDINGS = "bindings.cpp.o"
 
 
 def main(arguments: list[str]) -> int:
-    """Make, link or try."""
+    """Parses the command line and runs make, link or try."""
     if len(arguments) not in (2, 3) or arguments[0] not in ("make", "link", "try"):
         print(__doc__)
         return 2
@@ -40,16 +40,16 @@ def main(arguments: list[str]) -> int:
         if arguments[0] == "link":
             build["put"](folder / module_name(), ROOT / "voronerf/ops/_core" / module_name())
         else:
-            for name in (OBJECT_OF_BINDINGS, module_name()):  # which would be carried
+            for name in (OBJECT_OF_BINDINGS, module_name()):  # not part of the portable folder
                 (folder / name).unlink()
     print(f"prebuilt: {done} in {time.perf_counter() - begin:.1f} s")
     return 0
 
 
 def make(build: dict[str, Any], folder: Path, architecture: str = "90") -> str:
-    """Compile the objects into a folder that can be carried."""
+    """Compiles the objects into a portable folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "made").unlink(missing_ok=True)  # should this be stopped
+    (folder / "made").unlink(missing_ok=True)  # marks the folder as incomplete
     text = prepare(build, folder, architecture)
     objects = [name for name in edges(text) if name.endswith(".o") and name != OBJECT_OF_BINDINGS]
     command = [*build["ninja"](), "-C", str(folder), "-j", os.environ.get("MAX_JOBS", "2"), *objects]
@@ -60,16 +60,16 @@ def make(build: dict[str, Any], folder: Path, architecture: str = "90") -> str:
 
 
 def link(build: dict[str, Any], folder: Path) -> str:
-    """Link the objects with bindings.cpp for this Python."""
+    """Links the objects with bindings.cpp for this Python."""
     if not (folder / "made").exists():
         raise SystemExit(f"prebuilt: FOLDER must hold what `prebuilt.py make` has left, got {folder}")
     architecture, sources = (folder / "made").read_text().split()
     if sources != digest():
-        raise SystemExit("prebuilt: the objects must be those of csrc and setup.py as they are, got older ones")
+        raise SystemExit("prebuilt: the objects must match csrc and setup.py, got objects of other sources")
     if (there := build["architectures_there"]()) and there != (architecture,):
         raise SystemExit(f"prebuilt: the objects must be for this GPU, sm_{there[0]}, got sm_{architecture}")
     text = prepare(build, folder, architecture)
-    # Objects that are there are sources to ninja: it knows nothing of how they are made.
+    # Without build edges, ninja treats the existing objects as sources.
     kept = [OBJECT_OF_BINDINGS, module_name()]
     lines = text.splitlines()
     rules = lines[: next(i for i, line in enumerate(lines) if line.startswith("build "))]
@@ -82,7 +82,7 @@ def link(build: dict[str, Any], folder: Path) -> str:
 
 
 def prepare(build: dict[str, Any], folder: Path, architecture: str) -> str:
-    """Write what setup.py generates, and return the text of its build.ninja."""
+    """Generates the files of setup.py; returns the text of its build.ninja."""
     os.environ.update(VORONERF_CUDA="1", VORONERF_CUDA_ARCHITECTURES=architecture)
     cuda = build["find_cuda"]()
     text = str(build["ninja_file"](Path(module_name()), cuda, folder))
@@ -96,28 +96,28 @@ def prepare(build: dict[str, Any], folder: Path, architecture: str) -> str:
 
 
 def edges(text: str) -> dict[str, list[str]]:
-    """The lines of each edge of a build.ninja, by what it makes."""
-    found: dict[str, list[str]] = {}
+    """Returns the lines of each edge of a build.ninja, by its output."""
+    edges_by_output: dict[str, list[str]] = {}
     for line in text.splitlines():
         if line.startswith("build "):
-            last = found[line.split()[1].rstrip(":")] = [line]
-        elif found and line.startswith("  "):
+            last = edges_by_output[line.split()[1].rstrip(":")] = [line]
+        elif edges_by_output and line.startswith("  "):
             last.append(line)
-    return found
+    return edges_by_output
 
 
 def module_name() -> str:
-    """File of the extension for this Python."""
+    """Returns the file name of the extension for this Python."""
     return f"_C{sysconfig.get_config_var('EXT_SUFFIX')}"
 
 
 def digest() -> str:
-    """Checksum of everything that the objects are made from."""
+    """Returns a checksum of all sources of the objects."""
     paths = [*sorted(path for path in (ROOT / "csrc").rglob("*") if path.is_file()), ROOT / "setup.py"]
-    found = 0
+    checksum = 0
     for path in paths:
-        found = zlib.crc32(path.relative_to(ROOT).as_posix().encode() + path.read_bytes(), found)
-    return f"{found:08x}"
+        checksum = zlib.crc32(path.relative_to(ROOT).as_posix().encode() + path.read_bytes(), checksum)
+    return f"{checksum:08x}"
 
 
 if __name__ == "__main__":

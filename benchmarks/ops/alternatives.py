@@ -1,8 +1,8 @@
 """Alternatives to grouped_mlp and grouped_linear, each at its best setting.
 
-Samples are sorted by cell, and the alternatives get encoded inputs for free, while grouped_mlp encodes
-inside. Every call of each returns its output as one new tensor, through which training goes. n samples, k cells, i
-inputs and o outputs of a layer.
+Samples are sorted by cell. The alternatives get encoded inputs, whose encoding is not timed, while grouped_mlp encodes
+inside. Every call returns its output as one new tensor with a gradient. n samples, k cells, i inputs and o outputs of a
+layer.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
 
 PIECE = 4096
-"""Rows of a piece whose activations stay in cache."""
+"""Rows of a piece, small enough for its activations to stay in cache."""
 MOST_BYTES = 3 << 30
-"""Memory that padding may take."""
+"""The largest memory in bytes that padding may take."""
 
 Linear = Callable[[Tensor, Any, Any, str], Tensor]
 
 
 class Encoded:
-    """Encoded inputs of two sets of samples, in a dtype: large, so made once for all alternatives that share it."""
+    """The encoded inputs of two sets of samples in a dtype, shared by alternatives because they are large."""
 
     def __init__(self, batch: Batch, dtype: torch.dtype) -> None:
         sets = batch.positions[:2]
@@ -42,13 +42,13 @@ class Encoded:
 
 
 def encoded(x: Tensor, net: MLP, source: str) -> Tensor:
-    """Positions or directions as a layer table encodes them."""
+    """Encodes positions or directions as the layer table prescribes."""
     encoding = net.encoding(source)
     return x if encoding is None else ENCODINGS[encoding[0]].formula(x, encoding[1])
 
 
 def evaluate(net: MLP, x: Any, d: Any, weights: Sequence[Any], biases: Sequence[Any], linear: Linear) -> list[Any]:
-    """Results of the output layers, by whichever product."""
+    """Returns the results of the output layers; ``linear`` computes each layer."""
     results: list[Any] = []
     for layer, weight, bias in zip(net.layers, weights, biases):
         sources = [x if s == POSITIONS else d if s == DIRECTIONS else results[s] for s in layer.inputs]
@@ -58,7 +58,7 @@ def evaluate(net: MLP, x: Any, d: Any, weights: Sequence[Any], biases: Sequence[
 
 
 def torch_linear(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
-    """addmm and ReLU in place; the gradient needs no more."""
+    """Computes a linear layer with ReLU in place; the gradient needs only the ReLU's output."""
     y = F.linear(x, weight, bias)
     return y.relu_() if activation == "relu" else y
 
@@ -68,7 +68,7 @@ def join(parts: list[Tensor]) -> Tensor:
 
 
 def row_pieces(bounds: Sequence[int], piece: int | None) -> Iterator[tuple[int, int, int]]:
-    """(cell, first row, last row), cells without rows left out."""
+    """Yields (cell, first row, row after the last) of each piece; empty cells have no pieces."""
     for cell, (start, stop) in enumerate(itertools.pairwise(bounds)):
         step = piece or max(stop - start, 1)
         for first in range(start, stop, step):
@@ -76,9 +76,9 @@ def row_pieces(bounds: Sequence[int], piece: int | None) -> Iterator[tuple[int, 
 
 
 def loop(batch: Batch, encoded: Encoded, *, piece: int | None = None, stacked: bool = False) -> Contender:
-    """A loop over cells, each a plain torch network.
+    """Returns a loop over cells, each a plain torch network.
 
-    Parameters of a cell are leaves of their own unless ``stacked``: gradients then need no stacking.
+    Each cell's parameters are separate leaf tensors, unless ``stacked``: then one leaf has the parameters of all cells.
     """
     dtype, net = encoded.positions[0].dtype, batch.net
     parts = [tensor.detach().to(dtype) for tensor in batch.parameters]
@@ -113,8 +113,8 @@ def loop(batch: Batch, encoded: Encoded, *, piece: int | None = None, stacked: b
         return out, torch.autograd.grad(out, leaves, batch.gradient(call).to(dtype), allow_unused=True)
 
     def adapt(result: tuple[Tensor, tuple[Tensor | None, ...]]) -> tuple[Tensor, list[Tensor]]:
-        out, found = result
-        full = [torch.zeros_like(leaf) if one is None else one for leaf, one in zip(leaves, found)]
+        out, gradients = result
+        full = [torch.zeros_like(leaf) if one is None else one for leaf, one in zip(leaves, gradients)]
         if not stacked:
             full = [torch.stack(full[at : at + batch.k]) for at in range(0, len(full), batch.k)]
         return out, full
@@ -123,7 +123,7 @@ def loop(batch: Batch, encoded: Encoded, *, piece: int | None = None, stacked: b
 
 
 def compile_now(run: Callable[[], Any]) -> None:
-    """Compiles outside of the timing; a compiler that fails is a reason, not an error of the benchmark."""
+    """Compiles outside the timing; raises NotApplicable if the compiler fails."""
     try:
         run()
     except Exception as error:
@@ -132,7 +132,7 @@ def compile_now(run: Callable[[], Any]) -> None:
 
 
 def padded_bmm(batch: Batch, encoded: Encoded) -> Contender:
-    """All cells padded to the rows of the largest, then one batched product a layer."""
+    """Returns a way that pads all cells to the rows of the largest and runs one batched product per layer."""
     net, bounds, dtype = batch.net, torch.tensor(batch.bounds), encoded.positions[0].dtype
     most, device = int(bounds.diff().max()), batch.positions[0].device
     kept = sum(layer.width for layer in net.layers) * (2 if batch.direction == BACKWARD else 0)
@@ -177,10 +177,10 @@ def _finish(batch: Batch, forward: Callable[[int], Tensor], leaves: list[Tensor]
 
 
 def grouped_mm(batch: Batch, encoded: Encoded) -> Contender:
-    """torch's own grouped product.
+    """Returns a way by torch's grouped product.
 
-    It takes no bias and rows of multiples of 16 bytes: every source carries a column of ones, whose weights are the
-    bias, and zeros up to a multiple of eight.
+    ``F.grouped_mm`` takes no bias and needs rows of multiples of 16 bytes. Every source has an additional column of
+    ones, whose weights are the bias, and is zero-padded to a multiple of eight columns.
     """
     net, dtype = batch.net, encoded.positions[0].dtype
     if not hasattr(F, "grouped_mm"):
@@ -229,7 +229,7 @@ def _with_one(x: Tensor) -> Tensor:
 
 
 def onednn(batch: Batch, encoded: Encoded, *, piece: int | None = None) -> Contender:
-    """A loop over cells of the private op behind torch.compile's linear layers: prepacked weights, ReLU inside."""
+    """Returns a loop over cells with oneDNN's linear op, as torch.compile uses it: prepacked weights, fused ReLU."""
     if batch.direction == BACKWARD:
         raise NotApplicable("the op has no gradient")
     if batch.positions[0].device.type != "cpu":
@@ -263,37 +263,37 @@ def onednn(batch: Batch, encoded: Encoded, *, piece: int | None = None) -> Conte
 
 
 def alternatives(batch: Batch) -> dict[str, Callable[[], Contender]]:
-    """Everything above that makes sense for a batch; bfloat16 competes with float32 as well."""
-    made: dict[torch.dtype, Encoded] = {}
+    """Returns the applicable alternatives for a batch, by name; bfloat16 competes with float32 as well."""
+    inputs: dict[torch.dtype, Encoded] = {}
 
     def encoded(dtype: torch.dtype) -> Encoded:
-        if dtype not in made:
-            made[dtype] = Encoded(batch, dtype)
-        return made[dtype]
+        if dtype not in inputs:
+            inputs[dtype] = Encoded(batch, dtype)
+        return inputs[dtype]
 
     def own() -> Encoded:
         return encoded(batch.dtype)
 
-    found: dict[str, Callable[[], Contender]] = {
+    contenders: dict[str, Callable[[], Contender]] = {
         "torch loop": lambda: loop(batch, own()),
         f"torch loop, {PIECE} rows": lambda: loop(batch, own(), piece=PIECE),
     }
     if batch.dtype != torch.float32:
-        found["torch loop, float32"] = lambda: loop(batch, encoded(torch.float32))
-        found[f"torch loop, {PIECE} rows, float32"] = lambda: loop(batch, encoded(torch.float32), piece=PIECE)
+        contenders["torch loop, float32"] = lambda: loop(batch, encoded(torch.float32))
+        contenders[f"torch loop, {PIECE} rows, float32"] = lambda: loop(batch, encoded(torch.float32), piece=PIECE)
     if batch.direction == BACKWARD and batch.k > 1:
-        found["torch loop, stacked"] = lambda: loop(batch, own(), stacked=True)
+        contenders["torch loop, stacked"] = lambda: loop(batch, own(), stacked=True)
     if batch.k > 1:
-        found["padded bmm"] = lambda: padded_bmm(batch, own())
-        found["F.grouped_mm"] = lambda: grouped_mm(batch, own())
+        contenders["padded bmm"] = lambda: padded_bmm(batch, own())
+        contenders["F.grouped_mm"] = lambda: grouped_mm(batch, own())
     if batch.direction != BACKWARD:
-        found["oneDNN"] = lambda: onednn(batch, own())
-        found[f"oneDNN, {PIECE} rows"] = lambda: onednn(batch, own(), piece=PIECE)
-    return found
+        contenders["oneDNN"] = lambda: onednn(batch, own())
+        contenders[f"oneDNN, {PIECE} rows"] = lambda: onednn(batch, own(), piece=PIECE)
+    return contenders
 
 
 def ours(batch: Batch, backend: str) -> Contender:
-    """grouped_mlp, or grouped_linear for a single layer without encoding, on one of its backends."""
+    """Returns grouped_mlp on a backend, or grouped_linear for a single layer without encoding."""
     single = len(batch.net.layers) == 1 and batch.net.position_octaves is None
 
     def forward(call: int) -> Tensor:

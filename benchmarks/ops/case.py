@@ -1,6 +1,6 @@
-"""One row of the throughput table before it is measured: what runs, against what, and how results are checked.
+"""A row of the throughput table: its contenders and the check of their results.
 
-n samples, k cells. A case is cheap to make; its inputs and contenders are made when it is built.
+n samples, k cells. A case is cheap to construct; ``Case.build`` makes its inputs and contenders.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from torch import Tensor
 
 FORWARD, BACKWARD = "forward", "forward+backward"
 ROTATED_BYTES = 1 << 26
-"""Inputs of consecutive calls differ until they take this much, more than the caches of most processors."""
+"""The total bytes of the input sets that consecutive calls take in turn, more than most processors' caches."""
 
 
 class NotApplicable(Exception):
-    """An alternative cannot do this case; the message says why in one line."""
+    """Raised when an alternative cannot compute a case; the message gives the reason in one line."""
 
 
 @dataclass
@@ -28,8 +28,8 @@ class Contender:
     """A way to compute a case's result.
 
     Attributes:
-        run: call number -> result.
-        adapt: result -> what ``Work.error`` compares, if that is not the result itself.
+        run: A function call number -> result.
+        adapt: A function result -> value for ``Work.error``. Default: the result itself.
     """
 
     run: Run
@@ -41,15 +41,15 @@ class Work:
     """A case that is ready to run.
 
     Attributes:
-        ours: backend -> contender.
-        alternatives: name -> what sets it up, which may raise ``NotApplicable``.
-        error: result of call 0 -> largest error against float64: relative to the largest entry for floats, the number
-            of wrong ones for integers.
-        tolerance: largest error of an alternative that counts as correct.
-        amount: operations, or bytes read and written, of a call at the least; samples where there is no bound.
-        bound: which limit of the machine the amount is compared with: "float32", "bfloat16" or "copy"; "" for none.
-        executed: operations of a call with what is computed again, where that is more than ``amount``.
-        moved: bytes read and written at the least, where ``amount`` counts operations and both may be the limit.
+        ours: A function backend -> contender.
+        alternatives: Functions that set up alternatives, by name; each may raise ``NotApplicable``.
+        error: A function result of call 0 -> largest error against float64: relative to the largest entry for floats,
+            the number of wrong entries for integers.
+        tolerance: The largest error of an alternative that counts as correct.
+        amount: The least operations, or bytes read and written, of a call; samples if ``bound`` is empty.
+        bound: The peak rate that the amount is compared with: "float32", "bfloat16" or "copy"; "" for none.
+        executed: The operations of a call including recomputation, if more than ``amount``.
+        moved: The least bytes read and written, if ``amount`` counts operations and memory may be the limit too.
     """
 
     ours: Callable[[str], Contender]
@@ -64,22 +64,22 @@ class Work:
 
 @dataclass(frozen=True)
 class Case:
-    """A row of the table, for each of its backends.
+    """A case of the table, with one row for each of its backends.
 
     Attributes:
-        op: the operation.
-        case: what identifies the row among those of the op, dtype and direction.
-        dtype: of the parameters (of the points, where there are none).
+        op: The operation.
+        case: The name, unique among cases of the same op, dtype and direction.
+        dtype: The type of the parameters, or of the points if there are no parameters.
         direction: ``FORWARD`` or ``BACKWARD``.
-        n: samples.
-        k: cells; None where there are none.
-        build: makes inputs and contenders, on a device.
-        backends: whose rows there are; those that cannot run are reported and left out.
-        quick: part of --quick.
-        isa: instruction set forced on the native backend; None is the best one.
-        threads: of the row; None leaves the process's own number. A row of one thread is timed by its CPU time, which
+        n: The number of samples.
+        k: The number of cells; None if there are none.
+        build: A function that makes inputs and contenders on a device.
+        backends: The backends of the rows; backends that cannot run are reported and omitted.
+        quick: Whether --quick includes the case.
+        isa: The instruction set of the native backend; None selects the best one.
+        threads: The number of threads; None keeps the process's number. A row of one thread is timed by CPU time, which
             other processes disturb less.
-        needs: the op whose backends the row has; empty for ``op`` itself.
+        needs: The op that determines the available backends; empty for ``op`` itself.
     """
 
     op: str
@@ -97,7 +97,7 @@ class Case:
 
     @property
     def key(self) -> str:
-        """What --filter is matched with."""
+        """The text that --filter is matched with."""
         return f"{self.op}/{self.case}/{dtype_name(self.dtype)}/{self.direction}"
 
 
@@ -106,7 +106,7 @@ def dtype_name(dtype: torch.dtype) -> str:
 
 
 def optional(name: str) -> Any:
-    """An installed package, or ``NotApplicable``."""
+    """Imports an optional package; raises ``NotApplicable`` if the import fails."""
     try:
         return importlib.import_module(name)
     except Exception as error:
@@ -115,12 +115,12 @@ def optional(name: str) -> Any:
 
 
 def rotation(tensor_bytes: int) -> int:
-    """Number of input sets of this size, at most 64; small inputs are in a cache in real use as well."""
+    """Returns the number of input sets of this size, at most 64; small inputs are in cache in real use as well."""
     return min(max(ROTATED_BYTES // max(tensor_bytes, 1), 2), 64)
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Largest difference over the largest expected entry; inf where something is not finite."""
+    """Returns the largest difference over the largest expected entry; inf for other shapes or NaN."""
     if found.shape != expected.shape:
         return float("inf")
     if expected.numel() == 0:
@@ -135,5 +135,5 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def uniform_points(n: int, seed: int, device: torch.device, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Points [n, 3] spread evenly over the cube from -1 to 1."""
+    """Draws points [n, 3] uniformly from the cube from -1 to 1."""
     return (torch.rand(n, 3, generator=generator(seed), dtype=dtype) * 2 - 1).to(device)

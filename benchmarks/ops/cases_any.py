@@ -1,4 +1,4 @@
-"""A row for every operation that no other table has: calls of its own case, with the alternatives that it names."""
+"""Cases of all remaining operations, from their declarations in ``voronerf.ops._core.cases``."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ ROWS = 1 << 14
 
 
 def cases(others: list[Case]) -> list[Case]:
-    """Rows of the operations that have none among the others."""
+    """Returns the cases of operations that ``others`` does not cover."""
     covered = {case.op for case in others}
     missing = {op: case for op, case in of_ops.cases().items() if case.comparable and op not in covered}
-    found = []
+    rows = []
     for op, case in missing.items():
         for direction in (FORWARD, BACKWARD) if case.differentiable else (FORWARD,):
             work = functools.partial(_work, op, direction)
             quick = direction == FORWARD
-            found.append(Case(op, f"n={ROWS}", torch.float32, direction, ROWS, None, work, backends.BACKENDS, quick))
-    return found
+            rows.append(Case(op, f"n={ROWS}", torch.float32, direction, ROWS, None, work, backends.BACKENDS, quick))
+    return rows
 
 
 def _work(op: str, direction: str, device: torch.device) -> Work:
@@ -39,11 +39,11 @@ def _work(op: str, direction: str, device: torch.device) -> Work:
     def ready(tensor: Tensor) -> Tensor:
         return tensor.to(device).requires_grad_(backward and tensor.is_floating_point())
 
-    given = tree_map_only(Tensor, ready, case.make(Draw(), ROWS))
-    leaves = [leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.requires_grad]
+    arguments = tree_map_only(Tensor, ready, case.make(Draw(), ROWS))
+    leaves = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.requires_grad]
 
     def run(backend: str, call: int) -> list[Tensor]:
-        own = tree_map_only(Tensor, Tensor.clone, given) if case.in_place else given
+        own = tree_map_only(Tensor, Tensor.clone, arguments) if case.in_place else arguments
         out = getattr(ops, case.call or op)(**own, backend=backend)
         found = [part for part in tree_leaves(own if case.in_place else out) if isinstance(part, Tensor)]
         if backward:
@@ -59,7 +59,7 @@ def _work(op: str, direction: str, device: torch.device) -> Work:
         )
 
     def alternative(function: Any) -> Contender:
-        return Contender(lambda call: function(**given), lambda result: [result])
+        return Contender(lambda call: function(**arguments), lambda result: [result])
 
     alternatives = {
         name: functools.partial(alternative, function) for name, function in case.alternatives.items() if not backward

@@ -1,9 +1,9 @@
 """Cases of VoronoiRouter around fields of other codebases (``foreign_fields.py``). n samples, k cells.
 
-A row's own time is that of the router as it comes, without ``fuse``. Beside it: the router with ``fuse=True``, which
-takes the fastest way, and with ``way="fused"``; the loop over boolean masks with a module for each cell; and one module
-for all samples. The loop over masks is also what results and gradients are compared with. The lookup of the cells is
-given to the loop as the library's own.
+A row's main time is the default router's, without ``fuse``. Its alternatives are the router with ``fuse=True``, which
+chooses the fastest way; the router with ``way="fused"``; the loop over boolean masks with a module per cell; and one
+module for all samples. Results and gradients are compared with the loop over masks. The loop also uses the library's
+cell lookup.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from voronerf import VoronoiRouter, ops
 Arguments = tuple[Tensor, ...]
 Call = Callable[..., Tensor]
 TOLERANCE = 1e-2
-"""Largest error against the loop over masks: units of ReLU that rounding turns change gradients by some per mille."""
+"""Largest error against the loop over masks. ReLU units that rounding switches change gradients by some per mille."""
 SMALL, MIDDLE, LARGE = 1 << 10, 1 << 16, 1 << 18
 
 
 def positions(x: Tensor) -> Arguments:
-    """The positions alone."""
+    """Returns the positions alone."""
     return (x,)
 
 
 def encoded(x: Tensor) -> Arguments:
-    """Encoded positions and directions side by side, as nerf-pytorch gives them to its network."""
+    """Returns encoded positions and directions, concatenated as nerf-pytorch does."""
     return (torch.cat([fields.frequencies(x, 10), fields.frequencies(_directions(x), 4)], -1),)
 
 
 def encoded_and_image(x: Tensor) -> Arguments:
-    """Likewise, and the number of the image that a sample belongs to."""
+    """Returns encoded positions and directions, and the image number of each sample."""
     return (*encoded(x), torch.arange(x.shape[0]).div(64, rounding_mode="floor") % 100)
 
 
 def with_directions(x: Tensor) -> Arguments:
-    """Positions and directions."""
+    """Returns positions and directions."""
     return x, _directions(x)
 
 
@@ -54,12 +54,12 @@ def _directions(x: Tensor) -> Tensor:
 
 
 def values(call: Call, arguments: Arguments) -> list[Tensor]:
-    """What the field returns."""
+    """Evaluates the field."""
     return [call(*arguments)]
 
 
 def normals(call: Call, arguments: Arguments) -> list[Tensor]:
-    """Signed distances and their gradients, of which an eikonal loss is made."""
+    """Returns signed distances and their gradients, the inputs of an eikonal loss."""
     x = arguments[0].detach().requires_grad_()
     with torch.enable_grad():
         distance = call(x)
@@ -68,7 +68,7 @@ def normals(call: Call, arguments: Arguments) -> list[Tensor]:
 
 
 def laplacian(call: Call, arguments: Arguments) -> list[Tensor]:
-    """The Laplacian of the first output."""
+    """Returns the Laplacian of the first output."""
     x = arguments[0].detach().requires_grad_()
     with torch.enable_grad():
         (slope,) = torch.autograd.grad(call(x)[:, 0].sum(), x, create_graph=True)
@@ -78,15 +78,15 @@ def laplacian(call: Call, arguments: Arguments) -> list[Tensor]:
 
 @dataclass(frozen=True)
 class Field:
-    """A field with what its rows need.
+    """A field and the settings of its rows.
 
     Attributes:
-        make: a new module.
-        arguments: positions [n, 3] -> arguments of its forward.
-        evaluate: what is computed of a call.
-        most: largest number of samples; second derivatives and splines keep several GiB beyond.
-        most_cells: largest number of cells; larger tables would not fit.
-        share: names of the parameters of its ``encode``, which all cells have in common; its ``decode`` is the rest.
+        make: A function that makes a new module.
+        arguments: A function positions [n, 3] -> arguments of the module's forward.
+        evaluate: A function of the module and its arguments that returns the compared results.
+        most: The largest number of samples; more samples of second derivatives and splines would take several GiB.
+        most_cells: The largest number of cells; tables of more cells would not fit into memory.
+        share: Names of the parameters of ``encode``, shared by all cells; ``decode`` has the other parameters.
     """
 
     make: Callable[[], nn.Module]
@@ -134,8 +134,8 @@ FIELDS = {
 
 
 def cases() -> list[Case]:
-    """One row for each field, number of samples and cells, direction and number of threads."""
-    found = []
+    """Returns a case for each field, number of samples and cells, direction and number of threads."""
+    rows = []
     for name, field in FIELDS.items():
         for n in (SMALL, MIDDLE, LARGE):
             for k in (16, 256):
@@ -147,7 +147,7 @@ def cases() -> list[Case]:
                         quick = (n, k, direction, threads) == (SMALL, 16, BACKWARD, 1)
                         label = f"{name} n={n} k={k} threads={threads}"
                         needs, dtype = "grouped_linear", torch.float32
-                        found.append(
+                        rows.append(
                             Case(
                                 "foreign",
                                 label,
@@ -161,11 +161,11 @@ def cases() -> list[Case]:
                                 needs=needs,
                             )
                         )
-    return found
+    return rows
 
 
 def _sharing(module: nn.Module, first: nn.Module, names: set[str]) -> nn.Module:
-    """A module that has some of its parameters in common with the first."""
+    """Replaces the named parameters of a module by those parameters of the first module."""
     for name in names:
         path, _, last = name.rpartition(".")
         module.get_submodule(path).register_parameter(last, first.get_parameter(name))
@@ -173,13 +173,13 @@ def _sharing(module: nn.Module, first: nn.Module, names: set[str]) -> nn.Module:
 
 
 class Batch:
-    """Modules, samples and gradients of a case, and what the loop over masks makes of the first samples.
+    """Modules, samples and gradients of a case, and the result of the loop over masks for the first samples.
 
     Args:
-        field: whose rows.
-        n: samples.
-        k: cells.
-        direction: forward, or with backward.
+        field: The field.
+        n: The number of samples.
+        k: The number of cells.
+        direction: ``FORWARD`` or ``BACKWARD``.
     """
 
     def __init__(self, field: Field, n: int, k: int, direction: str) -> None:
@@ -200,7 +200,7 @@ class Batch:
         self.expected: list[Tensor] = []
 
     def step(self, call: Call, parameters: Sequence[Tensor], number: int) -> list[Tensor]:
-        """Results of a call, and with gradients those of the parameters."""
+        """Returns the results of a call and, with backward, the gradients of the parameters."""
         arguments = self.arguments[number % 2]
         if not self.training:
             with torch.no_grad():
@@ -215,7 +215,7 @@ class Batch:
         ]
 
     def stacked(self, found: list[Tensor]) -> list[Tensor]:
-        """Results and gradients of leaves of each cell -> results and gradients [k, ...]."""
+        """Returns results and gradients with the gradients of all cells stacked to [k, ...]."""
         if not self.training:
             return found
         counts = [len(leaves) for leaves in self.leaves]
@@ -225,9 +225,9 @@ class Batch:
         return [*results, *[part[0] if len(part) < self.k else torch.stack(part) for part in parts]]
 
     def masks(self, encoded: bool = False) -> Contender:
-        """The loop that one would write: each cell's module on its samples, results put back where they belong.
+        """Returns the usual loop over masks: each cell's module runs on its samples, whose results are scattered back.
 
-        Where cells share their encoding, it can also be computed before the loop, for all samples at once.
+        ``encoded`` computes an encoding that cells share before the loop, for all samples at once.
         """
         parameters = [leaf for leaves in self.leaves for leaf in leaves]
         calls: Sequence[Call] = self.modules
@@ -252,7 +252,7 @@ class Batch:
         return Contender(lambda number: self.step(call, parameters, number), self.stacked)
 
     def routed(self, **options: Any) -> Contender:
-        """The router."""
+        """Returns the router."""
         router = VoronoiRouter.from_modules(
             self.modules, self.centres, coords="first3", share=self.field.share, **options
         )
@@ -260,13 +260,13 @@ class Batch:
         return Contender(lambda number: self.step(router, parameters, number))
 
     def single(self) -> Contender:
-        """One module without cells, which computes something else: only its time counts."""
+        """Returns a single module without cells; its results differ, so only its time counts."""
         module = self.modules[0]
         parameters = list(module.parameters())
         return Contender(lambda number: self.step(module, parameters, number), lambda _: [])
 
     def error(self, found: list[Tensor]) -> float:
-        """Largest difference from the loop over masks, relative to the largest entry of each tensor."""
+        """Returns the largest difference from the loop over masks, relative to the largest entry of each tensor."""
         if not self.expected:
             contender = self.masks()
             self.expected = contender.adapt(contender.run(0))
@@ -274,10 +274,10 @@ class Batch:
 
 
 def foreign_work(field: Field, n: int, k: int, direction: str, device: torch.device) -> Work:
-    """The case of a field.
+    """Builds the case of a field.
 
     Raises:
-        NotApplicable: on another device than the CPU.
+        NotApplicable: The device is not the CPU.
     """
     if device.type != "cpu":
         raise NotApplicable("measured on the CPU")

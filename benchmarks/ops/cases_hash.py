@@ -1,5 +1,7 @@
-"""Cases of hash_encode, and of a network behind it. n samples along rays, k cells, L levels, e entries of all levels, f
-features of a level."""
+"""Cases of hash_encode, and of a network on top of it.
+
+n samples along rays, k cells, L levels, e entries of all levels, f features of a level.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from voronerf import MLP, HashGrid, Layer
 from voronerf.ops import hash_encode, nearest_centre, routed_mlp, spherical_harmonics
 
 SAMPLES = 64
-"""Of a ray."""
+"""Samples of a ray."""
 CELLS = 16
 PRIMES = (1, 2654435761, 805459861)
 
@@ -26,13 +28,13 @@ Network = Callable[..., Tensor]
 
 
 def cases() -> list[Case]:
-    """Rows on one thread; backwards to tables and weights, as in training."""
-    found = []
+    """Returns the cases, all on one thread; backward computes the gradients of tables and weights, as in training."""
+    rows = []
     for n in (1 << 16, 1 << 18):
         for direction in (FORWARD, BACKWARD):
             work = functools.partial(network_work, n, direction)
             name, quick = f"hash + MLP n={n}", (n, direction) == (1 << 16, FORWARD)
-            found.append(Case("routed_mlp", name, torch.float32, direction, n, CELLS, work, quick=quick, threads=1))
+            rows.append(Case("routed_mlp", name, torch.float32, direction, n, CELLS, work, quick=quick, threads=1))
     for n, log2_entries in ((1 << 16, 15), (1 << 18, 15), (1 << 16, 19)):
         for direction in (FORWARD, BACKWARD):
             name = f"8 x 2^{log2_entries} x 2 n={n}"
@@ -40,12 +42,12 @@ def cases() -> list[Case]:
             work = functools.partial(hash_work, n, log2_entries, direction, base)
             shown = ("native", "reference") if base else ("native",)
             quick = base and direction == FORWARD
-            found.append(Case("hash_encode", name, torch.float32, direction, n, None, work, shown, quick, threads=1))
-    return found
+            rows.append(Case("hash_encode", name, torch.float32, direction, n, None, work, shown, quick, threads=1))
+    return rows
 
 
 def _samples(n: int, seed: int, device: torch.device) -> Tensor:
-    """Positions [n, 3] ray by ray, in their order along it, in the unit cube."""
+    """Draws positions [n, 3] in the unit cube: ray by ray, sorted along each ray."""
     draw = generator(seed)
     begin, end = torch.rand(2, n // SAMPLES, 1, 3, generator=draw)
     depths = (torch.arange(SAMPLES)[:, None] + torch.rand(n // SAMPLES, SAMPLES, 1, generator=draw)) / SAMPLES
@@ -53,7 +55,7 @@ def _samples(n: int, seed: int, device: torch.device) -> Tensor:
 
 
 def _corners(x: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
-    """Entries [n, L, 8] of the corners, and their weights."""
+    """Returns the table entries [n, L, 8] of the corners, and their weights."""
     scale, shift, side, entries, offset, hashed = (x.new_tensor(column) for column in zip(*grid.rows))
     where = x[:, None, :] * scale[:, None] + shift[:, None]
     steps = torch.tensor([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)], device=x.device)
@@ -80,7 +82,7 @@ def _by_embedding_bag(x: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
 
 
 def hash_work(n: int, log2_entries: int, direction: str, compiled: bool, device: torch.device) -> Work:
-    """Eight levels of two features; compiled: also beside torch.compile."""
+    """Builds a case with eight levels of two features; ``compiled`` adds torch.compile as an alternative."""
     grid = HashGrid(levels=8, features=2, log2_entries=log2_entries, base=16, finest=256)
     count = rotation(n * 4 * (3 + grid.out_features))
     sets = [_samples(n, seed, device) for seed in range(count)]
@@ -108,7 +110,7 @@ def hash_work(n: int, log2_entries: int, direction: str, compiled: bool, device:
     def error(found: Any) -> float:
         return max(relative_error(a, b) for a, b in zip(found, exact(), strict=True))
 
-    # At the least: positions and features once each way, the table once, and its gradient once.
+    # Least bytes: read positions and the table, write features; backward the same, and the table's gradient.
     amount = float(n) * 4 * (3 + grid.out_features) + table.nbytes
     if direction == BACKWARD:
         amount += float(n) * 4 * (3 + grid.out_features) + table.nbytes
@@ -135,11 +137,11 @@ HIDDEN = (
     Layer((1, "directions"), 32, "relu"),
     Layer((3,), 3),
 )
-"""The density from 16 features, and the colour from these and the direction."""
+"""Layers of a network: the density from 16 features, and the colour from the features and the direction."""
 
 
 def network_work(n: int, direction: str, device: torch.device) -> Work:
-    """A hash grid of all cells, harmonics of the directions, and a small network for each cell."""
+    """Builds a case with one hash grid for all cells, harmonics of the directions, and a small network per cell."""
     grid, draw = HashGrid(levels=8, features=2, log2_entries=15, base=16, finest=256), generator(9)
     inside = MLP(HIDDEN, (4, 2), None, None, "hash", grid, "spherical", 4)
     behind = MLP(HIDDEN, (4, 2))
@@ -159,20 +161,20 @@ def network_work(n: int, direction: str, device: torch.device) -> Work:
         leaves = [parameter.to(dtype).requires_grad_(direction == BACKWARD) for parameter in parameters]
         own = leaves[0], leaves[1 : len(shapes) + 1], leaves[len(shapes) + 1 :]
         out = network(sets[call % count].to(dtype), rays.to(dtype), cells[call % count], *own)
-        out = out.to(dtype)  # from autocast's type
+        out = out.to(dtype)  # autocast may return another type
         return [out] if direction == FORWARD else [out, *torch.autograd.grad(out, leaves, gradient.to(dtype))]
 
     def fused(backend: str) -> Network:
         def network(x: Tensor, seen: Tensor, owners: Tensor, table: Tensor, *own: list[Tensor]) -> Tensor:
-            given: dict[str, Any] = {"layers": inside, "features": table, "direction_index": index}
-            return routed_mlp(x, *own, directions=seen, cells=owners, backend=backend, **given)[0]
+            options: dict[str, Any] = {"layers": inside, "features": table, "direction_index": index}
+            return routed_mlp(x, *own, directions=seen, cells=owners, backend=backend, **options)[0]
 
         return network
 
     def separate(x: Tensor, seen: Tensor, owners: Tensor, table: Tensor, *own: list[Tensor]) -> Tensor:
         x, seen = hash_encode(x, table, grid, backend="native"), spherical_harmonics(seen, 4, backend="native")
-        given: dict[str, Any] = {"layers": behind, "direction_index": index, "backend": "native"}
-        return routed_mlp(x, *own, directions=seen, cells=owners, **given)[0]
+        options: dict[str, Any] = {"layers": behind, "direction_index": index, "backend": "native"}
+        return routed_mlp(x, *own, directions=seen, cells=owners, **options)[0]
 
     @functools.cache
     def exact() -> list[Tensor]:
@@ -182,7 +184,7 @@ def network_work(n: int, direction: str, device: torch.device) -> Work:
         return max(relative_error(a, b) for a, b in zip(found, exact(), strict=True))
 
     operations = 2.0 * n * sum(o * i for o, i in shapes) * (1 if direction == FORWARD else 3)
-    # At the least: positions, indices, cells and outputs, and the table; backward those again, and the features twice.
+    # Least bytes: positions, indices, cells, outputs and the table; backward again all of them, and the features twice.
     moved = n * 4.0 * (3 + 1 + 1 + 4) + parameters[0].nbytes
     if direction == BACKWARD:
         moved = 2 * moved + n * 4.0 * 2 * grid.out_features
@@ -190,7 +192,7 @@ def network_work(n: int, direction: str, device: torch.device) -> Work:
         lambda backend: Contender(functools.partial(results, network=fused(backend))),
         {"native, encoded before": lambda: Contender(functools.partial(results, network=separate))},
         error,
-        3e-2,  # a ReLU within rounding of its kink may go either way
+        3e-2,  # rounding may switch a ReLU near its kink
         operations,
         "float32",
         moved=moved,

@@ -16,43 +16,43 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.voronoi import MANY_CELLS
 
 CHUNK = 1 << 19
-"""Distances that torch and numpy hold at a time: 2 MiB, what makes them fastest."""
+"""Distances that torch and numpy compute at a time: 2 MiB, the fastest size."""
 CHECKED = 1 << 14
-"""Points whose answer is compared with float64."""
+"""The number of points whose result is compared with float64."""
 PAIRS = 1 << 25
-"""Distances at most by which answers are checked in float64."""
+"""The largest number of distances of a check in float64."""
 FEW = 4096
-"""Centres beyond which only trees are an alternative."""
+"""Above this number of centres, only trees are alternatives."""
 MANY = 10_000
-"""Points of the rows with many centres."""
+"""The number of points in rows with many centres."""
 DIAGRAM = 4096
-"""Cells up to which samples are sorted by the cells of a diagram; by random cells beyond."""
+"""Up to this number of cells, cell_sort's cells come from a diagram; above it, they are random."""
 FLOPS = 8
-"""Of one squared distance: three differences, three products, two sums."""
+"""Operations of one squared distance: three differences, three products, two sums."""
 ALL = ("native", "reference", "warp")
 
 Lookup = Callable[[Tensor], Any]
 
 
 def cases() -> list[Case]:
-    """The rows of these ops."""
+    """Returns the cases of these ops."""
     n, single = 1 << 18, torch.float32
-    found = []
+    rows = []
     for k in (1, 16, 64, 256, 512, 4096):
-        found.append(_nearest(n, k, single, backends=ALL if k == 16 else ("native",), quick=k == 16))
-    found += [_nearest(count, 16, single) for count in (1, 16, 256, 1 << 10, 1 << 14, 1 << 20)]
+        rows.append(_nearest(n, k, single, backends=ALL if k == 16 else ("native",), quick=k == 16))
+    rows += [_nearest(count, 16, single) for count in (1, 16, 256, 1 << 10, 1 << 14, 1 << 20)]
     for k in (256, 1024, 4096, 1 << 14, 1 << 16, 1_000_000):
         for kind in KINDS:
-            found += [_nearest(MANY, k, single, kind=kind, way=way) for way in (KEPT, MADE)]
-    found += [_nearest(MANY, 4096, single, d=d, way=KEPT) for d in (1, 2, 4)]
-    found += [_nearest(count, 4096, single, way=KEPT) for count in (1, 16, 256)]
-    found.append(_nearest(n, 16, torch.float64))
+            rows += [_nearest(MANY, k, single, kind=kind, way=way) for way in (KEPT, MADE)]
+    rows += [_nearest(MANY, 4096, single, d=d, way=KEPT) for d in (1, 2, 4)]
+    rows += [_nearest(count, 4096, single, way=KEPT) for count in (1, 16, 256)]
+    rows.append(_nearest(n, 16, torch.float64))
     for count, shape, quick in ((n, (16, 16), True), (n, (64, 64), False), (1 << 10, (16, 16), False)):
         name = "x".join(str(k) for k in shape)
         work = functools.partial(_locate_work, count, shape)
         shown = ALL if quick else ("native",)
         cells = int(np.prod(shape))
-        found.append(Case("locate_cell", f"{name} n={count}", single, FORWARD, count, cells, work, shown, quick))
+        rows.append(Case("locate_cell", f"{name} n={count}", single, FORWARD, count, cells, work, shown, quick))
     for count, k in (
         (n, 1),
         (n, 16),
@@ -67,12 +67,12 @@ def cases() -> list[Case]:
         base = (count, k) == (n, 256)
         work = functools.partial(_sort_work, count, k)
         name = f"n={count} k={k}"
-        found.append(Case("cell_sort", name, torch.int32, FORWARD, count, k, work, ALL if base else ("native",), base))
+        rows.append(Case("cell_sort", name, torch.int32, FORWARD, count, k, work, ALL if base else ("native",), base))
     for count, k in ((10**6, 256), (10**5, 10**6), (1000, 10**6)):
         work = functools.partial(_sort_work, count, k)
         name = f"n={count} k={k} threads=1"
-        found.append(Case("cell_sort", name, torch.int32, FORWARD, count, k, work, ("native",), threads=1))
-    return found
+        rows.append(Case("cell_sort", name, torch.int32, FORWARD, count, k, work, ("native",), threads=1))
+    return rows
 
 
 def _nearest(
@@ -117,20 +117,20 @@ def _nearest_work(
 
         return set_up
 
-    bound = "float32" if dtype == torch.float32 and not way else ""  # of all pairs, where there is no index
-    known = {**LOOKUPS, **(TREES if way else {}), **({"torch searchsorted": _sorted_lookup} if d == 1 else {})}
+    bound = "float32" if dtype == torch.float32 and not way else ""  # without an index, the operations of all pairs
+    lookups = {**LOOKUPS, **(TREES if way else {}), **({"torch searchsorted": _sorted_lookup} if d == 1 else {})}
     return Work(
         ours,
-        {name: using(maker) for name, maker in known.items() if k <= FEW or name in TREES},
+        {name: using(maker) for name, maker in lookups.items() if k <= FEW or name in TREES},
         lambda cells: _wrong_cells(points[0], centres, cells),
-        tolerance=0.01 * min(n, CHECKED),  # the expanded square misplaces some points
+        tolerance=0.01 * min(n, CHECKED),  # the expanded square rounds some points into another cell
         amount=float(FLOPS) * n * k if bound else float(n),
         bound=bound,
     )
 
 
 def _wrong_cells(points: Tensor, centres: Tensor, cells: Tensor) -> float:
-    """The number of ``CHECKED`` points whose centre is farther than another, in float64."""
+    """Counts the points, of the first ``CHECKED``, whose centre is not the nearest in float64."""
     step = max(1, points.shape[0] // max(1, min(CHECKED, PAIRS // centres.shape[0])))
     points, chosen = points[::step].double().cpu(), cells[::step].long().cpu()
     if int(chosen.min()) < 0 or int(chosen.max()) >= centres.shape[0]:
@@ -144,7 +144,7 @@ def _wrong_cells(points: Tensor, centres: Tensor, cells: Tensor) -> float:
 
 
 def _torch_lookup(centres: Tensor) -> Lookup:
-    """The expanded square in pieces that stay in cache: addmm and argmin."""
+    """Returns a lookup by the expanded square in pieces that stay in cache: addmm and argmin."""
     squares, transposed = centres.square().sum(1), centres.t().contiguous()
     rows = max(256, CHUNK // centres.shape[0])
 
@@ -159,7 +159,7 @@ def _torch_lookup(centres: Tensor) -> Lookup:
 
 
 def _numpy_lookup(centres: Tensor) -> Lookup:
-    """The same in numpy, which is single-threaded but for the product."""
+    """Returns a lookup by the expanded square in numpy, single-threaded but for the product."""
     table = _host(centres).numpy()
     squares, transposed = np.square(table).sum(1), np.ascontiguousarray(table.T) * -2
     rows = max(256, CHUNK // table.shape[0])
@@ -184,14 +184,14 @@ def _fast_tree_lookup(centres: Tensor) -> Lookup:
 
 
 def _flat_lookup(centres: Tensor) -> Lookup:
-    """All distances, by a library for these."""
+    """Returns a brute-force lookup by faiss."""
     index = optional("faiss").IndexFlatL2(centres.shape[1])
     index.add(_host(centres).numpy())
     return lambda points: index.search(points.numpy(), 1)[1][:, 0]
 
 
 def _sorted_lookup(centres: Tensor) -> Lookup:
-    """A binary search between the middles of neighbours, in one coordinate."""
+    """Returns a lookup in one dimension: a binary search among midpoints between neighbouring centres."""
     ascending, order = centres[:, 0].sort(stable=True)
     middles = ((ascending[1:].double() + ascending[:-1].double()) / 2).float()
     return lambda points: order[torch.searchsorted(middles, points[:, 0])]
@@ -202,7 +202,7 @@ def _on_a_sphere(points: Tensor) -> Tensor:
 
 
 def _heavy_tailed(points: Tensor) -> Tensor:
-    """A ten-thousandth of the points is a thousand times as far away as most."""
+    """Moves a ten-thousandth of the points a thousand times as far away as most points."""
     return (points - 0.5) * points[:, :1].clamp(min=1e-6).pow(-0.8)
 
 
@@ -211,9 +211,9 @@ KINDS: dict[str, Callable[[Tensor], Tensor]] = {
     "on a sphere": _on_a_sphere,
     "heavy-tailed": _heavy_tailed,
 }
-"""Places of points and centres, made of uniform numbers."""
+"""Distributions of points and centres: functions of uniform numbers [n, d]."""
 KEPT, MADE = "kept", "made"
-"""An index or a tree is made once for all calls, or in each of them."""
+"""Names of the two ways to use an index or a tree: built once for all calls, or in each call."""
 TREES: dict[str, Callable[[Tensor], Lookup]] = {"scipy cKDTree": _tree_lookup, "pykdtree": _fast_tree_lookup}
 LOOKUPS: dict[str, Callable[[Tensor], Lookup]] = {
     "torch addmm + argmin": _torch_lookup,
@@ -255,7 +255,7 @@ def _locate_work(n: int, shape: tuple[int, int], device: torch.device) -> Work:
     levels = diagram.centres[:outer], diagram.centres[outer:].view(outer, inner, 3)
 
     def by_masks(make: Callable[[Tensor], Lookup]) -> Callable[[], Contender]:
-        """Level by level: the root's cell, then for each of them the points in it."""
+        """Returns a lookup level by level: first the cells of the root, then a loop over them with masks."""
 
         def set_up() -> Contender:
             top, below = make(levels[0]), [make(centres) for centres in levels[1]]
@@ -274,7 +274,7 @@ def _locate_work(n: int, shape: tuple[int, int], device: torch.device) -> Work:
         return set_up
 
     def error(leaves: Tensor) -> float:
-        """Points on the wrong side at either level, in float64."""
+        """Counts points in a wrong cell at either level, in float64."""
         leaves = leaves.long().cpu()
         parents = leaves // inner
         wrong = _wrong_cells(points[0], levels[0], parents)
@@ -338,7 +338,7 @@ def _sort_work(n: int, k: int, device: torch.device) -> Work:
         return Contender(lambda call: sort(arrays[call % sets], k))
 
     def error(result: tuple[Any, Any]) -> float:
-        """Number of entries that differ from numpy's stable sort."""
+        """Counts entries that differ from numpy's stable sort."""
         expected = cells[0].cpu().numpy().argsort(kind="stable")
         order, offsets = (torch.as_tensor(part).cpu().numpy() for part in result)
         first = cells[0].cpu().numpy()[expected].searchsorted(np.arange(k))
@@ -347,14 +347,14 @@ def _sort_work(n: int, k: int, device: torch.device) -> Work:
     alternatives: dict[str, Callable[[], Contender]] = {f"torch sort {narrow}": torch_sort(getattr(torch, narrow))}
     if k <= 256:
         alternatives["torch sort uint8"] = torch_sort(torch.uint8)
-    # At the least: read every cell once, write the order and the offsets.
+    # Least bytes: read all cells, write the order and the offsets.
     amount = 8.0 * n + 4 * (k + 1)
     alternatives |= {f"numpy argsort {narrow}": numpy_sort, "Numba counting sort": numba_sort}
     return Work(ours, alternatives, error, 0.0, amount, "copy")
 
 
 def _counting_sort(cells: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The eight lines that one would write, which Numba compiles."""
+    """Sorts by counting in eight lines that Numba compiles."""
     offsets = np.zeros(k + 1, np.int32)
     for cell in cells:
         offsets[cell + 1] += 1

@@ -20,26 +20,26 @@ from voronerf import ops
 FULL = torch.float32
 ALL = ("native", "reference", "warp")
 STRATA = 64
-"""Of a ray."""
+"""Strata of a ray."""
 GRID = 64
-"""Cells of the grid that is marched through, along each axis."""
+"""Cells of the marched grid along each axis."""
 STEPS = 500
-"""Of a balance."""
+"""Steps of balancing."""
 
 
 def cases() -> list[Case]:
-    """The rows of these ops."""
-    found = []
+    """Returns the cases of these ops."""
+    rows = []
     for n, jitter in ((1 << 18, False), (1 << 18, True), (1 << 22, False)):
         name = f"{'jittered' if jitter else 'middles'} {GRID}^3 n={n}"
         base = n == 1 << 18
         work = functools.partial(_march_work, n, jitter)
         shown = ALL if base else ("native",)
-        found.append(Case("march_rays", name, FULL, FORWARD, n, None, work, shown, base and not jitter))
+        rows.append(Case("march_rays", name, FULL, FORWARD, n, None, work, shown, base and not jitter))
     for n, k in ((10_000, 16), (10_000, 256)):
         work = functools.partial(_balance_work, n, k)
         name = f"n={n} k={k} {STEPS} steps"
-        found.append(
+        rows.append(
             Case(
                 "balance_centres",
                 name,
@@ -52,7 +52,7 @@ def cases() -> list[Case]:
                 k == 16,
             )
         )
-    return found
+    return rows
 
 
 def _march_work(n: int, jitter: bool, device: torch.device) -> Work:
@@ -80,35 +80,35 @@ def _march_work(n: int, jitter: bool, device: torch.device) -> Work:
         return Contender(run)
 
     def error(found: Any) -> float:
-        """Error of the depths against float64; if other strata are kept, the share of rays with a different number."""
+        """Returns the error of the depths against float64, or the share of rays whose number of samples differs."""
         others = float((found[0].diff() != exact.ray_offsets.diff()).double().mean())
         if found[1].shape != exact.ray_index.shape or not torch.equal(found[1], exact.ray_index):
-            return others or float("inf")  # the numbers are right, but the samples belong to other rays
+            return others or float("inf")  # counts agree, but samples belong to other rays
         return relative_error(found[2], _exact_depths(*sets[0], exact))
 
-    # Read the rays (and the places in the strata), look up a byte for each stratum, write what is kept.
+    # Least bytes: read the rays (and the jitter), look up a byte for each stratum, write the kept samples.
     amount = 32.0 * rays + n * (5.0 if jitter else 1.0) + 24.0 * exact.ray_index.shape[0] + 8.0 * rays
     return Work(
         lambda backend: contender(functools.partial(ops.march_rays, backend=backend)),
         {"torch, all strata and a mask": lambda: contender(_march_masked)},
         error,
-        0.01,  # with another rounding, a sample at the border of a cell falls on the other side
+        0.01,  # rounding may move a sample across a border of its grid cell
         amount,
         "copy",
     )
 
 
 def _shell() -> Tensor:
-    """A grid in which a thick sphere is occupied, about a tenth of the cells."""
+    """Returns a grid in which a thick spherical shell is occupied, about a tenth of the cells."""
     middles = (torch.arange(GRID) + 0.5) / GRID * 2 - 1
     x, y, z = torch.meshgrid(middles, middles, middles, indexing="ij")
     return ((x * x + y * y + z * z).sqrt() - 0.7).abs() < 0.07
 
 
 def _exact_depths(rays: list[Tensor], uniforms: Tensor | None, found: Any) -> Tensor:
-    """Float64 depths of the samples that are kept."""
+    """Returns the float64 depths of the kept samples."""
     near, far = (rays[i].double()[found.ray_index.long()] for i in (2, 3))
-    # The stratum is where the sample lies; an ulp of its depth moves none across a border of its stratum's inside.
+    # The depth gives the stratum: rounding does not move a depth out of its stratum.
     share = (found.depths.double() - near) / (far - near) * STRATA
     stratum = (share - 0.5).round() if uniforms is None else share.floor().clamp(0, STRATA - 1)
     inside = 0.5 if uniforms is None else uniforms[found.ray_index.long(), stratum.long()].double()
@@ -126,7 +126,7 @@ def _march_masked(
     *,
     uniforms: Tensor | None,
 ) -> tuple[Tensor, ...]:
-    """The place and cell of every sample, and the occupied rows: the code that one writes without the op."""
+    """Marches without the op, as a user would: the cell of every sample, then a mask of occupied samples."""
     r, size = origins.shape[0], occupied.shape[0]
     stratum = torch.arange(samples, device=near.device)
     at = (stratum + (0.5 if uniforms is None else uniforms)) / samples
@@ -145,7 +145,7 @@ def _march_masked(
 def _balance_work(n: int, k: int, device: torch.device) -> Work:
     def batch(seed: int) -> list[Tensor]:
         random = generator(seed)
-        # Clumps of unequal weight, as importance along surfaces is.
+        # Clumps of unequal weight, like importance near surfaces.
         middles, chosen = torch.randn(40, 3, generator=random), torch.randint(0, 40, (n,), generator=random)
         samples = middles[chosen] + 0.2 * torch.randn(n, 3, generator=random)
         masses = torch.rand(n, generator=random, dtype=torch.float64) ** 4
@@ -158,7 +158,7 @@ def _balance_work(n: int, k: int, device: torch.device) -> Work:
         return Contender(lambda call: function(*sets[call % len(sets)]))
 
     def error(found: Any) -> float:
-        """The remaining imbalance, relative to the one before; values differ because 500 steps amplify rounding."""
+        """Returns the remaining share of the imbalance; 500 steps amplify rounding, so values cannot be compared."""
         return _spread_of_masses(sets[0], found[0]) / before
 
     def tree() -> Contender:
@@ -193,7 +193,7 @@ def _masses_cdist(samples: Tensor, masses: Tensor, centres: Tensor) -> Tensor:
 def _balance_torch(
     find: Callable[[Tensor, Tensor, Tensor], Tensor], samples: Tensor, masses: Tensor, centres: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The published update in a Python loop, `find` giving the mass in each cell."""
+    """Runs the published update in a Python loop; `find` returns the mass in each cell."""
     for _ in range(STEPS):
         weights = find(samples, masses, centres)
         others = torch.cdist(centres, centres).topk(min(9, centres.shape[0]), largest=False).indices[:, 1:]
@@ -204,6 +204,6 @@ def _balance_torch(
 
 
 def _spread_of_masses(batch: list[Tensor], centres: Tensor) -> float:
-    """std(W / max W) over the cells."""
+    """Returns std(W / max W) over the cells."""
     weights = _masses_cdist(batch[0].double(), batch[1], centres.double())
     return float((weights / weights.max()).std())

@@ -15,11 +15,11 @@ from ops.route import route_work
 FULL, HALF = torch.float32, torch.bfloat16
 BASE = 1 << 18
 TOLERANCE = {(FULL, FORWARD): 1e-4, (FULL, BACKWARD): 0.02, (HALF, FORWARD): 0.05, (HALF, BACKWARD): 0.9}
-"""Largest error of an alternative. A unit of ReLU near 0 that rounding turns changes gradients by per cents, in
-bfloat16 by half of the largest; gradients that are missing have an error of 1."""
+"""Largest error of an alternative. A ReLU unit near 0 that rounding switches changes gradients by some percent, and in
+bfloat16 by half of the largest gradient. Missing gradients have an error of 1."""
 BOTH = ("native", "reference")
 
-# (network, n, k, dtype, direction); the first of each small network, dtype and direction also on the reference.
+# (network, n, k, dtype, direction). The first row of a small network, dtype and direction also runs the reference.
 MLP_ROWS: tuple[tuple[str, int, int, torch.dtype, str], ...] = (
     *[("w64d4", n, 16, FULL, FORWARD) for n in (BASE, 1 << 10, 1 << 14, 1 << 20)],
     *[("mlp32", BASE, k, FULL, FORWARD) for k in (256, 1, 16, 64, 512, 4096)],
@@ -65,8 +65,8 @@ LINEAR_ROWS = (("64-64", BASE, 16), ("63-64", BASE, 256), ("256-256", BASE, 16))
 
 
 def cases() -> list[Case]:
-    """The rows of these ops."""
-    found, seen = [], set()
+    """Returns the cases of these ops."""
+    rows, seen = [], set()
     for layer, n, k in LINEAR_ROWS:
         for dtype in (FULL, HALF):
             for direction in (FORWARD, BACKWARD):
@@ -75,25 +75,25 @@ def cases() -> list[Case]:
                 work = functools.partial(_linear_work, layer, n, k, dtype, direction)
                 shown = BOTH if first else ("native",)
                 name = f"{layer} n={n} k={k}"
-                found.append(Case("grouped_linear", name, dtype, direction, n, k, work, shown, quick))
+                rows.append(Case("grouped_linear", name, dtype, direction, n, k, work, shown, quick))
     for row in MLP_ROWS:
         net, n, k, dtype, direction = row
         shown = ("native",) if (net, dtype, direction) in seen or net in ("nerf128", "nerf256") else BOTH
         seen.add((net, dtype, direction))
         work = functools.partial(_mlp_work, row)
         name = f"{net} n={n} k={k}"
-        found.append(Case("grouped_mlp", name, dtype, direction, n, k, work, shown, row in MLP_QUICK))
+        rows.append(Case("grouped_mlp", name, dtype, direction, n, k, work, shown, row in MLP_QUICK))
     for row in AVX2_ROWS:
         net, n, k, dtype, direction = row
         work = functools.partial(_mlp_work, row)
         name = f"{net} n={n} k={k} avx2"
-        found.append(Case("grouped_mlp", name, dtype, direction, n, k, work, isa="avx2"))
+        rows.append(Case("grouped_mlp", name, dtype, direction, n, k, work, isa="avx2"))
     for row in ROUTE_ROWS:
         net, n, k, dtype, direction = row
         work = functools.partial(route_work, *row, TOLERANCE[dtype, direction])
         shown = BOTH if (net, n, k, dtype) == ("w64d4", BASE, 16, FULL) else ("native",)
-        found.append(Case("routed_mlp", f"{net} n={n} k={k}", dtype, direction, n, k, work, shown, row in ROUTE_QUICK))
-    return found
+        rows.append(Case("routed_mlp", f"{net} n={n} k={k}", dtype, direction, n, k, work, shown, row in ROUTE_QUICK))
+    return rows
 
 
 def _linear_work(layer: str, n: int, k: int, dtype: torch.dtype, direction: str, device: torch.device) -> Work:
@@ -114,7 +114,7 @@ def _mlp_work(row: tuple[str, int, int, torch.dtype, str], device: torch.device)
 
 
 def _work(batch: Any, flops: float, executed: float | None) -> Work:
-    """The case of a batch whose samples cost so much each."""
+    """Builds the case of a batch; ``flops`` and ``executed`` are operations per sample."""
     return Work(
         functools.partial(ours, batch),
         alternatives(batch),

@@ -20,18 +20,18 @@ ALL = ("native", "reference", "warp")
 OCTAVES = 10
 DEGREE = 4
 SAMPLES = 64
-"""Of a ray, on average where rays are packed."""
+"""Samples of a ray; the mean of packed rays."""
 FINE = 128
-"""Depths that resample draws from SAMPLES bins."""
+"""The number of depths that resample draws from SAMPLES bins."""
 CHECKED = 4096
-"""Rows, or rays, compared with float64."""
+"""The number of rows or rays compared with float64."""
 
 Function = Callable[..., Any]
 
 
 def cases() -> list[Case]:
-    """The rows of these ops."""
-    found = []
+    """Returns the cases of these ops."""
+    rows = []
     for n, dtype, direction in (
         (BASE, FULL, FORWARD),
         (BASE, FULL, BACKWARD),
@@ -45,15 +45,13 @@ def cases() -> list[Case]:
             work = functools.partial(_encode_work, op, n, dtype, direction, base)
             shown = ALL if base else ("native",)
             quick = base and direction == FORWARD
-            found.append(Case(op, f"L={OCTAVES} n={n}", dtype, direction, n, None, work, shown, quick))
+            rows.append(Case(op, f"L={OCTAVES} n={n}", dtype, direction, n, None, work, shown, quick))
     for n, direction in ((BASE, FORWARD), (BASE, BACKWARD), (1 << 14, FORWARD)):
         base = n == BASE
         work = functools.partial(_harmonics_work, n, direction, base)
         shown = ALL if base else ("native",)
         quick = base and direction == FORWARD
-        found.append(
-            Case("spherical_harmonics", f"degree {DEGREE} n={n}", FULL, direction, n, None, work, shown, quick)
-        )
+        rows.append(Case("spherical_harmonics", f"degree {DEGREE} n={n}", FULL, direction, n, None, work, shown, quick))
     for n, packed, direction in (
         *[(BASE, packed, direction) for packed in (False, True) for direction in (FORWARD, BACKWARD)],
         *[(n, False, direction) for n in (1 << 10, 1 << 14, 1 << 20) for direction in (FORWARD, BACKWARD)],
@@ -63,17 +61,17 @@ def cases() -> list[Case]:
         work = functools.partial(_composite_work, n, packed, direction)
         shown = ALL if base else ("native",)
         quick = base and direction == FORWARD
-        found.append(Case("composite", f"{kind} n={n}", FULL, direction, n, None, work, shown, quick))
+        rows.append(Case("composite", f"{kind} n={n}", FULL, direction, n, None, work, shown, quick))
     for n in (BASE, 1 << 10, 1 << 14, 1 << 20):
         work = functools.partial(_resample_work, n)
         name = f"{SAMPLES} bins {FINE} depths n={n}"
         base = n == BASE
-        found.append(Case("resample", name, FULL, FORWARD, n, None, work, ALL if base else ("native",), base))
-    return found
+        rows.append(Case("resample", name, FULL, FORWARD, n, None, work, ALL if base else ("native",), base))
+    return rows
 
 
 def _contender(function: Function, sets: Sequence[Sequence[Tensor]], gradients: Sequence[Tensor] | None) -> Contender:
-    """A function of a set of tensors: its result or, with gradients of it, those of the set's floating tensors."""
+    """Returns a contender that calls a function; with ``gradients`` it also computes input gradients."""
 
     def forward(call: int) -> Any:
         with torch.no_grad():
@@ -90,7 +88,7 @@ def _contender(function: Function, sets: Sequence[Sequence[Tensor]], gradients: 
 
 
 def _flat(result: Any) -> list[Tensor]:
-    """All tensors of a nested result."""
+    """Returns all tensors of a nested result."""
     return [result] if isinstance(result, Tensor) else [tensor for part in result for tensor in _flat(part)]
 
 
@@ -105,18 +103,18 @@ def _work(
     compiled: Sequence[str],
     tolerance: float,
 ) -> Work:
-    """The case of a plain function.
+    """Builds the case of a plain function.
 
     Args:
-        op: the operation, with ``backend`` as an argument.
-        functions: alternatives with the arguments of the op.
-        sets: arguments of consecutive calls.
-        gradients: of the first results; None for a forward case.
-        checked: of a flat result, what is compared.
-        exact: the same in float64.
-        amount: bytes a call.
-        compiled: the alternatives that are compiled as well.
-        tolerance: largest error of an alternative.
+        op: The operation, with an argument ``backend``.
+        functions: The alternatives, which take the arguments of the op, by name.
+        sets: The arguments of consecutive calls.
+        gradients: Gradients of the first results; None for a forward case.
+        checked: A function of a flat result that returns the compared tensors.
+        exact: A function that returns the compared tensors in float64.
+        amount: The least bytes of a call.
+        compiled: Names of the alternatives that are also measured with torch.compile.
+        tolerance: The largest error of an alternative.
     """
     expected: list[Tensor] = []
 
@@ -126,7 +124,7 @@ def _work(
         return max(relative_error(a, b) for a, b in zip(checked(_flat(result)), expected))
 
     def compiling(function: Function) -> Contender:
-        torch.compiler.reset()  # no row is compiled for what an earlier one has met
+        torch.compiler.reset()  # forgets the shapes of earlier rows
         contender = _contender(torch.compile(function), sets, gradients)
         compile_now(lambda: contender.run(1))
         return contender
@@ -169,7 +167,7 @@ def _encode_work(op: str, n: int, dtype: torch.dtype, direction: str, compiled: 
         if integrated
         else {"torch, octave by octave": _frequency_by_octave, "torch, all octaves at once": _frequency_at_once}
     )
-    # Read the points, write the features; and the other way round, with the points once more, for the gradient.
+    # Least bytes: forward reads points and writes features; backward reads points and gradients, and writes gradients.
     raw = (6 if integrated else 3) * dtype.itemsize
     amount = float(n) * (raw + features * dtype.itemsize)
     if direction == BACKWARD:
@@ -182,8 +180,8 @@ def _encode_work(op: str, n: int, dtype: torch.dtype, direction: str, compiled: 
         lambda found: [tensor[::step] for tensor in found],
         exact,
         amount,
-        ["torch, octave by octave"] if compiled else [],  # the other form is slower, above all its gradient
-        1e-3 if dtype == FULL else 1.5,  # angles of hundreds of radians have no digits left in a bfloat16 formula
+        ["torch, octave by octave"] if compiled else [],  # the other form is slower, especially backward
+        1e-3 if dtype == FULL else 1.5,  # bfloat16 rounds angles of hundreds of radians by more than a radian
     )
 
 
@@ -219,7 +217,7 @@ def _harmonics_work(n: int, direction: str, compiled: bool, device: torch.device
 
 
 def _harmonics_by_value(directions: Tensor) -> Tensor:
-    """Written into columns one by one, as nerfstudio does."""
+    """Computes harmonics column by column, as nerfstudio does."""
     x, y, z = directions.unbind(1)
     xx, yy, zz = x**2, y**2, z**2
     out = directions.new_empty(directions.shape[0], 16)
@@ -271,7 +269,7 @@ def _composite_work(n: int, packed: bool, direction: str, device: torch.device) 
     ray_offsets = None
     shape: tuple[int, ...] = (rays, SAMPLES)
     if packed:
-        # From none to twice the average.
+        # Lengths between 0 and twice the mean.
         lengths = torch.randint(0, 2 * SAMPLES + 1, (rays,), generator=generator(2))
         ray_offsets = torch.nn.functional.pad(lengths.cumsum(0), (1, 0)).to(device, torch.int32)
         shape = (int(lengths.sum()),)
@@ -303,8 +301,8 @@ def _composite_work(n: int, packed: bool, direction: str, device: torch.device) 
         if ray_offsets is not None
         else {"torch cumprod": _composite_cumprod, "torch cumsum": _composite_cumsum}
     )
-    # Read density, colour, depth and length of a sample, write its weight; the backward reads them once more and writes
-    # as many gradients.
+    # Least bytes: forward reads density, colour, depth and length of a sample and writes its weight. Backward reads
+    # these inputs again and writes their gradients.
     bytes_a_sample = 28.0 if direction == FORWARD else 28.0 + 24.0 + 24.0
     return _work(
         functools.partial(ops.composite, **extra),
@@ -324,14 +322,14 @@ def _rendered(weights: Tensor, rgb: Tensor, depths: Tensor) -> tuple[Tensor, Ten
 
 
 def _composite_cumprod(sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor) -> Any:
-    """As nerf-pytorch writes it."""
+    """Composites by cumprod, as nerf-pytorch does."""
     passing = torch.exp(-sigma * deltas)
     front = torch.cumprod(torch.cat([torch.ones_like(passing[:, :1]), passing[:, :-1] + 1e-10], 1), 1)
     return _rendered((1 - passing) * front, rgb, depths)
 
 
 def _composite_cumsum(sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor) -> Any:
-    """In logarithms, as mip-NeRF's successors write it."""
+    """Composites by cumsum in logarithms, as mip-NeRF's successors do."""
     optical = sigma * deltas
     front = torch.exp(-F.pad(optical[:, :-1].cumsum(1), (1, 0)))
     return _rendered(front * -torch.expm1(-optical), rgb, depths)
@@ -340,7 +338,7 @@ def _composite_cumsum(sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor
 def _composite_packed(
     ray_offsets: Tensor, sigma: Tensor, rgb: Tensor, depths: Tensor, deltas: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One running sum over all rays, in float64 for its digits, less its value where the ray begins."""
+    """Composites packed rays: one float64 cumsum over all rays, minus its value at the ray's start."""
     rays = ray_offsets.shape[0] - 1
     ray = torch.repeat_interleave(torch.arange(rays, device=sigma.device), ray_offsets.diff())
     optical = sigma * deltas
@@ -382,7 +380,7 @@ def _resample_work(n: int, device: torch.device) -> Work:
 
 
 def _resample_torch(weights: Tensor, edges: Tensor) -> Tensor:
-    """As nerf-pytorch's sample_pdf, at the middles of equal strata."""
+    """Resamples as nerf-pytorch's sample_pdf does, at the middles of equal strata."""
     cdf = F.pad((weights / weights.sum(1, keepdim=True)).cumsum(1), (1, 0))
     middles = (torch.arange(FINE, dtype=weights.dtype, device=weights.device) + 0.5) / FINE
     u = middles.expand(weights.shape[0], FINE).contiguous()

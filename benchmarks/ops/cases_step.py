@@ -1,7 +1,7 @@
-"""Cases of what surrounds the networks in a training step: pixel_rays, render_loss, observe_occupancy and adam.
+"""Cases of a training step's ops besides networks: pixel_rays, render_loss, observe_occupancy and adam.
 
-b rays of a batch, m samples of all rays, n rows of the table: rays, samples or entries. The sizes of its rows are those
-of a step on Lego at 100 x 100. One thread.
+b rays of a batch, m samples of all rays, n rows of the table: rays, samples or entries. Sizes are as in a step on Lego
+at 100 x 100. All cases run on one thread.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from voronerf.nerf.cameras import orbit_cameras
 from voronerf.ops.formulas import voxels_of
 
 RAYS, SAMPLES = 1 << 10, 1 << 13
-"""Of a step."""
+"""Rays of a step."""
 GRID = 64
 """Cells of the occupancy grid along each axis."""
 SCALE = 10.0
-"""Of the density."""
+"""The decay of the density."""
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 Results = list[Tensor]
 
 
 def cases() -> list[Case]:
-    """The rows of these ops."""
+    """Returns the cases of these ops."""
     pixels, losses = functools.partial(pixel_work, RAYS), functools.partial(loss_work, RAYS, SAMPLES)
     observed = functools.partial(observe_work, SAMPLES)
     rows: list[tuple[str, str, str, int, Callable[[torch.device], Work]]] = [
@@ -55,7 +55,7 @@ def _worst(expected: Results) -> Callable[[Any], float]:
 
 
 def pixel_work(b: int, device: torch.device) -> Work:
-    """Rays and colours of b pixels."""
+    """Builds the case of drawing rays and colours of b pixels."""
     draw, side, views = generator(0), 100, 100
     cameras = orbit_cameras(views, radius=4.0, elevation=0.5, width=side, height=side, focal=140.0).to(device)
     images = torch.randint(0, 256, (views, side, side, 4), generator=draw, dtype=torch.uint8).to(device)
@@ -65,8 +65,10 @@ def pixel_work(b: int, device: torch.device) -> Work:
     colours = torch.rand(b, 3, generator=draw).to(device)
 
     def contender(function: Callable[..., Any]) -> Contender:
-        given = {"near": 2.0, "far": 6.0, "box": box, "background": colours}
-        return Contender(lambda call: function(cameras.poses, cameras.intrinsics, images, sets[call % count], **given))
+        options = {"near": 2.0, "far": 6.0, "box": box, "background": colours}
+        return Contender(
+            lambda call: function(cameras.poses, cameras.intrinsics, images, sets[call % count], **options)
+        )
 
     exact = [x.double() for x in contender(functools.partial(ops.pixel_rays, backend="reference")).run(0)]
     return Work(
@@ -74,7 +76,7 @@ def pixel_work(b: int, device: torch.device) -> Work:
         {"torch, rays by matmul": lambda: contender(_rays_by_matmul)},
         _worst(exact),
         1e-4,
-        b * 64.0,  # an index, a colour, eleven floats
+        b * 64.0,  # an index, a colour and eleven floats
         "copy",
     )
 
@@ -90,7 +92,7 @@ def _rays_by_matmul(
     box: Any,
     background: Any,
 ) -> Results:
-    """As loaders of other codebases draw a batch: gather, directions, a matrix for each ray, slabs."""
+    """Draws a batch as other codebases do: gather, directions, a matrix product per ray, box intersection."""
     height, width = images.shape[1:3]
     camera, pixel = index // (height * width), index % (height * width)
     fx, fy, cx, cy = intrinsics[camera].unbind(-1)
@@ -107,7 +109,7 @@ def _rays_by_matmul(
 
 
 def loss_work(b: int, m: int, device: torch.device) -> Work:
-    """Loss and gradient of m samples on b rays of random lengths."""
+    """Builds the case of loss and gradient of m samples on b rays of random lengths."""
     draw = generator(0)
     cuts = torch.randint(0, m + 1, (b - 1,), generator=draw).sort().values
     offsets = F.pad(cuts, (1, 1))
@@ -128,8 +130,8 @@ def loss_work(b: int, m: int, device: torch.device) -> Work:
 
     def by_ours(raw: Tensor, backend: str = "reference") -> Tensor:
         lengths, aim, behind = (x.to(raw.dtype) for x in (deltas, target, background))
-        given = {"background": behind, "density_scale": SCALE, "backend": backend}
-        return ops.render_loss(raw, lengths, offsets, aim, **given).loss
+        options = {"background": behind, "density_scale": SCALE, "backend": backend}
+        return ops.render_loss(raw, lengths, offsets, aim, **options).loss
 
     def by_composite(raw: Tensor) -> Tensor:
         colour, sigma = torch.sigmoid(raw[:, :3]), SCALE * F.softplus(raw[:, 3])
@@ -151,7 +153,7 @@ def loss_work(b: int, m: int, device: torch.device) -> Work:
 
 
 def observe_work(m: int, device: torch.device) -> Work:
-    """What m samples near a sphere say."""
+    """Builds the case of observing m samples near a sphere."""
     draw = generator(0)
     box = torch.tensor(BOX, device=device)
     count = rotation(m * 24)
@@ -198,7 +200,7 @@ def _observe_all(
     threshold: float,
     hidden: float,
 ) -> None:
-    """The cells of the samples, then the threshold for all cells, as nerfacc's ``OccGridEstimator`` does it."""
+    """Updates the cells of the samples, then thresholds all cells, as nerfacc's ``OccGridEstimator`` does."""
     rows = voxels_of(positions, box, density.shape).long()
     seen = weights > hidden * (1 - torch.exp(-sigma * deltas))
     flat = density.view(-1)
@@ -208,7 +210,7 @@ def _observe_all(
 
 
 def adam_work(entries: int, touched: float, device: torch.device) -> Work:
-    """A table of entries of two features, some of which have a gradient."""
+    """Builds the case of a table of ``entries`` x 2 features; a share ``touched`` of the entries has a gradient."""
     draw = generator(0)
     table = torch.randn(entries, 2, generator=draw).to(device)
     present = torch.rand(entries, 1, generator=draw) < touched
@@ -242,7 +244,7 @@ def adam_work(entries: int, touched: float, device: torch.device) -> Work:
         {"torch.optim.Adam, fused": torchs},
         _worst(exact),
         1e-5,
-        # the gradient is read; of the entries that have one, parameter and two moments are read and written
+        # gradient read; parameter and two moments of touched entries read and written
         gradient.nbytes * (1 + 6 * touched),
         "copy",
     )

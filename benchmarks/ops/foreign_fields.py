@@ -1,6 +1,6 @@
-"""Stand-ins for the fields of other codebases, each written in the style of the code that it stands for.
+"""Stand-ins for the fields of other codebases, each in the style of its original.
 
-None knows of cells. n samples; R components of a plane; T entries of a table, f features of an entry.
+No field knows of cells. n samples; R components of a plane; T entries of a table, f features of an entry.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from torch import Tensor, nn
 
 
 def frequencies(x: Tensor, octaves: int) -> Tensor:
-    """``x``, then a sine and a cosine of each octave: [n, d] -> [n, d * (1 + 2 * octaves)]."""
+    """Returns ``x`` followed by sine and cosine of each octave: [n, d] -> [n, d * (1 + 2 * octaves)]."""
     waves = [wave(x * 2.0**octave) for octave in range(octaves) for wave in (torch.sin, torch.cos)]
     return torch.cat([x, *waves], -1)
 
 
 class NeRF(nn.Module):
-    """nerf-pytorch: eight layers on encoded positions and directions, a skip connection behind the fifth."""
+    """The network of nerf-pytorch: eight layers on encoded inputs, a skip connection after the fifth."""
 
     def __init__(self, width: int = 64, points: int = 63, views: int = 27) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class NeRF(nn.Module):
 
 
 class AppearanceNeRF(nn.Module):
-    """nerf_pl's NeRF-W: a code for each image beside the direction."""
+    """The NeRF-W of nerf_pl: an appearance code per image beside the direction."""
 
     def __init__(self, width: int = 64, images: int = 100, code: int = 48) -> None:
         super().__init__()
@@ -72,7 +72,7 @@ class AppearanceNeRF(nn.Module):
 
 
 class VanillaField(nn.Module):
-    """nerfacc's field: encoders of its own, a base with a skip connection, density and colour heads."""
+    """The field of nerfacc: encoders inside, a base with a skip connection, density and colour heads."""
 
     scales: Tensor
 
@@ -115,7 +115,7 @@ class Sine(nn.Module):
 
 
 class Siren(nn.Module):
-    """SIREN: four sine layers and a linear one."""
+    """A SIREN: four sine layers and a linear layer."""
 
     def __init__(self, width: int = 64, outputs: int = 4) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class Siren(nn.Module):
 
 
 class SignedDistance(nn.Module):
-    """NeuS's SDF network: softplus layers on encoded positions, a skip connection, an init near a sphere."""
+    """The SDF network of NeuS: softplus layers on encoded positions, a skip connection, initialised near a sphere."""
 
     def __init__(self, width: int = 64, depth: int = 4, skip: int = 2) -> None:
         super().__init__()
@@ -153,7 +153,7 @@ class SignedDistance(nn.Module):
 
 
 class HashTable(nn.Module):
-    """nerfacto's hash encoding in torch, ``table[index]`` for the eight corners of all levels, and a small head."""
+    """The hash encoding of nerfacto in torch: ``table[index]`` for eight corners of all levels, and a small head."""
 
     scalings: Tensor
     offsets: Tensor
@@ -197,7 +197,7 @@ class HashTable(nn.Module):
 
 
 class HashEmbedder(nn.Module):
-    """HashNeRF's encoding: one ``nn.Embedding`` for each level, looked up at eight corners, and a small head."""
+    """The encoding of HashNeRF: one ``nn.Embedding`` per level, looked up at eight corners, and a small head."""
 
     def __init__(self, entries: int = 1 << 14, levels: int = 16, width: int = 64) -> None:
         super().__init__()
@@ -234,7 +234,7 @@ class HashEmbedder(nn.Module):
 
 
 class GridEncoder(nn.Module):
-    """torch-ngp's hash grid: levels of (resolution + 1)^3 entries where they fit, in one table."""
+    """The hash grid of torch-ngp: one table, whose small levels are dense with (resolution + 1)^3 entries."""
 
     def __init__(self, entries: int = 1 << 19, levels: int = 16, finest: int = 2048) -> None:
         super().__init__()
@@ -261,7 +261,7 @@ class GridEncoder(nn.Module):
 
 
 class NeRFNetwork(nn.Module):
-    """torch-ngp's network: a hash grid, a density network of two layers, a colour network of three, no biases."""
+    """The network of torch-ngp: a hash grid, two density layers and three colour layers without biases."""
 
     def __init__(self, entries: int = 1 << 19, levels: int = 16, width: int = 64) -> None:
         super().__init__()
@@ -291,7 +291,7 @@ class NeRFNetwork(nn.Module):
 
 
 class TensorField(nn.Module):
-    """TensoRF's vector-matrix factors, planes and lines read by ``F.grid_sample``."""
+    """The vector-matrix factors of TensoRF: planes and lines read by ``F.grid_sample``."""
 
     def __init__(self, size: int = 64, components: int = 16, width: int = 64) -> None:
         super().__init__()
@@ -319,7 +319,7 @@ class TensorField(nn.Module):
 
 
 class KPlanes(nn.Module):
-    """K-Planes: products of plane features at several resolutions, read by ``F.grid_sample``, and a small head."""
+    """The field of K-Planes: products of plane features at several resolutions, and a small head."""
 
     def __init__(self, sizes: tuple[int, ...] = (32, 64), components: int = 16, width: int = 64) -> None:
         super().__init__()
@@ -375,7 +375,7 @@ class SplineLayer(nn.Module):
 
 
 class KAN(nn.Module):
-    """Three spline layers."""
+    """A KAN of three spline layers."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -403,7 +403,7 @@ class Activated(nn.Module):
 
 
 class WeightNormed(nn.Module):
-    """IDR and VolSDF: weight norm, softplus(100), several outputs."""
+    """A network of IDR and VolSDF: weight norm, softplus(100), several outputs."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -420,7 +420,7 @@ class WeightNormed(nn.Module):
 
 
 class DNeRF(nn.Module):
-    """D-NeRF: a network moves the positions, which are encoded again before the second."""
+    """The field of D-NeRF: a network deforms the positions, which are encoded again for the second network."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -439,7 +439,7 @@ class DNeRF(nn.Module):
 
 
 class Bacon(nn.Module):
-    """BACON: products of sines of the position with layers."""
+    """The field of BACON: layers multiplied by sines of the position."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -455,7 +455,7 @@ class Bacon(nn.Module):
 
 
 class FiLM(nn.Module):
-    """pi-GAN: sines whose frequency and phase come from a code."""
+    """The layers of pi-GAN: sines whose frequency and phase come from a code."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -471,7 +471,7 @@ class FiLM(nn.Module):
 
 
 class Normed(nn.Module):
-    """stable-dreamfusion's ResBlocks: LayerNorm without an affine part of its own, SiLU, skips."""
+    """The ResBlocks of stable-dreamfusion: LayerNorm, SiLU, skip connections."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -487,7 +487,7 @@ class Normed(nn.Module):
 
 
 class RawWeights(nn.Module):
-    """kilonerf-like code with weights of its own: ``x @ W``, ``addmm``, ``einsum``, ``matmul`` of a turned weight."""
+    """A field like KiloNeRF's with raw weights: ``x @ W``, ``addmm``, ``einsum``, ``matmul`` of a transposed weight."""
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
@@ -503,7 +503,7 @@ class RawWeights(nn.Module):
 
 
 class Barf(nn.Module):
-    """BARF: an encoding whose octaves are weighted by how far the training is, and constants of the type of x."""
+    """The field of BARF: an encoding whose octaves are weighted by the training progress, and constants of x's type."""
 
     progress: Tensor
 

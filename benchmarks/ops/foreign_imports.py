@@ -1,4 +1,4 @@
-"""Imports files of other repositories, with stand-ins in PyTorch for what needs CUDA, and nothing for what is absent.
+"""Imports files of other repositories, with PyTorch stand-ins for CUDA modules and mocks for missing packages.
 
 The stand-ins have the signatures that the repositories call. d inputs, F features of an entry.
 """
@@ -20,11 +20,11 @@ from unittest import mock
 import torch
 from torch import Tensor, nn
 
-ENTRIES = 1 << 10  # of a level, at the most
+ENTRIES = 1 << 10  # most entries of a level
 
 
 class GridEncoder(nn.Module):
-    """A hash grid of torch-ngp or tiny-cuda-nn: levels of (resolution + 1)^d entries where they fit."""
+    """A hash grid like torch-ngp's or tiny-cuda-nn's, whose small levels are dense with (resolution + 1)^d entries."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class GridEncoder(nn.Module):
 
 
 class FreqEncoder(nn.Module):
-    """Sines and cosines of the octaves."""
+    """A frequency encoding: sines and cosines of the octaves."""
 
     def __init__(self, input_dim: int = 3, degree: int = 4) -> None:
         super().__init__()
@@ -76,7 +76,7 @@ class FreqEncoder(nn.Module):
 
 
 class SHEncoder(nn.Module):
-    """A stand-in for spherical harmonics: as many products of coordinates."""
+    """A stand-in for spherical harmonics: the same number of products of coordinates."""
 
     def __init__(self, input_dim: int = 3, degree: int = 4) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ class SHEncoder(nn.Module):
 
 
 class Network(nn.Sequential):
-    """A network of tiny-cuda-nn: layers without biases."""
+    """A network like tiny-cuda-nn's: layers without biases."""
 
     def __init__(self, n_input_dims: int, n_output_dims: int, network_config: dict[str, Any], **_: Any) -> None:
         kinds = {"ReLU": nn.ReLU, "Sigmoid": nn.Sigmoid, "None": nn.Identity}
@@ -102,14 +102,14 @@ class Network(nn.Sequential):
 
 
 class UnitGrid(GridEncoder):
-    """The grid of tiny-cuda-nn: positions lie in [0, 1]."""
+    """A grid like tiny-cuda-nn's: positions lie in [0, 1]."""
 
     def forward(self, inputs: Tensor) -> Tensor:
         return super().forward(inputs, bound=None)
 
 
 def encoding(n_input_dims: int, encoding_config: dict[str, Any], **_: Any) -> nn.Module:
-    """An encoding of tiny-cuda-nn."""
+    """Returns the stand-in for an encoding of tiny-cuda-nn."""
     config = encoding_config.get("nested", [encoding_config])[0]
     if "n_levels" not in config:
         return SHEncoder(degree=config["degree"])
@@ -130,13 +130,13 @@ def encoded_network(
     network_config: dict[str, Any],
     **_: Any,
 ) -> nn.Module:
-    """A network of tiny-cuda-nn on its encoding."""
+    """Returns the stand-in for a network with an encoding of tiny-cuda-nn."""
     first = encoding(n_input_dims, encoding_config)
     return nn.Sequential(first, Network(int(first.n_output_dims), n_output_dims, network_config))
 
 
 def repeated(x: Tensor, pattern: str, sample: int) -> Tensor:
-    """The one pattern of ``einops.repeat`` that is used."""
+    """Replaces ``einops.repeat`` for the only pattern in use."""
     assert pattern == "batch feature -> batch sample feature"
     return x[:, None].expand(-1, sample, -1)
 
@@ -151,12 +151,12 @@ STAND_INS: dict[str, dict[str, Any]] = {
     "einops": {"repeat": repeated, "rearrange": None, "reduce": None},
 }
 ABSENT = ("raymarching", "psencoder", "torchsearchsorted", "hash_encoding", "internal.datasets")
-"""Files that compile or use CUDA while they are imported, or need an older numpy."""
+"""Modules that compile or use CUDA at import, or need an older numpy."""
 
 
 @contextlib.contextmanager
 def repository(folder: Path) -> Iterator[Callable[[str], Any]]:
-    """Imports files below a folder, which are forgotten afterwards."""
+    """Imports files of a folder; removes their modules from ``sys.modules`` at the end."""
     modules, path = dict(sys.modules), list(sys.path)
     for name, members in STAND_INS.items():
         sys.modules[name] = types.ModuleType(name)
@@ -176,7 +176,7 @@ def repository(folder: Path) -> Iterator[Callable[[str], Any]]:
 
 
 def _imported(name: str) -> Any:
-    """The module of a file; what it imports in vain is replaced."""
+    """Imports a file; mocks replace its missing imports."""
     while True:
         try:
             return importlib.import_module(name)
@@ -187,7 +187,7 @@ def _imported(name: str) -> Any:
 
 
 def _unchanged(made: Any = None) -> Any:
-    """A decorator, with brackets or without."""
+    """A decorator, with or without parentheses, that does nothing."""
     return made or _unchanged
 
 
@@ -199,5 +199,7 @@ def _foreign(name: str, module: Any, folder: Path) -> bool:
     if name in STAND_INS or isinstance(module, mock.MagicMock):
         return True
     spec = getattr(module, "__spec__", None)
-    places = [spec.origin, *(spec.submodule_search_locations or ())] if spec else []  # a folder alone has no origin
+    places = (
+        [spec.origin, *(spec.submodule_search_locations or ())] if spec else []
+    )  # a folder without __init__.py has no origin
     return any(str(place).startswith(str(folder)) for place in places)

@@ -1,4 +1,4 @@
-"""Small modules in the manner of public code, by kind; each has a habit that some public repository has."""
+"""Small modules by kind; each shows a coding habit of some public repository."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Part = int | tuple[int, int] | Callable[[], Any]
 
 
 class Module(nn.Module):
-    """Parts by their names, and a function of the module and its arguments as forward."""
+    """A module from named parts; its forward is a function of the module and the arguments."""
 
     def __init__(self, call: Callable[..., Any], parts: dict[str, Any]) -> None:
         super().__init__()
@@ -46,16 +46,17 @@ PARTS: dict[str, Part] = {"a": (3, W), "b": (W, W), "o": (W, 4), "net": 3}
 
 
 def own(name: str, call: Callable[..., Any], *inputs: Any, second: bool = False, **parts: Part) -> Row:
-    """A row of a :class:`Module`. Two sizes stand for a linear layer, one for a network with four outputs.
+    """Returns the row of a :class:`Module`.
 
-    Layers a, b and o and a network `net` are there, used or not, as in public code.
+    A part of two sizes is a linear layer; a part of one size is a network with four outputs. Layers a, b and o and a
+    network `net` always exist, used or unused, as in public code.
     """
 
-    def made(part: Part) -> Any:
+    def build(part: Part) -> Any:
         return nn.Linear(*part) if isinstance(part, tuple) else mlp(part, 4)() if isinstance(part, int) else part()
 
     def make() -> nn.Module:
-        return Module(call, {name: made(part) for name, part in {**PARTS, **parts}.items()})
+        return Module(call, {name: build(part) for name, part in {**PARTS, **parts}.items()})
 
     return Row(name, make, inputs or (3,), second=second)
 
@@ -138,7 +139,7 @@ PLAIN = [
 
 
 def harmonics(s: Any, d: Tensor) -> Tensor:
-    """Spherical harmonics of degree 2, written into a new tensor."""
+    """Writes spherical harmonics of degree 2 into a new tensor."""
     x, y, z = d.unbind(-1)
     values = d.new_empty(*d.shape[:-1], 9)
     values[..., 0] = 0.282
@@ -204,7 +205,7 @@ Field = namedtuple("Field", ["rgb", "sigma"])
 
 
 def spelled(name: str, call: Callable[[Tensor], Any]) -> Row:
-    """Ways to return four outputs."""
+    """Returns the row of a way to return four outputs."""
     return own(name, lambda s, x: call(s.net(x)))
 
 
@@ -249,7 +250,7 @@ def filters(s: Any, x: Tensor) -> Tensor:
 
 
 def distances(s: Any, x: Tensor) -> Tensor:
-    """Gabor filters of a multiplicative network: centres and widths of their own."""
+    """Computes Gabor filters of a multiplicative network, each with its centre and width."""
     d = (x**2).sum(-1)[..., None] + (s.mu**2).sum(-1)[None, :] - 2 * x @ s.mu.T
     return s.o(torch.sin(s.a(x)) * torch.exp(-0.5 * d * s.gamma[None, :]))
 
@@ -277,7 +278,7 @@ PERIODIC = [
 
 
 class Clipped(torch.autograd.Function):
-    """torch-ngp's exponential."""
+    """The exponential of torch-ngp, with a clipped gradient."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -306,7 +307,7 @@ def by_angles(s: Any, x: Tensor) -> Tensor:
 
 
 def hyper(s: Any, x: Tensor, z: Tensor) -> Tensor:
-    """The weights of a layer for each sample, made of its code."""
+    """Applies a layer whose weights come from the sample's code."""
     weight, bias = s.m(z).split([W * 3, W], -1)
     return s.o(torch.relu(torch.bmm(weight.view(-1, W, 3), x.unsqueeze(-1)).squeeze(-1) + bias))
 
@@ -385,13 +386,13 @@ DISTANCES = [
 
 
 def slope(y: Tensor, x: Tensor) -> Tensor:
-    """The gradient of a sum, as public code writes it."""
+    """Returns the gradient of a sum, as public code does."""
     ones = torch.ones_like(y, requires_grad=False, device=y.device)
     return torch.autograd.grad(y, x, ones, create_graph=True, retain_graph=True, only_inputs=True)[0]
 
 
 def inside(name: str, call: Callable[..., Any], **parts: Part) -> Row:
-    """A field that takes gradients in its forward."""
+    """Returns the row of a field that computes gradients in its forward."""
 
     def forward(s: Any, x: Tensor) -> Any:
         with torch.enable_grad():
@@ -407,7 +408,7 @@ def curvature(s: Any, x: Tensor) -> Tensor:
 
 
 def potential(s: Any, x: Tensor) -> Tensor:
-    """A velocity without divergence: the rotation of a potential."""
+    """Returns a divergence-free velocity: the curl of a potential."""
     a = s.net(x)[:, :3]
     jacobian = [slope(a[:, i : i + 1], x) for i in range(3)]
     return torch.stack([jacobian[2][:, 1] - jacobian[1][:, 2], jacobian[0][:, 2] - jacobian[2][:, 0]], -1)
@@ -456,7 +457,7 @@ def radial(s: Any, x: Tensor) -> Tensor:
 
 
 def wavelet(s: Any, x: Tensor) -> Tensor:
-    """Each pair of an input and an output has a Mexican hat of its own."""
+    """Sums Mexican hat wavelets, one for each pair of input and output."""
     scaled = (x.unsqueeze(1) - s.shift) / s.scale.exp()
     return ((scaled**2 - 1) * torch.exp(-0.5 * scaled**2) * s.w).sum(2)
 
@@ -716,7 +717,7 @@ CONVOLUTIONS = [
 
 
 class Methods(nn.Module):
-    """A field that its renderer asks by many names."""
+    """A field with many methods that a renderer calls."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -787,4 +788,4 @@ KINDS = {
     "between": BETWEEN,
 }
 IN_RUNS = ("gradients", "tables", "between")
-"""The kinds of which PyTorch computes a part, between runs; the others are fused whole."""
+"""The kinds that PyTorch computes in part, between fused runs; all other kinds are fused whole."""

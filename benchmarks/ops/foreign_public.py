@@ -1,6 +1,6 @@
-"""Modules of public repositories, by repository and file: how each is made and called.
+"""Modules of public repositories, by repository and file, with their construction and call.
 
-A key is "owner/name", the folder in it that is on the path of imports, and behind a colon the file's dotted name.
+A key is "owner/name", followed by the folder of the import path, a colon and the file's dotted name.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ WIDE = [64] * 4
 
 
 def per_ray(features: int) -> Any:
-    """A row for each ray."""
+    """Returns a function that makes a row of features for each ray."""
     return lambda lead: uniform(lead[:1], features)
 
 
 def images(lead: Lead) -> Tensor:
-    """The number of an image for each sample."""
+    """Returns an image number for each sample."""
     return torch.randint(0, 100, lead)
 
 
 def in_a_dict(**sizes: int) -> Any:
-    """Tensors by their names."""
+    """Returns a function that makes a dict of named tensors."""
     return lambda lead: {name: uniform(lead, size) for name, size in sizes.items()}
 
 
 def coords_of(key: str) -> Any:
-    """The positions of arguments in a dict."""
+    """Returns a function that takes the positions from an argument dict."""
     return lambda arguments, *_, **__: arguments[key]
 
 
 def with_image(features: int) -> Any:
-    """Features, the last of which numbers an image."""
+    """Returns a function that makes features whose last column is an image number."""
     return lambda lead: torch.cat([uniform(lead, features), images(lead)[..., None]], -1)
 
 
 class Unbatched(nn.Module):
-    """A module that takes one batch more, [1, n, d]."""
+    """A module that adds a leading batch dimension, [1, n, d]."""
 
     def __init__(self, net: nn.Module) -> None:
         super().__init__()
@@ -76,7 +76,7 @@ PLAIN, BARF = barf(barf_c2f=None), barf(barf_c2f=[0.1, 0.5])
 
 
 def progressed(module: nn.Module) -> nn.Module:
-    """BARF in the middle of its schedule."""
+    """Sets a BARF module to the middle of its schedule."""
     module.progress.data.fill_(0.3)
     return module
 
@@ -164,7 +164,7 @@ def offsets(m: Any) -> nn.Module:
 
 
 def ibrnet(m: Any) -> nn.Module:
-    m.IBRNet.posenc = lambda self, d_hid, n_samples: torch.randn(1, n_samples, d_hid)  # its own is on CUDA
+    m.IBRNet.posenc = lambda self, d_hid, n_samples: torch.randn(1, n_samples, d_hid)  # the original uses CUDA
     return m.IBRNet(ns(anti_alias_pooling=1), in_feat_ch=32, n_samples=RAYS[1])
 
 
@@ -193,17 +193,17 @@ def bacon(name: str, **more: Any) -> Any:
 
 
 def implicit(m: Any) -> nn.Module:
-    """VolSDF's and MonoSDF's signed distances."""
+    """Makes the signed distance network of VolSDF and MonoSDF."""
     return m.ImplicitNetwork(64, 3.0, 3, 1, WIDE, bias=0.6, **SDF)
 
 
 def rendering(m: Any) -> nn.Module:
-    """The colour networks of IDR and its descendants."""
+    """Makes the colour network of IDR and its descendants."""
     return m.RenderingNetwork(64, "idr", 9, 3, WIDE, multires_view=4)
 
 
 def skips(m: Any, **more: Any) -> nn.Module:
-    """The network of nerf-pytorch and its descendants."""
+    """Makes the network of nerf-pytorch and its descendants."""
     return m.NeRF(8, 64, 63, 27, use_viewdirs=True, **more)
 
 
@@ -427,7 +427,9 @@ PUBLIC: dict[str, list[Row]] = {
     ],
     "apchenstu/TensoRF:models.tensorBase": [
         Row("MLPRender_Fea", lambda m: m.MLPRender_Fea(27, featureC=64), (3, 3, 27)),
-        Row("MLPRender_PE", lambda m: m.MLPRender_PE(27, featureC=64), (3, 3, 30)),  # its first layer takes three more
+        Row(
+            "MLPRender_PE", lambda m: m.MLPRender_PE(27, featureC=64), (3, 3, 30)
+        ),  # its first layer has three more inputs
         Row("MLPRender", lambda m: m.MLPRender(27, featureC=64), (3, 3, 27)),
     ],
     "apchenstu/TensoRF:models.tensoRF": [

@@ -1,6 +1,6 @@
 """A module of other code in VoronoiRouter, compared with a loop over masks of distinct modules.
 
-Whoever adds a module writes a :class:`Row`; :func:`compare` does the rest. n samples, k cells.
+A new module needs only a :class:`Row`; :func:`compare` does the rest. n samples, k cells.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from voronerf import VoronoiRouter
 
 N, K, SEED = 300, 4, 1
 ROUNDED = 1e-4
-"""The error in float32 above which a module is compared in float64, too."""
+"""A module with a larger float32 error is compared in float64, too."""
 NO_PART = 1e-6
-"""The share of the largest tensor below which another one is zero but for rounding."""
+"""A tensor below this share of the largest tensor counts as zero up to rounding."""
 
 
 def uniform(lead: tuple[int, ...], *shape: int) -> Tensor:
@@ -38,10 +38,10 @@ class Row:
     Attributes:
         module: The name in the results.
         make: Makes the module; takes the imported file, if there is one.
-        inputs: The arguments: a number of features d stands for a tensor [n, d], a function makes one of the leading
-            shape, everything else is passed on.
+        inputs: The arguments: a number d stands for a tensor [n, d] of d features, a function makes an argument from
+            the leading shape, everything else is passed on.
         method: The method that is called.
-        keywords: Keyword arguments, likewise.
+        keywords: Keyword arguments, in the form of ``inputs``.
         coords: A function of the arguments that returns positions; None for the first features of the first tensor.
         lead: The leading shape of the samples, (n,) or (rays, samples).
         options: Further options of the router.
@@ -61,7 +61,7 @@ class Row:
     def arguments(self, dtype: torch.dtype) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """Returns arguments and keyword arguments, whose float tensors take a gradient."""
 
-        def made(item: Any) -> Any:
+        def build(item: Any) -> Any:
             value = uniform(self.lead, item) if type(item) is int else item(self.lead) if callable(item) else item
             return tree_map_only(Tensor, leaf, value)
 
@@ -69,14 +69,14 @@ class Row:
             return value.to(dtype).requires_grad_() if value.is_floating_point() else value
 
         torch.manual_seed(SEED)
-        return tuple(map(made, self.inputs)), {name: made(item) for name, item in self.keywords.items()}
+        return tuple(map(build, self.inputs)), {name: build(item) for name, item in self.keywords.items()}
 
     def modules(self, dtype: torch.dtype, imported: tuple[Any, ...]) -> list[nn.Module]:
-        """Returns a module for each cell, alike but for parameters that cells do not share."""
+        """Returns a module for each cell; the modules differ only in parameters that cells do not share."""
         modules: list[nn.Module] = []
         for cell in range(K):
             torch.manual_seed(SEED)
-            np.random.seed(SEED)  # noqa: NPY002  which constructors draw from
+            np.random.seed(SEED)  # noqa: NPY002  constructors draw from it
             modules.append(module := self.make(*imported))
             for tensor in (*module.parameters(), *module.buffers()):
                 if tensor.is_floating_point() or tensor.is_complex():
@@ -96,7 +96,7 @@ class Row:
         return [name for name in names if any(fnmatch.fnmatch(name, pattern) for pattern in patterns)]
 
     def part(self, value: Tensor, rows: Tensor) -> Tensor:
-        """Returns the given samples of an argument, as the router passes them; a ray's row for each of its samples."""
+        """Returns an argument's rows for some samples, as the router does; rows of rays are repeated per sample."""
         d = len(self.lead)
         if value.shape[:d] == self.lead:
             return value.flatten(0, d - 1)[rows].reshape(len(rows), *[1] * (d - 1), *value.shape[d:])
@@ -104,7 +104,7 @@ class Row:
 
 
 def compare(row: Row, *imported: Any) -> dict[str, Any]:
-    """Returns how a module runs in the router, and its largest errors; or why it is refused."""
+    """Returns a result: the way a module runs in the router and its largest errors, or the reason of a refusal."""
     kind = type(row.make(*imported))
     found: dict[str, Any] = {"module": row.module, "class": f"{kind.__module__}.{kind.__qualname__}"}
     try:
@@ -133,8 +133,8 @@ def _compared(row: Row, dtype: torch.dtype, imported: tuple[Any, ...]) -> tuple[
     options = {"coords": row.coords or f"first{d}", "methods": methods, **row.options}
     router = VoronoiRouter.from_modules(modules, centres, fuse=True, way="fused", **options)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a module that is not fused has it in its row
-        for _ in range(2):  # the first call finds the way that the next ones take
+        warnings.simplefilter("ignore")  # the row already reports an unfused module
+        for _ in range(2):  # the first call chooses the way of the next call
             routed = _tensors(getattr(router, row.method)(*args, **kwargs))
     looped = _loop(row, modules, cells, args, kwargs)
     if [value.shape for value in routed] != [value.shape for value in looped]:
@@ -156,7 +156,7 @@ def _compared(row: Row, dtype: torch.dtype, imported: tuple[Any, ...]) -> tuple[
 
 
 def _loop(row: Row, modules: list[nn.Module], cells: Tensor, args: Any, kwargs: Any) -> list[Tensor]:
-    """Results of the loop over masks: each module on the samples of its cell."""
+    """Runs the loop over masks: each module on the samples of its cell."""
     order, parts = [], []
     for cell, module in enumerate(modules):
         rows = (cells == cell).nonzero()[:, 0]
@@ -169,13 +169,13 @@ def _loop(row: Row, modules: list[nn.Module], cells: Tensor, args: Any, kwargs: 
 
 
 def _tensors(results: Any) -> list[Tensor]:
-    """The tensors of results; complex ones as pairs of numbers."""
+    """Returns the tensors of results; complex tensors as pairs of numbers."""
     tensors = [value for value in tree_leaves(results) if isinstance(value, Tensor)]
     return [torch.view_as_real(value) if value.is_complex() else value for value in tensors]
 
 
 def _weighted(results: list[Tensor], _: list[Tensor]) -> Tensor:
-    """A loss in which each number of the results has another weight."""
+    """Returns a loss in which each number of the results has a different weight."""
     torch.manual_seed(SEED)
     terms = [(value * torch.randn(value.shape).to(value)).sum() for value in results]
     return torch.stack([term for term in terms if term.requires_grad]).sum()
@@ -191,7 +191,7 @@ def _gradients(loss: Tensor, of: list[Tensor]) -> list[Tensor]:
 
 
 def _error(got: list[Tensor], right: list[Tensor], size: Callable[[Tensor], Tensor]) -> float:
-    """The largest error of a tensor, relative to its size."""
+    """Returns the largest relative error of the tensors."""
     sizes = [float(size(value.detach())) for value in right]
     least = max(NO_PART * max(sizes), 1e-30)
     errors = [float(size((a - b).detach())) / max(s, least) for a, b, s in zip(got, right, sizes, strict=True)]
@@ -199,12 +199,12 @@ def _error(got: list[Tensor], right: list[Tensor], size: Callable[[Tensor], Tens
 
 
 def _short(reason: str) -> str:
-    """A reason without the lines of the module that it quotes."""
+    """Returns a reason without its quoted lines of the module."""
     return re.sub(r" \([\w.]+\.py:\d+: .*\)", "", reason.splitlines()[0])
 
 
 def _way(router: VoronoiRouter, method: str) -> dict[str, Any]:
-    """How a method ran by `explain`, and the functions between runs."""
+    """Returns the way that `explain` reports for a method, and the functions between fused runs."""
     line = next(line for line in router.explain().splitlines() if line.startswith(f"{method}: "))
     name, _, why = line.removeprefix(f"{method}: ").partition(": ")
     if name != "fused in runs":

@@ -18,9 +18,9 @@ from voronerf.nerf.fields import NeRF
 from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 
 RAY = 64
-"""Consecutive samples of one view direction."""
+"""The number of consecutive samples with the same view direction."""
 CHECKED = 4096
-"""Samples whose results and gradients are compared with float64."""
+"""The number of samples whose results and gradients are compared with float64."""
 
 
 def _plain(width: int, depth: int) -> MLP:
@@ -39,7 +39,7 @@ NETS: dict[str, MLP] = {
     "nerf128": NeRF(width=128).layers,
     "nerf256": NeRF(width=256).layers,
 }
-# One layer with ReLU, inputs to outputs: the first of a network on encoded positions, and one in the middle.
+# Single layers with ReLU, inputs-outputs: first layers on encoded positions, and middle layers.
 LAYERS: dict[str, tuple[int, MLP]] = {
     "63-64": (63, _linear(64)),
     "64-64": (64, _linear(64)),
@@ -49,12 +49,12 @@ LAYERS: dict[str, tuple[int, MLP]] = {
 
 @dataclass(frozen=True)
 class Cost:
-    """Floating-point operations a sample, of products alone.
+    """The floating-point operations of matrix products, per sample.
 
     Attributes:
-        forward: two for each weight.
-        backward: the gradients of all weights, and of what comes from an earlier layer.
-        again: the forward as far as the backward needs it, for code that does not keep activations.
+        forward: Two operations for each weight.
+        backward: Operations for the gradients of all weights and of inputs from earlier layers.
+        again: Operations to recompute activations in the backward, for code that does not store them.
     """
 
     forward: float
@@ -63,7 +63,7 @@ class Cost:
 
 
 def cost(net: MLP, features: int = 3) -> Cost:
-    """What a network costs on raw inputs of this width."""
+    """Returns the cost of a network with raw inputs of ``features`` columns."""
     shapes = net.weight_shapes(features, 3)
     forward = 2.0 * sum(o * i for o, i in shapes)
     inner = 2.0 * sum(
@@ -79,23 +79,23 @@ def cost(net: MLP, features: int = 3) -> Cost:
 
 @dataclass
 class Batch:
-    """Inputs of one case: sets of samples, and one network for each cell.
+    """The inputs of a case: sets of samples, and one network per cell.
 
-    Samples of a set are sorted by cell unless it is for the route; all sets share ``offsets``, so that no alternative
-    has to be compiled again for other sizes.
+    Samples of a set are sorted by cell, except for the route. All sets share ``offsets``, so that no alternative is
+    recompiled for other sizes.
 
     Attributes:
-        net: layer table.
-        positions: sets of raw positions [n, 3], or inputs [n, d] of a single layer.
-        bounds: ``offsets`` on the host.
-        offsets: int32 [k + 1].
-        directions: [r, 3], where the network reads them.
-        direction_index: int32 [n].
-        weights: one [k, o, i] for each layer.
-        biases: one [k, o] for each layer.
-        gradients: [n, out] twice: zero but for the rows that are checked, for call 0, and dense for the others.
-        checked: rows compared with float64, rising.
-        direction: of the case, forward or with backward.
+        net: The layer table.
+        positions: Sets of raw positions [n, 3], or inputs [n, d] of a single layer.
+        bounds: The values of ``offsets`` on the host.
+        offsets: The row offsets of the cells, int32 [k + 1].
+        directions: Directions [r, 3], or None if the network reads none.
+        direction_index: The direction of each sample, int32 [n].
+        weights: A tensor [k, o, i] for each layer.
+        biases: A tensor [k, o] for each layer.
+        gradients: Two output gradients [n, out]: for call 0, zero except in checked rows; for later calls, dense.
+        checked: The rows compared with float64, rising.
+        direction: ``FORWARD`` or ``BACKWARD``.
     """
 
     net: MLP
@@ -131,7 +131,7 @@ class Batch:
 
 
 def parameters(net: MLP, k: int, features: int, dtype: torch.dtype, device: torch.device) -> list[list[Tensor]]:
-    """Random weights and biases that keep activations of order one."""
+    """Draws weights and biases that keep activations of order one."""
     random = generator(7)
     lists: list[list[Tensor]] = [[], []]
     for o, i in net.weight_shapes(features, 3):
@@ -151,17 +151,17 @@ def make_batch(
     features: int | None = None,
     centres: Tensor | None = None,
 ) -> Batch:
-    """Samples spread evenly, cells of random centres, and networks.
+    """Draws uniform samples, cells with random centres, and networks.
 
     Args:
-        net: layer table.
-        n: samples.
-        k: cells.
-        dtype: of the parameters.
-        direction: of the case.
-        device: of everything.
-        features: width of the inputs of a single layer; None for positions.
-        centres: [k, 3] of the route, whose samples come in no order; None for samples sorted by cell.
+        net: The layer table.
+        n: The number of samples.
+        k: The number of cells.
+        dtype: The type of the parameters.
+        direction: ``FORWARD`` or ``BACKWARD``.
+        device: The device of all tensors.
+        features: The input width of a single layer; None for positions.
+        centres: Centres [k, 3] for the route, whose samples are unsorted; None for samples sorted by cell.
     """
     sets = rotation(4 * n * (features or 3))
     points = [uniform_points(n, seed, device) for seed in range(sets)]
@@ -172,7 +172,7 @@ def make_batch(
     if features is not None:
         positions = [torch.randn(n, features, generator=generator(seed)).to(device, dtype) for seed in range(sets)]
     elif centres is None:
-        # Other samples in the same cells: a little beside those of the first set.
+        # The second set stays in the same cells: samples of the first set, moved a little.
         first = points[0][order]
         positions = [first + seed * 1e-4 for seed in range(sets)]
     rays = max(1, n // RAY)
@@ -202,7 +202,7 @@ def make_batch(
 
 
 def with_gradients(batch: Batch, forward: Callable[[int], Tensor], leaves: Sequence[Tensor]) -> Callable[[int], Any]:
-    """``forward`` itself for a forward case, without autograd; else (output, gradients of the leaves)."""
+    """Returns ``forward`` without autograd for a forward case, else a function call -> (output, leaf gradients)."""
     if batch.direction != BACKWARD:
 
         def run(call: int) -> Tensor:
@@ -219,14 +219,14 @@ def with_gradients(batch: Batch, forward: Callable[[int], Tensor], leaves: Seque
 
 
 def network_error(batch: Batch, cells: Tensor | None = None) -> Callable[[Any], float]:
-    """Error of a result of call 0: the output, and the gradients where there are any, each relative to its largest.
+    """Returns a function of call 0's result: the largest error of outputs and gradients, relative to their largest.
 
-    Gradients of the check are those of ``Batch.checked`` alone, so that float64 has to see only these rows. A result
-    may be (output, None): its gradients have another form and are left out.
+    Call 0 has output gradients only in the rows ``Batch.checked``, so that float64 needs only these rows. A result
+    (output, None) has no comparable gradients; only its output is checked.
 
     Args:
-        batch: the inputs.
-        cells: cell of every sample, for the route; None for sorted samples.
+        batch: The inputs.
+        cells: The cell of every sample, for the route; None for sorted samples.
     """
     expected: list[Tensor] = []
 
@@ -241,7 +241,7 @@ def network_error(batch: Batch, cells: Tensor | None = None) -> Callable[[Any], 
 
 
 def _exact(batch: Batch, cells: Tensor | None) -> list[Tensor]:
-    """Output of the checked rows in float64, and the gradients of all parameters."""
+    """Returns in float64 the outputs of the checked rows and the gradients of all parameters."""
     rows = batch.checked
     if cells is None:
         counts = torch.searchsorted(rows.cpu(), torch.tensor(batch.bounds))

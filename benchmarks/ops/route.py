@@ -1,8 +1,8 @@
-"""Cases of routed_mlp, the whole route: positions in any order to outputs in the same order. n samples, k cells.
+"""Cases of routed_mlp, the whole route: from unsorted positions to outputs in the same order. n samples, k cells.
 
-The alternatives are written in torch: look up the cell by the fastest way that is installed, then either sort and loop
-over the cells, or loop over boolean masks, as Mega-NeRF does; or give each of few samples a copy of its cell's
-parameters. All of them encode the positions themselves.
+The alternatives in torch look up the cells by the fastest installed method. Then they sort and loop over cells, or loop
+over boolean masks like Mega-NeRF, or gather a copy of the cell's parameters for each of few samples. All alternatives
+encode the positions themselves.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from voronerf import ops
 from voronerf.ops._core.layers import MLP
 
 FEW = 1 << 10
-"""Samples up to which each may have parameters of its own."""
+"""The largest number of samples for which parameters are gathered per sample."""
 
 
 def route_work(
@@ -35,7 +35,7 @@ def route_work(
     tolerance: float,
     device: torch.device,
 ) -> Work:
-    """The case of a network from ``NETS``."""
+    """Builds the case of a network from ``NETS``."""
     net, centres = NETS[name], uniform_points(k, 1000, device)
     batch, price = make_batch(net, n, k, dtype, direction, device, centres=centres), cost(net)
     training = direction == BACKWARD
@@ -69,7 +69,7 @@ def route_work(
 
 
 def ours(batch: Batch, centres: Tensor, backend: str) -> Contender:
-    """routed_mlp on one of its backends."""
+    """Returns routed_mlp on a backend."""
 
     def forward(call: int) -> Tensor:
         out, _ = ops.routed_mlp(
@@ -88,13 +88,13 @@ def ours(batch: Batch, centres: Tensor, backend: str) -> Contender:
 
 
 def fastest_lookup(centres: Tensor, points: Tensor) -> tuple[str, Callable[[Tensor], Any]]:
-    """The lookup of ``LOOKUPS`` that takes least time for these points, by two runs of each."""
+    """Returns the fastest lookup of ``LOOKUPS`` for these points, measured by two runs of each."""
     found = []
     for name, make in LOOKUPS.items():
         try:
             find = make(centres)
             find(points[: max(1, points.shape[0] // 8)])
-        except Exception:  # a lookup that is not installed or that fails is left out
+        except Exception:  # skips lookups that fail or are not installed
             continue
         synchronise(points)
         start = time.perf_counter()
@@ -106,13 +106,13 @@ def fastest_lookup(centres: Tensor, points: Tensor) -> tuple[str, Callable[[Tens
 
 
 def synchronise(points: Tensor) -> None:
-    """Waits for the device that points are on."""
+    """Waits for the device of the points."""
     if points.is_cuda:
         torch.cuda.synchronize(points.device)
 
 
 class Parameters:
-    """Leaves of each cell in a dtype, made once for a contender."""
+    """The leaf tensors of each cell in a dtype, for one contender."""
 
     def __init__(self, batch: Batch, dtype: torch.dtype) -> None:
         self.count, self.k, training = len(batch.weights), batch.k, batch.direction == BACKWARD
@@ -131,25 +131,25 @@ class Parameters:
 
 
 def torch_encode(x: Tensor, octaves: int, dtype: torch.dtype) -> Tensor:
-    """All octaves at once: the input, then a sine and a cosine block for each octave."""
+    """Encodes all octaves at once: the input, then a sine and a cosine block for each octave."""
     angles = x[:, None, None, :] * (2.0 ** torch.arange(octaves, device=x.device))[None, :, None, None]
     waves = torch.cat([angles.sin(), angles.cos()], 2)
     return torch.cat([x, waves.flatten(1)], 1).to(dtype)
 
 
 def encoded_directions(batch: Batch, dtype: torch.dtype) -> Tensor | None:
-    """Encoded once a ray."""
+    """Returns the encoded direction of each ray, or None."""
     octaves = batch.net.direction_octaves
     return None if batch.directions is None or octaves is None else torch_encode(batch.directions, octaves, dtype)
 
 
 def _of_rows(batch: Batch, directions: Tensor | None, rows: Tensor) -> Tensor | None:
-    """Encoded directions of the samples that an index or a mask names."""
+    """Returns the encoded directions of the samples that an index or a mask selects."""
     return None if directions is None or batch.direction_index is None else directions[batch.direction_index[rows]]
 
 
 def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece: int | None) -> Contender:
-    """Sort by cell with the narrowest key, then each cell's network on its rows; results back by index."""
+    """Returns a loop over sorted cells: sorts by the narrowest key, runs each cell's network, scatters the results."""
     lookup, own, net = find(), Parameters(batch, dtype), batch.net
     key = torch.uint8 if batch.k <= 256 else torch.int16
     bounds = torch.arange(batch.k + 1, device=batch.positions[0].device)
@@ -167,7 +167,7 @@ def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece
 
 
 def masked_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Contender:
-    """A boolean mask for each cell, as in Mega-NeRF's code."""
+    """Returns a loop over boolean masks of the cells, as in Mega-NeRF's code."""
     lookup, own, net = find(), Parameters(batch, dtype), batch.net
 
     def parts(call: int) -> Iterator[tuple[Tensor, Tensor]]:
@@ -185,7 +185,7 @@ def masked_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Co
 
 
 def gathered(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Contender:
-    """Each sample with a copy of its cell's parameters, which pays for few."""
+    """Returns a way that gathers a copy of the cell's parameters for each sample, which pays off for few samples."""
     lookup, net, training = find(), batch.net, batch.direction == BACKWARD
     leaves = [tensor.detach().to(dtype).requires_grad_(training) for tensor in batch.parameters]
 
@@ -208,7 +208,7 @@ def gathered(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Conte
 def _contender(
     batch: Batch, parts: Callable[[int], Iterator[tuple[Tensor, Tensor]]], own: Parameters, dtype: torch.dtype
 ) -> Contender:
-    """Puts the parts in their places; with gradients, the whole output is made before they are computed."""
+    """Returns a contender that scatters the parts into one output; gradients start from the complete output."""
 
     def empty() -> Tensor:
         return torch.empty(batch.n, batch.net.out_features, dtype=dtype, device=batch.positions[0].device)

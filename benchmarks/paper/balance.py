@@ -1,4 +1,4 @@
-"""The paper's experiment on balance: std(W / max W) of 16 cells before and after, over 100 diagrams."""
+"""The paper's experiment on balance: std(W / max W) of 16 cells before and after balancing, over 100 diagrams."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from paper.runs import Run, Settings, Variant, default_scenes, make_run
 from voronerf.diagram.balance import balance
 
 CELLS, DIAGRAMS = 16, 100
-#: std(W / max W) before and after balancing as published, the median of 100 diagrams.
+#: The published std(W / max W) before and after balancing, medians of 100 diagrams.
 PUBLISHED = (0.246, 0.0018)
 OBJECTS, COUNT = 9, 10_000
 Samples = tuple[Tensor, Tensor]  # points [m, 3] and importance [m]
 
 
 def runs(settings: Settings) -> list[Run]:
-    """Trainings that keep samples for their first split."""
+    """Returns the trainings, which keep the samples of their first split."""
     variant = Variant(f"{settings.cells} Voronoi cells", {"cells": (settings.cells,)})
     scenes = settings.scene or default_scenes()
     return [make_run(variant, scene, seed, settings) for scene in scenes for seed in range(settings.seeds)]
 
 
 def separate_objects(seed: int) -> Samples:
-    """Samples near the surfaces of balls of different sizes and shares, scattered in a box of side 6, some touching."""
+    """Draws samples near the surfaces of balls of different sizes and weights, scattered in a box of side 6."""
     generator = torch.Generator().manual_seed(seed)
     places = torch.rand(OBJECTS, 3, generator=generator) * 6 - 3
     radii = torch.rand(OBJECTS, generator=generator) * 0.5 + 0.15
@@ -41,7 +41,7 @@ def separate_objects(seed: int) -> Samples:
 
 
 def load_samples(path: Path) -> Samples:
-    """The samples that a training kept for its split."""
+    """Loads the samples that a training kept for its split."""
     with np.load(path) as file:
         return torch.from_numpy(file["points"]), torch.from_numpy(file["importance"])
 
@@ -49,7 +49,7 @@ def load_samples(path: Path) -> Samples:
 def measure(
     trained: Sequence[Run], backend: str, say: Callable[[str], None] = print, *, diagrams: int = DIAGRAMS
 ) -> list[dict[str, Any]]:
-    """Balances the diagrams of every source of samples, trainings and separate objects; returns the rows."""
+    """Balances diagrams for the samples of each training and of separate objects; returns the rows."""
     kept: dict[str, list[Samples]] = {}
     for run in trained:
         samples = load_samples(run.folder / "samples" / "level-1.npz")

@@ -1,8 +1,8 @@
-"""The paper's experiments that are trainings: which variants each compares, and what was published.
+"""The paper's experiments with trainings: their variants and the published scores.
 
-Both sides of every comparison have the same rays, samples, schedule and kernels; the learning rate follows from the
-width alone, by one rule for all (see ``voronerf train --lr``). Published figures are those of Elsner et al. 2023,
-"Adaptive Voronoi NeRFs": 400 x 400 images, 24 h on an RTX 2080 Ti.
+Both sides of every comparison have the same rays, samples, schedule and kernels. One rule sets all learning rates from
+the width alone (see ``voronerf train --lr``). Published figures come from Elsner et al. 2023, "Adaptive Voronoi NeRFs":
+400 x 400 images, 24 h on an RTX 2080 Ti.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DEFAULTS = "voronerf train"
 
 
 class Scores(NamedTuple):
-    """PSNR in dB, SSIM, LPIPS."""
+    """Scores of a training: PSNR in dB, SSIM, LPIPS."""
 
     psnr: float
     ssim: float
@@ -39,7 +39,7 @@ class Scores(NamedTuple):
 
 
 CONDITIONS = "published: 400 x 400, 24 h, RTX 2080 Ti"
-#: Published, (field, sampling, scene) -> one network of width 256, 12 Voronoi cells of width 64.
+#: Published scores: (field, sampling, scene) -> (one network of width 256, 12 Voronoi cells of width 64).
 PUBLISHED: dict[tuple[str, str, str], tuple[Scores, Scores]] = {
     ("nerf", "hierarchical", "lego"): (Scores(27.355, 0.9451, 0.0910), Scores(27.652, 0.9483, 0.0831)),
     ("mipnerf", "hierarchical", "lego"): (Scores(30.538, 0.9712, 0.0507), Scores(31.234, 0.9752, 0.0417)),
@@ -51,7 +51,7 @@ PUBLISHED: dict[tuple[str, str, str], tuple[Scores, Scores]] = {
     ("mipnerf", "stratified", "lego"): (Scores(27.401, 0.945, 0.111), Scores(27.979, 0.949, 0.105)),
 }
 PUBLISHED_CELLS = 12
-#: Published: the same networks for the same time, Lego: KiloNeRF's 512 uniform cells, 16 x 16 Voronoi cells.
+#: Published scores on Lego, with the same networks and time: (KiloNeRF's 512 uniform cells, 16 x 16 Voronoi cells).
 KILONERF = (Scores(27.080, 0.938, 0.098), Scores(27.765, 0.952, 0.078))
 
 
@@ -60,11 +60,11 @@ class Experiment:
     """One table or figure of the paper.
 
     Attributes:
-        kind: "table" or "figure".
-        about: what it compares, for the reader of its table.
-        variants: for some settings and a scene.
-        scenes: those to train if the settings name none.
-        published: the published scores of a variant on a scene, or None.
+        kind: The kind, "table" or "figure".
+        about: A description of the comparison, printed above its table.
+        variants: A function of the settings and a scene that returns the variants.
+        scenes: The scenes to train if the settings name none.
+        published: A function of a variant and a scene that returns the published scores, or None.
     """
 
     kind: str
@@ -74,7 +74,7 @@ class Experiment:
     published: Callable[[str, str], Scores | None] = lambda variant, scene: None
 
     def runs(self, settings: Settings) -> list[Run]:
-        """Its trainings."""
+        """Returns the trainings."""
         return [
             make_run(variant, scene, seed, settings)
             for scene in settings.scene or self.scenes()
@@ -84,22 +84,22 @@ class Experiment:
 
 
 def cells_name(count: int) -> str:
-    """The paper's own variant."""
+    """Returns the name of the variant with balanced cells."""
     return f"{count} Voronoi cells, width 64"
 
 
 def uniform_name(count: int) -> str:
-    """The same number of cells on a grid."""
+    """Returns the name of the variant with `count` cells on a uniform grid."""
     return f"{count} uniform cells, width 64"
 
 
 def levels_name(cells: tuple[int, ...]) -> str:
-    """The cells of each level: "12 cells", "4 x 4 cells"."""
+    """Returns a name with the cells of each level: "12 cells", "4 x 4 cells"."""
     return f"{' x '.join(map(str, cells))} cells" if cells else "one network"
 
 
 def one_or_cells(settings: Settings, scene: str = "") -> list[Variant]:
-    """One network of width 256, one of width 64, the cells."""
+    """Returns three variants: one network of width 256, one of width 64, and the cells."""
     return [
         Variant(WIDE, {"cells": (), "width": 256}),
         Variant(NARROW, {"cells": (), "width": 64}),
@@ -108,11 +108,11 @@ def one_or_cells(settings: Settings, scene: str = "") -> list[Variant]:
 
 
 def row_name(field: str, sampling: str, network: str) -> str:
-    """The name of a row of the tables by field and sampling."""
+    """Returns the name of a row in the tables by field and sampling."""
     return f"{FIELDS[field]}, {sampling}: {network}"
 
 
-# --- the tables by field and sampling -------------------------------------------------------------------------------
+# --- tables by field and sampling -----------------------------------------------------------------------------------
 
 
 def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant]]:
@@ -134,7 +134,7 @@ def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant
 
 
 def _published(variant: str, scene: str) -> Scores | None:
-    if variant == DEFAULTS:  # beside the paper's best: mip-NeRF with hierarchical samples and cells
+    if variant == DEFAULTS:  # compared with the paper's best: mip-NeRF with hierarchical samples and cells
         variant = row_name("mipnerf", "hierarchical", cells_name(PUBLISHED_CELLS))
     for (field, sampling, where), scores in PUBLISHED.items():
         for network, score in zip((WIDE, cells_name(PUBLISHED_CELLS)), scores):
@@ -149,7 +149,7 @@ def _published(variant: str, scene: str) -> Scores | None:
 def _kilo_variants(settings: Settings, scene: str) -> list[Variant]:
     common = {"field": "kilonerf"}
     uniform = {**common, "cells": (512,), "centres": "uniform"}
-    # The inherited grid is split when the Voronoi cells are for the first time.
+    # The inherited grid is split at the time of the Voronoi cells' first split.
     first_split = (TrainConfig(field="kilonerf", cells=(16, 16)).plan[0].at,)
     return [
         Variant(KILO_START, {**uniform, "split_at": (KILO_FIRST_STEPS,)}),
@@ -166,7 +166,7 @@ def _kilo_published(variant: str, scene: str) -> Scores | None:
 
 
 def _changed(*variants: tuple[str, dict[str, Any]]) -> Callable[[Settings, str], list[Variant]]:
-    """Variants of the cells of the settings, each with changes of its own."""
+    """Returns a function that makes variants of the settings' cells with the given changes."""
     return lambda settings, scene: [Variant(name, {"cells": (settings.cells,), **more}) for name, more in variants]
 
 
@@ -181,12 +181,12 @@ def _early_late_variants(settings: Settings, scene: str) -> list[Variant]:
 
 
 def _cell_count_variants(settings: Settings, scene: str) -> list[Variant]:
-    """Different numbers of cells, of one width, and of one number of parameters in total."""
+    """Returns variants with different numbers of cells: with equal widths, and with equal total parameters."""
     levels: list[tuple[int, ...]] = [(), *((count,) for count in COUNTS), (4, 4)]
     reference = TrainConfig(**{"data": scene, **AS_PUBLISHED, "cells": (PUBLISHED_CELLS,)})
     total = count_parameters(resolve(reference, open_scene(scene, settings)))
     own = [Variant(levels_name(cells), {"cells": cells}) for cells in levels]
-    # 12 cells are what the others are matched with: one training is both
+    # The other variants match the parameters of 12 cells, so that one training serves both series.
     matched = [{"cells": cells} | ({} if cells == (PUBLISHED_CELLS,) else {"parameters": total}) for cells in levels]
     return own + [Variant(f"{levels_name(cells)}, matched", changes) for cells, changes in zip(levels, matched)]
 

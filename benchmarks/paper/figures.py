@@ -1,4 +1,4 @@
-"""Plots and pictures of the paper's experiments, from their results and the looks in the run directories."""
+"""Plots and pictures of the paper's experiments, from results and the snapshots in the run directories."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from matplotlib import pyplot
 
 Row = dict[str, Any]
 Point = tuple[float, float]
-GRID = 200  # times at which the curves of several seeds are compared
+GRID = 200  # times at which curves of several seeds are averaged
 DPI = 100
 
 
 class Rows:
-    """Results by scene and variant, a value a seed.
+    """The results by scene and variant, with one value per seed.
 
     Attributes:
-        scenes: in the order of the results.
-        variants: in the order of the results.
+        scenes: The scenes, in the order of the results.
+        variants: The variants, in the order of the results.
     """
 
     def __init__(self, rows: Sequence[Row]) -> None:
@@ -40,12 +40,12 @@ class Rows:
         self.scenes, self.variants = (list(dict.fromkeys(row[name] for row in rows)) for name in ("scene", "variant"))
 
     def of(self, variant: str, scene: str) -> list[Row]:
-        """The rows of a variant on a scene, by seed."""
+        """Returns the rows of a variant on a scene, one per seed."""
         found = [row for row in self.rows if row["variant"] == variant and row["scene"] == scene]
         return sorted(found, key=lambda row: int(row["seed"]))
 
     def values(self, variant: str, scene: str) -> list[float]:
-        """PSNR of a variant on a scene, a value a seed; those that were not measured are left out."""
+        """Returns the measured PSNRs of a variant on a scene, one per seed."""
         return [row["psnr"] for row in self.of(variant, scene) if row.get("psnr") is not None]
 
 
@@ -59,7 +59,7 @@ def save(figure: Any, path: Path) -> Path:
 
 
 def panes(count: int, width: float = 5.6, height: float = 3.8) -> tuple[Any, list[Any]]:
-    """A figure of axes side by side."""
+    """Makes a figure with axes side by side."""
     figure, axes = pyplot.subplots(1, count, figsize=(width * count, height), layout="constrained", squeeze=False)
     for pane in axes[0]:
         pane.grid(alpha=0.3)
@@ -67,9 +67,9 @@ def panes(count: int, width: float = 5.6, height: float = 3.8) -> tuple[Any, lis
 
 
 def banded(axes: Any, label: str, curves: Sequence[Sequence[Point]], number: int = 0) -> Any:
-    """The mean of several curves over the times that they share, and the band between lowest and highest.
+    """Plots the mean of several curves over their common times, and the band from lowest to highest.
 
-    Its number is its colour, the same in every pane, whatever other curves a pane lacks.
+    ``number`` selects the colour, which is therefore the same in every pane.
     """
     curves = [curve for curve in curves if curve]
     if not curves:
@@ -85,12 +85,12 @@ def banded(axes: Any, label: str, curves: Sequence[Sequence[Point]], number: int
 
 
 def shown(evaluation: dict[str, Any]) -> Point:
-    """Seconds and PSNR of the mean error, which for a single picture is its PSNR."""
+    """Returns the seconds and the PSNR of the mean squared error; the plain PSNR for a single picture."""
     return evaluation["seconds"], evaluation.get("psnr_of_mean_error", evaluation["psnr"])
 
 
 def curves(path: Path, rows: Sequence[Row]) -> Path:
-    """PSNR of the mean squared error, as the paper's curves, over training seconds, a pane a scene.
+    """Plots PSNR of the mean squared error (as in the paper) over training seconds, one pane per scene.
 
     Bands are the range over the seeds, dotted lines the splits.
     """
@@ -109,7 +109,7 @@ def curves(path: Path, rows: Sequence[Row]) -> Path:
 
 
 def bars(path: Path, rows: Sequence[Row]) -> Path:
-    """Final PSNR of every variant, a pane a scene: mean and every seed."""
+    """Plots the final PSNR of every variant, one pane per scene: the mean and each seed."""
     table = Rows(rows)
     figure, axes = panes(len(table.scenes), 7.0, 0.9 + 0.3 * len(table.variants))
     for pane, scene in zip(axes, table.scenes):
@@ -127,7 +127,7 @@ def bars(path: Path, rows: Sequence[Row]) -> Path:
 
 
 def counts(path: Path, rows: Sequence[Row]) -> Path:
-    """Final PSNR over the number of cells, with networks of one width and with matched parameters."""
+    """Plots the final PSNR over the number of cells, with equal widths and with equal parameters."""
     table = Rows(rows)
     figure, axes = panes(len(table.scenes))
     for pane, scene in zip(axes, table.scenes):
@@ -150,7 +150,7 @@ def counts(path: Path, rows: Sequence[Row]) -> Path:
 
 
 def balance(path: Path, rows: Sequence[Row]) -> Path:
-    """std(W / max W) before and after, a box each."""
+    """Plots std(W / max W) before and after balancing, one box each."""
     figure, axes = panes(1)
     values, labels = [], []
     for row in rows:
@@ -185,7 +185,7 @@ def _density(look: dict[str, Any]) -> Tensor:
 
 
 def sheet(path: Path, rows: Sequence[Row], folder: Path, columns: Sequence[Column]) -> Path | None:
-    """Pictures of the first seed: a line for every scene and variant."""
+    """Draws pictures of the first seed, one row per scene and variant."""
     lines = []
     for row in rows:
         if row["seed"] != 0:
@@ -204,7 +204,7 @@ def sheet(path: Path, rows: Sequence[Row], folder: Path, columns: Sequence[Colum
 
 
 def stacked(pictures: Sequence[Tensor]) -> Tensor:
-    """Pictures uint8 [h, w, 3] below each other, the narrower ones with white beside them."""
+    """Stacks pictures uint8 [h, w, 3] vertically; narrower pictures are padded with white."""
     width = max(picture.shape[1] for picture in pictures)
     return torch.cat([torch.nn.functional.pad(p, (0, 0, 0, width - p.shape[1]), value=255) for p in pictures])
 
@@ -213,7 +213,7 @@ def _truth(look: dict[str, Any]) -> Tensor:
     return torch.from_numpy(look["truth"])
 
 
-Column = tuple[str, str, Callable[[dict[str, Any]], Tensor]]  # caption, look, the picture of a look
+Column = tuple[str, str, Callable[[dict[str, Any]], Tensor]]  # caption, name of the snapshot, its picture
 _TITLE: list[Column] = [("{scene}", "end", _truth), ("{variant}", "end", _view), ("cells", "end", _cells)]
 SHEETS: dict[str, list[Column]] = {
     "ghosting": [
@@ -249,7 +249,7 @@ PLOTS: dict[str, Callable[[Path, Sequence[Row]], Path]] = {
 
 
 def draw(name: str, rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Draws an experiment into ``folder``; returns the files."""
+    """Draws the plots and pictures of an experiment into ``folder``; returns the files."""
     found: list[Path | None] = []
     if name in PLOTS and rows:
         found.append(PLOTS[name](folder / f"{name}.png", rows))

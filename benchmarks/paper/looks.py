@@ -1,7 +1,7 @@
-"""Snapshots of a training: a held-out view, a slice through its density, its cells.
+"""Snapshots of a training ("looks"): a held-out view, a slice of the density, the cells.
 
-A look is a file of a run directory, looks/NAME.npz; NAME says when: "before" and "after" the first split, at quarters
-of the run, "end".
+A look is a file looks/NAME.npz of a run directory. NAME tells its time: "before" and "after" the first split, quarters
+of the run, and "end".
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene
 from voronerf.app.train import State
 
-VERSION = 1  # of what a look holds; those of another version are not used
-#: Fraction of the run after the first split at which inherited and random networks are compared.
+VERSION = 1  # format version of looks; looks of other versions are ignored
+#: Fraction of the run between the first split and the comparison of inherited with random networks.
 AFTER = 0.04
 QUARTERS = (0.25, 0.5, 0.75)
-SLICE = 96  # points on each side of a slice
+SLICE = 96  # points along each side of a slice
 
 
 def stops(training: Training) -> list[tuple[str, float]]:
-    """Names and training seconds of a run's looks, the end left out."""
+    """Returns names and training seconds of a run's looks, except the last."""
     config = training.state.config
     found = {f"at-{100 * at:02.0f}": at for at in QUARTERS}
     if config.plan and config.plan[0].at + AFTER < 1:
@@ -40,15 +40,15 @@ def stops(training: Training) -> list[tuple[str, float]]:
 
 
 def held_out_view(scene: Scene) -> int:
-    """The test view of the snapshots."""
+    """Returns the test view of the looks."""
     return len(scene.test) // 3
 
 
 def reached(training: Training, second: float) -> None:
-    """Writes the looks of a training that are due at a number of training seconds."""
+    """Writes the looks of a training that are due at ``second`` training seconds."""
     names = [name for name, at in stops(training) if at == second]
     if "after" in names and training.state.strategy.splits == 0:
-        # Steps may be longer than the time between the two stops; this one makes the split.
+        # A step may be longer than the time between the two stops; one more step makes the split.
         training.advance(math.nextafter(training.seconds, math.inf))
     for name in names:
         look(training, second, name)
@@ -56,14 +56,14 @@ def reached(training: Training, second: float) -> None:
 
 @torch.no_grad()
 def look(training: Training, second: float, name: str = "end") -> None:
-    """Writes a look of a training as it is; ``second`` is when it was due."""
+    """Writes a look of a training's current state; ``second`` is its due time."""
     data = io.BytesIO()
     np.savez_compressed(data, **picture(training.state), at=second, seconds=training.seconds, step=training.state.step)
     write_bytes(training.out / "looks" / f"{name}.npz", data.getvalue())
 
 
 def picture(state: State) -> dict[str, Any]:
-    """The arrays of a look."""
+    """Returns the arrays of a look."""
     scene, router = state.scene, state.router
     view = held_out_view(scene)
     with state.averaged():
@@ -86,7 +86,7 @@ def picture(state: State) -> dict[str, Any]:
 
 
 def load(folder: Path, name: str) -> dict[str, Any] | None:
-    """The arrays of a run's look; None if it was not made."""
+    """Loads the arrays of a run's look; None if there is no look."""
     path = folder / "looks" / f"{name}.npz"
     if not path.is_file():
         return None
@@ -95,7 +95,7 @@ def load(folder: Path, name: str) -> dict[str, Any] | None:
 
 
 def numbers(folder: Path) -> list[dict[str, Any]]:
-    """The numbers in the looks of a run, in the order of time."""
+    """Returns the numbers in the looks of a run, sorted by time."""
     found = []
     for path in (folder / "looks").glob("*.npz"):
         with np.load(path) as file:

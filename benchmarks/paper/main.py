@@ -1,12 +1,12 @@
-"""Every table and figure of "Adaptive Voronoi NeRFs" (Elsner et al. 2023) by name, at a size that fits the machine.
+"""Repeats tables and figures of "Adaptive Voronoi NeRFs" (Elsner et al. 2023) by name, at an adjustable size.
 
     python benchmarks/paper.py sampling --scene lego --downscale 4 --budget 480 --seeds 2
     python benchmarks/paper.py split-kinds title --scene builtin --budget 60
-    python benchmarks/paper.py --budget 20 --downscale 8        # all of them: `make paper`
+    python benchmarks/paper.py --budget 20 --downscale 8        # all experiments: `make paper`
 
-All variants of an experiment train for the same time. Each experiment writes NAME.json ({metadata, results})
-and pictures into --out, and report.md there has all of them. A training that was made before with the same settings is
-not made again, and an interrupted one is continued. Trainings that are started together take turns of a few seconds.
+All variants of an experiment train for the same time. Each experiment writes NAME.json ({metadata, results}) and
+pictures into --out; report.md in that folder collects all experiments. A finished training with the same settings is
+reused, and an interrupted training is continued. Trainings of one command take turns of a few seconds.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from voronerf.app.train.config import ConfigError
 
 
 def say(line: str) -> None:
-    """Progress, with the time."""
+    """Prints progress with the time of day."""
     print(f"{time.strftime('%H:%M:%S')}  {line}", flush=True)
 
 
 def trainings(name: str, settings: Settings) -> list[Run]:
-    """The trainings that an experiment needs."""
+    """Returns the trainings of an experiment."""
     if name == "balance":
         return balance.runs(settings)
     return EXPERIMENTS[name].runs(settings) if name in EXPERIMENTS else []
@@ -63,17 +63,17 @@ def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]
 
 
 def repeat(settings: Settings, names: tyro.conf.Positional[tuple[str, ...]] = ()) -> None:
-    """Repeat experiments of the paper.
+    """Repeats experiments of the paper.
 
     Args:
-        settings: How large they are.
-        names: Experiments, default all.
+        settings: The size of the experiments.
+        names: The names of the experiments. Default: all.
     """
     if unknown := [name for name in names if name not in ABOUT]:
         raise ConfigError(f"experiments are {', '.join(ABOUT)}, got {', '.join(unknown)}")
     started = time.perf_counter()
     runs = {name: trainings(name, settings) for name in names or ABOUT}
-    # Together, so that all trainings of a scene and a seed take turns with each other.
+    # One call for all experiments, so that all trainings of a scene and a seed take turns.
     train_missing([run for group in runs.values() for run in group], settings, say)
     for name, group in runs.items():
         finish(name, group, settings)

@@ -1,7 +1,7 @@
-"""Nested Voronoi cells of a picture: networks from a place in the plane to a colour, split where the picture is wrong.
+"""Nested Voronoi cells of a picture: networks from pixel positions to colours, split where the error is large.
 
-The cells are the library's own, whose points have three coordinates: pixel (x, y) stands at (x, y, 0), x and y in
--1..1. Importance of a pixel is its squared error, since every sample has the weight 1.
+The library's cells have points with three coordinates, so pixel (x, y) lies at (x, y, 0) with x and y in -1..1. The
+importance of a pixel is its squared error, since every sample has weight 1.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from voronerf import NeRF, SampleReservoir, VoronoiDiagram, VoronoiRouter, frequ
 from voronerf.app.evaluate.panels import contact_sheet, palette, picture_of_colour, picture_of_error, save_picture
 
 CHILDREN, LEVELS = 4, 3
-SPLITS = (0.15, 0.35, 0.55)  # of the budget, a level each
+SPLITS = (0.15, 0.35, 0.55)  # shares of the budget, one per level
 WIDTH, DEPTH = 16, 3
 BATCH = 4096
-RATE, RATE_FINAL = 0.01, 0.05  # of networks of WIDTH, and what is left of it at the end
+RATE, RATE_FINAL = 0.01, 0.05  # learning rate of networks of WIDTH, and its final fraction
 LEAST_SAMPLES = 16
 EVALUATIONS = 20
 ONE, MATCHED, NESTED = "one network", "one network, as many parameters", "nested Voronoi cells"
 
 
 class ImageField(nn.Module):
-    """Encoded position -> ReLU layers -> colour.
+    """A network from encoded positions to colours, with ReLU layers.
 
     Args:
-        width: of the hidden layers.
-        depth: their number.
-        octaves: frequencies of the encoding.
+        width: The width of the hidden layers.
+        depth: The number of hidden layers.
+        octaves: The number of frequencies of the encoding.
     """
 
     def __init__(self, width: int, depth: int, octaves: int) -> None:
@@ -51,7 +51,7 @@ class ImageField(nn.Module):
         self.colour = nn.Linear(width, 3)
 
     def forward(self, positions: Tensor) -> Tensor:
-        """[n, 3] -> colours [n, 3] in 0..1."""
+        """Returns colours [n, 3] in 0..1 at positions [n, 3]."""
         x = frequency_encode(positions, self.octaves)
         for layer in self.hidden:
             x = torch.relu(layer(x))
@@ -59,12 +59,12 @@ class ImageField(nn.Module):
 
 
 def parameters(width: int, octaves: int) -> int:
-    """Parameters of a field of ``DEPTH`` layers."""
+    """Returns the number of parameters of a field with ``DEPTH`` layers."""
     return (3 + 6 * octaves) * width + (DEPTH - 1) * width * width + DEPTH * width + 3 * width + 3
 
 
 def matching_width(total: int, octaves: int) -> int:
-    """The largest width of one network with at most ``total`` parameters."""
+    """Returns the largest width of one network with at most ``total`` parameters."""
     width = 1
     while parameters(width + 1, octaves) <= total:
         width += 1
@@ -73,7 +73,7 @@ def matching_width(total: int, octaves: int) -> int:
 
 @dataclass(frozen=True)
 class Level:
-    """The fit at the end of its time on one diagram: cells, the picture, each pixel's cell, and the balance."""
+    """The final fit on one diagram: number of cells, the picture, each pixel's cell, and the balance."""
 
     cells: int
     picture: Tensor
@@ -82,15 +82,15 @@ class Level:
 
 
 class ImageFit:
-    """Fits a picture for a number of seconds.
+    """A fit of a picture that trains for a number of seconds.
 
     Args:
-        image: [h, w, 3] in 0..1.
-        budget: training seconds.
-        width: of the networks.
-        splits: shares of the budget at which all cells are split into ``CHILDREN``.
-        seed: of every random choice.
-        backend: of the operations.
+        image: The picture [h, w, 3] in 0..1.
+        budget: The training seconds.
+        width: The width of the networks.
+        splits: Shares of the budget at which each cell is split into ``CHILDREN`` cells.
+        seed: The seed of all random choices.
+        backend: The backend of the operations.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class ImageFit:
             torch.manual_seed(seed)
             field = ImageField(width, DEPTH, octaves_of(image))
         self.router = VoronoiRouter(field, VoronoiDiagram(torch.zeros(1, 3)), coords="first3", backend=backend)
-        # the same rule for all widths as that of `voronerf train`
+        # the rule of `voronerf train` for all widths
         self.rate = RATE * NeRF.learning_rate(width) / NeRF.learning_rate(WIDTH)
         self.optimizer = torch.optim.Adam(self.router.parameters(), lr=self.rate, betas=(0.9, 0.99), eps=1e-15)
         self.reservoir = SampleReservoir(10_000, 100)
@@ -164,15 +164,15 @@ class ImageFit:
 
     @torch.no_grad()
     def picture(self) -> Tensor:
-        """What has been learnt, [h, w, 3]."""
+        """Renders the fitted picture [h, w, 3]."""
         return self.router(self.points).reshape(self.image.shape)
 
     def psnr(self) -> float:
-        """Of the whole picture, in dB."""
+        """Returns the PSNR of the whole picture in dB."""
         return float(-10 * torch.log10((self.picture() - self.image).square().mean()))
 
     def level(self) -> Level:
-        """The fit as it is."""
+        """Returns the current fit."""
         cells = self.router.diagram.locate(self.points).reshape(self.image.shape[:2])
         return Level(self.router.num_cells, self.picture(), cells, self.imbalance)
 
@@ -182,12 +182,12 @@ def _places(count: int) -> Tensor:
 
 
 def octaves_of(image: Tensor) -> int:
-    """Frequencies until the finest wave spans two pixels."""
+    """Returns the number of frequencies whose finest wavelength is two pixels."""
     return max(1, math.ceil(math.log2(math.pi * max(image.shape[:2]) / 2)))
 
 
 def nested(settings: Settings, say: Callable[[str], None] = print) -> list[dict[str, Any]]:
-    """Fits a held-out view of each scene by the three contenders and draws the cells; returns the rows."""
+    """Fits a held-out view of each scene with three contenders and draws the cells; returns the rows."""
     rows, pictures = [], []
     scenes = settings.scene or default_scenes()
     for name in scenes:
@@ -199,8 +199,8 @@ def nested(settings: Settings, say: Callable[[str], None] = print) -> list[dict[
 
 
 def fitted_view(name: str, settings: Settings, say: Callable[[str], None]) -> tuple[list[dict[str, Any]], Tensor]:
-    """The fits of one scene's view: a row a contender and seed, and the sheet of pictures of seed 0."""
-    # one picture is little to learn: it is taken four times as large as the scene's
+    """Fits one scene's view; returns a row per contender and seed, and the sheet of pictures of seed 0."""
+    # A single picture is easy to learn, so it has four times the scene's resolution.
     scene = open_scene(name, replace(settings, downscale=max(1, settings.downscale // 4)))
     image = scene.test.truth(held_out_view(scene), torch.ones(3))
     octaves = octaves_of(image)
@@ -241,7 +241,7 @@ def fitted_view(name: str, settings: Settings, say: Callable[[str], None]) -> tu
 
 
 def drawn(image: Tensor, fits: dict[str, ImageFit]) -> Tensor:
-    """Truth, one network, and the nested fit on each level with its cells."""
+    """Draws the truth, one network, and the nested fit on each level with its cells."""
     pictures = {"truth": picture_of_colour(image), ONE: picture_of_colour(fits[ONE].levels[-1].picture)}
     for level in fits[NESTED].levels[1:]:
         borders = outlined(level.cell_of)
@@ -253,7 +253,7 @@ def drawn(image: Tensor, fits: dict[str, ImageFit]) -> Tensor:
 
 
 def outlined(cells: Tensor) -> Tensor:
-    """Each pixel of [h, w] in the colour of its cell, uint8 [h, w, 3], borders dark."""
+    """Draws each pixel of the cells [h, w] in its cell's colour, with dark borders: uint8 [h, w, 3]."""
     picture = palette(int(cells.max()) + 1)[cells.long()]
     border = torch.zeros_like(cells, dtype=torch.bool)
     border[1:] |= cells[1:] != cells[:-1]

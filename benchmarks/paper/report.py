@@ -1,4 +1,4 @@
-"""Tables of the paper's experiments as Markdown, and one page of all of them, from the JSON in the output folder."""
+"""Markdown tables of the paper's experiments, and a page with all tables, from the JSON in the output folder."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ SIZES = ("cells", "width", "parameters", "steps")
 
 
 def grid(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
-    """A Markdown table."""
+    """Returns the lines of a Markdown table."""
     return [f"| {' | '.join(header)} |", "|---" * len(header) + "|", *(f"| {' | '.join(line)} |" for line in lines)]
 
 
 def score(values: Sequence[float | None], form: str) -> str:
-    """Mean of the seeds, with their range if there are several."""
-    known = [value for value in values if value is not None]
-    if not known:
+    """Formats the mean over the seeds, with the range if there are several seeds."""
+    measured = [value for value in values if value is not None]
+    if not measured:
         return "-"
-    mean = f"{statistics.fmean(known):{form}}"
-    return mean if len(known) == 1 else f"{mean} ({min(known):{form}} to {max(known):{form}})"
+    mean = f"{statistics.fmean(measured):{form}}"
+    return mean if len(measured) == 1 else f"{mean} ({min(measured):{form}} to {max(measured):{form}})"
 
 
 def span(values: Sequence[int | None]) -> str:
-    """One number, or the range of several."""
-    known = sorted({value for value in values if value is not None})
-    return " to ".join(f"{value:,}" for value in known[:: max(len(known) - 1, 1)]) or "-"
+    """Formats one number, or the range of several numbers."""
+    numbers = sorted({value for value in values if value is not None})
+    return " to ".join(f"{value:,}" for value in numbers[:: max(len(numbers) - 1, 1)]) or "-"
 
 
 def score_table(rows: Sequence[Row], published: Callable[[str, str], Scores | None]) -> list[str]:
-    """A line a scene and variant: means and ranges over the seeds, beside what was published."""
+    """Returns a table with a row per scene and variant: means and ranges over the seeds, and published scores."""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["scene"], row["variant"]), []).append(row)
@@ -53,8 +53,8 @@ def score_table(rows: Sequence[Row], published: Callable[[str, str], Scores | No
     lines = []
     for (scene, variant), group in groups.items():
         scores = [score([row.get(name) for row in group], f".{places}f") for name, places in PLACES.items()]
-        known = published(variant, scene)
-        middle = f"{known.psnr:.3f} / {known.ssim:g} / {known.lpips:g}" if known else "-"
+        reference = published(variant, scene)
+        middle = f"{reference.psnr:.3f} / {reference.ssim:g} / {reference.lpips:g}" if reference else "-"
         sizes = [span([row.get(name) for row in group]) for name in SIZES]
         lines.append([scene, variant, *scores, *([middle] if paper else []), *sizes])
     header = ["scene", "variant", "PSNR", "SSIM", "LPIPS", "PSNR of the mean error"]
@@ -62,7 +62,7 @@ def score_table(rows: Sequence[Row], published: Callable[[str, str], Scores | No
 
 
 def balance_table(rows: Sequence[Row]) -> list[str]:
-    """The table of the experiment on balance."""
+    """Returns the table of the experiment on balance."""
     lines = []
     for row in rows:
         cells = []
@@ -75,7 +75,7 @@ def balance_table(rows: Sequence[Row]) -> list[str]:
 
 
 def table(name: str, outcome: Mapping[str, Any]) -> list[str]:
-    """The table of one experiment."""
+    """Returns the table of one experiment."""
     if name == "balance":
         return balance_table(outcome["results"])
     published = EXPERIMENTS[name].published if name in EXPERIMENTS else lambda variant, scene: None
@@ -83,7 +83,7 @@ def table(name: str, outcome: Mapping[str, Any]) -> list[str]:
 
 
 def conditions(described: Mapping[str, Any]) -> str:
-    """Where and how large an experiment was, from its metadata."""
+    """Returns a description of an experiment's machine and size, from its metadata."""
     size = described.get("size")
     parts = [
         ", ".join(described["scenes"]),

@@ -1,8 +1,8 @@
-"""The trainings behind the paper's tables and figures: how large they are, and how they are made.
+"""The trainings behind the paper's tables and figures: their settings and their execution.
 
-A training is named by its whole configuration: two experiments that need the same one share it, and one that is in the
-output folder is not made again. All missing trainings of a scene and a seed take turns of a few seconds in one process.
-An interrupted one continues from its last turn. One that fails leaves its group, and its result.json says why.
+A training is named by a hash of its configuration: experiments share equal trainings, and a training in the output
+folder is reused. All missing trainings of a scene and a seed take turns of a few seconds in one process. An interrupted
+training continues from its last turn. A failed training leaves its group and writes the error into its result.json.
 
     OUT/runs/SCENE-SEED-HASH/   a run directory of `voronerf train`, with result.json and looks/
 """
@@ -33,48 +33,48 @@ from voronerf.nerf.split import RESERVOIR
 
 Row = dict[str, Any]
 PUBLISHED_SIZE = 400
-#: The method as published.
+#: The settings of the published method.
 AS_PUBLISHED = {"field": "nerf", "occupancy": False, "contraction": "none", "average": 0.0, "centres": "balanced"}
-#: Latest batches that kept samples come from, where not as in `voronerf train`: 512 cells need samples of few steps.
+#: The number of latest batches whose samples are kept, if not `voronerf train`'s: 512 cells need samples of few steps.
 BATCHES = {"kilonerf": 100}
-#: Settings and the least that they may be; a table with two passes needs a sample in each.
+#: The least values of settings; two passes need one sample each.
 LEAST = {"downscale": 1, "seeds": 1, "rays": 1, "samples": 2, "evaluations": 1, "eval_views": 1, "cells": 2}
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How large an experiment is."""
+    """The size of an experiment."""
 
     scene: tuple[str, ...] = ()
-    """Scenes: folders, names in the data folder (VORONERF_DATA, else ../shared/data), or built-in ones. Default: lego
-    if it is there, else builtin; the tables by sampling and architecture take more. Results are kept by a scene's
-    name: another scene of that name needs another --out."""
+    """The scenes: folders, names in the data folder (VORONERF_DATA, else ../shared/data), or built-in scenes. Default:
+    lego if it exists, else builtin; the tables by sampling and architecture use more scenes. Results are stored by
+    scene name, so another scene of the same name needs another --out."""
     downscale: int = 4
-    """Factor on a scene's own images, 400 x 400 as published; the built-in scenes have 100 x 100 at 4."""
+    """The downscale factor of the published 400 x 400 images; the built-in scenes have 100 x 100 pixels at 4."""
     budget: float = 480.0
-    """Training seconds of every variant."""
+    """The training seconds of each variant."""
     seeds: int = 2
-    """Runs of every variant, seeds 0, 1, ..."""
+    """The runs of each variant, with seeds 0, 1, ..."""
     out: Path = Path("runs/paper")
-    """Folder for runs, JSON, tables and pictures."""
+    """The folder for runs, JSON, tables and pictures."""
     turn: float = 5.0
-    """Seconds that a variant trains before the next one has its turn."""
+    """The seconds of a turn, after which the next variant trains."""
     clock: Literal["wall", "cpu"] = "wall"
-    """What counts as a second: wall time, or where others use the machine too, process CPU time / threads."""
+    """The clock of the training time: wall time or, on a shared machine, process CPU time divided by threads."""
     rays: int = 1024
-    """Rays per step."""
+    """The number of rays per step."""
     samples: int = 64
-    """Samples per ray; with two passes half of them in each."""
+    """The number of samples per ray; each of two passes has half of the samples."""
     evaluations: int = 8
-    """Evaluations during the budget."""
+    """The number of evaluations during the budget."""
     eval_views: int = 10
-    """Test views of an evaluation during training."""
+    """The number of test views in an evaluation during training."""
     final_views: int | None = None
-    """Test views of the final evaluation; default all."""
+    """The number of test views in the final evaluation. Default: all."""
     cells: int = 12
-    """Cells of the paper's comparison with one network."""
+    """The number of cells in the comparison with one network."""
     backend: str = "auto"
-    """Backend of the operations."""
+    """The backend of the operations."""
 
     def __post_init__(self) -> None:
         for name, least in LEAST.items():
@@ -87,7 +87,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Variant:
-    """A row of an experiment: its name and what it changes in the configuration."""
+    """A row of an experiment: its name and its changes to the configuration."""
 
     name: str
     changes: Mapping[str, Any]
@@ -104,23 +104,23 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """Its run directory."""
+        """The run directory."""
         assert self.config.out is not None
         return self.config.out
 
     @property
     def result(self) -> Path:
-        """The file that says that it was made."""
+        """The file of the result, which exists once the training has ended."""
         return self.folder / "result.json"
 
 
 def data_folder() -> Path:
-    """Where downloaded scenes are."""
+    """Returns the folder of downloaded scenes."""
     return Path(os.environ.get("VORONERF_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
 
 def scene_source(name: str) -> str:
-    """What `load_scene` takes for a scene's name.
+    """Returns the argument of `load_scene` for a scene's name.
 
     Raises:
         ConfigError: There is no such scene.
@@ -134,20 +134,20 @@ def scene_source(name: str) -> str:
 
 
 def default_scenes(count: int = 1) -> tuple[str, ...]:
-    """The first ``count`` scenes of the paper that are there, else the built-in one."""
+    """Returns the first ``count`` available scenes of the paper, or else the built-in scene."""
     found = [name for name in ("lego", "ship", "drums") if (data_folder() / name).is_dir()]
     return tuple(found[:count]) or ("builtin",)
 
 
 def factor(name: str, settings: Settings) -> int:
-    """The factor by which a scene's own images are made smaller."""
+    """Returns the factor by which a scene's original images are downscaled."""
     if not is_builtin(name):
         return settings.downscale
     return max(1, settings.downscale * BUILTIN_SIZE // PUBLISHED_SIZE)
 
 
 def open_scene(name: str, settings: Settings) -> Scene:
-    """Loads a scene at the size that the settings ask for."""
+    """Loads a scene at the size of the settings."""
     return _loaded(scene_source(name), factor(name, settings))
 
 
@@ -157,10 +157,10 @@ def _loaded(source: str, downscale: int) -> Scene:
 
 
 def make_run(variant: Variant, scene: str, seed: int, settings: Settings) -> Run:
-    """The training that a variant stands for, with the directory that its settings and the scene's name give it."""
+    """Returns the training of a variant; its directory is named by the scene and a hash of the settings."""
     values = {name: getattr(settings, name) for name in ("budget", "evaluations", "eval_views", "rays", "backend")}
     values |= {"seed": seed, "data": scene_source(scene), "downscale": factor(scene, settings)}
-    passes = SAMPLERS[variant.changes.get("sampling", "stratified")].passes  # several share the samples of one
+    passes = SAMPLERS[variant.changes.get("sampling", "stratified")].passes  # several passes share the samples of one
     first = settings.samples // passes
     values["samples"] = (*[first] * (passes - 1), settings.samples - first * (passes - 1))
     config = TrainConfig(**{**values, **AS_PUBLISHED, **variant.changes})
@@ -172,10 +172,10 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings) -> Run
 
 
 def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], None] = print) -> None:
-    """Trains what is not in the output folder, the runs of a scene and a seed in turns."""
+    """Trains the runs that the output folder lacks; runs of the same scene and seed take turns."""
     unique = {run.folder: run for run in runs}
     missing = [run for run in unique.values() if not run.result.is_file()]
-    say(f"{len(unique)} trainings, {len(unique) - len(missing)} of them made already; {settings.budget:g} s each")
+    say(f"{len(unique)} trainings, {len(unique) - len(missing)} of them finished; {settings.budget:g} s each")
     groups: dict[tuple[int, str], list[Run]] = {}
     for run in missing:
         groups.setdefault((run.seed, run.scene), []).append(run)
@@ -186,7 +186,7 @@ def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], 
 
 
 def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Callable[[str], None] = print) -> None:
-    """Trains runs of one scene in turns, from their checkpoints if there are any, and writes their results."""
+    """Trains runs of one scene in turns, resumes from checkpoints, and writes the results."""
     trainings: dict[Path, Training] = {}
     names = {run.folder: f"{run.variant.name:28}" for run in group}
     for run in group:
@@ -207,7 +207,7 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
         say(source)
 
     def failed(training: Training, error: Exception) -> None:
-        """Keeps why a training failed in place of its result."""
+        """Writes the error of a failed training in place of its result."""
         message = str(error).removeprefix(f"{training.out}: ").removeprefix("SplitStrategy: ")
         say(f"{names[training.out]} failed: {message}")
         write_text(training.out / "result.json", json.dumps({"failed": message, "psnr": None}, indent=1) + "\n")
@@ -241,7 +241,7 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
 
 
 def results(runs: Sequence[Run]) -> list[Row]:
-    """The results of runs that were trained, each with its variant's name, its scene, its seed and its folder."""
+    """Returns the results of trained runs, with variant, scene, seed and folder."""
     return [
         {
             "variant": run.variant.name,
@@ -256,7 +256,7 @@ def results(runs: Sequence[Run]) -> list[Row]:
 
 
 def failure(run: Run) -> str | None:
-    """Why a run failed; None if it did not."""
+    """Returns the error of a failed run, or None."""
     row = json.loads(run.result.read_text()) if run.result.is_file() else {}
     return (
         f"{run.variant.name} on {Path(run.scene).name}, seed {run.seed}: {row['failed']}" if "failed" in row else None

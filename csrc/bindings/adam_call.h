@@ -1,4 +1,4 @@
-// The Adam step of Python, which checks its arguments and runs in one call.
+// The Adam step for Python: one call checks the arguments and runs the step.
 #pragma once
 
 #include <pybind11/pybind11.h>

@@ -72,10 +72,10 @@ void call(const Loaded& loaded, Result& result) {
 }  // namespace
 
 // The calls of a step in order, with their arguments. They are replayed on the same memory, which the recording holds.
-// Row counts are read again from memory at each replay, so tensors must be large enough for the most rows.
+// Row counts are read again from memory at each replay, so tensors must be large enough for the largest row counts.
 class Recording {
  public:
-  // Adds the calls of this thread from here to `end`.
+  // Calls of this thread between `begin` and `end` are added to the recording.
   void begin() { recorded() = this; }
   void end() { recorded() = nullptr; }
 
@@ -95,13 +95,13 @@ class Recording {
   bool hold() const { return tensors_.holds(); }
   void add(std::unique_ptr<Loaded> loaded) {
     if (loaded->bound->machine != &type_of<Cpu>()) refuse(loaded->function->name + " runs on a device");
-    if (loaded->frame.misses_rows()) refuse(loaded->function->name + " takes no number of rows that is counted");
+    if (loaded->frame.misses_rows()) refuse(loaded->function->name + " has no RowCount among its arguments");
     calls_.push_back(std::move(loaded));
   }
 
-  // Replays the calls [first, last) `times` times in a row. Before each replay the next random numbers, `bytes` for
-  // each of `places`, are copied there. Returns the number of complete replays: it stops before a call whose rows would
-  // exceed its memory. Traced calls run on one thread.
+  // Replays the calls [first, last) `times` times in a row. Before each replay the next random numbers are copied to
+  // `places`, `bytes` bytes to each place. Returns the number of complete replays: the replay stops before a call whose
+  // rows would exceed the memory of its tensors. Traced calls run on one thread.
   int replay(int threads, int times, size_t first, size_t last, std::uintptr_t drawn,
              const std::vector<std::uintptr_t>& places, size_t bytes) {
     const py::gil_scoped_release released;
@@ -200,7 +200,7 @@ py::object run(Loaded& loaded) {
 
 namespace {
 
-// Loads the arguments of a call. Returns false if one does not have the type of its parameter.
+// Loads the arguments of a call. Returns false if an argument does not have the type of its parameter.
 bool load(Loaded& loaded, const py::args& arguments) {
   for (size_t i = 0; i < arguments.size(); ++i) {
     PyObject* const argument = PyTuple_GET_ITEM(arguments.ptr(), static_cast<Py_ssize_t>(i));

@@ -19,8 +19,8 @@
 #include "bindings/load.h"
 #include "common/isa.h"
 
-// A build without CUDA has null pointers for the CUDA functions, and the emulated build for the CPU functions. Their
-// signatures remain.
+// The CUDA functions are null pointers in a build without CUDA, and the CPU functions in the emulated build, but with
+// their signatures.
 #ifdef VN_WITH_CUDA
 #define VN_CUDA(...) &__VA_ARGS__
 #else

@@ -53,7 +53,7 @@ bool add_tensor(Recording& recording, PyObject* tensor);
 // The Python references that a call holds, released when it ends.
 class Frame {
  public:
-  // A row count of a recorded call: each replay sets *rows = *memory + more. *memory may be at most `most`.
+  // A row count of a recorded call: each replay sets *rows = *memory + more, where *memory is at most `most`.
   struct Counted {
     RowCount* rows;
     const int64_t* memory;
@@ -163,7 +163,8 @@ class Frame {
   // Records a RowCount of voronerf/ops/_core/rows.py, a subclass of int. A plain int cannot be recorded.
   void count(PyObject* object, RowCount& rows) {
     if (PyLong_CheckExact(object)) {
-      return refuse(*recorded(), "a number of rows lies in no memory, " + std::to_string(rows.value));
+      const std::string value = std::to_string(rows.value);
+      return refuse(*recorded(), "a row count is a plain int that a replay cannot read again: " + value);
     }
     const auto number = [object](const char* name) { return py::cast<int64_t>(py::handle(object).attr(name)); };
     const auto* memory = reinterpret_cast<const int64_t*>(py::cast<std::uintptr_t>(py::handle(object).attr("address")));
@@ -244,7 +245,7 @@ class Frame {
       const Member& member = type.members[i];
       void* at = place + member.offset;
       if (load(*member.type, PyTuple_GET_ITEM(object, static_cast<Py_ssize_t>(i)), at)) continue;
-      throw py::type_error(type.exact + ": " + member.name + " is no " + member.type->exact);
+      throw py::type_error(type.exact + ": " + member.name + " is not of type " + member.type->exact);
     }
     return true;
   }

@@ -226,7 +226,7 @@ Type describe() {
   }
 }
 
-// Returns the Type of a parameter, by value or by reference.
+// Returns the Type of a parameter that is passed by value or by reference.
 template <typename T>
 const Type& type_of() {
   using Plain = std::remove_cv_t<std::remove_reference_t<T>>;

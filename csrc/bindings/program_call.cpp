@@ -18,11 +18,11 @@ TableType table_type(unsigned dtype) {
 // A program with the shapes and types of its results, which a call allocates.
 class ProgramCall {
  public:
-  // `widths` has the columns of each output, and whether it has a row per ray. `sums` has the shape of an entry of each
-  // sum, and the parameter whose number of tables it has (-1: one entry per cell). `kept` has the columns of each kept
-  // look-up, `tables` the parameters that are tables, `sizes` the elements of each parameter per cell. `rays` is the
-  // first input with a row per ray, or -1. on_large is called with each result of at least `large` bytes, to place it
-  // on huge pages.
+  // `widths` has, for each output, the number of columns and whether there is a row per ray. `sums` has, for each sum,
+  // the parameter whose number of tables is the number of entries (-1: one entry per cell), and the shape of an entry.
+  // `kept` has the columns of each kept look-up, `tables` the parameters that are tables, `sizes` the elements of each
+  // parameter per cell. `rays` is the first input with a row per ray, or -1. on_large is called with each result of at
+  // least `large` bytes, to place it on huge pages.
   ProgramCall(py::object program, std::vector<std::pair<int64_t, bool>> widths,
               std::vector<std::pair<int, std::vector<int64_t>>> sums, std::vector<int64_t> kept,
               std::vector<size_t> tables, std::vector<int64_t> sizes, int rays, int64_t large, py::object on_large)
@@ -44,7 +44,7 @@ class ProgramCall {
 
   // Runs the program on `rows`: inputs, parameters, offsets, order, ray_index and the kept look-ups of an earlier call.
   // Returns the outputs, the sums and, if `keep`, the look-ups. Returns None if Python has to make the call: during a
-  // recording or for unsupported tensors and, if `asked`, also if a part of torch must see the call.
+  // recording, for unsupported tensors or, with `asked`, if a part of torch must see the call.
   py::object call(const py::tuple& rows, bool keep, int64_t gradients, const char* caller, bool asked) const {
     if (recorded() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
       return py::none();
@@ -75,7 +75,7 @@ class ProgramCall {
     in.r = rays_ < 0 ? 0 : views[static_cast<size_t>(rays_)].shape[0];
     in.k = offsets.shape[0] - 1;
 
-    // The row count of inputs per sample; -1 if rays and samples cannot be told apart by their counts.
+    // The row count of inputs per sample; -1 if rays and samples have the same count.
     const int64_t samples = ray_index != Py_None && in.n == in.r ? -1 : int64_t{in.n};
     const unsigned dtype = views[0].dtype();
     if (dtype != kFloat32 && dtype != kBfloat16) return py::none();
@@ -169,7 +169,7 @@ class ProgramCall {
     if (bytes >= large_) on_large_(tensor);
     results.append(tensor);
     TensorView view;
-    if (!view.look(tensor.ptr())) throw std::runtime_error("torch does not tell where new memory is");
+    if (!view.look(tensor.ptr())) throw std::runtime_error("torch gives no address for a new tensor");
     return view.address();
   }
 

@@ -1,4 +1,5 @@
-// Calls of programs (network/program.h) from Python, which derive the arguments of the program from its tensors.
+// Calls of programs (network/program.h) from Python. A call derives the other arguments of the program from its
+// tensors.
 #pragma once
 
 #include <pybind11/pybind11.h>

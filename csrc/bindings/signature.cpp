@@ -15,8 +15,8 @@ namespace {
 
 constexpr int kMostArguments = 32;
 
-// Returns how to call a custom op with these arguments: 0: bypass torch's dispatcher, which has nothing to do; 1:
-// bypass it and record gradients; 2: Python decides, for example for the dispatcher.
+// Returns how to call a custom op with these arguments. 0: without torch's dispatcher, which has nothing to do. 1:
+// without the dispatcher, but with gradients. 2: as Python decides, for example through the dispatcher.
 int way_of(PyObject* arguments, bool top = true) {
   if (top && questions.is_watched()) return 2;
   bool learns = false;

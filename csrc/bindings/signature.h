@@ -1,6 +1,5 @@
 // Calls of ops from Python. One call checks the arguments and runs a compiled function, unless a part of torch has to
-// see the call. The rules come from the signature of the public function (voronerf/ops/_core/declare.py), which is read
-// once.
+// see the call. The rules are read once, from the signature of the public function (voronerf/ops/_core/declare.py).
 #pragma once
 
 #include <pybind11/pybind11.h>

@@ -82,7 +82,7 @@ struct Common {
 // The rule for one tensor, as in Checked.tensor of checks.py.
 struct TensorRule {
   unsigned dtypes = 0;
-  // same: dtype of the first floating-point tensor; wide: that dtype, but at least float32
+  // same: the dtype of the first floating-point tensor; wide: the same dtype, but at least float32
   bool same = false, wide = false;
   bool either = false;  // either of the two shapes
   bool filled = false;  // the letter of the first size is at least 1
@@ -182,7 +182,7 @@ class Rules {
 };
 
 // Returns whether the lists have equally many tensors, with equal shapes at each place. All tensors must be float32 and
-// on one device, tensors of `written` lists must be contiguous, and the scalars must be tensors [].
+// on one device, tensors in lists marked in `written` must be contiguous, and the scalars must be tensors [].
 inline bool alike(const py::sequence& lists, const std::vector<bool>& written, const py::list& scalars) {
   std::vector<TensorView> first;
   for (size_t i = 0; i < lists.size(); ++i) {

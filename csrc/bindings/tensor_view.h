@@ -1,5 +1,5 @@
-// A view of a torch tensor through the DLPack exchange API (https://dmlc.github.io/dlpack/latest/c_api.html), in torch
-// from 2.10 on. One call takes 50 ns, while the Python methods of a tensor take a microsecond.
+// A view of a torch tensor through the DLPack exchange API (https://dmlc.github.io/dlpack/latest/c_api.html), which
+// torch has from version 2.10 on. One call takes 50 ns, while the Python methods of a tensor take a microsecond.
 #pragma once
 
 #include <cstddef>

@@ -1,4 +1,4 @@
-// A check, in every call, that the Python objects for which a step, router or field was prepared are unchanged.
+// A check that runs in every call: the Python objects for which a step, router or field was prepared must be unchanged.
 #pragma once
 
 #include <pybind11/pybind11.h>

@@ -94,7 +94,7 @@ __device__ __forceinline__ float unpack_half(uint16_t bits) {
 #endif
 }
 
-// Clamps the two float16 of a word to the largest finite numbers; NaN stays.
+// Clamps the two float16 numbers of a word to the largest finite numbers; NaN stays.
 __device__ __forceinline__ uint32_t clamp_halves(uint32_t word) {
 #ifdef VN_EMULATE
   for (int shift = 0; shift < 32; shift += 16) {

@@ -14,7 +14,7 @@ VN_HD uint32_t mixed(uint32_t x) {
   return x ^ x >> 16;
 }
 
-// hash_key returns the key of a ray. hashed returns a random number in [0, 1) for a key and a place.
+// `hash_key` returns the key of a ray. `hashed` returns a random number in [0, 1) for a key and a place.
 VN_HD uint32_t hash_key(int32_t seed, int64_t ray) {
   return mixed(static_cast<uint32_t>(seed) + static_cast<uint32_t>(ray));
 }

@@ -16,7 +16,7 @@ constexpr std::uintptr_t kHugePage = std::uintptr_t{1} << 21;
 
 void advise_huge_pages(void* memory, int64_t bytes) {
   const std::uintptr_t start = reinterpret_cast<std::uintptr_t>(memory);
-  // Only huge pages that lie entirely in the block: the memory around it belongs to others.
+  // Advise only huge pages that lie entirely in the block: the memory around the block belongs to others.
   const std::uintptr_t first = (start + kHugePage - 1) / kHugePage * kHugePage;
   const std::uintptr_t last = (start + static_cast<std::uintptr_t>(bytes)) / kHugePage * kHugePage;
   // On an error the pages stay small.

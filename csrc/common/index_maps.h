@@ -18,9 +18,9 @@ VN_HD constexpr MapPlace accumulator_place(unsigned lane, int i) {
   return {static_cast<int>(lane / 4) + 8 * (i / 2), static_cast<int>(2 * (lane % 4)) + i % 2};
 }
 
-// The range of a warp's search in non-decreasing values for the last one that is not above a bound. The 32 lanes probe
-// 32 values at a time (probed); `votes` counts the probes that are not above the bound (narrowed). The first value is
-// assumed not to be above it.
+// The range in which a warp searches non-decreasing values for the last value that is at most a bound. `probed` returns
+// the index that a lane probes, `narrowed` the range that remains if `votes` probes are at most the bound. The first
+// value must be at most the bound.
 struct MapSpan {
   int64_t first, last;
 };

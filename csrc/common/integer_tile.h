@@ -76,7 +76,7 @@ VN_INLINE I32 max(I32 a, I32 b) { return a > b ? a : b; }
 VN_INLINE I32 tag(I32 a, I32 mask, I32 b) { return (a & mask) | b; }
 VN_INLINE I32 subtract(I32 a, I32 b) { return a - b; }
 VN_INLINE I32 left(I32 a, int bits) { return a << bits; }
-// Only for non-negative numbers.
+// Shifts right; the numbers must not be negative.
 VN_INLINE I32 right(I32 a, int bits) { return a >> bits; }
 VN_INLINE Mask less(I32 a, I32 b) { return a < b; }
 VN_INLINE F32 divide(F32 a, F32 b) { return a / b; }

@@ -1,5 +1,5 @@
-// Instruction sets of the CPU paths. Every file *_isa.cpp is compiled once per instruction set, with its flags and
-// VN_ISA. The caller chooses one at run time, so one build runs on any processor of its architecture.
+// Instruction sets of the CPU paths. Every file *_isa.cpp is compiled once per instruction set, with the set's compiler
+// flags and VN_ISA. The caller chooses one at run time, so one build runs on any processor of its architecture.
 #pragma once
 
 namespace voronerf {

@@ -118,7 +118,7 @@ double bfloat16_gain() {
 double measure_peak(Peak kind, Isa isa, int threads) {
   if (!isa_supported(isa)) throw std::invalid_argument("measure_peak: isa must be one that this processor supports");
   if (kind == Peak::bfloat16 && isa != Isa::avx512_bf16 && isa != Isa::amx) {
-    throw std::invalid_argument("measure_peak: kind must be one that the instruction set has, got bfloat16");
+    throw std::invalid_argument("measure_peak: the instruction set has no bfloat16 products");
   }
   return kind == Peak::copy ? measure_copy(isa, threads) : measure_multiply_adds(kind, isa, threads);
 }

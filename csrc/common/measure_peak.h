@@ -10,7 +10,7 @@ enum class Peak : int { float32 = 0, bfloat16, copy };
 
 // Returns the floating-point operations per second of multiply-adds (two operations each; a bfloat16 dot product has
 // four per lane), or the bytes per second, read and written, of a copy. The result is the best of several bursts of one
-// or two milliseconds, 0.1 s in all. A copy uses cached or streaming stores, whichever are faster. Throws
+// or two milliseconds, 0.1 s in total. A copy uses cached or streaming stores, whichever are faster. Throws
 // std::invalid_argument if `isa` does not support `kind`.
 double measure_peak(Peak kind, Isa isa, int threads);
 

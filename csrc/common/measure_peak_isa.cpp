@@ -1,6 +1,6 @@
 // Each loop has enough independent sums to hide the latency of a multiply-add on two units (up to 5 cycles), in at most
 // 13 of 16 registers or 24 of 32. The unroll pragma is needed because gcc unrolls at most 16 by default. The sums start
-// with different values, or the compiler would compute only one of them.
+// with different values, since the compiler would compute only one of several equal sums.
 #include "common/measure_peak_isa.h"
 
 #include "common/memory_tile.h"

@@ -22,8 +22,8 @@
 namespace voronerf {
 
 // Calls body(thread) once on each thread of a team of at most `threads`, numbered from 0, and returns when all calls
-// have returned. With one thread there is no team: the calling thread runs the body, as a forked child must. The body
-// must not throw.
+// have returned. With one thread there is no team: the calling thread runs the body. A forked child must use one
+// thread. The body must not throw.
 template <typename Body>
 void parallel(int threads, const Body& body) {
   if (threads <= 1) {
@@ -46,8 +46,8 @@ void parallel(int threads, const Body& body) {
 #endif
 }
 
-// Calls body() on the calling thread. Up to `threads` - 1 other threads run its parallel regions with it and wait
-// between them, so that one team serves all regions of the body.
+// Calls body() on the calling thread. Up to `threads` - 1 other threads join the calling thread in the parallel regions
+// of the body, and wait between regions, so that one team serves all regions.
 template <typename Body>
 void with_team(int threads, const Body& body) {
   if (threads <= 1) return body();

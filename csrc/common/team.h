@@ -64,8 +64,8 @@ class Team {
 
  private:
   static constexpr uint64_t kMost = 1024, kEnd = ~uint64_t{0};
-  // A waiting thread spins for about as long as falling asleep and waking take, then it sleeps: so it loses at most
-  // half of its time. While it spins, it yields its core to other threads.
+  // A waiting thread spins for about as long as falling asleep and waking would take, and then sleeps, so it loses at
+  // most half of its time. While it spins, it yields its core to other threads.
   static constexpr std::chrono::microseconds kSpin{200};
 
   void post(uint64_t job) {

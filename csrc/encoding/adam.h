@@ -8,7 +8,8 @@
 
 namespace voronerf {
 
-// The update rule of a parameter. Its step is on the device, and its rate may be: CUDA never reads them on the host.
+// The update rule of a parameter. Its step is on the device, and its rate may be there too; with CUDA, the host reads
+// neither.
 struct AdamRule {
   double rate;           // the learning rate if rate_at is null
   const float* rate_at;  // [1], the learning rate, or null
@@ -31,14 +32,15 @@ void adam_cpu(const std::vector<AdamRule>& rules, float* const* parameters, cons
               float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,
               Isa isa, int threads);
 
-// Moves averages by a share [1] of the way to the parameters, or to 0 if `parameters` is null.
+// Moves averages towards the parameters, or towards 0 if `parameters` is null, by the fraction `share` [1] of the
+// distance.
 void average_cpu(float* const* averages, const float* const* parameters, const float* share,
                  const std::vector<int64_t>& sizes, int threads);
 
 // Adds gradients to totals.
 void add_cpu(const float* const* gradients, float* const* totals, const std::vector<int64_t>& sizes, int threads);
 
-// A step on CUDA, in two launches per 36 parameters. adam_workspace_cuda returns the floats of its workspace for
+// adam_cuda makes a step in two launches per 36 parameters. adam_workspace_cuda returns the floats of its workspace for
 // `count` parameters.
 int64_t adam_workspace_cuda(int64_t count);
 void adam_cuda(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,

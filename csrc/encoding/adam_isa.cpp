@@ -1,4 +1,4 @@
-// A step reads the whole gradient, but of the other three arrays only cache lines with a nonzero gradient: in a large
+// A step reads the whole gradient, but in the other three arrays only cache lines with a nonzero gradient: in a large
 // table most lines have none. A line is 16 floats. Its update has no branches, and entries with zero gradient are
 // written back unchanged. A rule with `every` streams through all arrays, which the hardware prefetches. Each operation
 // is rounded separately (the build turns contraction off), so that all instruction sets give the same bits.

@@ -15,7 +15,7 @@ template <typename Formula>
 struct ByRow {
   static constexpr int64_t kColumns = (Formula::kMost + kLanes - 1) / kLanes * kLanes;
 
-  // Columns of x [rows][stride] from `row` on. Lanes behind the last row repeat it.
+  // Columns of x [rows][stride] from `row` on. Lanes after the last row repeat the last row.
   struct Of {
     const float* x;
     int64_t stride, row, rows;
@@ -40,7 +40,7 @@ struct ByRow {
   };
 
   // Encodes x [rows][x_stride], `raw` columns of each row -> out [rows, rounded up to whole vectors][stride], with 0
-  // behind the columns of the encoding. If raw and x_stride are 3, x must be readable for the rounded number of rows.
+  // after the columns of the encoding. If raw and x_stride are 3, x must be readable for the rounded number of rows.
   static void values(const float* x, int64_t x_stride, int64_t raw, int64_t size, int64_t rows, float* out,
                      int64_t stride) {
     for (int64_t row = 0; row < rows; row += kLanes) {

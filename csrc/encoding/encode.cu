@@ -1,6 +1,6 @@
 // The encodings on CUDA. Octaves, forward: one thread per element of the result. Computing sine and cosine separately
-// costs less than passing one of them through shared memory. Octaves, backward: one thread per feature of a point; it
-// recomputes its sines and cosines and shares the cache lines of its gradients with neighbouring threads. ByRow: one
+// costs less than passing one of them through shared memory. Octaves, backward: one thread per feature of a point. A
+// thread recomputes its sines and cosines, and neighbouring threads read the same cache lines of gradients. ByRow: one
 // thread per row. Rows pass through shared memory, so that global accesses are coalesced; one padding column avoids
 // bank conflicts.
 #include <algorithm>

@@ -4,12 +4,12 @@
 //   ByRow<Formula>      a formula for one row; the CPU evaluates it for a vector of rows, a CUDA thread for one row
 //   Octaves<kBlurred>   sines and cosines; kBlurred: damped by the variances of x
 //
-// The CPU kernels are in by_row_tile.h and frequency_encode_tile.h. On CUDA programs have theirs in
-// program_cuda_encoding.h, and the separate ops in encode.cu.
+// The CPU kernels are in by_row_tile.h and frequency_encode_tile.h. The CUDA kernels are in program_cuda_encoding.h for
+// programs, and in encode.cu for the separate ops.
 //
 // A formula is a struct in its own header, written with F32 and the functions that network/functions.h requires, so
-// that both devices share it. It is included only if these functions are defined (VN_WORDS). of(i) is column i of x,
-// g(c) the gradient with respect to column c of the encoding. kMost is the largest number of columns.
+// that both devices share it. The header is included only if these functions are defined (VN_WORDS). of(i) is column i
+// of x, g(c) the gradient with respect to column c of the encoding. kMost is the largest number of columns.
 //
 //   values(of, columns of x, size, put)        calls put(c, value) for each column of the encoding
 //   gradient(of, columns of x, size, g, put)   calls put(i, value) for each column of x

@@ -1,6 +1,6 @@
 // The frequency encoding of the rows of a tile, and its gradient: [x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...], each
 // a block of d features, with or without x, as in voronerf/ops/frequency_encode/reference.py. For a Gaussian with mean
-// x each value is multiplied by exp(-4^l variance / 2), as in integrated_encode beside it.
+// x each value is multiplied by exp(-4^l variance / 2), as in voronerf/ops/integrated_encode.
 //
 // A lane is a column of the encoding. A permutation selects its feature, a table gives its octave and phase, and one
 // sine with one range reduction computes it. So rows have the layout that the products read, without a transposition.
@@ -15,7 +15,7 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// Lane i of the result is lane index[i] of x.
+// Returns a vector whose lane i is lane index[i] of x.
 VN_INLINE F32 permute(F32 x, Bits index) {
 #if VN_ISA == 2
   return _mm512_maskz_permutexvar_ps(0xffff, reinterpret_cast<__m512i>(index),
@@ -213,7 +213,7 @@ VN_INLINE void encode_floats(const float* x, int64_t x_stride, const float* tabl
 }
 
 // Encodes rows as encode_floats does. For tile registers, `pairs` [rows][pairs_stride] is written too unless it is
-// null; its rows are whole vectors. If `left` is not 0, the rounding remainders follow `left` floats behind the pairs.
+// null; its rows are whole vectors. If `left` is not 0, the rounding remainders follow `left` floats after the pairs.
 // With pairs and without `kept`, `out` may stay unwritten.
 void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns, float* out,
             int64_t stride, [[maybe_unused]] float* pairs = nullptr, [[maybe_unused]] int64_t pairs_stride = 0,
@@ -279,7 +279,8 @@ VN_INLINE void encode_row_backward(const float* value, const float* gradient, co
   }
 }
 
-// Computes the gradient of a row's variances: the derivative of exp(-4^l variance / 2) is -4^l / 2 times itself.
+// Computes the gradient of a row's variances: the derivative of the factor exp(-4^l variance / 2) is -4^l / 2 times the
+// factor.
 VN_INLINE void blur_row_backward(const float* value, const float* gradient, const float* table, int64_t stride,
                                  const Columns& columns, float* out) {
   const int64_t d = columns.d;

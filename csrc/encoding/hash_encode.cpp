@@ -1,5 +1,5 @@
 // The hash encoding on the CPU. A task computes features or gradients of positions for a run of points, or the table's
-// gradient for one level. It sums in the order of the points, so that results do not depend on the number of threads.
+// gradient for one level. Sums are in the order of the points, so results do not depend on the number of threads.
 #include "encoding/hash_encode.h"
 
 #include <algorithm>

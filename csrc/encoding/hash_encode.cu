@@ -1,7 +1,7 @@
 // The hash encoding on CUDA. A thread handles one point and a few levels. The y axis of the grid runs over groups of
 // levels, so that the entries read at a time fit the L2 cache (Mueller et al. 2022, section 4, do this level by level).
-// A thread's levels have eight features together: it writes a whole sector of 32 bytes, and reads one in the backward
-// pass.
+// The levels of a thread have eight features together, so the thread writes a whole sector of 32 bytes, and reads one
+// in the backward pass.
 //
 // The table's gradient is summed by atomic operations, in no fixed order. For the gradient of the positions, one thread
 // per point sums over the levels.

@@ -1,6 +1,7 @@
 // hash_encode (Mueller et al. 2022) and its gradients: positions [n,3] and a table [tables, entries, features] -> [n,
 // levels x features], as in voronerf/ops/hash_encode/reference.py. If each point has a direction, the kernels compute
-// the derivative along it instead of the value. Second derivatives use this (voronerf/ops/hash_encode/autograd.py).
+// the derivative along it instead of the value. Second derivatives use this mode
+// (voronerf/ops/hash_encode/autograd.py).
 #pragma once
 
 #include <cstddef>
@@ -42,13 +43,13 @@ void hash_encode_cpu(const HashInputs& in, const HashGrid& grid, float* out, Isa
 void hash_encode_backward_cpu(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
                               float* of_positions, Isa isa, int threads);
 
-// Writes the features of one level for points `begin` to `end`; rows of the result are `stride` floats apart. A part of
-// hash_encode_cpu, on the calling thread.
+// Writes the features of one level for points `begin` to `end`; rows of the result are `stride` floats apart. This is a
+// part of hash_encode_cpu, on the calling thread.
 void hash_level_cpu(const HashEncoding& in, int64_t level, float* out, int64_t stride, int64_t begin, int64_t end,
                     Isa isa);
 
 // Sets the gradient of one level's entries to the sum over points `begin` to `end`, in their order; rows of `gradient`
-// are `stride` floats apart. A part of hash_encode_backward_cpu, on the calling thread.
+// are `stride` floats apart. This is a part of hash_encode_backward_cpu, on the calling thread.
 void hash_level_backward_cpu(const HashEncoding& in, int64_t level, const float* gradient, int64_t stride,
                              int64_t begin, int64_t end, float* of_table, Isa isa);
 

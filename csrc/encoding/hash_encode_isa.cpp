@@ -1,8 +1,8 @@
 // The CPU kernels of the hash encoding, compiled once per instruction set. They loop over blocks of points, and over
 // the levels of each block.
 //
-// The gradient of the table has the loops the other way around: one thread handles all points of a level. It sums in
-// the order of the points, and the level's entries stay in the L2 cache.
+// For the gradient of the table, the outer loop is over the levels: one thread handles all points of a level. The
+// thread sums in the order of the points, and the level's entries stay in the L2 cache.
 #include "encoding/hash_encode_tile.h"
 
 namespace voronerf {

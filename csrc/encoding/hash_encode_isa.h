@@ -15,7 +15,7 @@ constexpr int64_t kHashBlock = 64;  // points of a block, whose corners stay in 
 VN_DECLARE_FOR_ISA(void hash_encode_rows(const HashEncoding& in, float* out, int64_t stride, int64_t begin,
                                          int64_t end))
 
-// The same for one level; its features are the first of a row.
+// The same for one level, whose features are the first of each row.
 VN_DECLARE_FOR_ISA(void hash_encode_level(const HashEncoding& in, int64_t level, float* out, int64_t stride,
                                           int64_t begin, int64_t end))
 

@@ -1,8 +1,9 @@
 // Arithmetic of the hash encoding for one point and one level, and the structs that describe a call. The CPU's vector
 // form is in hash_encode_tile.h.
 //
-// The weights of the eight corners around a point are products of one factor for each axis: w(t) or 1 - w(t), t being
-// the distance from the lower corner, w(t) = t or t^2 (3 - 2 t). Derivatives have the same corners and other factors.
+// The weights of the eight corners around a point are products of one factor for each axis: w(t) or 1 - w(t), where t
+// is the distance from the lower corner and w(t) is t or t^2 (3 - 2 t). Derivatives use the same corners with other
+// factors.
 #pragma once
 
 #include <cstdint>
@@ -54,8 +55,8 @@ VN_HD HashPlace hash_place(float x, float low, float inverse) {
   return {place, place == place ? inverse : 0.0f};
 }
 
-// One axis of a level: the lower corner, then for the lower and the upper corner the weight's factor and its first and
-// second derivative with respect to the place.
+// One axis of a level: the lower corner, and for both the lower and the upper corner the factor of the weight and its
+// first and second derivatives with respect to the place.
 struct HashAxis {
   uint32_t corner;
   float at[2], slope[2], bend[2];

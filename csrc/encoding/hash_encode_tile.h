@@ -230,7 +230,8 @@ VN_INLINE T* table_of(const HashEncoding& in, T* level, int64_t point) {
   return in.in.cells == nullptr ? level : level + in.in.cells[point] * in.in.entries * kFeatures;
 }
 
-// Bytes from which a level does not fit in the L2 cache beside the others, so that prefetching pays.
+// The size in bytes from which a level does not fit in the L2 cache together with the other levels, so that prefetching
+// pays.
 constexpr int64_t kFetchedLevel = 1 << 20;
 
 // Prefetches the entries of all points of a block on one level, since out-of-order execution reaches only a few points

@@ -1,5 +1,5 @@
-// The real spherical harmonics of bands 0 to 3 as polynomials of a direction, in the order, with the signs and
-// constants of tiny-cuda-nn.
+// The real spherical harmonics of bands 0 to 3 as polynomials of a direction, with the order, signs and constants of
+// tiny-cuda-nn.
 #pragma once
 
 namespace voronerf {

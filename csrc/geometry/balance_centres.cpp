@@ -1,5 +1,5 @@
-// balance_centres on the CPU, with all steps in one call: a step of the usual size (ten thousand samples, sixteen
-// cells) takes a few tens of microseconds, less than separate calls would. nearest_centre finds the cells. Masses are
+// balance_centres on the CPU, as one call. At the usual size (ten thousand samples, sixteen cells) it takes a few tens
+// of microseconds, less than a separate call for each of its parts would. nearest_centre finds the cells. Masses are
 // added in the order of the samples, and all computation on the few centres is float64 on one thread. So the result
 // depends neither on the number of threads nor on the instruction set.
 #include "geometry/balance_centres.h"

@@ -13,7 +13,7 @@
 // If a warp has too few counters for the cells, the toolkit's radix sort sorts by the bits of the bucket numbers. With
 // counters in global memory every 32 rows would wait for a counter, and the many counters would allow too few chunks to
 // fill the device (for 4 M rows, 256 warps with 4,096 cells and 16 with 65,536). cell_sort_keys writes buckets and row
-// numbers for it, and cell_sort_offsets finds each cell's first row in the sorted keys.
+// numbers for the radix sort, and cell_sort_offsets finds each cell's first row in the sorted keys.
 //
 // A stable order is unique, so both methods give the CPU's result bit for bit.
 #include "common/cuda_wrappers.h"

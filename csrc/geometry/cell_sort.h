@@ -1,7 +1,7 @@
 // Stable sort by cell: cells [n] -> order [n], offsets [k+1].
 //
-// Counting cuts the rows into chunks, each with its own histogram. A chunk has more rows than there are cells, so the
-// histograms are smaller than n.
+// The counting sort splits the rows into chunks, each with its own histogram. A chunk has more rows than there are
+// cells, so the histograms are smaller than n.
 #pragma once
 
 #include <cstdint>
@@ -14,7 +14,7 @@ namespace voronerf {
 // Returns false if a cell lies outside 0..k-1; `order` and `offsets` are then undefined.
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCount n, int64_t k, int threads);
 
-// Writes the result for all samples in one cell: cells 0, offsets 0 and n.
+// Writes the result if all samples are in one cell: cells 0, offsets 0 and n.
 void one_cell_cpu(int32_t* cells, int32_t* offsets, RowCount n, int threads);
 
 // The sorting method on CUDA: by counting if a warp's counters fit in shared memory, since this moves the fewest bytes

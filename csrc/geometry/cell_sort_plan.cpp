@@ -13,7 +13,7 @@ CellSortPlan cell_sort_plan(int64_t n, int64_t k, CellSortWay way, int64_t tempo
   CellSortPlan plan{};
   plan.buckets = k + 2;
   const bool few = plan.buckets <= kCellSortBuckets;
-  VN_CHECK(few || way != CellSortWay::counting, "cell_sort: too many cells to be counted in shared memory");
+  VN_CHECK(few || way != CellSortWay::counting, "cell_sort: too many cells for counting in shared memory");
   plan.radix = way == CellSortWay::radix || !few;
   if (!plan.radix) {
     // Short chunks keep many warps busy, while long chunks need fewer counters: at most half as many counters as rows.

@@ -77,7 +77,7 @@ class Builder {
       : shape_(centre_index_shape(k, D, sizeof(T))), index_(index), centres_(new Centre<T, D>[k]) {
     for (int64_t i = 0; i < k; ++i) {
       for (int axis = 0; axis < D; ++axis) {
-        const T value = input[D * i + axis];  // NaN has no order; as infinity it is never the nearest
+        const T value = input[D * i + axis];  // NaN has no order; it becomes infinity, never the nearest
         centres_[i].at[axis] = value == value ? value : std::numeric_limits<T>::infinity();
       }
       centres_[i].number = static_cast<int32_t>(i);

@@ -5,7 +5,7 @@
 // boxes of its 16 children, axis by axis. The root has the remaining 1 to 4 levels. A leaf holds the coordinates of its
 // centres, axis by axis, then their numbers. The layout follows from k: a head that describes the centres, nodes level
 // by level, leaves. For three coordinates of float32 it takes 18 bytes a centre if k is a power of two, and 36 if k is
-// one more than that.
+// one more than a power of two.
 #pragma once
 
 #include <cstdint>

@@ -1,10 +1,10 @@
 // Searches an index of centres; compiled once per instruction set. It searches one point at a time, with the children
 // of a node or the centres of a leaf in the lanes.
 //
-// The nearest child comes first, and a box that is farther than the best centre is skipped. A box's squared distance
-// uses the same operations as a centre's. Rounding is monotonic, so the box's distance never exceeds the distance of a
-// centre in it. Float32 skips only boxes beyond nearest_is_certain's margin, so the final check covers all centres. If
-// the check fails, the point is searched again in float64.
+// The nearest child is searched first, and a box that is farther than the best centre is skipped. A box's squared
+// distance uses the same operations as a centre's. Rounding is monotonic, so the box's distance never exceeds the
+// distance of a centre in it. Float32 skips only boxes beyond nearest_is_certain's margin, so the final check covers
+// all centres. If the check fails, the point is searched again in float64.
 //
 // Consecutive points lie along rays, so the previous point's nearest centre bounds the search of the next point.
 #include "common/integer_tile.h"
@@ -172,7 +172,7 @@ VN_INLINE Found search(const float* input, const int32_t* index, const CentreInd
         store(children[level] + p * kLanes, tag(as_integer(v), distance_bits, lanes[p]));
       }
     }
-    for (; level >= 0; --level, node >>= 4) {  // go to the nearest unvisited child, here or above
+    for (; level >= 0; --level, node >>= 4) {  // go to the nearest unvisited child of this node or of one above
       I32 keys[kParts];
       __builtin_memcpy(keys, children[level], sizeof keys);
       I32 least = keys[0];

@@ -25,8 +25,8 @@ bool locate_cell_cpu(const T* points, const T* centres, const int32_t* child_off
 
 // g is the number of diagrams. Invalid tables (locate_cell_fault) cannot be rejected without a host read. A point's
 // walk ends where a table entry is out of range, so that nothing outside is read. A point gets a negative number if its
-// walk ends without a leaf or takes more than `depth` levels. rows: [1], the number of leading points to locate, the
-// other points get -1; null for all points.
+// walk ends without a leaf or takes more than `depth` levels. rows: [1], the number of leading points to locate (other
+// points get -1), or null to locate all points.
 template <typename T>
 void locate_cell_cuda(const T* points, const T* centres, const int32_t* child_offsets, const int32_t* child,
                       const int32_t* rows, int32_t* leaves, int64_t n, int64_t m, int64_t g, int depth, void* stream);

@@ -17,8 +17,9 @@ namespace {
 // threads.
 constexpr int64_t kBlock = 2048;
 
-// Returns whether building an index pays. Searching all centres takes 0.11 ns per point and centre (AVX-512), an index
-// some 100 ns per point and 50 to 120 ns per centre to build. For d = 4 there is no vectorised search of all centres.
+// Returns whether building an index pays. Searching all centres takes 0.11 ns per point and centre (AVX-512). Searching
+// an index takes some 100 ns per point, and building it 50 to 120 ns per centre. For d = 4 there is no vectorised
+// search of all centres.
 bool index_pays(int64_t n, int64_t k, int64_t d) { return d < 4 ? n >= 1024 && k >= 2048 : n >= 64; }
 
 // Pads one or two coordinates to three.

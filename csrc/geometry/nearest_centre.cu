@@ -1,8 +1,8 @@
 // Nearest centre on CUDA. Search of all centres: a thread has two points. Centres pass through shared memory in tiles;
-// all threads of a block read the same address (a broadcast), once for both points. Search of an index: half a warp has
-// one point, and each of its threads has a child of a node or a centre of a leaf, like a lane on the CPU
-// (centre_index_isa.cpp). Float32 input is screened and, rarely, decided again in float64 by nearest_centre_math.h. All
-// indices equal the CPU's.
+// all threads of a block read the same address (a broadcast), and each read serves both points of a thread. Search of
+// an index: half a warp has one point, and each of its threads has a child of a node or a centre of a leaf, like a lane
+// on the CPU (centre_index_isa.cpp). Float32 input is screened and, rarely, decided again in float64 by
+// nearest_centre_math.h. All indices are the same as on the CPU.
 #include "common/cuda_wrappers.h"
 #include "geometry/nearest_centre.h"
 #include "geometry/nearest_centre_math.h"
@@ -88,8 +88,8 @@ __device__ __forceinline__ T least_of_half(T x) {
   return x;
 }
 
-// Returns the squared distance of a box in the search's type. With low and high the same it is the distance of a
-// centre.
+// Returns the squared distance from a point to a box, in the search's type. If `low` and `high` are the same, the box
+// is a centre.
 template <int D, typename S, typename T>
 __device__ __forceinline__ S box_distance(const S* point, const T* low, const T* high, int apart) {
   S sum = 0;
@@ -107,8 +107,8 @@ __device__ __forceinline__ S box_distance(const S* point, const T* low, const T*
   return sum;
 }
 
-// key_of stores a child's number in the lowest bits of its distance; as integers, keys have the distances' order.
-// distance_of reads the distance back.
+// `key_of` stores a child's number in the lowest bits of its distance; as integers, keys have the distances' order.
+// `distance_of` reads the distance back.
 template <typename Key, typename S>
 __device__ __forceinline__ Key key_of(S v, int child) {
   static_assert(sizeof(Key) == sizeof(S), "the bits of the one are the other");
@@ -165,7 +165,7 @@ __device__ Seen<S> search(const S* point, bool wanted, S bound, const int32_t* i
     }
     const S best = least_of_half(seen.best), reach = exact ? best : best + (kMargin * best + kFloor);
     bound = reach < bound ? reach : bound;
-    // Go to the nearest unvisited child, here or above.
+    // Go to the nearest unvisited child of this node or of one above.
     for (bool looking = level >= 0; __ballot_sync(kAllLanes, looking) != 0;) {
       const Key own_key = looking ? keys[level * apart] : Key{0}, key = least_of_half(own_key);
       if (!looking) continue;

@@ -26,9 +26,9 @@ struct ProgramInput {
 };
 struct ProgramOutput {
   int32_t width;
-  // The output is [r, w], the sum of the rows of each ray's samples, added in the order of the cells. On CUDA it is the
-  // rows [n, w] in the caller's order, which the caller sums: with deterministic algorithms, PyTorch sums without
-  // atomics.
+  // The output is [r, w], the sum of the rows of each ray's samples, added in the order of the cells. On CUDA the
+  // output is the unsummed rows [n, w] in the caller's order, and the caller sums them: with deterministic algorithms,
+  // PyTorch sums without atomics.
   bool ray;
   int32_t memory;  // holds the unsummed rows of a ray output, or another output itself; -1: none
 };
@@ -90,8 +90,8 @@ struct ProgramInputs {
   // a null entry: the result is not kept.
   float* const* kept;
   bool ready;
-  // The first of the inputs that are gradients, none of them per ray: rows that are 0 in all of them add nothing to any
-  // sum. -1: none.
+  // The index of the first gradient input. All later inputs are gradients too, and none has a row per ray. Rows that
+  // are 0 in all gradients add nothing to any sum. -1: no gradients.
   int64_t gradients;
   const char *caller, *ray_name;  // the operation named in errors, and its argument name for ray_index
 };
@@ -118,9 +118,10 @@ bool multiplies_halves_cuda(ProgramPrecision precision, void* stream);
 int64_t program_code_bytes_cuda(const Program& program);
 void program_code_cuda(const Program& program, unsigned char* code);
 
-// Returns the bytes of the workspace, and runs a program on CUDA. Both throw std::invalid_argument for more than 64
-// tensors of a kind or 16 look-ups. Out-of-range offsets, order or ray_index cannot be rejected without a read by the
-// host, but they never access memory outside the tensors. Gradients of tables are added by atomics.
+// The first function returns the bytes of the workspace, the second runs a program on CUDA. Both throw
+// std::invalid_argument for more than 64 tensors of a kind or 16 look-ups. Out-of-range offsets, order or ray_index
+// cannot be rejected without a read by the host, but they never access memory outside the tensors. Gradients of tables
+// are added by atomics.
 int64_t grouped_program_workspace_cuda(const Program& program, int64_t n, int64_t r, int64_t k);
 void grouped_program_cuda(const Program& program, const unsigned char* code, const ProgramInputs& in,
                           const ProgramResults& results, ProgramPrecision precision, unsigned char* workspace,

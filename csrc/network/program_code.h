@@ -1,5 +1,5 @@
 // A program as the kernels of both devices read it. The structs are plain data: files compiled per instruction set
-// include them, and CUDA copies them to the device unchanged. voronerf/ops/grouped_program/lowering.py makes the
+// include them, and CUDA copies them to the device unchanged. voronerf/ops/grouped_program/lowering.py fills the
 // records by the names of their members.
 //
 // A tile is a range of rows of one cell. Each value of a tile has a slot: rows of `stride` floats, `slot` columns from
@@ -62,9 +62,10 @@ struct ProgramStep {
   ProgramEncoding encoding;
   ProgramFinish finish;  // linear: the activation
   ProgramHands hands;
-  // function: order of the derivative. linear: 1 or 4 outputs by few_outputs_tile.h, else 0. move: 1 if exactly one
+  // function: order of the derivative. linear: the number of outputs, 1 or 4, of a step
+  // that few_outputs_tile.h computes, else 0. move: 1 if exactly one
   // operand writes each column. encode: 0, or 1 for the gradient of <g, e(x)> with respect to x, with operands x, g,
-  // e(x). outer: 1 if the inputs are contiguous in the partial.
+  // e(x). outer: 1 if the inputs are contiguous in the partial sum.
   int32_t order;
   int32_t width, slot, stride, memory;  // of the result; memory as in ProgramOperand
   // input, output: its index. linear: its pack. total: columns of a group. encode: its pack of waves, or the grid.
@@ -87,7 +88,7 @@ enum class ProgramSumKind : int { none, inputs_outputs, outputs_inputs, vector }
 struct ProgramSum {
   int32_t sum;
   ProgramSumKind kind;
-  bool adds;  // adds to a sum that starts at 0; else the parts of the sum do not overlap, and are written
+  bool adds;  // adds to a sum that starts at 0; else the parts of the sum do not overlap and overwrite it
   int32_t partial, o, i, start, width, stride, size;
 };
 

@@ -1,7 +1,7 @@
 // Volume rendering on CUDA: one warp per ray, 32 samples at a time. Optical depths are scanned across the lanes. The
 // sum of earlier chunks is carried in two floats, so that long rays stay precise without float64, which is slow on most
 // GPUs. The formulas are in composite_isa.cpp. As there, the backward pass first walks along the ray and stores the
-// optical depth in front of each sample in the memory of sigma's gradient, then walks back with the sum over samples
+// optical depth in front of each sample in the memory of sigma's gradient, then walks back and sums over the samples
 // behind.
 #include "common/cuda_wrappers.h"
 #include "rays/composite.h"

@@ -40,7 +40,7 @@ struct CompositeGradients {
   float* left;        // [r], workspace; required if the input has a background
 };
 
-// Both CPU functions throw std::invalid_argument for offsets that decrease or exceed m.
+// Both CPU functions throw std::invalid_argument if offsets decrease or exceed m.
 void composite_cpu(const CompositeInputs& in, const CompositeOutputs& out, Isa isa, int threads);
 void composite_backward_cpu(const CompositeInputs& in, const CompositeGradients& gradients, Isa isa, int threads);
 

@@ -2,14 +2,14 @@
 //
 // Let o_i = sigma_i delta_i be the optical depth of sample i, and F_i = o_0 + ... + o_(i-1) the optical depth in front
 // of it. Its weight is exp(-F_i) (1 - exp(-o_i)). A ray is processed in chunks that stay in the L1 cache. Only the
-// running sum is serial; it is float64 for precision. Exponentials and later operations are vectors of samples, also
-// colours if there are three channels. Summing exponents, instead of multiplying transmittances, avoids the slow
+// running sum is serial; it is float64 for precision. Exponentials and later operations run on vectors of samples; so
+// do colours if there are three channels. Summing exponents, instead of multiplying transmittances, avoids the slow
 // denormal numbers of such a product behind a surface, and gives 0 behind an infinite density.
 //
 // In the backward pass let G_i be the gradient with respect to weight i, through all outputs. Then
 //     gradient of o_i = G_i exp(-F_i - o_i) - sum over j > i of G_j w_j.
-// A first sweep along the ray stores F_i in the memory of sigma's gradient. A second sweep runs back with the sum over
-// samples behind, which begins with the background. Nothing is saved in the forward pass. The background's weight is
+// A first sweep along the ray stores F_i in the memory of sigma's gradient. A second sweep runs back and sums over the
+// samples behind, beginning with the background. Nothing is saved in the forward pass. The background's weight is
 // exp(-F) over the whole ray, which is more precise than 1 - opacity.
 #include "rays/composite_isa.h"
 
@@ -23,7 +23,7 @@ namespace {
 constexpr int64_t kChunk = 128;
 constexpr float kOpaque = 1e30f;  // replaces infinite density; just as opaque over any length but 0
 
-// NaN stays NaN.
+// Caps a density at kOpaque; NaN stays NaN.
 VN_INLINE float finite_density(float sigma) { return sigma > kOpaque ? kOpaque : sigma; }
 
 // For a vector of samples: transmittance in front, transmittance of the samples themselves, and 1 minus the latter.
@@ -31,7 +31,7 @@ struct Passage {
   F32 front, through, absorbed;
 };
 
-// Transmittances too small for float32 are 0.
+// Computes the Passage of a vector of samples. Transmittances too small for float32 are 0.
 VN_INLINE Passage passage(F32 front, F32 optical) {
   const F32 zero = splat(0.0f), far = splat(-87.0f);
   const F32 x = zero - front, y = zero - optical;

@@ -12,8 +12,8 @@ namespace voronerf {
 struct DrawPixelsInputs {
   const int32_t* seed;   // [1]
   const int64_t* ends;   // [n], running sums of the runs' lengths; or null for all pixels 0 to below - 1
-  const int64_t* shift;  // [n], turns a place in a run into a pixel by addition
-  const int32_t* first;  // the first run that ends behind place 0, 2^bits, 2 * 2^bits, ...; speeds up the search
+  const int64_t* shift;  // [n], pixel minus place, for the places in each run
+  const int32_t* first;  // the first runs that end behind places 0, 2^bits, 2 * 2^bits, ...; they speed up the search
   int64_t n, places;     // n: entries of ends and shift; places: entries of first
   int64_t bits;
   int64_t below;  // the total number of places in all runs
@@ -24,8 +24,8 @@ struct DrawPixelsInputs {
   RowCount several;  // how many leading pixels are drawn from the known pixels
 };
 
-// Returns the first run that can hold a place, from which run_of finds the run of the place. Both stay within the
-// tables, even if their entries are invalid.
+// `first_run` returns the first run that can hold a place; from there, `run_of` finds the run of the place. Both stay
+// within the tables, even if their entries are invalid.
 VN_HD int64_t first_run(const DrawPixelsInputs& in, int64_t place) {
   const int64_t at = place >> in.bits, run = in.first[at < in.places ? at : in.places - 1];
   return run < 0 ? 0 : run < in.n ? run : in.n - 1;

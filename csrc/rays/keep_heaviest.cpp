@@ -1,8 +1,8 @@
 // A sample is encoded as one number: the bits of its importance, which sort like positive floats, above the negated
 // bits of its place. So no two numbers are equal, larger numbers are kept, and the kept samples do not depend on the
 // order of comparisons. Each part of the samples collects entries above a common bound. When a part has 2 q entries, it
-// drops the smaller half, and its smallest entry raises the bound, since q entries are no smaller. Few samples are
-// collected: of n in random order about q (1 + ln(n / q)).
+// drops the smaller half and raises the bound to its smallest entry, since q entries are no smaller. Few samples are
+// collected: about q (1 + ln(n / q)) of n samples in random order.
 #include "rays/keep_heaviest.h"
 
 #include <algorithm>
@@ -20,7 +20,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kParts = 8, kRun = 64;  // parts of a call; samples weighed before they are compared
+constexpr int64_t kParts = 8, kRun = 64;  // parts of a call; samples weighed at a time
 
 uint64_t entry_of(float importance, int64_t i) {
   uint32_t bits;

@@ -16,13 +16,13 @@ namespace {
 
 constexpr int64_t kRays = 32;  // rays of a task
 
-// Lowers distances `to` [cells] to the distances by way of `from` [cells], which lies `away` cells away: the maximum of
-// from and away.
+// Lowers the distances `to` [cells] where the path through the cells `from` [cells], `away` cells away, is shorter. Its
+// Chebyshev length is max(from, away).
 void spread(const uint8_t* from, uint8_t* to, int64_t cells, uint8_t away) {
   for (int64_t j = 0; j < cells; ++j) to[j] = std::min(to[j], std::max(from[j], away));
 }
 
-// Computes slice i of `size` slices of `step` cells from the slices around it.
+// Computes slice i of `size` slices, of `step` cells each, from the neighbouring slices.
 void spread_around(const uint8_t* from, uint8_t* to, int64_t i, int64_t size, int64_t step) {
   uint8_t* target = to + i * step;
   std::copy_n(from + i * step, step, target);

@@ -3,7 +3,7 @@
 // of a ray's samples are coalesced. Numbers of strata are small: 64 strata take two steps.
 //
 // One block sums over the rays, 1,024 at a time: a training step has some thousands of rays. An image rendered at once
-// has a million rays, and its thousand rounds are short beside the milliseconds of its networks.
+// has a million rays, and its thousand rounds are short compared with the milliseconds of the networks.
 #include <algorithm>
 
 #include "common/cuda_wrappers.h"

@@ -1,5 +1,5 @@
 // Samples rays in the occupied cells of a grid: r rays, s strata each, m kept samples. The formulas are in
-// voronerf/ops/march_rays, and each operation is in voronerf/ops/march_rays/reference.py.
+// voronerf/ops/march_rays, and every rounded operation is in voronerf/ops/march_rays/reference.py.
 //
 // There are two calls, since the number of samples is known only after the first call. The first call sets a bit for
 // every kept stratum; the second call reads the bits instead of the grid.
@@ -28,7 +28,7 @@ struct MarchInputs {
   const uint8_t* occupied;            // [x,y,z], 0 or 1
   const float* box;                   // [2,3]
   const float* uniforms;              // [r,s], or null
-  const int32_t* seed;                // [1], the seed of hashed uniforms, or null; middles if uniforms is null too
+  const int32_t* seed;                // [1], the seed of hashed uniforms, or null; if both are null, middles
   const int32_t* start;               // [r], the first stratum, or null for 0
   RowCount r;
   int64_t s;

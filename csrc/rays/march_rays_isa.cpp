@@ -3,9 +3,9 @@
 // Strata are processed in words of 32. Their positions are computed without branches, which the compiler vectorises;
 // each cell is looked up by a byte load. A ray that has its maximum of samples stops after the current word.
 //
-// Whole images have many strata, most of them empty, and their samples are middles. There a vector holds rays instead,
-// and each ray leaps to the next stratum that may be occupied (`leap`). It tests the same middles with the same
-// arithmetic, so that the samples have the same bits.
+// Whole images have many strata, most of them empty, and their samples are middles. For them, a vector holds rays
+// instead of strata, and each ray leaps to the next stratum that may be occupied (`leap`). `leap` tests the same
+// middles with the same arithmetic, so the samples have the same bits.
 #include "rays/march_rays_isa.h"
 
 #include "common/memory_tile.h"
@@ -119,8 +119,8 @@ VN_INLINE float pace_of(const MarchInputs& in, float width, const float* origin,
     return ((outwards > 0.0f) & (r > 1.0f) ? falling : any) / width;
   }
   if (W == MarchWhere::kPerspective) {
-    // Lines stay lines, on which a point at depth z moves at a speed proportional to 1 / z^2. The bound holds down to
-    // three quarters of the current depth. Where depths are clamped there is no bound.
+    // A perspective maps lines to lines, on which a point at depth z moves at a speed proportional to 1 / z^2. The
+    // bound holds down to three quarters of the current depth. Where depths are clamped there is no bound.
     const float *axes = in.space.perspective + 3, *slopes = in.space.perspective + 12;
     float forwards[3] = {};
     for (int axis = 0; axis < 3; ++axis) {
@@ -167,7 +167,7 @@ VN_INLINE void enter(const MarchInputs& in, float width, int64_t i, int64_t j, W
 }
 
 // Marches the rays of [begin, end) whose count is kToWalk, through the middles of strata. From an empty cell a ray
-// leaps as far as no occupied cell can lie. A lane whose ray has ended takes the next ray.
+// leaps the distance within which no cell can be occupied. A lane whose ray has ended takes the next ray.
 template <MarchWhere W, typename Rule>
 VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* scale, uint32_t* mask, int32_t* counts,
                     int64_t begin, int64_t end) {
@@ -175,8 +175,8 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
   const int32_t strata = static_cast<int32_t>(in.s);
   const float width = 1.0f / __builtin_fmaxf(scale[0], __builtin_fmaxf(scale[1], scale[2]));
   const float sides[3] = {static_cast<float>(in.x), static_cast<float>(in.y), static_cast<float>(in.z)};
-  // Truncating a place in strata plus `before` gives the first stratum whose middle is not in front of the place, with
-  // a tolerance of 0.01 strata and rounding.
+  // A place in strata plus `before`, truncated, is the first stratum whose middle is not in front of the place, with a
+  // tolerance of 0.01 strata plus rounding errors.
   const float count = static_cast<float>(in.s), before = 0.5f - (0.01f + 2e-6f * count);
   const MarchRay any = march_ray(in, begin);  // all rays have the same number of strata
   Walk walk;

@@ -7,8 +7,9 @@
 
 namespace voronerf {
 
-// Returns the `room` of march_count (march_rays_isa.h), or null if rays shall not leap over empty cells. Visiting all
-// cells pays if there are many more strata, as for a whole image; a training step has too few strata.
+// Returns the `room` of march_count (march_rays_isa.h), or null if rays should not leap over empty cells. The
+// computation visits all cells. It pays if there are many more strata than cells, as in a whole image, but not in a
+// training step.
 std::unique_ptr<uint8_t[]> march_rooms(const MarchInputs& in, int threads);
 
 }  // namespace voronerf

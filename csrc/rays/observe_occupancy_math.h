@@ -44,8 +44,8 @@ VN_HD float observed_stretch(const ObservedSamples& in, int64_t i) {
   return 1.0f;
 }
 
-// Returns the density that a sample observes in its cell: its own density, or 0 if no more than the share `hidden` of
-// the light reaches it.
+// Returns the density that a sample observes in its cell: its own density, or 0 if at most the fraction `hidden`
+// of the light reaches it.
 VN_HD float observed_density(const ObservedSamples& in, int64_t i) {
   const float density = in.sigma[i] == in.sigma[i] ? in.sigma[i] : INFINITY;
   if (in.weights == nullptr) return density * observed_stretch(in, i);

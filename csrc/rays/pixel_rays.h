@@ -11,7 +11,7 @@ namespace voronerf {
 struct PixelRaysInputs {
   const float* poses;       // [c,4,4], camera to world
   const float* intrinsics;  // [c,4]: fx, fy, cx, cy
-  const int32_t* lens;      // [c], the table of each camera, outside [0, l) for no distortion; null if tables is
+  const int32_t* lens;      // [c], the table of each camera; not in [0, l): no distortion; null if `tables` is null
   const float* tables;      // [l,h,w,2], directions (x, y, z) of pixels in the camera as (x, -y) / (1 - z); or null
   const uint8_t* images;    // [c,h,w,channels]
   const int64_t* pixels;    // [b], numbered across all images

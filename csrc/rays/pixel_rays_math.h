@@ -36,7 +36,7 @@ VN_HD void pixel_direction(const PixelRaysInputs& in, int64_t camera, int64_t x,
   for (int axis = 0; axis < 3; ++axis) direction[axis] /= length;
 }
 
-// As std::min and std::max, which CUDA lacks: they return the first argument if one is NaN.
+// Like std::min and std::max, which CUDA lacks: if an argument is NaN, they return the first argument.
 VN_HD float smaller(float a, float b) { return b < a ? b : a; }
 VN_HD float larger(float a, float b) { return a < b ? b : a; }
 

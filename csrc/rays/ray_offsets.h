@@ -1,4 +1,4 @@
-// Offsets of the rays' samples: their check, and the light that a ray's samples let through.
+// The check of ray offsets, and the light that a ray's samples let through.
 #pragma once
 
 #include <cstdint>
@@ -12,15 +12,15 @@ inline void check_ray_offsets(const std::string& op, const int32_t* offsets, int
   int64_t before = 0;
   for (int64_t i = 0; i <= r; ++i) {
     if (offsets[i] < before || offsets[i] > m) {
-      throw std::invalid_argument(op + ": ray_offsets must rise from 0 or more to at most the number of samples, " +
-                                  std::to_string(m) + ", got " + std::to_string(offsets[i]) + " for ray " +
+      throw std::invalid_argument(op + ": ray_offsets must ascend within 0 to " + std::to_string(m) +
+                                  " (the number of samples), got " + std::to_string(offsets[i]) + " for ray " +
                                   std::to_string(i));
     }
     before = offsets[i];
   }
 }
 
-// Returns the share of the light that no sample of a ray has absorbed.
+// Returns the fraction of the light that no sample of a ray has absorbed.
 template <typename In>
 double light_left(const In& in, int64_t ray) {
   double left = 1.0;

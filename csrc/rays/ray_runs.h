@@ -18,7 +18,7 @@ struct KnownSamples {
   bool bent;  // rays are curved by a contraction
 };
 
-// The rank's own samples. Each array has room for n samples.
+// The rank's own samples. Each array has space for n samples.
 struct OwnSamples {
   float* positions;
   int32_t* ray_index;
@@ -41,8 +41,8 @@ struct RunsOfRays {
   float robust;  // as in RenderLossInputs
 };
 
-// Writes an answer to each sum, answers [q,6], and returns these rays' part of the loss. Throws std::invalid_argument
-// for a run of another ray.
+// Writes an answer for each sum to `answers` [q,6], and returns the part of the loss due to these rays. Throws
+// std::invalid_argument if a run belongs to another ray.
 float compose_runs_cpu(const RunsOfRays& in, float* answers, int threads);
 
 }  // namespace voronerf

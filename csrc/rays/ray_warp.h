@@ -7,7 +7,7 @@ namespace voronerf {
 
 constexpr float kOpaque = 1e30f;  // replaces infinite density; just as opaque over any length but 0
 
-// NaN stays NaN.
+// Caps a density at kOpaque; NaN stays NaN.
 __device__ inline float finite_density(float sigma) { return sigma > kOpaque ? kOpaque : sigma; }
 
 // A compensated sum in two floats.
@@ -29,7 +29,8 @@ __device__ inline float sum_of_lanes(float x) {
   return x;
 }
 
-// Returns the sum over this lane and the lanes before it; running_sum_back, over the lanes after it.
+// `running_sum` returns the sum over this lane and the lanes before it, `running_sum_back` the sum over this lane and
+// the lanes after it.
 template <typename T>
 __device__ T running_sum(T x, int lane) {
   for (int step = 1; step < 32; step *= 2) {
@@ -58,7 +59,7 @@ __device__ double sum_of_block(double sum, double* sums) {
   return sums[threadIdx.x];
 }
 
-// Returns the optical depth in front of each lane's sample; the carry moves to the end of the chunk.
+// Returns the optical depth in front of each lane's sample. The carry advances to the end of the chunk.
 __device__ inline float depth_in_front(float optical, int lane, Carry& carry) {
   const float through = running_sum(optical, lane);
   float before = __shfl_up_sync(kAllLanes, through, 1);
@@ -68,8 +69,8 @@ __device__ inline float depth_in_front(float optical, int lane, Carry& carry) {
   return front;
 }
 
-// Returns the sum of `share` over the samples behind each lane's sample, which its gradient of the optical depth loses.
-// Lanes without a sample have share 0. The carry moves to the front of the chunk.
+// Returns the sum of `share` over the samples behind each lane's sample; the sum is subtracted in the gradient of the
+// sample's optical depth. Lanes without a sample have share 0. The carry moves to the front of the chunk.
 __device__ inline float share_behind(float share, int lane, Carry& carry) {
   const float rest = running_sum_back(share, lane);
   float after = __shfl_down_sync(kAllLanes, rest, 1);

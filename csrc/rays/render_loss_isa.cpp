@@ -3,7 +3,7 @@
 // They compute activations, volume rendering as in composite_isa.cpp, and the squared error of the colour. With an
 // occupancy grid a ray has fewer samples than a vector has lanes, so the samples of several rays are processed
 // together. The forward pass runs over chunks that stay in the L1 cache, until the colours and their gradients are
-// known. The backward pass runs back with the sum over samples behind. Only sums along a ray are serial. Rays that fit
+// known. The backward pass runs back and sums over the samples behind. Only sums along a ray are serial. Rays that fit
 // in one chunk are activated once. The samples of a longer ray are activated again in the backward pass; the optical
 // depth in front of them is stored in the memory of the density's gradient. Rays without a target have no backward
 // pass.
@@ -78,7 +78,7 @@ VN_INLINE void compare(const RenderLossInputs& in, const RenderLossOutputs& out,
   }
 }
 
-// Reads the answers of whole rays to runs.
+// Reads the answers that runs receive from their whole rays.
 VN_INLINE void hear(const float* answers, int64_t from, int64_t to, Sums& sums) {
   for (int64_t run = from; run < to; ++run) {
     for (int k = 0; k < 3; ++k) sums.slopes[k][run - from] = answers[kRunSums * run + k];
@@ -151,7 +151,7 @@ VN_INLINE void reset(int64_t rays, Sums& sums) {
   }
 }
 
-// Renders the rays of one call of each_chunk. With answers these are runs.
+// Renders the rays of one call of each_chunk. With `answers`, the rays are runs.
 VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& out, const float* answers, int64_t from,
                            int64_t to, Chunk& chunk, Sums& sums) {
   const int64_t begin = in.offsets[from], end = in.offsets[to];

@@ -7,7 +7,8 @@
 
 namespace voronerf {
 
-// Uses no standard header, because files compiled for different instruction sets would share its inline functions.
+// Uses no standard header, because files compiled for different instruction sets would share the header's inline
+// functions.
 VN_HD float root_of(float x) {
 #ifdef __CUDA_ARCH__
   return sqrtf(x);

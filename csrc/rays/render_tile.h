@@ -19,7 +19,7 @@ struct Chunk {
   alignas(64) float rgb[3][kChunk], shade[3][kChunk];  // shade: gradient of the ray's colour
   alignas(64) float density[kChunk], slope[kChunk];    // slope: derivative of density by raw
   alignas(64) float deltas[kChunk], optical[kChunk], front[kChunk];
-  alignas(64) float light[kChunk], weights[kChunk];    // light: share that reaches a sample
+  alignas(64) float light[kChunk], weights[kChunk];    // light: fraction that reaches a sample
   alignas(64) float part[kChunk], of_optical[kChunk];  // terms in the gradient of the optical depth
 };
 

@@ -1,7 +1,7 @@
-// Walks along each ray once, from its end. The weights give the light behind a sample, and the losses of the weights
-// behind it are summed, so no exponential of an optical depth is recomputed. Rays are independent, so results do not
-// depend on the number of threads. Colours are activated only if a gradient needs them. The slope of the softplus is a
-// sigmoid, whose exp takes half the time of the expm1 of density_slope.h.
+// Walks along each ray once, from its end. The walk sums the weights behind each sample, which gives the light behind
+// it, and these weights times their gradients, so no exponential of an optical depth is recomputed. Rays are
+// independent, so results do not depend on the number of threads. Colours are activated only if a gradient needs them.
+// The slope of the softplus is a sigmoid, whose exp takes half the time of the expm1 of density_slope.h.
 #include "rays/rendered_gradient.h"
 
 #include <cmath>
@@ -36,7 +36,7 @@ void learn_ray(const RenderedGradient& in, int64_t ray, float* gradient) {
     }
     const double weight = static_cast<double>(in.weights[i]), worth = static_cast<double>(of_weight);
     if (!(through + weight <= hidden)) {
-      const float of_depth = static_cast<float>(through * worth - behind);  // of the optical depth
+      const float of_depth = static_cast<float>(through * worth - behind);  // gradient of the optical depth
       const float of_density = in.deltas[i] * of_depth + entry(in.of_density, i);
       gradient[4 * i + 3] += of_density * (in.activated ? 1.0f : in.density_scale * sigmoid(in.raw[4 * i + 3]));
       for (int k = 0; coloured && k < 3; ++k) {

@@ -16,13 +16,13 @@ struct RenderedGradient {
   bool background_per_ray;
   const float *of_colour, *of_opacity, *of_depth;  // [r,3], [r], [r]; null for zero
   const float *of_weights, *of_rgb, *of_density;   // [m], [m,3], [m]; null for zero
-  float hidden;  // if positive, samples that at most this share of the light reaches have no gradient
+  float hidden;                                    // if positive: transmittance up to which samples have no gradient
   float density_scale;
   bool activated;  // raw holds colours and densities themselves, else their values before activation
   RowCount r, m;
 };
 
-// Adds to gradient [m,4]. Throws std::invalid_argument for offsets that decrease or exceed m, and then adds nothing.
+// Adds to gradient [m,4]. Throws std::invalid_argument if offsets decrease or exceed m, and then adds nothing.
 void rendered_gradient_cpu(const RenderedGradient& in, float* gradient, int threads);
 
 }  // namespace voronerf

@@ -1,5 +1,5 @@
-// Inverse-CDF sampling on the CPU. Sorted targets and bins are merged, so a ray takes s + count steps and no table of
-// its running mass, which is float64. Threads share the rays, which are independent.
+// Inverse-CDF sampling on the CPU. Sorted targets and bins are merged, so a ray takes s + count steps and needs no
+// table of its running mass (float64). Threads share the rays, which are independent.
 #include "rays/resample.h"
 
 #include <algorithm>

@@ -1,5 +1,6 @@
 // Hierarchical sampling: weights [r,s], edges [r,s+1], uniforms [r,count] or null (midpoints of equal strata) -> depths
-// [r,count], increasing along a ray. s, count >= 1; r = 0 is legal. As in voronerf/ops/resample/reference.py.
+// [r,count], increasing along a ray. s, count >= 1; r = 0 is legal. The formulas are in
+// voronerf/ops/resample/reference.py.
 #pragma once
 
 #include <cstdint>

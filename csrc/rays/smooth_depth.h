@@ -12,15 +12,15 @@ struct SmoothDepth {
   const float *density, *depths, *deltas, *weights;  // [m]
   const int32_t* offsets;                            // [r+1]
   const float* far;                                  // [r]
-  float factor, hidden;  // hidden: samples that at most this share of the light reaches have no gradient
-  float edge;            // scale of the robust loss of the logarithms, like `robust` for colours
+  float factor, hidden;                              // hidden: transmittance up to which samples have no gradient
+  float edge;  // scale of the robust loss of the logarithms, like `robust` for colours
   float density_scale;
   bool activated;  // the network's output is the density itself, else its value before the softplus
   RowCount triples, r, m;
 };
 
-// Adds to loss [1] and to the last column of gradient [m,4]. of_rays: [r], workspace. Throws std::invalid_argument for
-// offsets that decrease or exceed m, and then adds nothing.
+// Adds to loss [1] and to the last column of gradient [m,4]. of_rays: [r], workspace. Throws std::invalid_argument if
+// offsets decrease or exceed m, and then adds nothing.
 void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* gradient, float* of_rays, int threads);
 
 }  // namespace voronerf

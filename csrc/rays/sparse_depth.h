@@ -18,8 +18,8 @@ struct SparseDepth {
   RowCount s, r, m;
 };
 
-// Adds to loss [1] and to the last column of gradient [m,4]. of_rays: [s], workspace. Throws std::invalid_argument for
-// offsets that decrease or exceed m, and then adds nothing.
+// Adds to loss [1] and to the last column of gradient [m,4]. of_rays: [s], workspace. Throws std::invalid_argument if
+// offsets decrease or exceed m, and then adds nothing.
 void sparse_depth_gradient_cpu(const SparseDepth& in, float* loss, float* gradient, float* of_rays, int threads);
 
 }  // namespace voronerf

@@ -11,7 +11,7 @@ namespace voronerf {
 
 namespace {
 
-// Returns the decrease of the opacity from a sample to the next, 0 unless the next sample lies right behind it.
+// Returns the decrease of the opacity from a sample to the next, 0 unless the next sample lies directly behind it.
 float fall(const Surface& in, int64_t i, float opacity, float next) {
   const bool beside = in.depths[i + 1] - in.depths[i] < in.deltas[i] + in.deltas[i + 1];
   return beside ? std::max(opacity - next, 0.0f) : 0.0f;

@@ -13,14 +13,14 @@ struct Surface {
   const int32_t* offsets;                            // [r+1]
   const float *near, *far;                           // [r]
   float distortion, orientation;                     // factors of the two losses
-  float hidden;                                      // samples that at most this share of the light reaches are ignored
+  float hidden;                                      // transmittance up to which samples are ignored
   float density_scale;
   bool activated;  // the network's output is the density itself, else its value before the softplus
   RowCount r, m;
 };
 
-// Adds to loss [1] and to the last column of gradient [m,4]. of_rays: [r], workspace. Throws std::invalid_argument for
-// offsets that decrease or exceed m, and then adds nothing.
+// Adds to loss [1] and to the last column of gradient [m,4]. of_rays: [r], workspace. Throws std::invalid_argument if
+// offsets decrease or exceed m, and then adds nothing.
 void surface_gradient_cpu(const Surface& in, float* loss, float* gradient, float* of_rays, int threads);
 
 }  // namespace voronerf

@@ -1,4 +1,4 @@
-"""Draws the figures of docs/method.md with the library itself, into docs/images/method, and the first page's chart.
+"""Draws the figures of docs/method.md into docs/images/method with the library, and the chart of the first page.
 
 python docs/scripts/figures.py
 """
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def samples() -> tuple[Tensor, Tensor]:
-    """Samples in the plane z = 0, and their importance: a disc, and a detail of it that weighs more."""
+    """Draws samples in the plane z = 0 and their importance: a disc with a detail that weighs more."""
     generator = torch.Generator().manual_seed(1)
     disc = torch.rand(8000, 2, generator=generator) * 2 - 1
     disc = disc[disc.norm(dim=1) < 0.85][:2000]
@@ -47,14 +47,14 @@ def samples() -> tuple[Tensor, Tensor]:
 
 
 def plane() -> Tensor:
-    """[SIZE, SIZE, 3]: the points of the drawn square."""
+    """Returns the points [SIZE, SIZE, 3] of the drawn square."""
     line = torch.linspace(-1, 1, SIZE)
     y, x = torch.meshgrid(line, line, indexing="ij")
     return torch.stack([x, y, torch.zeros_like(x)], -1)
 
 
 def show_cells(axes: plt.Axes, colours: Tensor, cells: Tensor, *, lines: float = 1.0) -> None:
-    """Paints each pixel in the colour of its cell, pale, with the borders in white."""
+    """Paints each pixel in a pale colour of its cell, with white borders."""
     picture = colours[cells.long()] * 0.55 + 0.45
     axes.imshow(picture, extent=(-1, 1, -1, 1), origin="lower", interpolation="nearest")
     line = torch.linspace(-1, 1, SIZE)
@@ -65,12 +65,12 @@ def show_cells(axes: plt.Axes, colours: Tensor, cells: Tensor, *, lines: float =
 
 
 def palette(count: int) -> Tensor:
-    """[count, 3] colours."""
+    """Returns distinct colours [count, 3]."""
     return torch.tensor([COLOURS[i % len(COLOURS)] for i in range(count)])
 
 
 def draw_balance(points: Tensor, importance: Tensor) -> None:
-    """Random centres and balanced ones, and the importance in every cell."""
+    """Draws random and balanced centres, and the importance in every cell."""
     k = 16
     figure, axes = plt.subplots(2, 2, figsize=(8, 5.6), height_ratios=[3, 1], constrained_layout=True)
     for column, steps in enumerate((0, 500)):
@@ -91,7 +91,7 @@ def draw_balance(points: Tensor, importance: Tensor) -> None:
 
 
 def draw_nested(points: Tensor, importance: Tensor) -> None:
-    """A diagram of four cells, and the same with four cells in each."""
+    """Draws a diagram of four cells, and its refinement with four cells in each."""
     figure, axes = plt.subplots(1, 2, figsize=(8, 4.2), constrained_layout=True)
     diagram = VoronoiDiagram(torch.zeros(1, 3))
     for axis, title in zip(axes, ("4 cells", "4 x 4 cells")):
@@ -108,7 +108,7 @@ def draw_nested(points: Tensor, importance: Tensor) -> None:
 
 
 def draw_sort() -> None:
-    """Samples in the order of the batch, and sorted by cell beside the offsets and the stacked weights."""
+    """Draws samples in the order of the batch, and sorted by cell with offsets and stacked weights."""
     cells = torch.tensor([2, 0, 1, 0, 2, 2, 1, 0, 2, 0], dtype=torch.int32)
     order, offsets = cell_sort(cells, 3)
     figure, axis = plt.subplots(figsize=(8, 3.1), constrained_layout=True)
@@ -133,7 +133,7 @@ def draw_sort() -> None:
 
 
 def draw_loops() -> None:
-    """How long networks of many cells take here, and in the fastest loop over cells in PyTorch."""
+    """Draws the times of networks of many cells, here and in the fastest loop over cells in PyTorch."""
     measured = json.loads((DOCS.parent / "benchmarks" / "results" / "throughput.json").read_text())
     rows = {
         (row["case"], row["dtype"], row["direction"]): row

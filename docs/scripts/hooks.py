@@ -1,5 +1,4 @@
-"""Fills the pages of the site that come from the code, cleans what docstrings leave in them, sets formulas, and adds a
-scene."""
+"""Hooks of the site: generates pages from the code, cleans up docstring markup, sets formulas, and adds a scene."""
 
 from __future__ import annotations
 
@@ -22,19 +21,19 @@ MARKER = "<!-- options -->"
 
 
 def on_files(files: Any, *, config: Any) -> Any:
-    """Adds the page of a scene, which is drawn in the browser."""
+    """Adds the page of a scene that the browser renders."""
     files.append(File.generated(config, "scene.html", abs_src_path=str(scene.scene_page())))
     return files
 
 
 def on_config(config: Any) -> Any:
-    """Says the version at the foot of each page."""
+    """Adds the version to the footer of each page."""
     config.copyright = f"voronerf {voronerf.__version__}"
     return config
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
-    """Replaces the marker by the tables of options."""
+    """Replaces a marker by the tables of options."""
     if page.file.src_uri == "options.md":
         assert MARKER in markdown, f"docs/options.md must hold {MARKER}"
         return markdown.replace(MARKER, options.markdown())
@@ -42,8 +41,7 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Sets formulas as MathML, which browsers draw themselves, and drops the roles of cross-references in docstrings,
-    such as :class:, which only Sphinx reads."""
+    """Converts formulas to MathML, which browsers render, and drops Sphinx roles of docstrings such as :class:."""
     content = re.sub(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', _formula, content, flags=re.DOTALL)
     return re.sub(r":(?:class|meth|func|mod|attr|data):<code>~?", "<code>", content)
 

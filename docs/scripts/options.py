@@ -1,4 +1,4 @@
-"""Tables of every option of the command line, read from the functions and the dataclass behind it."""
+"""Tables of all command-line options, read from the functions and dataclasses that define them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HEADER = ["| option | values | default | |", "|---|---|---|---|"]
 
 
 def markdown() -> str:
-    """The page's tables, a section for each command."""
+    """Returns the page's tables, with a section for each command."""
     lines = []
     for name, function in COMMANDS.items():
         summary, _, arguments = inspect.cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")
@@ -31,7 +31,7 @@ def markdown() -> str:
 
 
 def train_tables() -> list[str]:
-    """The settings of a training, a table for each group of them."""
+    """Returns the settings of a training, with a table for each group."""
     lines = []
     for group in reversed(TrainConfig.__bases__):
         lines += [f"### {group_name(group).capitalize()}", "", *HEADER, *settings(group), ""]
@@ -39,13 +39,13 @@ def train_tables() -> list[str]:
 
 
 def settings(kind: type) -> list[str]:
-    """A row for each field of a dataclass."""
+    """Returns a row for each field of a dataclass."""
     texts, kinds = field_docs(kind), get_type_hints(kind)
     return [row(f"--{dashed(f.name)}", kinds[f.name], f.default, texts[f.name]) for f in dataclasses.fields(kind)]
 
 
 def table(function: Callable[..., Any], arguments: str) -> list[str]:
-    """The arguments of a command."""
+    """Returns a table of a command's arguments."""
     texts, kinds = dict(argument_docs(arguments)), get_type_hints(function)
     marked = get_type_hints(function, include_extras=True)
     lines = []
@@ -65,7 +65,7 @@ def table(function: Callable[..., Any], arguments: str) -> list[str]:
 
 
 def row(label: str, kind: Any, default: Any, text: str) -> str:
-    """One line of a table."""
+    """Returns one row of a table."""
     shown = "" if default in (None, (), inspect.Parameter.empty) else f"`{words(default)}`"
     if isinstance(default, bool):
         label, shown = f"{label}` or `{label.replace('--', '--no-')}", "on" if default else "off"
@@ -74,7 +74,7 @@ def row(label: str, kind: Any, default: Any, text: str) -> str:
 
 
 def values(kind: Any) -> str:
-    """What an option takes, from its type."""
+    """Returns the values of an option as text, from its type."""
     parts = [part for part in get_args(kind) if part is not type(None)]
     if get_origin(kind) is Literal:
         return ", ".join(f"`{word}`" for word in get_args(kind))
@@ -86,12 +86,12 @@ def values(kind: Any) -> str:
 
 
 def words(default: Any) -> str:
-    """A default as one types it."""
+    """Returns a default as typed on the command line."""
     return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
 
 
 def argument_docs(arguments: str) -> Iterator[tuple[str, str]]:
-    """Names and texts of a docstring's arguments."""
+    """Yields names and texts of a docstring's arguments."""
     for block in re.split(r"\n(?= {4}\w+:)", arguments):
         name, _, text = block.strip().partition(":")
         if name:
@@ -99,12 +99,12 @@ def argument_docs(arguments: str) -> Iterator[tuple[str, str]]:
 
 
 def dashed(name: str) -> str:
-    """A setting's name on the command line."""
+    """Returns a setting's name on the command line."""
     return name.replace("_", "-")
 
 
 def escape(text: str) -> str:
-    """Text inside of a table's cell."""
+    """Escapes text for a cell of a table."""
     return text.replace("|", "\\|").replace("<", "&lt;")
 
 

@@ -1,4 +1,4 @@
-"""Draws docs/images/turn.webp, the run of ``voronerf demo`` beside its cells.
+"""Draws docs/images/turn.webp: the run of ``voronerf demo`` beside its cells.
 
 python docs/scripts/turn.py runs/demo
 """

@@ -59,7 +59,7 @@ def test_any_camera_is_rendered(folder, scene) -> None:
 def mappings(folder):
     """Returns a list of (start, end, anonymous bytes), a row for each mapping of a file in the folder."""
     if sys.platform != "linux":
-        pytest.skip("asks Linux what memory holds")
+        pytest.skip("reads /proc, which only Linux has")
     lines = Path("/proc/self/smaps").read_text()
     rows = re.findall(r"^(\w+)-(\w+) .*?(/\S+)?$((?:\n[A-Z]\w+:.*)+)", lines, re.MULTILINE)
     return [

@@ -1,6 +1,6 @@
-"""Attacks the library with random calls, kills, damage and strangers' files: ``python tests/attack --help``.
+"""Attacks the library with random calls, kills, damaged and hostile files: ``python tests/attack --help``.
 
-Each attempt comes from a seed of its own. The last line of a failure is the command that repeats it.
+Each attempt has its own seed. The last line of a failure is the command that repeats it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-import given
+import input_files
 import mutate
 import op_attacks
 import rank_attacks
@@ -26,7 +26,7 @@ import training_attacks
 import viewer_attacks
 from attempts import FAILED, MEMORY, REFUSED, RIGHT, Part, Tally, prepare, run_part
 
-#: Each part with its attempts in the long form and in the short one.
+#: Each part, with its number of attempts in a long and in a short run.
 PARTS = {
     part.name: (part, long, short)
     for part, long, short in (
@@ -34,14 +34,14 @@ PARTS = {
         (Part("invalid-calls", op_attacks.invalid_call, 20, 200, MEMORY // 2), 60_000, 150),
         (Part("steps", step_sequences.changed_steps, 120, 20, peak=2 * MEMORY), 500, 5),
         (Part("routers", router_sequences.random_sequence, 60, 10), 500, 6),
-        (Part("kills", training_attacks.killed_training, 300, 1, prepare=given.prepare_scenes), 20, 1),
+        (Part("kills", training_attacks.killed_training, 300, 1, prepare=input_files.prepare_scenes), 20, 1),
         (Part("ranks", rank_attacks.harmed_ranks, 600), 16, 0),
-        (Part("bits", run_attacks.flipped_bit, 60, 20, prepare=given.prepare_runs), 500, 15),
-        (Part("scenes", scene_attacks.stranger_scene, 60, 1, prepare=given.prepare_photographs), 150, 4),
-        (Part("runs", run_attacks.stranger_run, 60, 1, prepare=given.prepare_runs), 150, 4),
-        (Part("stores", store_attacks.harmed_store, 60, 1, prepare=given.prepare_scenes), 150, 4),
-        (Part("clients", viewer_attacks.hostile_client, 60, 1, prepare=given.prepare_runs), 150, 2),
-        (Part("stress", training_attacks.stressed_command, 60, 1, prepare=given.prepare_scenes), 150, 4),
+        (Part("bits", run_attacks.flipped_bit, 60, 20, prepare=input_files.prepare_runs), 500, 15),
+        (Part("scenes", scene_attacks.stranger_scene, 60, 1, prepare=input_files.prepare_photographs), 150, 4),
+        (Part("runs", run_attacks.stranger_run, 60, 1, prepare=input_files.prepare_runs), 150, 4),
+        (Part("stores", store_attacks.harmed_store, 60, 1, prepare=input_files.prepare_scenes), 150, 4),
+        (Part("clients", viewer_attacks.hostile_client, 60, 1, prepare=input_files.prepare_runs), 150, 2),
+        (Part("stress", training_attacks.stressed_command, 60, 1, prepare=input_files.prepare_scenes), 150, 4),
     )
 }
 
@@ -50,14 +50,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python tests/attack", description=__doc__)
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)}; default all")
     parser.add_argument("--short", action="store_true", help="the few attempts that the test suite makes")
-    parser.add_argument("--seed", type=int, default=0, help="of the first attempt of each part (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first attempt of each part (default: 0)")
     parser.add_argument("--count", type=int, help="attempts of each part; a chain of kills is one")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes (default: one a core)")
     parser.add_argument(
         "--mutate", nargs="*", metavar="WORD", help="plant faults, all or those named by words, instead"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="with --mutate, for what became of each fault")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="no attempt begins later")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="with --mutate: a JSON file for the outcome of each fault"
+    )
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="minutes after which no attempt begins")
     options = parser.parse_args()
     if options.mutate is not None:
         return mutate.plant(options.mutate, options.json)
@@ -66,16 +68,16 @@ def main() -> int:
         parser.error(f"PART must be one of {', '.join(PARTS)}, got {unknown[0]}")
 
     torch.set_num_threads(1)
-    os.environ["RUST_BACKTRACE"] = "0"  # safetensors would wait for ever where memory is out
+    os.environ["RUST_BACKTRACE"] = "0"  # safetensors would hang when memory is exhausted
     until = time.monotonic() + 60 * options.minutes
     tallies: dict[str, Tally] = {}
     with tempfile.TemporaryDirectory(prefix="attack-") as scratch:
         for name in options.parts or PARTS:
             part, long, short = PARTS[name]
             count = options.count or (short if options.short else long)
-            if not count:  # what takes too long for the short form
+            if not count:  # too slow for the short run
                 continue
-            folder = Path(scratch) / getattr(part.prepare, "__name__", "nothing")  # which several parts start from
+            folder = Path(scratch) / getattr(part.prepare, "__name__", "nothing")  # parts share it
             if not folder.exists():
                 prepare(part, folder)
             seeds = range(options.seed, options.seed + count)

@@ -1,8 +1,8 @@
-"""Attempts to break the library, each from a seed and in a forked process, so that a crash is a failure like another.
+"""Runs attempts to break the library, each from a seed in a forked process, so that a crash counts as a failure.
 
-A part of the attack is a function of a random generator and an empty folder. It returns what became of the attempt,
-and raises :class:`Failed` where the library broke a promise. Nothing before the forks may differentiate: torch does
-not work in the child of a process that has.
+A part of the attack is a function of a random generator and an empty folder. It returns the outcome of the attempt, and
+raises :class:`Failed` if the library broke a promise. The parent process must not run autograd before it forks, because
+torch would then fail in the child.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from pathlib import Path
 import torch
 
 REFUSED, RIGHT, FAILED = "refused", "right", "failed"
-#: Memory in bytes that what a stranger sends may take: it is refused before it takes more.
+#: The most memory in bytes that hostile input may take; the library must refuse it before it takes more.
 MEMORY = 2 << 30
 
 
 class Failed(Exception):
-    """A promise that was broken; the message says which."""
+    """Raised when the library broke a promise; the message says which."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class Part:
     """One part of the attack.
 
     Attributes:
-        name: In the table and on the command line.
-        attempt: What is tried; returns REFUSED or RIGHT, or how many of each there were.
-        seconds: Limit of an attempt.
-        memory: Bytes that an attempt may allocate; None where it starts what needs more address space.
-        batch: Attempts of a process.
-        peak: Bytes of memory that an attempt may take in all.
-        prepare: Makes, in a process of its own, what the attempts of the part start from.
+        name: The name in the table and on the command line.
+        attempt: The function of an attempt; returns REFUSED or RIGHT, or a count of each.
+        seconds: The time limit of an attempt.
+        memory: The bytes that an attempt may allocate; None if its programs need more address space.
+        batch: The number of attempts in a process.
+        peak: The limit of the process's peak memory in bytes.
+        prepare: A function that writes the input files of the attempts; it runs in a separate process.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Part:
 
 @dataclass
 class Tally:
-    """What became of the attempts of a part."""
+    """The outcomes of the attempts of a part."""
 
     counts: Counter[str] = field(default_factory=Counter)
     failures: list[tuple[int, str]] = field(default_factory=list)
@@ -70,17 +70,20 @@ class Tally:
         return self.counts.total()
 
 
-def prepare(part: Part, given: Path) -> None:
-    """Makes what the attempts of a part start from, in a folder that is not there yet."""
-    given.mkdir()
+def prepare(part: Part, inputs: Path) -> None:
+    """Writes the input files of a part's attempts into a new folder."""
+    inputs.mkdir()
     if part.prepare is not None:
-        status, _ = _finish(_fork(lambda: part.prepare(given)))
+        status, _ = _finish(_fork(lambda: part.prepare(inputs)))
         if status != 0:
             raise RuntimeError(f"{part.name} could not be prepared")
 
 
-def run_part(part: Part, seeds: Iterable[int], given: Path, *, jobs: int, until: float = float("inf")) -> Tally:
-    """Makes the attempts of some seeds from what is given, ``jobs`` at a time; none begins after the time ``until``."""
+def run_part(part: Part, seeds: Iterable[int], inputs: Path, *, jobs: int, until: float = float("inf")) -> Tally:
+    """Runs the attempts of some seeds, ``jobs`` at a time; no attempt begins after the time ``until``.
+
+    ``inputs`` is the folder of their input files.
+    """
     tally, started = Tally(), time.monotonic()
     waiting = list(seeds)[::-1]
     with tempfile.TemporaryDirectory(prefix="attack-") as scratch:
@@ -88,7 +91,7 @@ def run_part(part: Part, seeds: Iterable[int], given: Path, *, jobs: int, until:
         while running.get_map() or (waiting and time.monotonic() < until):
             while waiting and len(running.get_map()) < jobs and time.monotonic() < until:
                 batch = [waiting.pop() for _ in range(min(part.batch, len(waiting)))]
-                worker = _Worker(part, batch, given, Path(tempfile.mkdtemp(dir=scratch)))
+                worker = _Worker(part, batch, inputs, Path(tempfile.mkdtemp(dir=scratch)))
                 running.register(worker.pipe, selectors.EVENT_READ, worker)
             for key, _ in running.select():
                 worker = key.data
@@ -101,12 +104,12 @@ def run_part(part: Part, seeds: Iterable[int], given: Path, *, jobs: int, until:
 
 
 class _Worker:
-    """A process that makes some attempts and writes what became of each to a pipe."""
+    """A process that runs some attempts and writes their outcomes to a pipe."""
 
-    def __init__(self, part: Part, seeds: list[int], given: Path, folder: Path) -> None:
+    def __init__(self, part: Part, seeds: list[int], inputs: Path, folder: Path) -> None:
         self.part, self.seeds, self.folder, self._text = part, seeds, folder, b""
         self.pipe, write = os.pipe()
-        self.pid = _fork(lambda: _attempts(part, seeds, given, folder, write))
+        self.pid = _fork(lambda: _attempts(part, seeds, inputs, folder, write))
         os.close(write)
 
     def read(self) -> bool:
@@ -115,7 +118,7 @@ class _Worker:
         return bool(text)
 
     def end(self, tally: Tally) -> list[int]:
-        """Adds what became of the attempts; returns the seeds that are left, since one of them ended the process."""
+        """Adds the outcomes of the attempts; returns the remaining seeds if an attempt ended the process."""
         os.close(self.pipe)
         status, peak = _finish(self.pid)
         _stop_children(self.folder)
@@ -137,9 +140,9 @@ class _Worker:
         return self.seeds[done:]
 
 
-def _attempts(part: Part, seeds: list[int], given: Path, folder: Path, pipe: int) -> None:
+def _attempts(part: Part, seeds: list[int], inputs: Path, folder: Path, pipe: int) -> None:
     (folder / "group").write_text(str(os.getpid()))
-    os.environ["VORONERF_CACHE"] = str(folder / "cache")  # images on disk go with the attempts
+    os.environ["VORONERF_CACHE"] = str(folder / "cache")  # cached images are removed with the attempts
     for seed in seeds:
         place = folder / str(seed)
         place.mkdir()
@@ -150,7 +153,7 @@ def _attempts(part: Part, seeds: list[int], given: Path, folder: Path, pipe: int
             resource.setrlimit(resource.RLIMIT_AS, (taken + part.memory, resource.RLIM_INFINITY))
         result: dict[str, object] = {"seed": seed}
         try:
-            found = part.attempt(random.Random(seed), place, given)
+            found = part.attempt(random.Random(seed), place, inputs)
             result["counts"] = found if isinstance(found, Counter) else {found: 1}
         except Exception as error:
             where = "" if isinstance(error, Failed) else f" ({traceback.format_exc().splitlines()[-3].strip()})"
@@ -161,7 +164,7 @@ def _attempts(part: Part, seeds: list[int], given: Path, folder: Path, pipe: int
 
 
 def _fork(run: Callable[[], object]) -> int:
-    """The number of a new process, which leads a group and runs a function."""
+    """Forks a process, which leads a group and runs a function; returns its id."""
     pid = os.fork()
     if pid:
         return pid
@@ -176,24 +179,24 @@ def _fork(run: Callable[[], object]) -> int:
 
 
 def fork_command(run: Callable[[], int]) -> int:
-    """The number of a new process of the same group, whose exit status a function returns."""
+    """Forks a process of the same group, whose exit status the function returns; returns its id."""
     pid = os.fork()
     if pid:
         return pid
     try:
-        signal.alarm(120)  # it holds the pipe open that tells of the end of the attempt
+        signal.alarm(120)  # it holds the attempt's pipe open
         os._exit(run())
     except BaseException:
         os._exit(70)
 
 
 def _finish(pid: int) -> tuple[int, int]:
-    """The exit status of a process, below 0 for a signal, and the bytes of memory that it had at most."""
+    """Waits for a process; returns its exit status (negative for a signal) and its peak memory in bytes."""
     _, status, usage = os.wait4(pid, 0)
     return os.waitstatus_to_exitcode(status), usage.ru_maxrss * 1024
 
 
 def _stop_children(folder: Path) -> None:
-    """Ends what an attempt has left running."""
+    """Kills the processes that an attempt has left running."""
     with contextlib.suppress(OSError, ValueError):
         os.killpg(int((folder / "group").read_text()), signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""The command line in an attempt: what it prints, and whether that is a clear refusal."""
+"""Runs the command line in an attempt, and checks that its output is a clear refusal."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from attempts import REFUSED, RIGHT, Failed
 from voronerf import ops
 from voronerf.app.cli import main
 
-# Not in every attempt again; and a file that changes meanwhile then changes no attempt.
+# Imported once before the forks: faster, and a later change of a file does not affect attempts.
 every_op = [module.name for module in pkgutil.walk_packages(ops.__path__, "voronerf.ops.")]
 for slow in ("matplotlib.pyplot", "imageio_ffmpeg", "rich._emoji_codes", *every_op):
     importlib.import_module(slow)
@@ -23,7 +23,7 @@ LONGEST = 1000
 
 
 def run(*args: str | Path) -> tuple[int, str, str]:
-    """The exit status of a command, and what it prints to stdout and stderr."""
+    """Runs a command; returns its exit status, stdout and stderr."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
@@ -34,10 +34,10 @@ def run(*args: str | Path) -> tuple[int, str, str]:
 
 
 def judged(*args: str | Path) -> str:
-    """RIGHT where a command ends well, REFUSED where it says in one line why not.
+    """Runs a command; returns RIGHT if it succeeds, and REFUSED if it prints one clear line of error.
 
     Raises:
-        Failed: When what it prints is unclear, or a terminal would obey it.
+        Failed: The output is unclear, or has control characters that a terminal would execute.
     """
     status, out, err = run(*args)
     spoken = " ".join(map(str, args))
@@ -46,7 +46,7 @@ def judged(*args: str | Path) -> str:
         raise Failed(f"a terminal would obey what this prints: {spoken}: {err!r:.300}")
     if status == 0:
         return RIGHT
-    if status == 2:  # the parser of options explains itself in a box
+    if status == 2:  # the option parser prints its error in a box
         return REFUSED
     wrong = [line for line in lines if len(line) > LONGEST or not re.match(r"voronerf: |[^:]*: [0-9]+ of ", line)]
     if status != 1 or not lines or wrong or not lines[-1].startswith("voronerf: error: "):

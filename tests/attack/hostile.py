@@ -1,4 +1,4 @@
-"""Hostile values, and what a stranger can do to JSON and to bytes."""
+"""Hostile values, and hostile changes of JSON and bytes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VALUES = (*NUMBERS, *TEXTS, None, True, False, [], {}, [[]], [1, "a", None], {"a
 
 
 def nested(depth: int) -> Any:
-    """Lists in lists."""
+    """Returns nested lists of a given depth."""
     value: Any = 0
     for _ in range(depth):
         value = [value]
@@ -27,17 +27,17 @@ def nested(depth: int) -> Any:
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Where there is a value within nested lists and dictionaries."""
-    found = [path] if path else []
+    """Returns the paths of all values in nested lists and dictionaries."""
+    paths = [path] if path else []
     if isinstance(value, (dict, list)):
         entries = value.items() if isinstance(value, dict) else enumerate(value)
         for key, entry in entries:
-            found += places(entry, (*path, key))
-    return found
+            paths += places(entry, (*path, key))
+    return paths
 
 
 def mutated(rng: random.Random, value: Any) -> Any:
-    """A copy of a JSON value in which one place is replaced, removed, doubled or scaled."""
+    """Copies a JSON value and replaces, removes, doubles or scales one value in it."""
     value = copy.deepcopy(value)
     *to, last = rng.choice(places(value))
     holder = value
@@ -60,7 +60,7 @@ def mutated(rng: random.Random, value: Any) -> Any:
 
 
 def json_text(value: Any) -> bytes:
-    """As JSON; what is nested too deeply for Python's writer is brackets alone."""
+    """Returns a value as JSON; values nested too deeply for Python's writer become plain brackets."""
     try:
         return json.dumps(value).encode()
     except RecursionError:
@@ -68,7 +68,7 @@ def json_text(value: Any) -> bytes:
 
 
 def damaged(rng: random.Random, data: bytes) -> bytes:
-    """Bytes of which one bit is changed, some are overwritten, or the end is missing."""
+    """Returns damaged bytes: one bit flipped, some bytes overwritten or inserted, or the end cut off."""
     kind, at = rng.randrange(6), rng.randrange(max(1, len(data)))
     if kind == 0:
         return data[:at]
@@ -81,5 +81,5 @@ def damaged(rng: random.Random, data: bytes) -> bytes:
 
 
 def flipped(data: bytes, bit: int) -> bytes:
-    """Bytes of which one bit is changed."""
+    """Returns the bytes with one bit flipped."""
     return data[: bit // 8] + bytes([data[bit // 8] ^ 1 << bit % 8]) + data[bit // 8 + 1 :]

@@ -1,4 +1,4 @@
-"""Fuzzed calls of the ops: a valid one gives what the reference gives, an invalid one is refused by name."""
+"""Fuzzed calls of the ops: valid calls match the reference, invalid calls are refused with the argument's name."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ SLOW = ("render_opaque",)
 
 
 def called(op: str) -> Callable[..., Any]:
-    """The public function of an op."""
+    """Returns the public function of an op."""
     function: Callable[..., Any] = getattr(ops, CASES[op].call or op)
     return function
 
 
-def valid_call(rng: random.Random, folder: Path, given: Path) -> str:
-    """A call that keeps to the contract, with gradients now and then, and seldom with up to a million rows."""
+def valid_call(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Compares a random valid call with the reference, sometimes with gradients, seldom with up to a million rows."""
     op = rng.choice([name for name, case in CASES.items() if case.comparable])
     many = rng.random() < 0.002 and op not in SLOW
     n = int(2 ** rng.uniform(12, 20)) if many else rows(rng)
@@ -51,29 +51,29 @@ def valid_call(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 def rows(rng: random.Random) -> int:
-    """A number of rows: few, or about some blocks of a kernel."""
+    """Draws a number of rows: few rows, or a number around the block size of a kernel."""
     return rng.choice(SIZES if rng.random() < 0.8 else blocks.sizes(4200))
 
 
 def compare(op: str, call: dict[str, Any], viewed: dict[str, Any], *, gradients: bool) -> None:
-    """Fails where a call, or the same values in other memory, gives anything but what the reference gives."""
+    """Fails if the call ``viewed`` (the same values, maybe as views) differs from the reference."""
     found, slopes = results(op, viewed, "auto", gradients)
     expected, others = results(op, call, "reference", gradients)
     wide = functools.cache(lambda: results(op, tree_map(widened, call), "reference", gradients))
     for place, (part, other) in enumerate(zip(found, expected, strict=True)):
         if tolerances.agree(part, other) or (not CASES[op].in_place and nearer(part, other, wide()[0][place])):
             continue
-        raise Failed(f"{op}: not what the reference gives: {difference(part, other)}; {describe(call)}")
+        raise Failed(f"{op}: differs from the reference: {difference(part, other)}; {describe(call)}")
     if tolerances.agree_gradients(slopes, others):
         return
     near = (tolerances.agree_gradients([s], [o]) or nearer(s, o, w) for s, o, w in zip(slopes, others, wide()[1]))
     if not all(near):
         apart = ", ".join(difference(part, other) for part, other in zip(slopes, others, strict=True))
-        raise Failed(f"{op}: not the gradients of the reference: {apart}; {describe(call)}")
+        raise Failed(f"{op}: gradients differ from the reference's: {apart}; {describe(call)}")
 
 
 def nearer(part: Tensor, other: Tensor, exact: Tensor) -> bool:
-    """Whether a result is nearer to that of float64 than the reference's, which may subtract numbers that are alike."""
+    """Returns whether a result is closer to float64 than the reference, which may suffer from cancellation."""
     if part.shape != other.shape:
         return False
     far, near = ((each.double() - exact).norm(torch.inf) for each in (other, part))
@@ -81,17 +81,17 @@ def nearer(part: Tensor, other: Tensor, exact: Tensor) -> bool:
 
 
 def widened(value: Any) -> Any:
-    """In float64."""
+    """Converts floating-point tensors to float64."""
     return value.double() if isinstance(value, Tensor) and value.is_floating_point() else value
 
 
 def negated(value: Any) -> Any:
-    """The same values in a view with the negative bit, as ``.conj().imag`` gives."""
+    """Returns the same values as views with the negative bit, as in ``.conj().imag``."""
     return torch._neg_view(-value) if isinstance(value, Tensor) and value.is_floating_point() else value
 
 
 def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tuple[list[Tensor], list[Tensor]]:
-    """The tensors that an op returns or has written into, and the gradients of their sum where they are asked for."""
+    """Returns the output tensors of an op (also in-place outputs), and the gradients of their sum if requested."""
     case = CASES[op]
     own = tree_map(lambda value: value.detach().clone() if isinstance(value, Tensor) and case.in_place else value, call)
     leaves = []
@@ -113,19 +113,20 @@ def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tup
     return found, list(torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True))
 
 
-def invalid_call(rng: random.Random, folder: Path, given: Path) -> str:
-    """A call of which an argument, or a part of one, is not what it must be, on each backend that has the op.
+def invalid_call(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Runs a call with an invalid argument, or an invalid part of one, on each backend that has the op.
 
-    All of them refuse it by name, or none does; then nothing may break, and no gradient either.
+    Either all backends refuse it with the argument's name, or none does. An accepted call must not crash, nor may its
+    gradients.
     """
     op, seed, gradients = rng.choice(list(CASES)), rng.getrandbits(32), rng.random() < 0.3
     said: dict[str, str] = {}
     for backend in (*backends.implemented(op), "auto"):
-        generator = random.Random(seed)  # the same call again, since an op may write into its arguments
+        generator = random.Random(seed)  # rebuilds the call, since an op may write into its arguments
         torch.manual_seed(seed)
         try:
             call, names = harmed_call(generator, op)
-        except (ValueError, TypeError) as error:  # of a struct, which its constructor refuses
+        except (ValueError, TypeError) as error:  # a struct's constructor refused it
             if "\n" in str(error) or len(str(error)) > 500:
                 raise Failed(f"{op}: a struct is not refused clearly: {error}") from None
             return REFUSED
@@ -149,25 +150,25 @@ def invalid_call(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 def huge(call: dict[str, Any]) -> bool:
-    """Whether an argument speaks of gigabytes."""
+    """Returns whether an argument stands for gigabytes."""
     sizes = [leaf.numel() if isinstance(leaf, Tensor) else leaf for leaf in tree_leaves(call)]
     return any(isinstance(size, int) and size > 2**24 for size in sizes)
 
 
 def harmed_call(rng: random.Random, op: str) -> tuple[dict[str, Any], list[str]]:
-    """The arguments of an op, and those of them that were harmed."""
+    """Returns the arguments of an op, and the names of the invalid arguments."""
     case = CASES[op]
-    made, other = (case.make(Draw(rng.getrandbits(32), free=True), rows(rng)) for _ in range(2))
+    arguments, other = (case.make(Draw(rng.getrandbits(32), free=True), rows(rng)) for _ in range(2))
     parameters = inspect.signature(called(op)).parameters.values()
-    call = {each.name: made.get(each.name, each.default) for each in parameters if each.name != "backend"}
+    call = {each.name: arguments.get(each.name, each.default) for each in parameters if each.name != "backend"}
     names = rng.sample([*call, "backend"], rng.choice((1, 1, 1, 2)))
     for name in names:
         if name == "backend":
             call[name] = rng.choice(("", "cuda", None, 3, "Native", [], "a" * 10_000))
-        elif rng.random() < 0.15:  # of another call
+        elif rng.random() < 0.15:  # from another call
             call[name] = other.get(name, call[name])
         elif call[name] is None:
-            tensors = [part for part in tree_leaves(made) if isinstance(part, Tensor)]
+            tensors = [part for part in tree_leaves(arguments) if isinstance(part, Tensor)]
             few = torch.tensor([rng.choice((0, 1, -1, 5, 1000, 2**31 - 1, -(2**31)))], dtype=torch.int32)
             call[name] = rng.choice((3, "x", [1.0], harmed(rng, rng.choice(tensors)), rng.choice(tensors), few))
         else:
@@ -176,36 +177,36 @@ def harmed_call(rng: random.Random, op: str) -> tuple[dict[str, Any], list[str]]
 
 
 def check_message(op: str, call: dict[str, Any], names: list[str], error: Exception) -> None:
-    """The error names the op, or one that it is composed of, and an argument, in a line of some length."""
+    """Checks that the error is one short line with the names of an argument and of the op (or an op it consists of)."""
     text = str(error)
     arguments = {*inspect.signature(called(op)).parameters, *named(call)}
     arguments |= {*inspect.signature(ops.routed_mlp).parameters} if "network" in call else set()
-    arguments |= {argument.removesuffix("s") for argument in arguments}  # an entry of a list
+    arguments |= {argument.removesuffix("s") for argument in arguments}  # the name of a list's entry
     clear = re.match(rf"({'|'.join(backends.ops())})(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
     if not clear or "\n" in text or len(text) > 500:
         raise Failed(f"{op}: the error for {names} is not clear: {type(error).__name__}: {text:.300}; {describe(call)}")
 
 
 def named(value: Any) -> set[str]:
-    """The names of all parts of structs."""
-    found = {str(key) for key, _ in parts(value)} if not isinstance(value, (list, tuple)) else set()
-    found |= set(getattr(value, "_fields", ()))
-    return found.union(*(named(part) for _, part in parts(value)))
+    """Returns the names of all parts of structs."""
+    names = {str(key) for key, _ in parts(value)} if not isinstance(value, (list, tuple)) else set()
+    names |= set(getattr(value, "_fields", ()))
+    return names.union(*(named(part) for _, part in parts(value)))
 
 
 def parts(value: Any) -> list[tuple[Any, Any]]:
-    """Keys and parts of a list or struct."""
+    """Returns keys and parts of a list or struct."""
     if isinstance(value, (list, tuple)):
         return list(enumerate(value))
     if isinstance(value, dict):
         return list(value.items())
     if dataclasses.is_dataclass(value):
-        return [(each.name, getattr(value, each.name)) for each in dataclasses.fields(value) if each.init]
+        return [(field.name, getattr(value, field.name)) for field in dataclasses.fields(value) if field.init]
     return []
 
 
 def with_part(value: Any, key: Any, part: Any) -> Any:
-    """A list or struct, of which one part is another."""
+    """Returns a list or struct with one part replaced."""
     if dataclasses.is_dataclass(value):
         return dataclasses.replace(value, **{key: part})
     if isinstance(value, dict):
@@ -217,7 +218,10 @@ def with_part(value: Any, key: Any, part: Any) -> Any:
 
 
 def harmed(rng: random.Random, value: Any, counted: bool = False) -> Any:
-    """Something else in the place of a value, or of a part of it; what is ``counted`` is worked off, however large."""
+    """Replaces a value or a part of it by an invalid value.
+
+    A ``counted`` value is a number of iterations, so it gets no large numbers.
+    """
     inside = parts(value)
     if inside and rng.random() < 0.8:
         key, part = rng.choice(inside)
@@ -239,7 +243,7 @@ def harmed(rng: random.Random, value: Any, counted: bool = False) -> Any:
 
 
 def other_tensor(rng: random.Random, tensor: Tensor) -> Any:
-    """A tensor of another kind, dtype, shape or place, or something that is none."""
+    """Returns a tensor of another kind, dtype, shape or device, or a value that is no tensor."""
     kind = rng.randrange(14)
     if kind == 0:
         return rng.choice((None, "x", 3, tensor.tolist(), tensor.float().numpy(), torch.float32, object()))
@@ -257,7 +261,7 @@ def other_tensor(rng: random.Random, tensor: Tensor) -> Any:
         return rng.choice(
             (lambda: tensor.to_sparse(), lambda: tensor.to("meta"), lambda: tensor.expand(2, *tensor.shape))
         )()
-    if kind == 9 and tensor.dim() and tensor.shape[0]:  # more rows than an index counts, in no memory; 2^31 - 1 of some
+    if kind == 9 and tensor.dim() and tensor.shape[0]:  # more rows than int32 indexes, by stride 0
         rows = 2**31 - (tensor.dim() == 1 and not tensor.is_floating_point() and rng.random() < 0.5)
         return tensor[:1].expand(rows, *tensor.shape[1:])
     if kind == 10 and tensor.is_floating_point():
@@ -278,7 +282,7 @@ def difference(found: Tensor, expected: Tensor) -> str:
 
 
 def describe(call: dict[str, Any]) -> str:
-    """Shapes and dtypes of the arguments."""
+    """Returns a text with shapes and dtypes of the arguments."""
 
     def one(value: Any) -> str:
         if isinstance(value, Tensor):

@@ -1,4 +1,4 @@
-"""Trainings in territories: ranks are killed, stopped, paused, have no room, read damage, or are given other data."""
+"""Attacks on trainings in territories: ranks are killed or paused, disks are full, files are damaged, data differ."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 from attempts import REFUSED, RIGHT, Failed
-from given import FIELDS, TINY
+from input_files import FIELDS, TINY
 
 from voronerf.app.cli import main
 from voronerf.app.train.checkpoint import checkpoint_paths
@@ -22,24 +22,24 @@ from voronerf.town import group
 sys.path.append(str(Path(__file__).parents[1] / "town"))
 from ranks import complaints, network_files, said_by, start_ranks, town_tensors
 
-#: The networks of a training in four territories.
+#: Options for the networks of a training in four territories.
 VARIANTS = (
     ["--field", "nerf"],
     FIELDS["hashgrid"],
     [*FIELDS["hashgrid"], "--contraction", "sphere"],
     ["--field", "nerf", "--cells", "2", "2", "--split-at", "0.3", "0.6"],
 )
-#: What happens to ranks, and how often: killed, stopped for good, stopped for some seconds; so many in an attempt.
+#: Faults of ranks and their weights (killed, stopped for good, stopped for some seconds), and faults in an attempt.
 FAULTS, COUNT = {"kill": 10, "stop": 10, "pause": 2}, 4
 PAUSE = 1.5
-#: Share of the faults after which a bit of the last checkpoint is another.
+#: The share of faults after which a bit of the last checkpoint is flipped.
 DAMAGED = 0.25
-#: Seconds that ranks of an attack wait for each other (50 in a training), and in which the fault is to be told.
+#: Seconds that ranks of an attack wait for each other (50 in a training), and seconds until the fault must be reported.
 PATIENCE, TOLD = 8, 60
 
 
 def rank(args: list[str], file_size: int | None = None) -> int:
-    """A rank, whose files may have so many bytes, as on a full disk."""
+    """Runs a rank; ``file_size`` limits the bytes of its files, like a full disk."""
     group.PATIENCE = PATIENCE
     if file_size is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
@@ -47,14 +47,14 @@ def rank(args: list[str], file_size: int | None = None) -> int:
 
 
 class Ranks:
-    """A training on several ranks, which goes on from its last checkpoint.
+    """A training on several ranks, which continues from its last checkpoint.
 
     Args:
-        out: The run directory; what is printed goes beside it.
-        size: How many ranks.
-        options: Of ``voronerf train-territories``.
-        also: More of them for the last rank alone.
-        file_size: The bytes that a file of the last rank may have.
+        out: The run directory; the output of the ranks is written beside it.
+        size: The number of ranks.
+        options: Options of ``voronerf train-territories``.
+        also: Additional options of the last rank.
+        file_size: The largest bytes of a file of the last rank.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Ranks:
         self.processes = start_ranks(rank, [(args,)] * (size - 1) + [last], self.said)
 
     def end(self, but: int = -1) -> list[int | None]:
-        """Waits for all ranks, but one; the exit status of each."""
+        """Waits for all ranks except number ``but``; returns the exit status of each rank."""
         until = time.monotonic() + TOLD
         for number, process in enumerate(self.processes):
             if number != but:
@@ -80,7 +80,7 @@ class Ranks:
 
     @property
     def complaints(self) -> list[str]:
-        """The lines that tell of an error."""
+        """The printed lines about errors."""
         return complaints(said_by(self.processes, self.said))
 
     def ends_well(self) -> None:
@@ -90,14 +90,14 @@ class Ranks:
             raise Failed(f"ranks that were left alone ended with {self.end()}: {self.complaints}")
 
     def is_refused(self, sign: str) -> None:
-        """All ranks end, and one of them says why in a line."""
+        """Checks that all ranks end, and that one rank reports the reason in one line."""
         codes, lines = self.end(), self.complaints
         if not all(codes) or len(lines) != 1 or sign not in lines[0]:
             raise Failed(f"ranks that are to say {sign!r} ended with {codes}: {lines}")
 
 
-def harmed_ranks(rng: random.Random, folder: Path, _given: Path) -> Counter[str]:
-    """Whatever happens to a rank, one line tells of it, and the run ends, to the bit, as that of one process."""
+def harmed_ranks(rng: random.Random, folder: Path, _inputs: Path) -> Counter[str]:
+    """Harms ranks: one line must report each fault, and the resumed run must equal a single-process run bit for bit."""
     options = [*("--data", "builtin", "--downscale", "8"), *TINY, *rng.choice(VARIANTS), "--territories", "4"]
     options += ["--steps", "100", "--checkpoint-every", rng.choice(("1e-9", "0.1"))]
     whole, part = folder / "whole", folder / "part"
@@ -113,10 +113,10 @@ def harmed_ranks(rng: random.Random, folder: Path, _given: Path) -> Counter[str]
 
 
 def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[str]) -> int:
-    """Ends ranks at random moments, and starts others; how many."""
+    """Kills or stops ranks at random moments and resumes the run; returns the number of faults."""
     faults = rng.choices([*FAULTS], [*FAULTS.values()], k=COUNT)
     done, runs, length = 0, 0, 4.0
-    while faults:  # a run may end before all of them
+    while faults:  # a run may end before all faults
         part, ended = folder / f"part-{runs}", False
         while not ended:
             ranks, began = Ranks(part, rng.choice((2, 3, 4)), options), time.monotonic()
@@ -133,7 +133,7 @@ def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[st
                 continue
             fault = faults.pop()
             os.kill(number, signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
-            if fault == "pause":  # which is none
+            if fault == "pause":  # a pause is no fault
                 time.sleep(PAUSE)
                 os.kill(number, signal.SIGCONT)
                 ranks.ends_well()
@@ -147,7 +147,7 @@ def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[st
                 told = ranks.complaints
                 print(f"{fault} {at - began:.1f} s after the start, told after {took:.1f} s:", *told, flush=True)
                 left = [code for other, code in enumerate(codes) if other != chosen]
-                ended = not any(left) and bool(checkpoint_paths(part))  # they were through
+                ended = not any(left) and bool(checkpoint_paths(part))  # the run was already complete
                 if len(told) != (0 if ended else 1):
                     raise Failed(f"{fault}: ranks ended with {codes} and said {told}")
                 if len(checkpoint_paths(part)) > 1 and rng.random() < DAMAGED:
@@ -159,7 +159,7 @@ def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[st
 
 
 def _same_runs(whole: Path, part: Path) -> None:
-    """Compares the files of all territories."""
+    """Compares the tensors of all territories."""
     first, second = town_tensors(whole), town_tensors(part)
     other = [name for name in first.keys() | second.keys() if name not in first or not first[name].equal(second[name])]
     if other:
@@ -167,7 +167,7 @@ def _same_runs(whole: Path, part: Path) -> None:
 
 
 def _damage(rng: random.Random, run: Path) -> None:
-    """Changes a bit of a territory's file of the last checkpoint."""
+    """Flips a bit in a territory's file of the last checkpoint."""
     path = rng.choice(network_files(run))
     data = bytearray(path.read_bytes())
     data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)

@@ -1,4 +1,4 @@
-"""Random calls of a router and changes around it, against a loop over masks with a plain module for each cell."""
+"""Random calls and changes of a router, compared with a loop over masks with a plain module per cell."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ sys.path.append(str(Path(__file__).parents[1] / "router"))
 from router_fields import Heads, Sine, SkipNet, tensors
 
 WAYS = ("fastest", "fused", "grouped", "loop")
-#: Numbers of samples of calls, of which each router has several.
+#: Numbers of samples of a call.
 SAMPLES = (0, 1, 1, 2, 7, 8, 41, 300)
 MOST_CELLS = 12
 
 
 class Changing(nn.Module):
-    """Reads attributes and buffers that change between calls."""
+    """A module that reads attributes and buffers, which change between calls."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ class Changing(nn.Module):
 
 
 class Normed(nn.Module):
-    """Layer norm and RMS norm, with weights and without."""
+    """A module with layer norms and RMS norms, with and without weights."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class Normed(nn.Module):
 
 
 class Looked(nn.Module):
-    """A table of each cell beside layers."""
+    """A module with a table beside layers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ class Looked(nn.Module):
 
 
 class Split(nn.Module):
-    """Works on pieces of tensors, and gives them back."""
+    """A module that computes on pieces of tensors and returns them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -104,7 +104,7 @@ class Split(nn.Module):
 
 
 class OfRays(nn.Module):
-    """Directions of rays beside samples of them."""
+    """A module that reads samples and the directions of their rays."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ class OfRays(nn.Module):
 
 
 class Custom(nn.Module):
-    """A custom function of autograd, and shared layers before those of cells."""
+    """A module with a custom autograd function, and shared layers before the layers of cells."""
 
     class Exp(torch.autograd.Function):
         @staticmethod
@@ -141,7 +141,7 @@ class Custom(nn.Module):
 
 
 class Again(nn.Module):
-    """A checkpoint inside."""
+    """A module with an activation checkpoint inside."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -153,16 +153,16 @@ class Again(nn.Module):
 
 @dataclass(frozen=True)
 class Kind:
-    """A field, and what a router of it is given.
+    """A field, and the options of its router.
 
     Attributes:
-        make: Makes the field.
-        features: The columns of each argument.
-        share: Names of parameters that cells may share.
-        methods: Further methods, which take the first argument.
-        twice: Whether second derivatives are compared, which a custom function may not have.
-        plain: Whether transforms and checkpoints take the field, which has no checkpoint of its own.
-        per_ray: Whether the last argument may have a row for each ray.
+        make: A function that makes the field.
+        features: The number of columns of each argument.
+        share: A pattern of parameter names that cells may share.
+        methods: Additional methods, which take the first argument.
+        twice: Whether second derivatives are compared; a custom function may have none.
+        plain: Whether the field has no checkpoint inside, so that transforms and checkpoints accept it.
+        per_ray: Whether the last argument may have one row per ray.
     """
 
     make: Callable[[], nn.Module]
@@ -199,12 +199,12 @@ KINDS = {
 }
 
 
-def random_sequence(rng: random.Random, folder: Path, given: Path) -> str:
-    """Draws a router and a sequence of calls and changes; after each call it equals the loop over masks."""
+def random_sequence(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Draws a router and a sequence of calls and changes; compares each call with the loop over masks."""
     measure = dispatch.measure
 
     def drawn(ways: Any, call: Any, grouping: Any) -> list[float]:
-        """Runs what a measurement runs, and says any times."""
+        """Runs the measured ways, and returns random times."""
         return [rng.random() for _ in measure(ways, call, grouping)]
 
     sequence = Sequence(rng)
@@ -220,7 +220,7 @@ def random_sequence(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 class Sequence:
-    """A router, and what has happened to it."""
+    """A router and the events of its sequence."""
 
     def __init__(self, rng: random.Random) -> None:
         self.rng, name = rng, rng.choice(list(KINDS))
@@ -234,12 +234,12 @@ class Sequence:
         }
         self.router = VoronoiRouter(self.kind.make(), torch.rand(rng.randrange(1, 7), 3), coords="first3", **options)
         self.events = [f"{name} in {self.router.num_cells} cells, {options}"]
-        self.forms = [rng.random() for _ in range(3)]  # seeds of calls that are alike but for their samples
+        self.forms = [rng.random() for _ in range(3)]  # seeds of calls that differ only in their samples
         self.differ()
         self.states = [copy.deepcopy(self.router.state_dict())]
 
     def step(self) -> None:
-        """Calls the router, or changes something."""
+        """Calls the router or changes it."""
         if self.rng.random() < 0.6:
             self.call()
         else:
@@ -250,13 +250,13 @@ class Sequence:
             change(self)
 
     def differ(self) -> None:
-        """Makes the cells differ."""
+        """Adds different noise to the parameters of each cell."""
         with torch.no_grad():
             for parameter in self.router.parameters():
                 parameter += 0.2 * torch.randn_like(parameter)
 
     def call(self) -> None:
-        """Compares a call, and its gradients, with the loop over masks."""
+        """Compares a call and its gradients with the loop over masks."""
         rng, router, kind = random.Random(self.rng.choice(self.forms)), self.router, self.kind
         lead, way = (
             self._lead(rng),
@@ -318,7 +318,7 @@ class Sequence:
         first, rest = wanted[: leaf.requires_grad], wanted[leaf.requires_grad :]
         for i, parameter in enumerate(parameters.values()):
             of_cells = torch.stack(rest[i * len(modules) : (i + 1) * len(modules)])
-            first.append(of_cells if of_cells.shape == parameter.shape else of_cells.sum(0))  # which all cells share
+            first.append(of_cells if of_cells.shape == parameter.shape else of_cells.sum(0))  # shared by all cells
         self._compare("gradient", gradients, first)
 
     def _gradients(self, total: Tensor, leaves: list[Tensor]) -> list[Tensor]:
@@ -332,12 +332,12 @@ class Sequence:
         return lead if len(lead) == 1 or lead[0] != lead[1] or lead == (1, 1) else (n,)
 
     def arguments(self, lead: tuple[int, ...], rng: random.Random) -> tuple[list[Tensor], list[Tensor]]:
-        """Arguments with a row for each sample, and as the router takes them."""
+        """Returns the arguments with one row per sample, and in the shapes that the router takes."""
         n = math.prod(lead)
         flat = [torch.rand(n, f, dtype=self.dtype) for f in self.kind.features]
         args = [a.reshape(*lead, a.shape[1]) for a in flat]
         if self.kind.per_ray and n and rng.random() < 0.4:
-            if len(lead) == 1:  # the same for all samples
+            if len(lead) == 1:  # one row for all samples
                 args[1] = args[1][:1].clone()
                 flat[1] = args[1].expand(n, -1)
             elif self.router.layout == "rays":
@@ -347,7 +347,7 @@ class Sequence:
 
     @torch.no_grad()
     def _tensors(self, result: Any, method: str, lead: tuple[int, ...]) -> list[Tensor]:
-        """The tensors of a result, which has the structure and the shapes that the module itself gives."""
+        """Returns the tensors of a result, after a check of its structure and shapes against the module's."""
         some = [torch.rand(2, f, dtype=self.dtype) for f in self.kind.features]
         plain = getattr(self.router.cell(0), method)(*(some if method == "forward" else some[:1]))
         shapes = [(*lead, *tensor.shape[1:]) for tensor in tensors(plain)]
@@ -356,7 +356,7 @@ class Sequence:
         return tensors(result)
 
     def _expected(self, method: str, flat: list[Tensor]) -> tuple[list[Tensor], list[nn.Module]]:
-        """The results of a mask and a plain module for each cell; those in frozen cells are constants."""
+        """Returns the results of the loop over masks, and its modules; results of frozen cells are constants."""
         router, results = self.router, list[Tensor]()
         cells, frozen = router.assign(flat[0][:, :3].detach()), router.frozen
         modules = [router.cell(i) for i in range(router.num_cells)]
@@ -370,7 +370,7 @@ class Sequence:
         return results, modules
 
     def _compare(self, what: str, found: list[Tensor], expected: list[Tensor]) -> None:
-        """Raises Failed where tensors differ by more than rounding."""
+        """Raises Failed if tensors differ by more than rounding."""
         for number, (ours, theirs) in enumerate(zip(found, expected, strict=True)):
             ours, theirs = ours.detach().clone().reshape(theirs.shape), theirs.detach()
             if ours.dtype != theirs.dtype:
@@ -380,7 +380,7 @@ class Sequence:
                 raise Failed(f"{what} {number} differs by {far:.3g} of {size:.3g}; {self.router.explain()}")
 
 
-# Changes
+# Changes of the router
 
 
 def mode(s: Sequence) -> None:
@@ -411,7 +411,7 @@ def load(s: Sequence) -> None:
 
 
 def data(s: Sequence) -> None:
-    s.router.unfreeze()  # frozen cells that are written to are an error
+    s.router.unfreeze()  # writing to frozen cells is an error
     parameter = s.rng.choice(list(s.router.parameters()))
     parameter.data = parameter.data * 0.9
 
@@ -431,7 +431,7 @@ def copied(s: Sequence) -> None:
 
 
 def stored(s: Sequence) -> None:
-    if "parametrizations" in str(s.router):  # which torch does not store
+    if "parametrizations" in str(s.router):  # torch cannot store them
         return
     held = io.BytesIO()
     torch.save(s.router, held)

@@ -1,4 +1,4 @@
-"""Damaged checkpoints, and runs that a stranger made."""
+"""Damaged checkpoints and hostile runs."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 from attempts import REFUSED, RIGHT, Failed
 from commands import judged
-from given import FIELDS, copied_run
 from hostile import damaged, flipped, json_text, mutated
+from input_files import FIELDS, copied_run
 
 from voronerf.app.train.checkpoint import (
     Checkpoint,
@@ -34,7 +34,7 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
 
 
 def same(first: Checkpoint, second: Checkpoint) -> bool:
-    """Whether two checkpoints hold the same, bit for bit."""
+    """Returns whether two checkpoints are equal bit for bit."""
     if first.values != second.values or first.tensors.keys() != second.tensors.keys():
         return False
     return all(
@@ -47,21 +47,21 @@ def bits(tensor: torch.Tensor) -> torch.Tensor:
     return tensor.reshape(-1).view(torch.uint8)
 
 
-def flipped_bit(rng: random.Random, folder: Path, given: Path) -> str:
-    """A checkpoint of which one bit changed, or a piece is gone: refused, and the one before takes its place."""
-    run = copied_run(given, rng.choice(list(FIELDS)), folder)
+def flipped_bit(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Damages a checkpoint: it must be refused, and the previous checkpoint loaded instead."""
+    run = copied_run(inputs, rng.choice(list(FIELDS)), folder)
     path = checkpoint_path(run)
     whole, data = load_checkpoint(path), path.read_bytes()
     older = load_checkpoint(checkpoint_paths(run)[1])
-    # The header is a small part of the file, and the one with most structure.
+    # Half of the damage hits the header, a small part of the file with the most structure.
     bit = rng.randrange(8 * min(len(data), 6000 if rng.random() < 0.5 else len(data)))
-    path.unlink()  # tensors that were read may be a map of the file
+    path.unlink()  # loaded tensors may map the file
     path.write_bytes(flipped(data, bit) if rng.random() < 0.7 else damaged(rng, data))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         found = last_checkpoint(run)
     if same(found, whole):
-        return RIGHT  # what changed means nothing, as a space in the header
+        return RIGHT  # the change has no effect, like a space in the header
     if not same(found, older) or len(said) != 1 or str(path) not in str(said[0].message):
         raise Failed(f"a damaged checkpoint was taken, or another than the one before it: {said}")
     try:
@@ -73,13 +73,13 @@ def flipped_bit(rng: random.Random, folder: Path, given: Path) -> str:
     raise Failed("a damaged checkpoint was read")
 
 
-def stranger_run(rng: random.Random, folder: Path, given: Path) -> str:
-    """A run with other settings, tensors, files or links: a command on it is refused in a line, or ends well."""
-    run = copied_run(given, rng.choice(list(FIELDS)), folder)
-    outside = Path(shutil.copytree(given / "outside", folder / "outside"))
+def stranger_run(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Changes settings, tensors, files or links of a run: a command must succeed or refuse it in one line."""
+    run = copied_run(inputs, rng.choice(list(FIELDS)), folder)
+    outside = Path(shutil.copytree(inputs / "outside", folder / "outside"))
     change = rng.choice((config, values, values, tensors, tensors, metrics, links, files))
     if change in (values, tensors) and rng.random() < 0.7:
-        for path in checkpoint_paths(run)[1:]:  # so that no older one takes its place
+        for path in checkpoint_paths(run)[1:]:  # so that no other checkpoint is loaded
             path.unlink()
     change(rng, run, outside)
     before = contents(folder, run)
@@ -90,7 +90,7 @@ def stranger_run(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 def contents(folder: Path, run: Path) -> dict[str, bytes]:
-    """What the files beside a run hold."""
+    """Returns the contents of the files outside a run."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.is_relative_to(run))
     return {str(path): path.read_bytes() for path in files}
 
@@ -101,7 +101,7 @@ def config(rng: random.Random, run: Path, outside: Path) -> None:
 
 
 def values(rng: random.Random, run: Path, outside: Path) -> None:
-    """Other values with the right checksum; those of the settings often in config.json too."""
+    """Changes values and fixes the checksum; settings often change in config.json too."""
     path = checkpoint_path(run)
     checkpoint = load_checkpoint(path)
     other = mutated(rng, checkpoint.values)
@@ -114,7 +114,7 @@ def values(rng: random.Random, run: Path, outside: Path) -> None:
 
 
 def tensors(rng: random.Random, run: Path, outside: Path) -> None:
-    """Tensors that are missing, of another shape or dtype, or full of odd numbers."""
+    """Removes tensors, or changes their shape, dtype or values."""
     path = checkpoint_path(run)
     checkpoint = load_checkpoint(path)
     held = dict(checkpoint.tensors)
@@ -154,7 +154,7 @@ def metrics(rng: random.Random, run: Path, outside: Path) -> None:
 
 
 def links(rng: random.Random, run: Path, outside: Path) -> None:
-    """A folder or a file that leads out of the run."""
+    """Replaces a folder or a file by a link out of the run."""
     there = run / rng.choice(("checkpoints", "images", "plots", "samples", "eval.json", "video.mp4", "metrics.jsonl"))
     if there.is_dir():
         shutil.rmtree(there)
@@ -164,7 +164,7 @@ def links(rng: random.Random, run: Path, outside: Path) -> None:
 
 
 def files(rng: random.Random, run: Path, outside: Path) -> None:
-    """A file that is none, or holds something else."""
+    """Replaces a file by a folder, a pipe or other contents."""
     path = run / rng.choice(
         ("config.json", "checkpoints/last.safetensors", "metrics.jsonl", "eval.json", "summary.json")
     )

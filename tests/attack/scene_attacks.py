@@ -1,4 +1,4 @@
-"""Scenes that a stranger made."""
+"""Hostile scenes."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from pathlib import Path
 
 from attempts import Failed
 from commands import judged
-from given import FIELDS, SIDE, TINY
 from hostile import VALUES, damaged, json_text, mutated
+from input_files import FIELDS, SIDE, TINY
 from PIL import Image
 
 
-def stranger_scene(rng: random.Random, folder: Path, given: Path) -> str:
-    """Two steps of training on a scene with other contents: refused in a line, or ends well."""
+def stranger_scene(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Trains two steps on a changed scene: the command must succeed or refuse it in one line."""
     name = rng.choice(("blender", "capture", "colmap", "colmap-text", "llff"))
-    scene = Path(shutil.copytree(given / name, folder / "scene"))
-    outside = Path(shutil.copytree(given / "outside", folder / "outside"))
+    scene = Path(shutil.copytree(inputs / name, folder / "scene"))
+    outside = Path(shutil.copytree(inputs / "outside", folder / "outside"))
     transforms = name in ("blender", "capture")
     change = rng.choice((contents, contents, picture, path, text) if transforms else (model, model, picture, link))
     change(rng, scene, outside)
@@ -39,7 +39,7 @@ def stranger_scene(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 def model(rng: random.Random, scene: Path, outside: Path) -> None:
-    """A file of COLMAP's model, or LLFF's poses, is damaged or has another number somewhere."""
+    """Damages a file of the COLMAP model or the LLFF poses, or changes a number in it."""
     file = rng.choice(sorted([*scene.glob("sparse/0/*"), *scene.glob("*.npy")]))
     data = file.read_bytes()
     if file.suffix == ".txt" and rng.random() < 0.7:
@@ -57,7 +57,7 @@ def model(rng: random.Random, scene: Path, outside: Path) -> None:
 
 
 def link(rng: random.Random, scene: Path, outside: Path) -> None:
-    """An image, all of them or the model's folder lead outside."""
+    """Replaces an image, all images or the model's folder by links outside the scene."""
     there = scene / rng.choice(("images/01.jpg", "images", "sparse" if (scene / "sparse").is_dir() else "images"))
     away = outside.with_name("away") if there.is_dir() else outside / "secret.png"
     if there.is_dir():
@@ -72,7 +72,7 @@ def transforms(rng: random.Random, scene: Path) -> Path:
 
 
 def contents(rng: random.Random, scene: Path, outside: Path) -> None:
-    """One value of a transforms file is another."""
+    """Changes one value of a transforms file."""
     file = transforms(rng, scene)
     value = mutated(rng, json.loads(file.read_text()))
     if rng.random() < 0.2 and isinstance(value, dict):
@@ -83,7 +83,7 @@ def contents(rng: random.Random, scene: Path, outside: Path) -> None:
 
 
 def text(rng: random.Random, scene: Path, outside: Path) -> None:
-    """A transforms file that is damaged, a folder, a pipe or a link to a device."""
+    """Damages a transforms file, or replaces it by a folder, a pipe or a link to a device."""
     file = transforms(rng, scene)
     data, kind = file.read_bytes(), rng.randrange(6)
     file.unlink()
@@ -98,7 +98,7 @@ def text(rng: random.Random, scene: Path, outside: Path) -> None:
 
 
 def path(rng: random.Random, scene: Path, outside: Path) -> None:
-    """A frame, or a folder, leads to an image outside."""
+    """Makes a frame's path or a linked folder lead to an image outside."""
     file = transforms(rng, scene)
     value = json.loads(file.read_text())
     frame = rng.choice(value["frames"])
@@ -119,7 +119,7 @@ def path(rng: random.Random, scene: Path, outside: Path) -> None:
 
 
 def picture(rng: random.Random, scene: Path, outside: Path) -> None:
-    """One image, or all of them, are something else."""
+    """Replaces one image or all images."""
     images = sorted((scene / "images").iterdir())
     data = other_picture(rng, images[0].read_bytes())
     for image in images if rng.random() < 0.3 else [rng.choice(images)]:
@@ -131,17 +131,17 @@ def picture(rng: random.Random, scene: Path, outside: Path) -> None:
 
 
 def other_picture(rng: random.Random, whole: bytes) -> bytes | None:
-    """Bytes in the place of a picture; None for a pipe, which a reader would wait for."""
+    """Returns bytes to replace a picture; None stands for a pipe, on which a reader would block."""
     kind = rng.randrange(9)
     if kind == 0:
         return None
     if kind <= 3:
         return damaged(rng, whole)
-    if kind == 4:  # other formats, of which EPS would start a program
+    if kind == 4:  # other formats; EPS would start a program
         file = io.BytesIO()
         Image.new("RGB", (SIDE, SIDE)).save(file, rng.choice(("EPS", "GIF", "TIFF", "BMP", "PPM", "PDF", "ICO", "TGA")))
         return file.getvalue()
-    if kind == 5:  # other kinds of a format that is read
+    if kind == 5:  # other modes of a supported format
         file = io.BytesIO()
         mode = rng.choice(("1", "L", "P", "CMYK", "I;16", "LA"))
         Image.new(mode, (SIDE, SIDE)).save(file, "JPEG" if mode == "CMYK" else "PNG")
@@ -155,7 +155,7 @@ def other_picture(rng: random.Random, whole: bytes) -> bytes | None:
 
 
 def bomb(width: int, height: int, depth: int, colour: int) -> bytes:
-    """A PNG of any size whose data is a few zeros."""
+    """Returns a PNG of any size whose data is a few zeros."""
     header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(100_000))), (b"IEND", b""))
     parts = (

@@ -1,4 +1,4 @@
-"""Random changes around a recorded training step, which gives the bits of steps that run as they are."""
+"""Random changes around recorded training steps, whose results must equal eager steps bit for bit."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from voronerf import OccupancyGrid
 from voronerf.nerf import Batch, PlannedSplit, RenderOutput, Seen, SplitStrategy
 
-sys.path.append(str(Path(__file__).resolve().parents[1]))  # of the tests' helpers
+sys.path.append(str(Path(__file__).resolve().parents[1]))  # the tests' helpers
 
 from step_training import BOX, Scaled, Training, same
 
-#: Changes of a sequence, between which there are steps.
+#: The number of changes in a sequence, with steps between the changes.
 CHANGES = 8
 
 
-def changed_steps(rng: random.Random, folder: Path, given: Path) -> str:
-    """A training with random changes between its steps, and one with the same changes whose steps are not recorded."""
+def changed_steps(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Compares two trainings with the same random changes between their steps: one recorded, one eager."""
     options = {"cells": rng.choice((1, 1, 3)), "photograph": rng.random() < 0.3}
     if rng.random() < 0.3:
         options |= {"field": Scaled, "fuse": True, "way": "fused"}
@@ -58,7 +58,7 @@ def changed_steps(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 class Own(SplitStrategy):
-    """Counts, and calls its base."""
+    """A split strategy that counts its calls and calls its base."""
 
     seen = 0
 
@@ -83,7 +83,7 @@ def _fetch(training: Training) -> None:
     training.batches.fetch = lambda pixels: None
 
 
-#: What runs in Python in each step of a sequence.
+#: Functions that add Python code to each step of a sequence.
 HOOKS: dict[str, Callable[[Training], None]] = {
     "a strategy": _set_strategy,
     "a term": _add_term,
@@ -92,24 +92,28 @@ HOOKS: dict[str, Callable[[Training], None]] = {
 
 
 def _steps(rng: random.Random, trainings: list[Training], said: list[str]) -> None:
-    """Some steps of both, and what they have found."""
+    """Runs some steps of both trainings and compares the results."""
     for _ in range(rng.randint(1, 3)):
         rays, steps, at = rng.choice((64, 64, 50, 90)), rng.choice((1, 1, 2, 7, 16)), rng.choice((None, True))
         said.append(f"{steps} steps of {rays} rays{' at' if at else ''}")
-        found = []
+        outcomes = []
         for training in trainings:
-            made, error = None, ""
+            result, error = None, ""
             try:
-                made = training.step(rays, steps, at=training.done if at else None)
+                result = training.step(rays, steps, at=training.done if at else None)
             except RuntimeError as raised:
                 error = str(raised)
             training.done += steps
             training.optimizer.steps_done = training.done
-            tensors = [] if made is None else [made.loss, made.output.weights, made.output.colour, made.batch.target]
+            tensors = (
+                []
+                if result is None
+                else [result.loss, result.output.weights, result.output.colour, result.batch.target]
+            )
             tensors += [each for each in training.everything() if each is not None]
-            found.append((error, [tensor.detach().clone() for tensor in tensors]))
-        if found[0][0] != found[1][0] or not same(found[0][1], found[1][1]):
-            raise Failed(f"another result after {'; '.join(said)} ({found[0][0]!r}, {found[1][0]!r})")
+            outcomes.append((error, [tensor.detach().clone() for tensor in tensors]))
+        if outcomes[0][0] != outcomes[1][0] or not same(outcomes[0][1], outcomes[1][1]):
+            raise Failed(f"another result after {'; '.join(said)} ({outcomes[0][0]!r}, {outcomes[1][0]!r})")
 
 
 def _parameters(training: Training) -> list[Tensor]:
@@ -117,7 +121,7 @@ def _parameters(training: Training) -> list[Tensor]:
 
 
 def _tensors(training: Training) -> list[Tensor]:
-    """All that a step may read or write."""
+    """Returns all tensors that a step may read or write."""
     state = [value for each in training.optimizer.state.values() for value in each.values()]
     gradients = [p.grad for p in _parameters(training) if p.grad is not None]
     batches, grid = training.batches, training.sampler.grid
@@ -132,7 +136,7 @@ def _move(training: Training, rng: random.Random) -> None:
 
 
 def _lay_out(training: Training, rng: random.Random) -> None:
-    """Images or poses in the same memory: turned, or one for all."""
+    """Changes the strides of images or poses in the same memory: flipped, or expanded from one."""
     tensor = rng.choice((training.batches.images, training.batches.cameras.poses))
     every = [-1] * (tensor.dim() - 1)
     tensor.data = rng.choice(
@@ -156,11 +160,11 @@ def _share(training: Training, rng: random.Random) -> None:
 
 
 def _write(training: Training, rng: random.Random) -> None:
-    training.router.unfreeze()  # whose cells are not to be written to
+    training.router.unfreeze()  # frozen cells must not be written to
     with torch.no_grad():
         rng.choice(_parameters(training)).mul_(0.9)
     pictures = rng.choice((training.batches.images, training.batches.cameras.poses))
-    pictures.data = pictures.data.contiguous()  # of one for all
+    pictures.data = pictures.data.contiguous()  # may be expanded from one
     pictures.copy_(pictures.flip(0))
 
 
@@ -217,7 +221,7 @@ def _no_gradients(training: Training, rng: random.Random) -> None:
 
 
 def _hook(training: Training, rng: random.Random) -> None:
-    """One of another kind in the place of the one before."""
+    """Replaces the hook by another kind, or removes it."""
     for handle in training.handles:
         handle.remove()
     parameter = rng.choice(_parameters(training))
@@ -234,7 +238,7 @@ def _learn(training: Training, rng: random.Random) -> None:
 
 
 def _second_optimizer(training: Training, rng: random.Random) -> None:
-    """Holds a parameter that the first does not, then gives it back."""
+    """Moves a parameter to a second optimiser, or steps it there and maybe moves it back."""
     group = training.optimizer.param_groups[0]
     if training.other is None:
         parameter = rng.choice(group["params"])
@@ -242,7 +246,7 @@ def _second_optimizer(training: Training, rng: random.Random) -> None:
         training.optimizer.state.pop(parameter, None)
         training.other = torch.optim.SGD([parameter], lr=0.1)
         return
-    training.router.unfreeze()  # SGD, which was not given to freeze, would move frozen cells
+    training.router.unfreeze()  # SGD does not know of frozen cells and would move them
     training.other.step()
     training.other.zero_grad()
     if rng.random() < 0.5:
@@ -275,12 +279,12 @@ def _set_threads(training: Training, rng: random.Random) -> None:
 
 
 class _Seen(TorchDispatchMode):
-    def __torch_dispatch__(self, function: Any, types: Any, given: Any = (), named: Any = None) -> Any:
-        return function(*given, **(named or {}))
+    def __torch_dispatch__(self, function: Any, types: Any, arguments: Any = (), named: Any = None) -> Any:
+        return function(*arguments, **(named or {}))
 
 
 def _step_within(training: Training, rng: random.Random) -> None:
-    """A step where none is replayed, or none learns."""
+    """Runs a step in a context that prevents replays or learning."""
     with rng.choice((torch.no_grad, _Seen))(), contextlib.suppress(RuntimeError):
         training.step(64)
 

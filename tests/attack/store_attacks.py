@@ -1,4 +1,4 @@
-"""Images on disk whose files were damaged, cut short, replaced, or are links that somebody planted."""
+"""Attacks on the image cache: files are damaged, truncated, replaced, or planted links."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from voronerf.app.train.build import make_batches
 from voronerf.app.train.config import TrainConfig
 
 
-def harmed_store(rng: random.Random, folder: Path, given: Path) -> str:
-    """Images on disk after something happened to them: those of the scene as it is now, or refused in a line."""
+def harmed_store(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Harms the image cache: it must return the scene's current images or refuse in one line."""
     os.environ["VORONERF_CACHE"] = str(folder / "cache")
-    scene = Path(shutil.copytree(given / "blender", folder / "scene"))
-    outside = Path(shutil.copytree(given / "outside", folder / "outside"))
+    scene = Path(shutil.copytree(inputs / "blender", folder / "scene"))
+    outside = Path(shutil.copytree(inputs / "outside", folder / "outside"))
     (outside / "pixels").write_bytes(b"mine")
     before = {path.name: path.read_bytes() for path in outside.iterdir()}
     load_scene(scene, images="disk")
@@ -31,7 +31,7 @@ def harmed_store(rng: random.Random, folder: Path, given: Path) -> str:
     try:
         found = load_scene(scene, images="disk").train.images
         if not torch.equal(found, load_scene(scene, images="memory").train.images):
-            raise Failed(f"other images than those of the scene after {change.__name__}")
+            raise Failed(f"images differ from the scene's after {change.__name__}")
         verdict = RIGHT
     except SceneError as error:
         if "\n" in str(error) or str(folder) not in str(error):
@@ -43,21 +43,21 @@ def harmed_store(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 def pixels(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
-    """A bit of the pixels is another, a piece is overwritten, or the end is missing."""
+    """Damages the pixels: flips a bit, overwrites a piece, or cuts off the end."""
     data = (store / "pixels").read_bytes()
     data = flipped(data, rng.randrange(8 * len(data))) if rng.random() < 0.5 else damaged(rng, data)
     (store / "pixels").write_bytes(data)
 
 
 def record(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
-    """What the record says is something else."""
+    """Changes a value of the record."""
     path = store / "store.json"
     text = path.read_bytes()
     path.write_bytes(damaged(rng, text) if rng.random() < 0.5 else json_text(mutated(rng, json.loads(text))))
 
 
 def replaced(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
-    """An image of the scene is another one of the same size and time."""
+    """Replaces an image of the scene by another image with the same file size and time."""
     two = rng.sample(sorted((scene / "images").glob("transforms_train*")), 2)
     second, first = sorted(two, key=lambda path: path.stat().st_size)
     times = first.stat().st_atime_ns, first.stat().st_mtime_ns
@@ -69,7 +69,7 @@ def replaced(rng: random.Random, store: Path, scene: Path, outside: Path) -> Non
 
 
 def link(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
-    """A file or a folder of the cache leads elsewhere."""
+    """Replaces a file or a folder of the cache by a link."""
     there = rng.choice((store, store.parent, store / "pixels", store / "store.json"))
     if there.is_dir():
         shutil.rmtree(there)
@@ -79,7 +79,7 @@ def link(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
 
 
 def cut(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
-    """The file becomes shorter while a training reads it: the next batch says so."""
+    """Truncates the file while a training reads it; the next batch must report it."""
     used = load_scene(scene, images="disk")
     batches = make_batches(TrainConfig(device="cpu"), used)
     os.truncate(store / "pixels", rng.randrange((store / "pixels").stat().st_size))

@@ -1,4 +1,4 @@
-"""The short form of `make attack`."""
+"""A short run of `make attack`."""
 
 import os
 import signal
@@ -15,8 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 linux = pytest.mark.skipif(sys.platform != "linux", reason="forks, and limits memory and files")
 
 
-def harmed(rng, folder, given):
-    """An attempt whose folder is named by its seed."""
+def harmed(rng, folder, inputs):
+    """Runs an attempt, whose folder is named after its seed."""
     seed = int(folder.name)
     if seed == 1:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -36,7 +36,7 @@ def test_a_crash_is_a_failure_like_another(tmp_path):
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.what)
 def test_a_fault_can_be_planted(fault):
-    """Its line is in its file once; ``python tests/attack --mutate`` plants it, and needs minutes."""
+    """Checks that the fault's line occurs once in its file; ``python tests/attack --mutate`` plants it, in minutes."""
     text = (ROOT / fault.file).read_text()
     assert text.count(fault.line) == 1 and fault.line != fault.wrong
     tests = fault.tests[: fault.tests.index("-k")] if "-k" in fault.tests else fault.tests

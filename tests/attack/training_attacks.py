@@ -1,4 +1,4 @@
-"""Trainings that are ended at any moment or find no memory and no room, and settings that nobody should give."""
+"""Attacks on training: kills at any moment, full disks, little memory, and absurd settings."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from typing import Any, get_type_hints
 import torch
 from attempts import REFUSED, RIGHT, Failed, fork_command
 from commands import judged, run
-from given import FIELDS, TINY
 from hostile import NUMBERS, TEXTS
+from input_files import FIELDS, TINY
 
 from voronerf.app.files import read_json_lines
 from voronerf.app.train.checkpoint import Checkpoint, checkpoint_path, checkpoint_paths, last_checkpoint
 from voronerf.app.train.config import CHOICES, TrainConfig
 
-#: The networks of a chain of interrupted trainings.
+#: Options for the networks of interrupted trainings.
 VARIANTS = (
     *FIELDS.values(),
     ["--field", "mipnerf", "--no-occupancy"],
@@ -34,15 +34,15 @@ VARIANTS = (
     [*FIELDS["nerf"], "--assignment", "stochastic"],
     [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6", "--init", "random"],
 )
-#: What ends a training; None is a full disk.
+#: Signals that end a training; None is a full disk.
 SIGNALS = (*[signal.SIGKILL] * 6, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGINT, None)
-#: Interruptions of a chain.
+#: The number of interruptions of a training.
 KILLS = 5
 
 
-def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[str]:
-    """A training that is ended at random moments and resumed ends, to the bit, as one that is left alone."""
-    os.chdir(given)
+def killed_training(rng: random.Random, folder: Path, inputs: Path) -> Counter[str]:
+    """Kills and resumes a training at random moments; its result must equal an undisturbed training bit for bit."""
+    os.chdir(inputs)
     options = [*("--data", "blender"), *TINY, *rng.choice(VARIANTS)]
     options += ["--steps", str(rng.choice((30, 60))), "--checkpoint-every", rng.choice(("1e-9", "0.02", "0.1"))]
     whole, part = folder / "whole", folder / "part"
@@ -51,7 +51,7 @@ def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[st
     length = time.monotonic() - began
     for _ in range(KILLS):
         number = rng.choice(SIGNALS)
-        if number is None:  # a disk that is full after so many bytes of a file
+        if number is None:  # simulates a full disk by a limit of file sizes
             pid = _train(part, options, rng.randrange(1, 200_000))
         else:
             pid = _train(part, options)
@@ -64,13 +64,13 @@ def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[st
 
 
 def _train(out: Path, options: list[str], file_size: int | None = None) -> int:
-    """The number of a process that begins or continues a training; files may have so many bytes."""
+    """Forks a process that begins or resumes a training, with a limit of file sizes; returns its id."""
 
     def begin() -> int:
         if file_size is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
         status, _, err = run("train", "--out", out, *(["--resume"] if checkpoint_paths(out) else []), *options)
-        if status == 1:  # a disk that is full names a file
+        if status == 1:  # a full disk must be reported with the file's name
             return 1 if "File too large" in err and str(out) in err and err.startswith("voronerf: ") else 70
         return status
 
@@ -78,9 +78,9 @@ def _train(out: Path, options: list[str], file_size: int | None = None) -> int:
 
 
 def _ends(pid: int, number: int | None) -> None:
-    """Waits for a training; ``number`` is the signal that it was sent."""
+    """Waits for a training and checks its status; ``number`` is the signal that was sent."""
     status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    # A signal that comes before the training has begun ends the process as it does any.
+    # A signal before the start of the training has its default effect.
     allowed = (0, 1) if number is None else (0, -number) if number == signal.SIGKILL else (0, 130, -number)
     if status not in allowed:
         raise Failed(f"a training that got {number or 'a full disk'} ended with status {status}")
@@ -93,7 +93,7 @@ def _ends_well(pid: int) -> None:
 
 
 def same_tensors(first: Checkpoint, second: Checkpoint, but: Container[str] = ()) -> None:
-    """Compares the tensors of two checkpoints, but those of some names."""
+    """Compares the tensors of two checkpoints except the names in ``but``."""
     for name in sorted(first.tensors.keys() | second.tensors.keys()):
         a, b = first.tensors.get(name), second.tensors.get(name)
         if name not in but and (a is None or b is None or not torch.equal(a.nan_to_num(), b.nan_to_num())):
@@ -101,7 +101,7 @@ def same_tensors(first: Checkpoint, second: Checkpoint, but: Container[str] = ()
 
 
 def same_runs(whole: Path, part: Path, but: Container[str] = ()) -> None:
-    """Compares two runs, but the tensors of some names."""
+    """Compares two runs except the tensors named in ``but``."""
     first, second = last_checkpoint(whole), last_checkpoint(part)
     same_tensors(first, second, but)
     for key in ("step", "skipped"):
@@ -115,18 +115,18 @@ def same_runs(whole: Path, part: Path, but: Container[str] = ()) -> None:
         raise Failed(f"{left} were left behind")
 
 
-def stressed_command(rng: random.Random, folder: Path, given: Path) -> str:
-    """Settings that nobody should give, little memory, or a place where nothing can be written."""
-    os.chdir(given)
+def stressed_command(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Runs a command with absurd settings, little memory, or an unwritable folder."""
+    os.chdir(inputs)
     return rng.choice((settings, settings, settings, memory, places))(rng, folder)
 
 
-#: Settings that are a wish for more work, however much, or that choose what is tried.
+#: Settings that are not varied: valid requests for more work, and settings of the attack itself.
 WORK = ("steps", "budget", "evaluations", "eval_views", "out", "device")
 
 
 def settings(rng: random.Random, folder: Path) -> str:
-    """One or two settings have extreme values."""
+    """Runs a training with extreme values of one or two settings."""
     hints = get_type_hints(TrainConfig)
     names = [entry.name for entry in dataclasses.fields(TrainConfig) if entry.name not in WORK]
     options: list[str] = []
@@ -138,7 +138,7 @@ def settings(rng: random.Random, folder: Path) -> str:
             options += [option, _value(rng, name, hints[name])]
     out = folder / "run"
     verdict = judged("train", "--data", "blender", "--out", out, *TINY, *rng.choice(list(FIELDS.values())), *options)
-    began = bool(checkpoint_paths(out)) or (out / "metrics.jsonl").exists()  # it may diverge then
+    began = bool(checkpoint_paths(out)) or (out / "metrics.jsonl").exists()  # it may have diverged
     if verdict == REFUSED and out.exists() and not began:
         raise Failed(f"{[str(path) for path in out.rglob('*')]} were written before {options} were refused")
     return verdict
@@ -152,13 +152,13 @@ def _value(rng: random.Random, name: str, kind: Any) -> str:
     return str(rng.choice([number for number in NUMBERS if "float" in str(kind) or isinstance(number, int)]))
 
 
-#: What is printed when libraries end a process that has no memory (Pillow by SIGSEGV), or when Python waits for ever
-#: in ``Thread.start`` (python/cpython#140746).
+#: Outputs of processes that other libraries end when memory is exhausted (Pillow by SIGSEGV), or that hang in Python's
+#: ``Thread.start`` (python/cpython#140746).
 BENEATH = ("PanicException", "out of memory", "memory allocation", "allocate", "in _getdecoder\n", "in start\n")
 
 
 def memory(rng: random.Random, folder: Path) -> str:
-    """A limit of the address space, as by ``ulimit -v``, above what the process has."""
+    """Runs a training with a limit of the address space (``ulimit -v``) above the current size."""
     extra = rng.randrange(1 << 20, 1 << 29)
     large = rng.choice(("--width 64", "--width 2000", "--rays 20000", "--samples 500", "--seed 1"))
     command = ("train", "--data", "blender", "--out", folder / "run", *TINY, *FIELDS["nerf"])
@@ -187,7 +187,7 @@ def memory(rng: random.Random, folder: Path) -> str:
 
 
 def places(rng: random.Random, folder: Path) -> str:
-    """An --out that is a file, a link, full of other things or in use by another training."""
+    """Runs a training whose --out is a file, a link, or a folder with other contents."""
     out = folder / "run"
     kinds: tuple[Callable[[], object], ...] = (
         lambda: out.write_text("mine"),

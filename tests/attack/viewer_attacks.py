@@ -1,4 +1,4 @@
-"""Messages of a browser that no page of the viewer sends."""
+"""Hostile messages to the viewer, which its page never sends."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import Any
 
 import torch
 from attempts import REFUSED, RIGHT, Failed
-from given import FIELDS
 from hostile import VALUES, damaged
+from input_files import FIELDS
 
 from voronerf.app import open_run
 
 sys.path.append(str(Path(__file__).parents[1] / "app" / "viewer"))
 
-#: Messages of a client in an attempt.
+#: The number of messages of a client in an attempt.
 MESSAGES = 20
 
 
-def hostile_client(rng: random.Random, folder: Path, given: Path) -> str:
-    """One client sends what it likes; the viewer says it in lines, and another client goes on."""
+def hostile_client(rng: random.Random, folder: Path, inputs: Path) -> str:
+    """Sends hostile messages from one client: the viewer must log each in a line and keep serving another client."""
     import msgspec  # here, since the viewer is an extra
     from tab import Tab
     from websockets.exceptions import ConnectionClosed
@@ -37,7 +37,7 @@ def hostile_client(rng: random.Random, folder: Path, given: Path) -> str:
     handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
     logging.getLogger("voronerf").addHandler(handler)
     torch.set_num_threads(1)
-    viewer = view_run(open_run(given / rng.choice(list(FIELDS)), data=given / "blender"), port=0)
+    viewer = view_run(open_run(inputs / rng.choice(list(FIELDS)), data=inputs / "blender"), port=0)
     cameras = viewer.subject.scene.test.cameras
     printed = io.StringIO()
     with contextlib.ExitStack() as stack:
@@ -48,7 +48,7 @@ def hostile_client(rng: random.Random, folder: Path, given: Path) -> str:
         other.set("Pixels", 128)
         bad = Tab(viewer, cameras, number=1)
         bad.rest()
-        bad.set("Crop", True)  # so that its sliders count
+        bad.set("Crop", True)  # so that its sliders have an effect
         with contextlib.suppress(ConnectionClosed):
             for _ in range(MESSAGES):
                 data = msgspec.msgpack.encode(message(rng, bad.gui))
@@ -67,7 +67,7 @@ def hostile_client(rng: random.Random, folder: Path, given: Path) -> str:
 
 
 def message(rng: random.Random, gui: dict[str, Any]) -> dict[str, Any]:
-    """A message of which something is odd."""
+    """Returns a hostile message."""
     from tab import CAMERA, CLICK
 
     part = rng.choice([part for part in gui.values() if part.get("value") is not None or "options" in part] or [{}])
@@ -79,14 +79,14 @@ def message(rng: random.Random, gui: dict[str, Any]) -> dict[str, Any]:
         "ShareUrlRequest": {},
     }
     kind = rng.choice(("GuiUpdateMessage", "GuiUpdateMessage", "ViewerCameraMessage", *kinds))
-    made = {"type": kind, **kinds[kind]}
+    result = {"type": kind, **kinds[kind]}
     if kind != "GuiUpdateMessage" or rng.random() < 0.3:
-        made[rng.choice(list(made))] = value(rng)
-    return made
+        result[rng.choice(list(result))] = value(rng)
+    return result
 
 
 def value(rng: random.Random) -> Any:
-    """Something that a message can hold."""
+    """Returns a random value for a message."""
     found = rng.choice((*VALUES, [1.0], [math.nan] * 2, [1e300] * 3, [[1.0], [2.0, 3.0]], {"update_cb": 3}, -1.0))
     large = isinstance(found, int) and abs(found) > 2**63
     return str(found) if large else found

@@ -1,4 +1,4 @@
-"""Scripts and packages of benchmarks/ are imported by their own names, as they import one another."""
+"""Makes scripts and packages of benchmarks/ importable by their names, as they import one another."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the scripts under benchmarks/ share, and that the throughput table compares like with like."""
+"""Tests of the benchmarks' shared code, and of the throughput table's contenders and checks."""
 
 import re
 import subprocess
@@ -124,7 +124,7 @@ def test_foreign_contenders_compute_what_masks_do(name):
 
 @pytest.mark.parametrize("name", [name for name in cases_foreign.FIELDS if not re.search("2.19|torch-ngp", name)])
 def test_fused_foreign_fields_compute_what_masks_do(name):
-    """Values and gradients of every parameter; of those with second derivatives those too."""
+    """Compares values and the gradients of every parameter, through second derivatives where a field has them."""
     work = cases_foreign.foreign_work(cases_foreign.FIELDS[name], 300, 4, "forward+backward", CPU)
     fused = work.alternatives["fused"]()
     assert work.error(fused.adapt(fused.run(0))) < 1e-3
@@ -137,7 +137,7 @@ def test_cost_counts_products():
     assert w64d4.backward == w64d4.forward + hidden + head, "all weights, and the inputs of all layers but the first"
     assert w64d4.again == w64d4.forward - head
     assert 1.18e6 < networks.cost(networks.NETS["nerf256"]).forward < 1.19e6
-    # The layer behind the skip connection reads the encoding again, whose gradient nobody wants.
+    # The layer after the skip connection reads the encoding again, which needs no gradient.
     skip = networks.NETS["nerf64"].layers[5]
     assert skip.inputs == ("positions", 4)
 
@@ -162,7 +162,7 @@ def test_alternatives_compute_the_same(name, direction):
                 done.append(label)
                 continue
             assert error(contender.adapt(contender.run(0))) < tolerance, f"{label}, {dtype}"
-            # A later call sees other samples and a dense gradient.
+            # A later call has other samples and a dense gradient.
             assert error(contender.adapt(contender.run(1))) > 0
             done.append(label)
         fastest = "oneDNN" if direction == "forward" else "torch loop, stacked"
@@ -227,7 +227,7 @@ def test_wrong_answers_are_found():
         (nearest, lambda right: right + 7, infinite),
         (lookup._sort_work(500, 7, CPU), lambda right: (right[0].flip(0), right[1]), 1e-6),
         (marched, lambda right: right._replace(depths=right.depths * 1.1), 0.05),
-        (marched, lambda right: marched.ours("reference").run(1), 0.1),  # other rays
+        (marched, lambda right: marched.ours("reference").run(1), 0.1),  # rays of another call
     ):
         right = work.ours("reference").run(0)
         assert work.error(right) < 1e-6 and work.error(spoilt(right)) >= least

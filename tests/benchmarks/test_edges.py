@@ -1,4 +1,4 @@
-"""The figures of silhouettes, plain patches and holes, of a ball before a wall."""
+"""Tests of benchmarks/edges.py: the figures of silhouettes, plain patches and holes for a ball before a wall."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BOX = torch.tensor([[-3.0, -3, -3], [3, 3, 3]])
 
 
 def figures(fur=0.0, bumps=0.0, hole=0.0):
-    """A ball of radius 0.4, whose hair hides half of what is behind, stands before a wall with bumps and a hole."""
+    """Measures a ball of radius 0.4 with half-transparent fur before a wall with bumps and a hole."""
 
     def field(positions, directions, ray_index):
         x, y, z = positions.unbind(-1)
@@ -56,5 +56,5 @@ def test_bumps_are_rough(clean):
 
 
 def test_holes_are_counted():
-    seen = (90 * 1.0 / 6) ** 2 - (90 * 0.4 / 3) ** 2  # around the ball, through the far end of a hole of radius 1
+    seen = (90 * 1.0 / 6) ** 2 - (90 * 0.4 / 3) ** 2  # the visible far end of a hole of radius 1, around the ball
     assert figures(hole=1.0)["holes"] == pytest.approx(100 * math.pi * seen / 96**2, abs=0.2)

@@ -1,4 +1,4 @@
-"""The examples of docs/extend.md that are timed."""
+"""Tests of the timed examples of docs/extend.md."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from voronerf.nerf import SplitStrategy
 
 
 def test_the_distortion_of_the_page_is_that_of_its_source() -> None:
-    """A double sum over the samples of each ray, in float64, and the same gradient by both terms."""
+    """Compares with a double sum over the samples of each ray in float64, and both terms' gradients with each other."""
     own = own_parts.examples()
     gradients = []
     for term in (own["distortion"], own["Distortion"](0.01)):
@@ -37,7 +37,7 @@ def test_the_distortion_of_the_page_is_that_of_its_source() -> None:
 
 
 def test_what_is_timed_is_what_the_table_says() -> None:
-    """Hooks run in Python where it names them, and a class that is replayed has none."""
+    """Checks that the named hooks run in Python, and that a replayed class has none."""
     own, python = own_parts.examples(), []
     for name, change in own_parts.WAYS.items():
         training = Training(cells=2)

@@ -1,4 +1,4 @@
-"""Modules in the manner of public code run fused, kind by kind; those of public repositories have a result each."""
+"""Modules in the style of public code run fused, kind by kind; modules of public repositories have stored results."""
 
 import json
 import sys
@@ -20,7 +20,7 @@ def test_modules_of_a_kind_are_fused_and_right(kind):
     for row in rows:
         assert row["how"] == "fused" or (kind in foreign_kinds.IN_RUNS and row["how"] == "fused in runs"), row
         for name, error in row.items():
-            if name.endswith("error"):  # above ROUNDED, a unit on the kink of a ReLU: then float64 decides
+            if name.endswith("error"):  # above ROUNDED, rounding switched a ReLU: float64 decides
                 assert error <= foreign_rows.ROUNDED or row[f"{name}_float64"] < 1e-9, row
 
 
@@ -52,18 +52,18 @@ def test_files_are_imported_without_what_they_lack(tmp_path):
 
 def test_the_script_writes_rows_and_counts(tmp_path, capsys):
     foreign_modules.main(["--filter", "norms RMSNorm|tables embed", "--json", str(tmp_path / "rows.json")])
-    made = json.loads((tmp_path / "rows.json").read_text())
-    assert [row["module"] for row in made["results"]] == ["RMSNorm", "embedding"]
-    ways = {name: made["metadata"][name] for name in ("modules", "fused", "fused in runs", "others")}
+    result = json.loads((tmp_path / "rows.json").read_text())
+    assert [row["module"] for row in result["results"]] == ["RMSNorm", "embedding"]
+    ways = {name: result["metadata"][name] for name in ("modules", "fused", "fused in runs", "others")}
     assert ways == {"modules": 2, "fused": 1, "fused in runs": 1, "others": 0}
-    assert made["results"][1]["between"] == ["torch.nn.functional.embedding"]
+    assert result["results"][1]["between"] == ["torch.nn.functional.embedding"]
     assert '"RMSNorm"' in capsys.readouterr().out
 
 
 def test_the_result_has_every_row_of_the_table():
-    made = json.loads(RESULT.read_text())
+    stored = json.loads(RESULT.read_text())
     rows = [(key.split(":")[0], row.module) for key, rows in foreign_public.PUBLIC.items() for row in rows]
     names = [("/".join(path.split("/")[:2]), module) for path, module in rows]
-    found = [(row["repository"].removeprefix("https://github.com/"), row["module"]) for row in made["results"]]
+    found = [(row["repository"].removeprefix("https://github.com/"), row["module"]) for row in stored["results"]]
     assert found == names
-    assert foreign_modules.counts(made["results"]).items() <= made["metadata"].items()
+    assert foreign_modules.counts(stored["results"]).items() <= stored["metadata"].items()

@@ -1,4 +1,4 @@
-"""Trainings with few and with many cells: all are measured, and the cells are there."""
+"""Tests of benchmarks/many_cells.py: trainings with few and many cells have a row each."""
 
 import many_cells
 from helpers import read_json

@@ -1,4 +1,4 @@
-"""benchmarks/paper.py: trainings in turns, and the files of tiny experiments."""
+"""Tests of benchmarks/paper.py: trainings in turns, and the files of tiny experiments."""
 
 import contextlib
 import itertools
@@ -30,7 +30,7 @@ TINY |= {"evaluations": 2, "eval_views": 1, "final_views": 1, "turn": 0.1, "cell
 
 @pytest.fixture(autouse=True)
 def steady_clock(monkeypatch):
-    """A step takes ten milliseconds however busy the machine is, so that every run splits and ends where it should."""
+    """Sets a clock on which a step always takes ten milliseconds, so that splits and ends are deterministic."""
     ticks = itertools.count()
     clock = SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks), time=time.time)
     monkeypatch.setattr(nested, "time", clock)
@@ -43,7 +43,7 @@ def settings(tmp_path):
 
 
 class Fake:
-    """A training of steps of equal length."""
+    """A fake training with steps of equal length."""
 
     def __init__(self, name, seconds, step, log=None):
         self.name, self.seconds, self.step, self.log = name, seconds, step, log
@@ -67,13 +67,13 @@ def test_turns():
         after_turn=lambda fake: log.append(("after", fake.name)),
     )
     first = [("a", 0.5), ("look", 0.5, 0.5), ("a", 1.0), ("after", "a"), ("c", 1.0), ("after", "c")]
-    assert log[:6] == first  # b has come further and waits
+    assert log[:6] == first  # b is ahead and waits
     assert log[6:9] == [("a", 2.0), ("look", 2.0, 2.0), ("a", 2.0)]
     assert log[-5:] == [("after", "a"), ("b", 3.0), ("after", "b"), ("c", 3.0), ("after", "c")]
     assert all(fake.seconds >= 3.0 for fake in fakes)
     refuses("--turn must be positive, got 0", turns.take_turns, fakes, budget=1, turn=0, error=ConfigError)
 
-    # resumed in the midst of a turn, after a stop that a long step had passed: it is due all the same
+    # A run resumed within a turn still gets the stop that a long step had passed.
     looks = []
     stops, on_stop = lambda fake: (3.0, 4.5, 5.0), lambda fake, second: looks.append(second)
     turns.take_turns([Fake("a", 4.7, 0.5)], budget=6.0, turn=2.0, stops=stops, on_stop=on_stop)
@@ -97,7 +97,7 @@ def test_experiments_write_their_files_and_are_not_run_again(settings, capsys, m
     with Image.open(settings.out / "initialisation.png") as picture:
         assert picture.width > 400 and len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 10
 
-    # its first variant keeps the samples that the experiment on balance takes
+    # its first variant keeps the samples for the experiment on balance
     trained = [run for run in EXPERIMENTS["initialisation"].runs(settings) if run.variant.name == "inherited"]
     rows = balance.measure(trained, "auto", diagrams=3)
     assert [row["variant"] for row in rows] == ["kept by a training, builtin", "separate objects"]
@@ -108,7 +108,7 @@ def test_experiments_write_their_files_and_are_not_run_again(settings, capsys, m
         raise AssertionError("must not be trained again")
 
     monkeypatch.setattr(runs, "Training", refuse)
-    paper.repeat(settings, ("initialisation", "density", "ghosting"))  # the same trainings
+    paper.repeat(settings, ("initialisation", "density", "ghosting"))  # these reuse the trainings
     assert read_json(settings.out / "initialisation.json")["results"] == stored["results"]
     assert read_json(settings.out / "ghosting.json")["results"] == stored["results"]
     assert (settings.out / "density-pictures.png").is_file()
@@ -125,12 +125,12 @@ def test_defaults_at_size(settings):
 
 
 def one(settings, seed=0, scene="builtin", **changes):
-    """The training of one network."""
+    """Makes the training of one network."""
     return runs.make_run(runs.Variant("one", {"cells": (), **changes}), scene, seed, settings)
 
 
 def test_an_interrupted_training_goes_on(settings, monkeypatch):
-    made, save, saved = one(settings), turns.Training.save, []
+    training, save, saved = one(settings), turns.Training.save, []
 
     def write(self):
         save(self)
@@ -139,8 +139,8 @@ def test_an_interrupted_training_goes_on(settings, monkeypatch):
 
     with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
         patched.setattr(turns.Training, "save", write)
-        runs.train_missing([made], settings)
-    assert not made.result.exists() and not runs.results([made])
+        runs.train_missing([training], settings)
+    assert not training.result.exists() and not runs.results([training])
     began, advance = [], turns.Training.advance
 
     def note(self, *until):
@@ -148,17 +148,17 @@ def test_an_interrupted_training_goes_on(settings, monkeypatch):
         advance(self, *until)
 
     monkeypatch.setattr(turns.Training, "advance", note)
-    runs.train_missing([made, made], settings)
+    runs.train_missing([training, training], settings)
     assert began[0] == saved[0] > 0
-    (row,) = runs.results([made])
+    (row,) = runs.results([training])
     assert row["seconds"] >= settings.budget and row["steps"] > saved[0]
 
 
 def test_a_curve_is_of_the_same_views_throughout(settings):
     settings = replace(settings, final_views=3)
-    made = one(settings, width=8)
-    runs.train_missing([made], settings)
-    (row,) = runs.results([made])
+    training = one(settings, width=8)
+    runs.train_missing([training], settings)
+    (row,) = runs.results([training])
     assert row["views"] == 3 and [entry["views"] for entry in row["curve"]] == [1, 1]
     assert row["psnr"] != row["curve"][-1]["psnr"] and row["curve"][-1]["seconds"] >= settings.budget
 
@@ -167,12 +167,12 @@ def test_failures_of_a_training_are_told(settings):
     variant = runs.Variant("too many", {"cells": (5000,), "split_at": (2,)})
     failing, other, said = runs.make_run(variant, "builtin", 0, settings), one(settings), []
     runs.train_missing([other, failing], settings, said.append)
-    assert any("too many" in line and "failed: more cells than samples" in line for line in said)
+    assert any("too many" in line and "failed: 5000 cells need at least 5000 samples" in line for line in said)
     (row,) = runs.results([other, failing])
     assert row["variant"] == "one" and row["seconds"] >= settings.budget
-    assert runs.failure(failing).startswith("too many on builtin, seed 0: more cells than samples")
+    assert runs.failure(failing).startswith("too many on builtin, seed 0: 5000 cells need at least 5000 samples")
     runs.train_missing([other, failing], settings, said.append)
-    assert said[-1].startswith("2 trainings, 2 of them made already")
+    assert said[-1].startswith("2 trainings, 2 of them finished")
 
 
 def test_runs_are_known_by_what_they_learn(settings):
@@ -198,7 +198,7 @@ def test_sizes_and_scenes(tmp_path, monkeypatch):
 
 
 def test_both_sides_have_the_same_settings(settings):
-    """Variants differ in what is compared: no side has rays, samples, a rate or a schedule of its own."""
+    """Checks that variants differ only in the compared settings, not in rays, samples, learning rate or schedule."""
     compared = {"cells", "width", "parameters", "centres", "init"}
     compared |= {"assignment", "split_at"}
     for name, experiment in EXPERIMENTS.items():
@@ -225,7 +225,7 @@ def test_matched_parameters(settings):
 
 
 def test_a_nested_picture(settings):
-    small = replace(settings, budget=0.2, downscale=4 * settings.downscale)  # the picture is taken four times as large
+    small = replace(settings, budget=0.2, downscale=4 * settings.downscale)  # the picture has four times the resolution
     paper.repeat(small, ("nested-2d",))
     rows = read_json(settings.out / "nested-2d.json")["results"]
     cells = {row["variant"]: row["cells"] for row in rows}

@@ -1,4 +1,4 @@
-"""The room whose depths are known: its capture is read as any other, and the measure of depths has the right ends."""
+"""Tests of benchmarks/room.py: its capture loads like any other, and the measured depth errors are right."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def test_points_and_cameras_are_those_of_the_pictures(folder):
     sparse, train = scene.train.sparse_depth, scene.train.cameras
     view, rest = sparse.pixels // (40 * 30), sparse.pixels % (40 * 30)
     off = []
-    for each in range(len(train)):  # points that training views see, projected into a held-out view
+    for each in range(len(train)):  # points of training views, projected into a held-out view
         own = rest[view == each]
         rays = train.image_rays(each)
         points = rays.origins[own] + sparse.distances[view == each, None] * rays.directions[own]
@@ -34,7 +34,7 @@ def test_points_and_cameras_are_those_of_the_pictures(folder):
         away = (points[inside] - scene.test.cameras.poses[0, :3, 3]).norm(dim=-1)
         off.append((away / (scale * torch.from_numpy(known[0])[row, column]) - 1).abs())
     off = torch.cat(off)
-    assert off[off < 0.1].median() < 0.02  # of those that nothing hides
+    assert off[off < 0.1].median() < 0.02  # of the visible points
 
 
 @pytest.mark.parametrize("density, before", [(0.0, 0.0), (1e6, 1.0)])

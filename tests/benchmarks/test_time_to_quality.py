@@ -1,4 +1,4 @@
-"""time_to_quality.py from end to end, and the rival that it trains beside ours."""
+"""Tests of time_to_quality.py from end to end, and of its rival."""
 
 import dataclasses
 import itertools
@@ -22,13 +22,13 @@ def test_sides_train_for_the_same_time(tmp_path):
     options = "--downscale 10 --budget 0.15 --turn 0.05 --evaluations 3 --eval-views 1 --seeds 2 --clock cpu"
     common = "--common=--rays 64 --samples 8 --width 8 --depth 2 --cells 3"
     said = script(BENCHMARKS / "time_to_quality.py", *options.split(), common, "--sides", *sides, "--json", path)
-    found = read_json(path)
-    assert found["metadata"]["benchmark"] == "time_to_quality" and found["metadata"]["clock"] == "cpu"
-    assert [(row["side"], row["seed"]) for row in found["results"]] == [
+    result = read_json(path)
+    assert result["metadata"]["benchmark"] == "time_to_quality" and result["metadata"]["clock"] == "cpu"
+    assert [(row["side"], row["seed"]) for row in result["results"]] == [
         (side.split(":")[0], seed) for side in sides for seed in (0, 1)
     ]
-    assert [row["settings"].get("cells") for row in found["results"][::2]] == [[4], [], [2], None]
-    for row in found["results"]:
+    assert [row["settings"].get("cells") for row in result["results"][::2]] == [[4], [], [2], None]
+    for row in result["results"]:
         assert row["steps"] > 0 and row["curve"][-1]["seconds"] >= 0.14 and row["curve"][-1]["psnr"] == row["psnr"]
         assert row["seconds_to"]["32"] is None
     assert sum(line.startswith(tuple(f"| {side.split(':')[0]} |" for side in sides)) for line in said.splitlines()) == 4

@@ -1,4 +1,4 @@
-"""Walks on which people look around: they stay where they should, and are read as what they are."""
+"""Tests of benchmarks/walks.py: cameras stay inside their place, and captures load with the right kind."""
 
 import pytest
 import walks

@@ -1,4 +1,4 @@
-// Random inputs of the C++ tests, and what each of their results must hold.
+// Random inputs and result checks of the C++ tests.
 #pragma once
 
 #include <cmath>
@@ -37,7 +37,7 @@ Array<T> uniform(int64_t size) {
   return values;
 }
 
-// Points on a coarse lattice too, so that there are ties.
+// Draws values from a coarse lattice, so that there are ties.
 template <typename T>
 Array<T> lattice(int64_t size) {
   Array<T> values(size);
@@ -45,7 +45,7 @@ Array<T> lattice(int64_t size) {
   return values;
 }
 
-// Heap memory of exactly this size, so that AddressSanitizer guards its ends.
+// Returns NaN in heap memory of exactly this size, so that AddressSanitizer guards its ends.
 inline Array<float> poisoned(int64_t size) {
   return Array<float>(size, std::nanf(""));
 }
@@ -62,9 +62,8 @@ void same(const Array<T>& a, const Array<T>& b, const char* what) {
   }
 }
 
-// What the portable path gave in a case. The other instruction sets repeat its calls on the same random numbers: the
-// same integers, and floats whose difference is small beside the whole result, since single ones may fall to the other
-// side of a kink.
+// Results of the portable path in a case. The other instruction sets repeat its calls on the same random numbers.
+// Integers must be equal. Differences of floats must be small by norm, since rounding may switch single ReLU units.
 inline std::vector<Array<double>> portable;
 inline size_t compared = 0;
 
@@ -84,7 +83,7 @@ void like_portable(const Array<T>& found, const char* what, double tolerance = 1
     difference += (found[i] - expected[i]) * (found[i] - expected[i]);
     size += expected[i] * expected[i];
   }
-  if (tolerance > 0.1 && size == 0) return;  // a ReLU that no row passes may be passed by one that was rounded
+  if (tolerance > 0.1 && size == 0) return;  // rounding may activate a ReLU that is off in all rows
   const double most = std::is_integral_v<T> ? 0 : tolerance * (std::sqrt(size) + 1e-3);
   if (!wild && !(std::sqrt(difference) <= most)) {
     fail(std::string(what) + ": differs from the portable path by " + std::to_string(std::sqrt(difference)) + " of " +

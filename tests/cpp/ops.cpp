@@ -1,8 +1,7 @@
-// Every CPU kernel but the whole networks', over random and edge sizes, with every instruction set of the machine.
-//
-// Numbers are compared with the reference in Python (tests/); here every array has exactly its size, so that sanitizers
-// guard its ends, outputs start poisoned, every eighth case has NaN and infinity among its inputs, one and three
-// threads must agree bit for bit, and all instruction sets with the portable path.
+// Runs every CPU kernel except networks on random and edge sizes, with every instruction set of the machine. The tests
+// in Python (tests/) compare numbers with the reference. Here every array has exactly its size, so that sanitizers
+// guard its ends, and outputs start poisoned. Every eighth case has NaN and infinity among its inputs. One and three
+// threads must agree bit for bit. All instruction sets must agree with the portable path.
 #include <algorithm>
 #include <cstdio>
 #include <cstdlib>
@@ -49,7 +48,7 @@ void search(Isa isa) {
 
 template <typename T>
 void locate(Isa isa) {
-  // A root whose every other centre is refined, by diagrams of different sizes.
+  // Refines every other centre of the root by diagrams of different sizes.
   const int64_t n = some_rows(), root = 1 + below(20);
   Array<int32_t> offsets = {0, static_cast<int32_t>(root)}, child(root);
   int32_t leaves = 0;
@@ -118,7 +117,7 @@ void composite(Isa isa) {
       offsets.push_back(static_cast<int32_t>(m));
       if (i < r) m += below(3) == 0 ? 0 : below(70);
     }
-    m += below(3);  // samples of no ray
+    m += below(3);  // adds samples of no ray
   }
   const Array<float> sigma = uniform<float>(m), rgb = uniform<float>(m * c), depths = uniform<float>(m);
   const Array<float> deltas = uniform<float>(m), behind = uniform<float>(background ? (per_ray ? r * c : c) : 0);
@@ -217,7 +216,7 @@ void march(Isa isa) {
                                   positions.data(), stop.data(), isa, threads);
     within(ray, std::max<int64_t>(r, 1), "march_rays");
     if (i > 0) continue;
-    // A sample on the side of a cell may be in the next one.
+    // Rounding may move a sample on a border into the next cell.
     const double found = static_cast<double>(rows);
     like_portable(Array<double>{found}, "march_rays", 1e-2);
   }
@@ -314,7 +313,7 @@ int main(int count, char** arguments) {
         loss(isa);
         adam(isa);
       };
-      i % 2 == 0 ? ops() : voronerf::with_team(3, ops);  // as a recording is replayed
+      i % 2 == 0 ? ops() : voronerf::with_team(3, ops);  // with a team, as in replays
     }
     sort();
     resample();

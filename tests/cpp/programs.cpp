@@ -1,8 +1,7 @@
-// Random programs, as Python lowers them (programs.py), on random cells, with every instruction set of the machine.
-//
-// Numbers are compared with the definition in Python (tests/ops/test_grouped_program.py); here every array has exactly
-// its size, results start poisoned and must come out finite, one and three threads must agree bit for bit, and all
-// instruction sets with the portable path, which keeps nothing and leaves no rows out.
+// Runs random programs, lowered by Python (programs.py), on random cells with every instruction set of the machine. The
+// tests in Python (tests/ops/test_grouped_program.py) compare numbers with the definition. Here every array has exactly
+// its size, and results start poisoned and must become finite. One and three threads must agree bit for bit. All
+// instruction sets must agree with the portable path, which stores no lookups and skips no rows.
 #include <algorithm>
 #include <fstream>
 
@@ -14,7 +13,7 @@ namespace {
 using voronerf::Isa;
 using voronerf::TableType;
 
-// Records, in the order in which programs.py writes their members ----------------------------------------------------
+// Records, in the order of programs.py -------------------------------------------------------------------------------
 
 std::ifstream file;
 
@@ -70,7 +69,7 @@ void read(T&... values) {
   (read_one(values), ...);
 }
 
-// Of one cell.
+// A parameter of one cell.
 struct Parameter {
   int64_t size, depth;
   bool table;
@@ -83,7 +82,7 @@ void members(Parameter& p) {
 struct Description {
   voronerf::ProgramTable floats, pairs, tiles, parts;
   Array<Parameter> parameters;
-  Array<int32_t> gaussians;  // inputs whose second half are variances
+  Array<int32_t> gaussians;  // inputs whose second half is variances
   int64_t gradients;         // as in ProgramInputs
 };
 
@@ -102,7 +101,7 @@ struct Tensor {
   int64_t size() const { return static_cast<int64_t>(bytes.size()) / (type == TableType::float32 ? 4 : 2); }
 };
 
-// bfloat16 is the upper half of a float; float16 is drawn as bits of numbers below 1.
+// Stores values as a type: bfloat16 as the upper half of a float, float16 as random bits of numbers below 1.
 Tensor stored(const Array<float>& values, TableType type) {
   const int64_t size = static_cast<int64_t>(values.size()), each = type == TableType::float32 ? 4 : 2;
   Tensor made{type, Array<char>(size * each)};
@@ -149,7 +148,7 @@ struct Case {
       const int64_t sizes[] = {0, 1, 47 + below(3), 95 + below(3), below(500), below(9) == 0 ? 4500 : 1300};
       if (c < k) n += sizes[below(6)];
     }
-    n += below(4);  // rows of no cell
+    n += below(4);  // adds rows of no cell
     bool rays = false;
     for (const voronerf::ProgramInput& input : table.inputs) rays |= input.ray;
     r = n == 0 ? 0 : 1 + below(20);
@@ -161,7 +160,7 @@ struct Case {
     const bool half = table.grids.empty() && !rays && below(3) == 0;
     if (half) tolerance = 2e-2;
     sifts = d.gradients >= 0 && !half && below(4) > 0;
-    const int64_t without = below(3);  // a gradient: no rows, half of them, all
+    const int64_t without = below(3);  // rows without a gradient: none, half or all
     Array<bool> dark(n);
     for (int64_t i = 0; i < n; ++i) dark[i] = sifts && below(2) < without;
     for (size_t i = 0; i < table.inputs.size(); ++i) {
@@ -190,7 +189,7 @@ struct Case {
     output_types.assign(table.outputs.size(), half ? TableType::bfloat16 : TableType::float32);
   }
 
-  // Outputs, then sums, then what is kept. `plain`: keeps nothing and leaves no rows out.
+  // Returns outputs, then sums, then stored lookups. `plain` stores no lookups and skips no rows.
   Array<Tensor> run(Isa isa, const voronerf::ProgramTable& table, int threads, bool plain) const {
     const auto program = voronerf::make_program(table);
     Array<Tensor> results;
@@ -250,7 +249,7 @@ struct Case {
   }
 };
 
-// What runs a program. In tile registers the portable path has their double.
+// A way to run a program. The portable path emulates tile registers.
 struct Way {
   Isa isa;
   voronerf::ProgramTable Description::* table;
@@ -283,8 +282,8 @@ void run_case(const Description& description, int number) {
         for (const float value : values) {
           if (!std::isfinite(value)) fail(what + " is not finite");
         }
-        if (i + description.floats.lookups.size() >= alone.size()) continue;  // kept
-        // Of any steps, differences of what was rounded to bfloat16 may be small themselves.
+        if (i + description.floats.lookups.size() >= alone.size()) continue;  // a stored lookup
+        // Programs of any steps may subtract values rounded to bfloat16, which leaves a large relative error.
         const double pairs = number % 4 < 2 ? 0.2 : 0.5;
         like_portable(values, what.c_str(), rounds ? pairs : one.tolerance);
       }

@@ -1,8 +1,8 @@
-"""Random programs for programs.cpp, as numbers: ``programs.py CASES FILE``.
+"""Writes random programs as numbers for programs.cpp: ``programs.py CASES FILE``.
 
-In each case a layer table, the gradient of one, a program of any steps, and a gradient of one, of the first or second
-order; what is asked for of gradients is drawn too. Each is lowered for every layout of what products take.
-Numbers stand in the order of the members, enumerators by their number.
+The cases are, in turn: a layer table, the gradient of one, a program of any steps, and the first or second gradient of
+one. The requested gradients are drawn too. Each program is lowered for every operand layout of products. The numbers
+have the order of the records' members; enumerators are written as numbers.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from voronerf.ops.grouped_program import lowering
 compiled = native.compiled
 WIDTHS = (1, 3, 4, 5, 15, 16, 17, 33, 48, 63, 64, 65, 90, 129, 130)
 CONVENTIONS = ("tiny-cuda-nn", "torch-ngp", "nerfstudio")
-JUMPS = ("step", "at_least", "floor")  # of inputs alone, which are the same for every instruction set
+JUMPS = ("step", "at_least", "floor")  # applied to inputs only, which are equal for all instruction sets
 POSITIVE = ("log", "power")
 
 
 def grid(draw: random.Random) -> HashGrid:
-    """Up to five levels, the first of which have an entry for each corner."""
+    """Draws a grid of up to five levels, whose first levels are dense."""
     given = {"levels": draw.randint(1, 5), "features": draw.choice((1, 2, 4, 8)), "base": draw.randint(2, 5)}
     words = {"interpolation": draw.choice(("linear", "smoothstep")), "convention": draw.choice(CONVENTIONS)}
     return HashGrid(log2_entries=10, finest=18, box=((-1, -1, -1), (0.5, 1, 2)), **given, **words)
 
 
 def layer_table(draw: random.Random) -> Program:
-    """The program of a random network."""
+    """Draws the program of a random network."""
     position = draw.choice(("none", "frequency", "integrated", "hash"))
     direction = draw.choice(("none", "frequency", "spherical"))
     layers, outputs = [], []
@@ -45,7 +45,7 @@ def layer_table(draw: random.Random) -> Program:
         sources = [draw.choice(known) for _ in range(draw.choice((1, 1, 2, 3, 4, 12)))]
         layers.append(Layer(tuple(sources), draw.choice(WIDTHS), draw.choice(ACTIVATIONS)))
     outputs = [draw.randrange(len(layers)) for _ in range(draw.randint(1, 3))]
-    if draw.random() < 0.5:  # a head of few outputs, which are dot products
+    if draw.random() < 0.5:  # a head with few outputs runs as dot products
         layers.append(Layer(("positions",), 32 * draw.randint(1, 3), "relu"))
         layers.append(Layer((len(layers) - 1,), draw.randint(1, 4), draw.choice(ACTIVATIONS)))
         outputs.append(len(layers) - 1)
@@ -66,14 +66,14 @@ def layer_table(draw: random.Random) -> Program:
 
 
 def any_steps(draw: random.Random) -> Program:
-    """A program with every kind of step, all of whose values are finite."""
+    """Draws a program with every kind of step and only finite values."""
     b = Builder()
     inputs = [b.input(draw.choice(WIDTHS)), b.input(3), b.input(3, ray=draw.random() < 0.5)]
     values = list(inputs)
     vector = Columns(PARAMETER, b.parameter(140), 0, 140)
 
     def some(width: int) -> Columns:
-        """So many columns of a value or of a parameter, or one in the place of all."""
+        """Draws ``width`` columns of a value or of a parameter, or one broadcast column."""
         wide = [value for value in values if value.width >= width]
         kind = draw.random()
         if kind < 0.2 or not wide:
@@ -88,7 +88,7 @@ def any_steps(draw: random.Random) -> Program:
         if name == HASH:
             own = grid(draw)
             return b.encode(name, inputs[1], b.grid(own.text), b.parameter(*own.table_shape))
-        wide = b.move(4, [(b.binary("mul", inputs[1], inputs[1]), 0)])  # the variances of a Gaussian are not negative
+        wide = b.move(4, [(b.binary("mul", inputs[1], inputs[1]), 0)])  # squares, as variances are not negative
         fitting = [
             (x, size)
             for x in (wide, *(inputs[1:] if name != "integrated" else ()))
@@ -142,7 +142,7 @@ def any_steps(draw: random.Random) -> Program:
 
 
 def random_program(draw: random.Random, number: int) -> tuple[Program, int]:
-    """A program, and the first of its inputs whose rows of zeros add nothing to any sum, or -1."""
+    """Draws a program; returns it and the index of its first gradient input, whose zero rows add nothing, or -1."""
     while True:
         program, first = (layer_table if number % 4 < 2 else any_steps)(draw), -1
         for _ in range(draw.choice(((0,), (1,), (0,), (1, 1, 2))[number % 4])):
@@ -155,7 +155,7 @@ def random_program(draw: random.Random, number: int) -> tuple[Program, int]:
                 tuple(shown),
                 tuple(True for _ in program.sums),
             )
-            first = len(program.inputs)  # as run_gradient in grouped_program/native.py has it
+            first = len(program.inputs)  # as in run_gradient of grouped_program/native.py
             first = first if not own.outputs and not program.sums and max(own.rays, default=-1) < first else -1
             program = own
         if (program.outputs or program.sums) and lowering.compiled_runs(program.text):
@@ -163,7 +163,7 @@ def random_program(draw: random.Random, number: int) -> tuple[Program, int]:
 
 
 def table_of(program: Program, layout: str) -> Any:
-    """The records that the compiled module would get."""
+    """Returns the records that the compiled module would get."""
     records: list[Any] = []
     make, compiled.make_program = compiled.make_program, records.append
     lowering.lower.__wrapped__(program.text, layout)
@@ -181,7 +181,7 @@ ENUMERATORS |= {
 
 
 def numbers(record: Any) -> Iterator[str]:
-    """Everything in a record: of a list, how many come first."""
+    """Yields all numbers of a record; a list starts with its length."""
     if isinstance(record, (list, tuple)):
         names = getattr(record, "_fields", None)
         if names is None:

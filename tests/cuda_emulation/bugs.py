@@ -1,6 +1,6 @@
-"""Planted bugs, without torch: ``bugs.py MODULE BUG SEED``, a bug of planted.cu by its number.
+"""Runs a planted bug without torch: ``bugs.py MODULE BUG SEED``; BUG is its number in planted.cu.
 
-The last line printed is the verdict. Under a sanitizer a bug needs a process of its own.
+The last printed line is the verdict. Under a sanitizer each bug needs a separate process.
 """
 
 import sys
@@ -10,7 +10,7 @@ from emulation_build import load
 
 
 def planted(module, bug, seed):
-    """The largest error of three times the sum of a block, in each of its threads."""
+    """Runs the kernel; returns the largest error of its results, three times the sum of each block."""
     blocks, threads = 2, 64
     values = ((7 * np.arange(blocks * threads)) % 13).astype(np.float32)
     out, counter = np.full_like(values, -1), np.zeros(1, np.int32)
@@ -21,7 +21,7 @@ def planted(module, bug, seed):
 
 
 def verdict(module, bug, seed):
-    """ "right", "wrong" or the error."""
+    """Returns "right", "wrong" or the error."""
     try:
         return "right" if planted(module, int(bug), seed) < 1e-6 else "wrong"
     except RuntimeError as fault:

@@ -1,7 +1,7 @@
-"""The CUDA half of the native backend on CPU tensors: ``with emulated(): voronerf.nearest_centre(...)``.
+"""Runs the CUDA half of the native backend on CPU tensors: ``with emulated(): voronerf.nearest_centre(...)``.
 
-Everything from the public function to the kernel is what runs on a GPU; only the compiled module is the emulated one,
-and the question whether a tensor is on CUDA is answered with yes.
+All code from the public function to the kernel is the code that runs on a GPU. Only the compiled module is replaced by
+the emulation, and CPU tensors count as CUDA tensors.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from voronerf.ops.grouped_program import native as _programs
 
 @functools.cache
 def module() -> ModuleType:
-    """The emulated module, built if need be."""
+    """Returns the emulated module; builds it if necessary."""
     loaded = load(build())
     _native.know_torch(loaded)
     return loaded
 
 
 class _Both:
-    """The compiled module with the emulated entries over its own."""
+    """The compiled module, whose entries are overridden by the emulated module's."""
 
     def __init__(self, over: Any, under: Any) -> None:
         self._over, self._under = over, under
@@ -41,9 +41,13 @@ class _Both:
 def emulated(
     *, seed: int = 0, capability: int = 90, compiled: int = 120, shared_bytes: int = 227 * 1024
 ) -> Iterator[ModuleType]:
-    """The native backend on the emulated device: its compute capability and shared memory of a block.
+    """Runs the native backend on the emulated device inside the block.
 
-    ``compiled``: the architecture that the kernels are compiled for.
+    Args:
+        seed: The seed of the order of threads.
+        capability: The compute capability of the device.
+        compiled: The architecture that the kernels are compiled for.
+        shared_bytes: The bytes of shared memory per block.
     """
     loaded = module()
     loaded.seed(seed)
@@ -61,7 +65,7 @@ def emulated(
 
 
 def _forget() -> None:
-    """Programs are objects of the module that made them."""
+    """Clears the caches of programs, which belong to the module that made them."""
     _programs.lower.cache_clear()
     _programs._code.cache_clear()
     _programs._multiplies_halves.cache_clear()

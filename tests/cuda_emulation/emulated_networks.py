@@ -1,4 +1,4 @@
-"""Networks for the tests of the CUDA kernels that run on the CPU, and what comes out of them against float64."""
+"""Networks for the tests of the emulated CUDA kernels, and the comparison of their results with float64."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import voronerf
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 KIB = 1024
-# Relative error, in the Frobenius norm, of what is multiplied so.
+# Allowed relative errors (Frobenius norm) by the precision of products.
 ALLOWED = {"float32": 3e-6, "tf32": 3e-3, "float16": 3e-3, "bfloat16": 2.5e-2}
 
-# Smooth, so that a rounding does not move a sample across a kink; every kind of source, and outputs in the middle.
+# Smooth activations, which rounding does not switch; every kind of source, and outputs of middle layers.
 BRANCHED = MLP(
     (
         Layer((POSITIONS,), 24, "sine"),
@@ -23,7 +23,7 @@ BRANCHED = MLP(
         Layer((1, POSITIONS), 32, "sigmoid"),
         Layer((2,), 1, "softplus"),
         Layer((2, DIRECTIONS), 17, "softplus"),
-        Layer((0,), 5, "relu"),  # dead
+        Layer((0,), 5, "relu"),  # unused
         Layer((4,), 3, "sigmoid"),
     ),
     (6, 3),
@@ -32,7 +32,7 @@ BRANCHED = MLP(
 )
 WIDE = MLP((Layer((POSITIONS,), 130, "sine"), Layer((0, POSITIONS), 70, "sigmoid"), Layer((1,), 4)), (2,))
 GAUSSIANS = MLP((Layer((POSITIONS,), 16, "sigmoid"), Layer((0,), 2)), (1,), 3, position_encoding="integrated")
-# Harmonics of the directions, in the first layer and in a later one; of degree 3 some columns stay free.
+# Harmonics of the directions in the first and in a later layer; degree 3 leaves some padding columns.
 HARMONICS = MLP(
     (Layer((POSITIONS, DIRECTIONS), 24, "softplus"), Layer((0, DIRECTIONS), 5)),
     (1,),
@@ -41,14 +41,14 @@ HARMONICS = MLP(
     direction_degree=3,
 )
 
-# Nineteen layers that all read the ones before: more than the fused kernel takes, of layers and of sources.
+# Nineteen layers that read all earlier layers: more layers and sources than the fused kernel takes.
 DENSE = MLP(
     (*(Layer((POSITIONS, *range(index)), 5 + index % 3, "softplus") for index in range(18)), Layer((17, 3), 2)),
     (18, 4, 4),
 )
 BROAD = MLP((Layer((POSITIONS,), 270, "sigmoid"), Layer((0, POSITIONS), 300, "sine"), Layer((1,), 3)), (2,), 2)
 
-# ReLU on values that are read late, twice, side by side and when another one is held; two chunks of outputs, one of
+# ReLU outputs that are read late, twice, side by side, and while another value is live; two chunks of outputs, one of
 # them narrow; encodings that are read again; every kind of head.
 SKIPS = MLP(
     (
@@ -64,19 +64,19 @@ SKIPS = MLP(
     direction_octaves=2,
 )
 
-# More weights than a block's shared memory holds, at 128 features, chained; for it they pass through.
+# A chain of layers of 128 features, whose weights exceed a block's shared memory and are loaded in pieces.
 THICK = MLP(
     (Layer((POSITIONS,), 128, "relu"), *(Layer((index,), 128, "relu") for index in range(7)), Layer((7, POSITIONS), 4)),
     (8,),
     position_octaves=10,
 )
 
-# 32 features: the kernel with the fewest registers.
+# 32 features, for the kernel with the fewest registers.
 NARROW = MLP((Layer((POSITIONS,), 32, "relu"), Layer((0,), 32, "relu"), Layer((1,), 4, "sigmoid")), (2,), 10)
 
 
 def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.float32) -> dict:
-    """Arguments in float64, the values those of `dtype`."""
+    """Draws arguments in float64, whose values `dtype` represents exactly."""
     n, k = sum(counts), len(counts)
     directions = torch.rand(4, 3) if layers.uses_directions else None
     shapes = layers.weight_shapes(d, 3 if directions is not None else 0)
@@ -100,12 +100,12 @@ def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.floa
 
 @functools.cache
 def wave(*shape: int) -> Tensor:
-    """A gradient, made once: PyTorch's first sine of a process is off by 1e-4 in what its second thread computes."""
+    """Returns a gradient, computed once: PyTorch's first sine of a process is off by 1e-4 on its second thread."""
     return torch.linspace(-1, 1, math.prod(shape)).reshape(shape).sin()
 
 
-def run(given: dict, layers: MLP, dtype: torch.dtype, backend: str, gradient: Tensor | None = None) -> list[Tensor]:
-    """Output and gradients of everything, from the gradient to the output or from a sine."""
+def run(arguments: dict, layers: MLP, dtype: torch.dtype, backend: str, gradient: Tensor | None = None) -> list[Tensor]:
+    """Returns the output and all gradients; the output's gradient is ``gradient`` or a sine wave."""
     leaves: list[Tensor] = []
 
     def leaf(value):
@@ -116,10 +116,10 @@ def run(given: dict, layers: MLP, dtype: torch.dtype, backend: str, gradient: Te
         leaves.append(value.to(dtype).requires_grad_())
         return leaves[-1]
 
-    named = {name: leaf(given[name]) for name in ("positions", "weights", "biases", "directions")}
-    options = {"layers": layers, "directions": named["directions"], "direction_index": given["direction_index"]}
+    named = {name: leaf(arguments[name]) for name in ("positions", "weights", "biases", "directions")}
+    options = {"layers": layers, "directions": named["directions"], "direction_index": arguments["direction_index"]}
     parameters = named["weights"], named["biases"]
-    out = voronerf.grouped_mlp(named["positions"], given["offsets"], *parameters, **options, backend=backend)
+    out = voronerf.grouped_mlp(named["positions"], arguments["offsets"], *parameters, **options, backend=backend)
     if gradient is None:
         gradient = wave(*out.shape)
     return [out, *torch.autograd.grad(out, leaves, gradient.to(dtype), allow_unused=True, materialize_grads=True)]
@@ -127,23 +127,23 @@ def run(given: dict, layers: MLP, dtype: torch.dtype, backend: str, gradient: Te
 
 def check(layers: MLP, counts: list[int], d: int, precision: str) -> None:
     dtype = torch.float32 if precision in ("float32", "tf32") else getattr(torch, precision)
-    given = case(layers, counts, d, dtype)
+    arguments = case(layers, counts, d, dtype)
     before = torch.backends.cuda.matmul.fp32_precision
     try:
         torch.backends.cuda.matmul.fp32_precision = "tf32" if precision == "tf32" else "ieee"
-        found = run(given, layers, dtype, "native")
+        found = run(arguments, layers, dtype, "native")
     finally:
         torch.backends.cuda.matmul.fp32_precision = before
-    for part, exact in zip(found, run(given, layers, torch.float64, "reference")):
+    for part, exact in zip(found, run(arguments, layers, torch.float64, "reference")):
         difference, scale = (part.double() - exact).norm().item(), exact.norm().item()
         assert part.isfinite().all()
         assert difference <= ALLOWED[precision] * max(scale, 1e-6), (list(part.shape), difference / max(scale, 1e-6))
 
 
 def check_forward(layers: MLP, counts: list[int], d: int, precision: str) -> None:
-    """The output alone: gradients of ReLU differ where a rounding moves a sample across its kink."""
+    """Compares the output alone, since gradients of ReLU differ where rounding switches a unit."""
     dtype = getattr(torch, precision)
-    given = case(layers, counts, d, dtype)
-    out = run(given, layers, dtype, "native")[0].double()
-    exact = run(given, layers, torch.float64, "reference")[0]
+    arguments = case(layers, counts, d, dtype)
+    out = run(arguments, layers, dtype, "native")[0].double()
+    exact = run(arguments, layers, torch.float64, "reference")[0]
     assert (out - exact).norm() <= ALLOWED[precision] / 2 * exact.norm(), (out - exact).norm() / exact.norm()

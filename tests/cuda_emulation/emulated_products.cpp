@@ -1,5 +1,5 @@
-// Products of the warp: the twins of mma.sync, by the fragment layouts of the PTX manual (section "Matrix fragments for
-// mma.m16n8k16" and after it). Compiled without instrumentation: they touch registers alone.
+// Warp-level products: emulates mma.sync with the fragment layouts of the PTX manual (section "Matrix fragments for
+// mma.m16n8k16" and the next ones). Compiled without sanitizers, since products touch only registers.
 #include <vector>
 
 #include "emulation.h"
@@ -12,7 +12,7 @@ struct Fragments {
   uint32_t a[4], b[2];
 };
 
-// Every number of 16 bits: without an instruction for it, float16 takes longer to widen than to multiply.
+// A table of all float16 values: without hardware support, the conversion takes longer than the product.
 std::vector<float> all_halves() {
   std::vector<float> values(1 << 16);
   for (unsigned bits = 0; bits < values.size(); ++bits) values[bits] = half_value(bits, false);
@@ -25,10 +25,11 @@ float float_of(uint32_t bits) {
   return value;
 }
 
-// a [16][kDepth] and b [kDepth][8], kPerRegister elements in a register; value(bits, part) is one of them.
+// d += a b for a [16][kDepth] and b [kDepth][8], with kPerRegister elements per register; value(bits, part) unpacks
+// one.
 template <int kDepth, int kPerRegister, typename Value>
 void multiply(const char* name, float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2], const Value& value) {
-  constexpr int kQuad = 4 * kPerRegister;  // elements of k that four lanes hold in one register each
+  constexpr int kQuad = 4 * kPerRegister;  // elements along k in one register of each of four lanes
   static_assert(kDepth == 2 * kQuad, "two registers along k");
   const Fragments mine = {{a[0], a[1], a[2], a[3]}, {b[0], b[1]}};
   const int lane = vn_emulation::lane();

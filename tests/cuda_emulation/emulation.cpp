@@ -1,5 +1,5 @@
-// The scheduler of the emulation: fibers of a block, in shuffled order. Compiled without instrumentation of its own, so
-// that the sanitizers see the kernels' accesses and not these; they are told of fibers and of what orders them.
+// The scheduler of the emulation: runs the fibers of a block in shuffled order. It is compiled without sanitizers, so
+// that they see only the kernels' memory accesses. It reports fibers and their synchronisation to the sanitizers.
 #include "emulation.h"
 
 #include <cstdio>
@@ -27,8 +27,8 @@ dim3 block_size, grid_size;
 namespace {
 
 constexpr size_t kStack = 32 * 1024;
-constexpr unsigned kNoOrder = 1;         // a switch between fibers orders nothing
-constexpr unsigned char kPoison = 0xff;  // NaN as float32, bfloat16 and float16, and -1 as an index
+constexpr unsigned kNoOrder = 1;         // a switch between fibers is no synchronisation
+constexpr unsigned char kPoison = 0xff;  // NaN in float32, bfloat16 and float16, and -1 as an index
 constexpr size_t kStaticShared = 48 * 1024;
 
 bool racing() {
@@ -61,10 +61,10 @@ struct Warp {
   unsigned arrived = 0;
   unsigned generation = 0;
   unsigned char slots[2][32 * kSlot];
-  char order[2];  // what ThreadSanitizer synchronises on
+  char order[2];  // addresses for ThreadSanitizer's synchronisation
 };
 
-// What ThreadSanitizer knows of fibers, which takes it a millisecond to make: of a launch that is over, used again.
+// ThreadSanitizer's fiber objects of earlier launches, reused because creating one takes a millisecond.
 std::vector<void*> idle_watches;
 
 struct Block {
@@ -78,7 +78,7 @@ struct Block {
 
   Block(size_t threads, size_t bytes) : fibers(threads), warps(threads / 32) {
     for (unsigned i = 0; i < threads; ++i) fibers[i].index = i;
-    // A buffer of exactly the size: AddressSanitizer knows its ends.
+    // The buffer has exactly the requested size, so that AddressSanitizer guards its ends.
     if (bytes > 0) dynamic = poisoned(bytes);
   }
   ~Block() {
@@ -99,7 +99,7 @@ struct Block {
   }
 };
 
-// Stacks are used again, except under ThreadSanitizer: what is on them would pass for shared.
+// Stacks are reused, except under ThreadSanitizer, which would report accesses to a reused stack as races.
 std::vector<std::unique_ptr<unsigned char[]>> idle_stacks;
 
 struct Launch {
@@ -168,8 +168,8 @@ void prepare(Fiber& fiber) {
 #ifdef __x86_64__
   auto top = reinterpret_cast<uintptr_t>(fiber.stack.get() + kStack) & ~uintptr_t{15};
   auto* words = reinterpret_cast<void**>(top);
-  *--words = nullptr;                         // keeps the stack aligned as after a call
-  *--words = reinterpret_cast<void*>(&body);  // where vn_switch returns to
+  *--words = nullptr;                         // aligns the stack as after a call
+  *--words = reinterpret_cast<void*>(&body);  // the address to which vn_switch returns
   for (int i = 0; i < 6; ++i) *--words = nullptr;
   fiber.stack_pointer = words;
 #else
@@ -256,7 +256,7 @@ const unsigned char* meet(const char* operation, const void* mine, size_t size, 
   warp.operation = operation;
   const unsigned side = warp.generation % 2;
   unsigned char* slots = warp.slots[side];
-  // Byte by byte: ThreadSanitizer sees memcpy, wherever it is called from.
+  // Copies byte by byte, because ThreadSanitizer intercepts memcpy even in uninstrumented code.
   volatile unsigned char* slot = slots + (index % 32) * kSlot;
   for (size_t i = 0; i < size; ++i) slot[i] = static_cast<const unsigned char*>(mine)[i];
   if (ordered) release(&warp.order[side]);
@@ -287,7 +287,7 @@ void* dynamic_shared() {
   return launching->block->dynamic;
 }
 
-// All that there were, for tests.
+// The number of launches so far, for tests.
 static int64_t launched = 0;
 int64_t launches() {
   return launched;
@@ -299,7 +299,7 @@ void launch(void (*run)(void*), void* context, dim3 grid, dim3 block_of, size_t 
   if (grid.y > 65535 || grid.z > 65535 || grid.x > 0x7fffffffu) fail("a grid that is too large");
   if (threads == 0 || threads > 1024) fail("a block of " + std::to_string(threads) + " threads");
   if (threads % 32 != 0) fail("a block that is not of whole warps");
-  // 48 KiB are there without being asked for, on every device.
+  // Every device provides 48 KiB by default.
   if (dynamic_bytes > std::max<size_t>(kStaticShared, settings().shared))
     fail("more shared memory than a block may have");
   ++launched;
@@ -324,7 +324,7 @@ void launch(void (*run)(void*), void* context, dim3 grid, dim3 block_of, size_t 
     it.block = &block;
     run_block(it, block, random);
     if (!it.error.empty()) break;
-    // Under ThreadSanitizer no memory is used again within a launch: blocks are not ordered.
+    // Under ThreadSanitizer a launch reuses no memory, since its blocks are not synchronised.
     if (racing()) continue;
     for (Fiber& fiber : block.fibers) idle_stacks.push_back(std::move(fiber.stack));
     kept.clear();

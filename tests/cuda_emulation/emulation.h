@@ -1,8 +1,8 @@
-// What nvcc gives to a .cu file, for g++: the same sources run on the CPU, a grid block by block, every thread a fiber.
-//
-// Test only: csrc/common/cuda_wrappers.h includes it under VN_EMULATE. Threads of a block run in an order shuffled by a
-// seed, and are stopped at barriers and at operations of the warp, where all lanes must meet. Shared memory is poisoned
-// before every block. It proves logic, not speed; there are no partial warps (every mask names all 32 lanes).
+// Replaces CUDA for g++: the same .cu sources run on the CPU, block by block, with every thread as a fiber. For tests
+// only: csrc/common/cuda_wrappers.h includes it under VN_EMULATE. Threads of a block run in a shuffled order that
+// depends on a seed. They stop at barriers and at warp operations, which all lanes must reach. Shared memory is
+// poisoned before every block. The emulation checks logic, not speed. It has no partial warps: every mask has all 32
+// lanes.
 #pragma once
 
 #include <algorithm>
@@ -75,28 +75,28 @@ struct cudaFuncAttributes {
 
 namespace vn_emulation {
 
-constexpr size_t kSlot = 64;  // bytes a lane may hand to the others of its warp
+constexpr size_t kSlot = 64;  // bytes that a lane may pass to other lanes
 
 struct Settings {
   uint64_t seed = 0;
-  int device = 0;           // its number: whoever changes one of the others makes another device
-  int capability = 90;      // of the device that is played
-  int compiled = 120;       // architecture that kernels are compiled for
-  int multiprocessors = 2;  // few, so that loops over a grid are walked
-  int shared = 227 * 1024;  // bytes a block may ask for
+  int device = 0;           // number of the device, increased with each change of the other settings
+  int capability = 90;      // compute capability of the emulated device
+  int compiled = 120;       // architecture of the compiled kernels
+  int multiprocessors = 2;  // few, so that grid-stride loops run several times
+  int shared = 227 * 1024;  // shared memory per block in bytes
 };
 Settings& settings();
 
-// One launch: run(context) is the kernel. Throws std::runtime_error for what would hang or fault.
+// Launches the kernel run(context). Throws std::runtime_error for errors that would hang or fault on a GPU.
 void launch(void (*run)(void*), void* context, dim3 grid, dim3 block, size_t dynamic_bytes);
 
-// Memory that the threads of a block share: one piece for each place in the source, named by `key`.
+// Static shared memory of a block: one piece for each declaration in the source, identified by `key`.
 void* shared(const void* key, size_t size);
 void* dynamic_shared();
 
-// All threads of the block meet; those of the warp meet, each with `size` bytes, and get all lanes' [32][kSlot]. What
-// they wrote to memory before is ordered for the others if `ordered` says so: of CUDA's operations of the warp that is
-// __syncwarp alone.
+// block_barrier waits for all threads of the block. meet waits for all lanes of the warp: each lane passes `size` bytes
+// and gets the bytes of all lanes [32][kSlot]. `ordered` makes earlier memory writes visible to the other lanes; in
+// CUDA only __syncwarp does so.
 void block_barrier();
 const unsigned char* meet(const char* operation, const void* mine, size_t size, bool ordered = false);
 int lane();
@@ -153,7 +153,8 @@ cudaError_t cudaFuncGetAttributes(cudaFuncAttributes* attributes, Kernel) {
   attributes->ptxVersion = vn_emulation::settings().compiled;
   return cudaSuccess;
 }
-// An error unless it is all that there is: host threads that set what they need themselves take it from each other.
+// Returns an error unless a kernel requests all shared memory: host threads with different values would overwrite each
+// other's limit.
 template <typename Kernel>
 cudaError_t cudaFuncSetAttribute(Kernel, cudaFuncAttribute, int value) {
   return value == vn_emulation::settings().shared ? cudaSuccess : cudaErrorInvalidValue;
@@ -172,7 +173,7 @@ cudaError_t cudaFuncSetAttribute(Kernel, cudaFuncAttribute, int value) {
   name##_type& name = *static_cast<name##_type*>(vn_emulation::shared(&name##_key, sizeof(name##_type)))
 #define VN_DYN_SHARED(T, name) T* name = static_cast<T*>(vn_emulation::dynamic_shared())
 
-// Functions that CUDA has and C++ has not. Every lane of a warp must come to the same one.
+// CUDA intrinsics. All lanes of a warp must reach the same warp operation.
 
 inline void __syncthreads() {
   vn_emulation::block_barrier();
@@ -245,8 +246,8 @@ inline int __popc(unsigned x) {
 
 namespace voronerf {
 
-// The twins of the instructions in csrc/common/cuda_wrappers.h, by the fragment layouts of the PTX manual (section
-// "Matrix fragments for mma.m16n8k16" and after it).
+// Emulates the instructions of csrc/common/cuda_wrappers.h, with the fragment layouts of the PTX manual (section
+// "Matrix fragments for mma.m16n8k16" and the next ones).
 
 inline unsigned half_bits(float x, bool bfloat16) {
   if (!bfloat16) {
@@ -275,7 +276,7 @@ inline float half_value(unsigned bits, bool bfloat16) {
 }
 
 enum class Multiplied { bfloat16, float16, tf32 };
-// d [16][8] += a b, of operands of this type; in emulated_products.cpp.
+// d [16][8] += a b for operands of a type; defined in emulated_products.cpp.
 void emulated_multiply(Multiplied type, float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]);
 
 }  // namespace voronerf

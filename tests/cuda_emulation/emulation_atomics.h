@@ -1,5 +1,5 @@
-// CUDA's atomic operations for emulation.h. They return what was there before, and are atomic for the sanitizers too,
-// which know of threads alone.
+// CUDA's atomic operations for emulation.h. They return the old value. They are real atomics, so that sanitizers, which
+// treat fibers as threads, see no race.
 #pragma once
 
 #include <algorithm>

@@ -1,7 +1,8 @@
-"""Builds the emulated CUDA module: ``emulation_build.py [none|address|thread]`` prints where it is.
+"""Builds the emulated CUDA module: ``emulation_build.py [none|address|thread]`` prints its path.
 
-The .cu files of csrc/ are compiled by g++ with emulation.h in place of CUDA; ninja redoes only what has changed. One
-module for each sanitizer, which are told nothing of the scheduler (emulation.cpp): it is what they must look through.
+g++ compiles the .cu files of csrc/ with emulation.h in place of CUDA; ninja recompiles only changed files. Each
+sanitizer has its own module. The scheduler (emulation.cpp) is compiled without sanitizers, so that they see only the
+kernels.
 """
 
 import fcntl
@@ -18,29 +19,29 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 HERE = Path(__file__).resolve().parent
 SANITIZERS = {
     "none": [],
-    # Checks by calls, not inline: the compiler takes half as long.
+    # Checks by calls instead of inline checks halve the compile time.
     "address": ["-fsanitize=address", "--param", "asan-instrumentation-with-call-threshold=0"],
     "thread": ["-fsanitize=thread"],
 }
 PYTHON = {"module.cpp", "index_maps.cpp"}
-"""Files for Python, which are compiled with the bindings of csrc/."""
+"""Files of Python bindings, which are compiled together with the bindings of csrc/."""
 PLAIN = {"emulation.cpp", "emulated_products.cpp", "python.cpp"}
-"""Files with nothing to watch."""
+"""Files that are compiled without sanitizers."""
 FAST = {"emulation.cpp", "emulated_products.cpp"}
-"""The scheduler and the products among these, where a launch spends most of its time."""
+"""Optimised files, the scheduler and the products, in which a launch spends most of its time."""
 SHARED = ("cell_sort_plan.cpp", "centre_index.cpp")
-"""What the launchers need of the C++ beside them."""
+"""C++ files of csrc/ that the launchers need."""
 REPLACED = {"radix_sort.cu"}
-"""What consists of the CUDA toolkit's headers: a file of the same name in this folder stands in."""
+"""Files that need the CUDA toolkit's headers; a file of the same name in this folder replaces each."""
 
 
 @functools.cache
 def build(sanitizer="none"):
-    """The module, built where it was not up to date."""
+    """Builds the module if it is out of date; returns its path."""
     out = ROOT / "build" / "cuda-emulation" / f"{platform.machine()}-{sys.implementation.cache_tag}"
     (out / sanitizer).mkdir(parents=True, exist_ok=True)
     with (out / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # tests in several processes share the folder
+        fcntl.flock(lock, fcntl.LOCK_EX)  # test processes share the folder
         return _build(out, sanitizer)
 
 
@@ -70,7 +71,7 @@ def _build(out, sanitizer):
         "rule link",
         f"  command = g++ -shared $in {shlex.join(watched)} -o $out",
     ]
-    # What all kernels include is compiled once: small files take half the time.
+    # The headers of all kernels are precompiled, which halves the compile time of small files.
     header = f"{sanitizer}/kernels.h"
     _write(out / header, '#include "emulation.h"\n')
     lines += [f"build {header}.gch: header {header}", f"  flags = {shlex.join(watched)}"]
@@ -92,7 +93,7 @@ def _build(out, sanitizer):
 
 
 def _for_python(path):
-    """One file with everything that is written for Python: the compiler's time goes into pybind11's headers."""
+    """Writes one file that includes all bindings, since the compiler's time goes into pybind11's headers."""
     bindings = ROOT / "csrc" / "bindings"
     files = [file for file in sorted(bindings.glob("*.cpp")) if "VN_CUDA(" in file.read_text()]
     files += [
@@ -119,7 +120,7 @@ def _write(path, text):
 
 
 def load(path):
-    """The module at a path, without torch, which takes a sanitizer minutes."""
+    """Loads the module at a path without torch, whose import takes minutes under a sanitizer."""
     spec = importlib.util.spec_from_file_location("voronerf_emulation", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

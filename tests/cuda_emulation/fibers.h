@@ -1,9 +1,9 @@
-// What fibers need of the machine: a change of stacks, and sanitizers that are told of it. For emulation.cpp alone.
+// Fiber support for emulation.cpp: switching stacks, and the sanitizers' interface for it.
 #pragma once
 
 #include <cstddef>
 
-// Sanitizers, where the program runs under one.
+// Functions of the sanitizers; null without a sanitizer.
 extern "C" {
 __attribute__((weak)) void* __tsan_create_fiber(unsigned);
 __attribute__((weak)) void* __tsan_get_current_fiber(void);
@@ -17,7 +17,7 @@ __attribute__((weak)) void __asan_unpoison_memory_region(const volatile void*, s
 }
 
 #ifdef __x86_64__
-// Saves what a call must preserve on the stack, and changes stacks.
+// Saves the callee-saved registers on the stack, and switches stacks.
 extern "C" void vn_switch(void** save, void* to);
 asm(R"(
 .text

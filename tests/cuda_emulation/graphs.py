@@ -1,9 +1,9 @@
-"""CUDA graphs of the emulated device: ``with emulated(), graphs() as seen: ...``.
+"""Emulates CUDA graphs: ``with emulated(), graphs() as seen: ...``.
 
-In a capture nothing is computed: launches are kept, of this project's kernels and of torch's operations, and replays
-alone make them. Memory that is made in a capture is poisoned in each replay where it was made, since on a GPU it may
-have been other memory of the capture before. A read of the host, which ends a capture on a GPU, is an error there, and
-a warning in torch's mode for it. Streams are in order by themselves.
+A capture computes nothing: it stores launches of this project's kernels and of torch's operations, and only replays run
+them. Each replay poisons memory at its allocation in the capture, since a GPU may reuse the memory of a freed tensor. A
+read by the host, which ends a capture on a GPU, raises an error in a capture, and warns in torch's sync debug mode.
+Streams are always ordered.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from torch.utils._pytree import tree_leaves
 from voronerf.ops._core import native as _native
 
 ASKED = "_workspace", "multiplies_halves"
-"""Ends of the names of functions that launch nothing."""
+"""Suffixes of the names of functions that launch nothing."""
 
 
 def reads(function: Any, args: Any) -> bool:
-    """Whether the host waits for the device."""
+    """Returns whether the host waits for the device."""
     masks = args[1] if function is aten.index.Tensor else ()
     by_bool = any(index is not None and index.dtype == torch.bool for index in masks)
     return by_bool or function in READING or function is aten.lift_fresh.default
 
 
 class Warned(TorchDispatchMode):
-    """Warns of reads, as ``torch.cuda.set_sync_debug_mode("warn")``."""
+    """A mode that warns of reads, like ``torch.cuda.set_sync_debug_mode("warn")``."""
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
         if reads(function, args):
             asks = next(f for f, _ in traceback.walk_stack(sys._getframe(1)) if "torch" not in f.f_code.co_filename)
-            where = asks.f_code.co_filename, asks.f_lineno  # torch's own code is no Python on a GPU
+            where = asks.f_code.co_filename, asks.f_lineno  # skips torch's Python code, which is C++ on a GPU
             warnings.warn_explicit("called a synchronizing CUDA operation", UserWarning, *where)
         return function(*args, **(kwargs or {}))
 
 
 class Graph(TorchDispatchMode):
-    """A ``torch.cuda.CUDAGraph``; a mode while it is captured."""
+    """A stand-in for ``torch.cuda.CUDAGraph``, which is a dispatch mode during its capture."""
 
     def __init__(self, seen: Seen) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class Graph(TorchDispatchMode):
 
     def replay(self) -> None:
         self._seen.calls.append("replay")
-        with torch.no_grad():  # what autograd adds was captured, too
+        with torch.no_grad():  # the backward was captured as well
             for each in self._work:
                 each()
 
@@ -77,7 +77,7 @@ class Graph(TorchDispatchMode):
         if function.is_view or name in FREE:
             result = function(*args, **kwargs)
             if "empty" in name:
-                result.zero_()  # torch may look for shapes in it, as an index
+                result.zero_()  # torch may read it as an index to find shapes
                 self.add(result.fill_, float("nan") if result.is_floating_point() else 77)
             return result
         generator = kwargs.get("generator")
@@ -108,32 +108,32 @@ class Graph(TorchDispatchMode):
 
 
 class Kernels:
-    """The compiled module, whose launches a capture keeps."""
+    """The compiled module, whose launches a capture stores."""
 
     def __init__(self, compiled: Any, seen: Seen) -> None:
         self._compiled, self._seen = compiled, seen
 
     def __getattr__(self, name: str) -> Any:
-        found, graph = getattr(self._compiled, name), self._seen.capturing
-        if graph is None or isinstance(found, type) or not callable(found) or name.endswith(ASKED):
-            return found
+        entry, graph = getattr(self._compiled, name), self._seen.capturing
+        if graph is None or isinstance(entry, type) or not callable(entry) or name.endswith(ASKED):
+            return entry
 
         def call(*arguments: Any) -> Any:
             assert not any(isinstance(each, _native.compiled.Cpu) for each in arguments), f"{name} of the processor"
             if any(isinstance(each, _native.compiled.Cuda) for each in arguments):
-                return graph.add(found, *arguments)
-            return found(*arguments)
+                return graph.add(entry, *arguments)
+            return entry(*arguments)
 
         return call
 
 
 class Seen:
-    """What was asked of torch's graphs.
+    """The recorded use of torch's graphs.
 
     Attributes:
-        calls: In order: "register", "capture", "replay".
-        pools: What each capture was given as its memory.
-        capturing: The graph of now.
+        calls: The calls in order: "register", "capture", "replay".
+        pools: The memory pool argument of each capture.
+        capturing: The graph in capture, or None.
     """
 
     def __init__(self) -> None:
@@ -152,7 +152,7 @@ class Seen:
 
 @contextmanager
 def graphs() -> Iterator[Seen]:
-    """Torch's graphs and streams are the emulation's."""
+    """Replaces torch's graphs and streams by the emulation inside the block."""
     seen, modes = Seen(), ExitStack()
 
     def set_mode(mode: str) -> None:

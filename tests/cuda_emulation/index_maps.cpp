@@ -1,4 +1,4 @@
-// csrc/common/index_maps.h for test_index_maps.py.
+// Bindings of csrc/common/index_maps.h for test_index_maps.py.
 #include "common/index_maps.h"
 
 #include <pybind11/pybind11.h>

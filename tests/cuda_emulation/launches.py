@@ -1,6 +1,6 @@
-"""What a piece of work would ask of a GPU, counted without one: launches of kernels and reads of the host.
+"""Counts kernel launches and host reads of a piece of work without a GPU.
 
-Kernels of this project are counted by the emulation, torch's by its operations: one that computes is one launch.
+The emulation counts the kernels of this project. Each computing operation of torch counts as one launch.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ READING = {
     *(aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default, aten.equal.default),
     *(aten.is_nonzero.default, aten._unique2.default, aten.repeat_interleave.Tensor),
 }
-"""Operations after which the host knows something of the device's: a number, or a size."""
+"""Operations with which the host reads a number or a size from the device."""
 FREE = {
     *("empty", "empty_like", "new_empty", "empty_strided", "new_empty_strided", "_unsafe_view", "detach"),
     *("promote_types", "_record_function_enter_new", "_record_function_exit"),
 }
-"""Operations that only allocate, or only name what is there."""
+"""Operations that launch nothing: allocations, views and bookkeeping."""
 
 
 class Asked(TorchDispatchMode):
-    """Counts torch's operations while it lasts.
+    """A mode that counts torch's operations.
 
     Attributes:
-        operations: how often each operation that computes was called, by name.
-        reads: how often each that the host waits for.
-        kernels: launches of each compiled function.
-        on_cpu: how often each compiled function was called that has no CUDA kernel.
+        operations: The number of calls of each computing operation, by name.
+        reads: The number of calls of each operation that the host waits for.
+        kernels: The number of launches of each compiled function.
+        on_cpu: The number of calls of each compiled function without a CUDA kernel.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class Asked(TorchDispatchMode):
 
     @property
     def launches(self) -> int:
-        """Kernels of this project and of torch."""
+        """The launches of this project's and torch's kernels."""
         return self.kernels.total() + self.operations.total()
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
@@ -57,7 +57,7 @@ class Asked(TorchDispatchMode):
         by_bool = function is aten.index.Tensor and any(
             index is not None and index.dtype == torch.bool for index in args[1]
         )
-        # torch.tensor of a number: a copy from memory of the host, which waits for it.
+        # torch.tensor of a number is a synchronous copy from the host.
         if function in READING or by_bool or function is aten.lift_fresh.default:
             self.reads[name] += 1
         elif not function.is_view and name not in FREE:
@@ -66,19 +66,19 @@ class Asked(TorchDispatchMode):
 
 
 class Watched:
-    """The compiled module, whose functions are counted."""
+    """The compiled module with counted functions."""
 
     def __init__(self, compiled: Any, module: Any, counted: Asked) -> None:
         self._compiled, self._module, self._counted = compiled, module, counted
 
     def __getattr__(self, name: str) -> Any:
-        found = getattr(self._compiled, name)
-        if isinstance(found, type) or not callable(found):
-            return found
+        entry = getattr(self._compiled, name)
+        if isinstance(entry, type) or not callable(entry):
+            return entry
 
         def call(*arguments: Any) -> Any:
             before = self._module.launches()
-            result = found(*arguments)
+            result = entry(*arguments)
             launched = self._module.launches() - before
             if launched:
                 self._counted.kernels[name] += launched
@@ -91,7 +91,7 @@ class Watched:
 
 @contextmanager
 def asked() -> Iterator[Asked]:
-    """Counts what is asked of the emulated GPU; custom ops run as without a mode, so that what is in them counts."""
+    """Counts launches and reads of the emulated GPU inside the block, also of operations inside custom ops."""
     with emulated() as module, mock.patch("voronerf.ops._core.custom_op.LISTENERS", []):
         counted = Asked()
         with mock.patch.object(_native, "compiled", Watched(_native.compiled, module, counted)), counted:

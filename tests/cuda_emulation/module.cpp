@@ -1,4 +1,4 @@
-// The CUDA half of voronerf.ops._core._C, emulated: the bindings of csrc/bindings over .cu files compiled by g++.
+// The emulated CUDA half of voronerf.ops._core._C: the bindings of csrc/bindings for .cu files compiled by g++.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 

@@ -1,24 +1,24 @@
-// Small kernels, each right or with one bug of a kind that the emulation is there to find; `bug` 0 is the right one.
+// A small kernel, correct (`bug` 0) or with one planted bug that the emulation must find.
 #include "common/cuda_wrappers.h"
 
 namespace {
 
 enum Bug {
   kRight,
-  kNoBarrier,          // reads what another thread writes with no __syncthreads between
-  kNoWarpBarrier,      // the same within a warp, with no __syncwarp
-  kDivergentBarrier,   // half of the block leaves out a barrier
-  kDivergentShuffle,   // a lane leaves out a shuffle
-  kPastTheEnd,         // writes behind the dynamic shared memory
-  kPastTheOutput,      // writes behind the output
-  kUnwritten,          // reads shared memory that nobody wrote
-  kPlainIncrement,     // adds to one counter from all threads without an atomic
+  kNoBarrier,          // no __syncthreads between one thread's write and another's read
+  kNoWarpBarrier,      // no __syncwarp between a write and a read in a warp
+  kDivergentBarrier,   // half of the block skips a barrier
+  kDivergentShuffle,   // a lane skips a shuffle
+  kPastTheEnd,         // writes past the end of dynamic shared memory
+  kPastTheOutput,      // writes past the end of the output
+  kUnwritten,          // reads uninitialised shared memory
+  kPlainIncrement,     // all threads increment one counter without an atomic
   kBlocksMeet,         // two blocks write the same element
-  kBarrierTooSoon,     // writes for the next round while the last one is being read
-  kShuffleForBarrier,  // a shuffle in the place of __syncwarp, which orders no memory
+  kBarrierTooSoon,     // overwrites values that other threads still read
+  kShuffleForBarrier,  // a shuffle instead of __syncwarp, which does not order memory
 };
 
-// out[i] of a block: three times the sum of the values of all its threads, taken in two rounds through shared memory.
+// Writes to out[i] three times the sum of the block's values, computed in two rounds through shared memory.
 __global__ void planted_kernel(const float* values, float* out, int* counter, int bug) {
   VN_DYN_SHARED(float, staged);
   const int i = threadIdx.x, threads = blockDim.x;

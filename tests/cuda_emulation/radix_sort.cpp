@@ -1,5 +1,5 @@
-// Stands in for csrc/geometry/radix_sort.cu, the toolkit's radix sort, which g++ cannot compile: a stable sort by the same bits,
-// strict about what the real one is given. What is around it is the code that runs on a GPU.
+// Replaces csrc/geometry/radix_sort.cu, the CUDA toolkit's radix sort, which g++ cannot compile: a stable sort by the
+// same bits, with strict checks of its arguments. The calling code is the code that runs on a GPU.
 #include "geometry/radix_sort.h"
 
 #include <algorithm>
@@ -26,7 +26,7 @@ void radix_sort(void* temporary, int64_t bytes, const Key* keys, Key* sorted, co
   std::iota(order.begin(), order.end(), int64_t{0});
   std::stable_sort(order.begin(), order.end(),
                    [&](int64_t a, int64_t b) { return (keys[a] & mask) < (keys[b] & mask); });
-  // All of it may be written, and whatever lies there is overwritten.
+  // The real sort may write all of its temporary memory.
   std::memset(temporary, 0xff, bytes);
   for (int64_t i = 0; i < n; ++i) {
     sorted[i] = keys[order[i]];

@@ -1,8 +1,8 @@
-"""The calls of kernels that the ops' cases lead to, as data that a process without torch can make again (sanitize.py).
+"""Records the kernel calls of the ops' cases as data, for a process without torch (sanitize.py).
 
-A call is the function's name, its arguments, and the arrays that these refer to, before and after it. An argument is
-a number, a text, None, a list, ("array", its number), ("struct", name of the type, names and values of its fields), or
-("plan", name of the function that makes it, (), its arguments).
+A call is the function's name, its arguments, and their arrays before and after the call. An argument is a number, a
+text, None, a list, ("array", index), ("struct", type name, field names and values), or ("plan", name of the function
+that makes it, (), its arguments).
 """
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ from voronerf.ops._core import native as _native
 from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops.cell_sort.native import sort as sort_cells
 
-# Products, and KiB of shared memory beside the cases' own 227 with its tiles of 64 rows: of 32, and the workspace.
+# Products and KiB of shared memory. The cases' 227 KiB have tiles of 64 rows; these sizes have tiles of 32 rows, and
+# values in the workspace.
 NETWORKS = (("bfloat16", 40), ("float16", 12), ("float32", 12))
 
 
 class Recorder:
-    """The compiled module, whose calls of kernels are kept."""
+    """The compiled module, which records its kernel calls."""
 
     def __init__(self, compiled: Any, kernels: Any) -> None:
         self._compiled, self._kernels, self.calls = compiled, kernels, []
-        self.plans: dict[int, tuple[Any, Any]] = {}  # by their addresses, and so that these stay theirs
+        self.plans: dict[int, tuple[Any, Any]] = {}  # by address; kept alive, so that addresses stay unique
 
     def __getattr__(self, name: str) -> Any:
-        found = getattr(self._compiled, name)
-        if isinstance(found, type) or not callable(found) or not hasattr(self._kernels, name):
-            return found
+        entry = getattr(self._compiled, name)
+        if isinstance(entry, type) or not callable(entry) or not hasattr(self._kernels, name):
+            return entry
 
         def call(*arguments: Any) -> Any:
             tensors: dict[int, tuple[int, Tensor]] = {}
             packed = [as_data(argument, tensors, self.plans) for argument in arguments]
             before = [as_array(tensor) for _, tensor in tensors.values()]
-            result = found(*arguments)
+            result = entry(*arguments)
             if type(result).__name__ == "PyCapsule":
                 self.plans[id(result)] = result, ("plan", name, (), packed)
                 return result
@@ -74,7 +75,7 @@ def as_array(tensor: Tensor) -> np.ndarray:
 
 
 def call_case(op: str, pins: dict[str, Any], n: int) -> None:
-    """A call as an op's case makes it, and its gradients."""
+    """Runs a call of an op's declared case, and its gradients."""
     case = cases()[op]
     given = tree_map_only(Tensor, Tensor.clone, case.make(Draw(1, **pins), n))
     leaves = [x for x in tree_leaves(given) if isinstance(x, Tensor) and x.is_floating_point()]
@@ -87,27 +88,27 @@ def call_case(op: str, pins: dict[str, Any], n: int) -> None:
 
 
 def recorded() -> list[tuple[int, str, list[Any]]]:
-    """Bytes of shared memory of a device, what may be senseless (`Case.hostile`), and calls of an op."""
-    found = []
+    """Returns for each op: bytes of shared memory, the arguments that may be hostile (`Case.hostile`), its calls."""
+    records = []
 
     def record(op: str, run: Any, *arguments: Any, shared: int = 227) -> None:
         with emulated(shared_bytes=shared * 1024) as loaded:
             recorder = Recorder(_native.compiled, loaded)
             with mock.patch.object(_native, "compiled", recorder):
                 run(*arguments)
-        found.append((shared * 1024, cases()[op].hostile, recorder.calls))
+        records.append((shared * 1024, cases()[op].hostile, recorder.calls))
 
     for op in backends.ops("native", "cuda"):
-        # A sanitizer counts threads; those of an index are seen in nearest_centre.
+        # Sanitizers are slow per thread; lookups by an index already run in nearest_centre.
         kinds = (pins for kind, pins in cases()[op].kinds.items() if kind != "by an index")
         for pins in (*kinds, *cases()[op].on_devices):
             record(op, call_case, op, pins, cases()[op].device_rows)
     for (precision, shared), kind in itertools.product(NETWORKS, ("", "hashed")):
         pins = {**cases()["grouped_mlp"].kinds[kind], "dtype": getattr(torch, precision)}
         record("grouped_mlp", call_case, "grouped_mlp", pins, 64, shared=shared)
-    # By counting and by radix. Keys of 4 bytes would need 65,535 cells, each a thread: too many for a sanitizer.
+    # Counting and radix sorts. Keys of 4 bytes would need 65,535 cells with a thread each: too many for a sanitizer.
     for n, k, way in ((3000, 5, "automatic"), (9000, 2, "counting"), (600, 3, "radix"), (300, 1100, "automatic")):
         cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32)
         memory = torch.full_like(cells, -7), cells.new_full((k + 1,), -7)
         record("cell_sort", sort_cells, cells, *memory, "cell_sort", way)
-    return found
+    return records

@@ -1,10 +1,11 @@
-"""Every kernel on a few blocks, for a process under a sanitizer: ``sanitize.py MODULE CALLS [hostile]``.
+"""Runs every kernel on a few blocks under a sanitizer: ``sanitize.py MODULE CALLS [hostile]``.
 
-CALLS is a pickle of what recorded.py keeps: calls of the ops' cases, made here without torch, which takes a sanitizer
-minutes. Their results must be the ones that were recorded.
+CALLS is a pickle of recorded.py with calls of the ops' cases. They run without torch, whose import takes minutes under
+a sanitizer. Their results must equal the recorded results.
 
-``hostile``: instead with indices and numbers that the host cannot refuse without reading them: offsets that fall or
-leave the batch, trees and cells that are none. Nothing outside of the tensors may be touched; results are undefined.
+``hostile`` replaces indices and numbers by invalid ones that the host cannot refuse without reading them: decreasing or
+out-of-range offsets, invalid trees and cells. Kernels must not access memory outside the tensors; results are
+undefined.
 """
 
 import pickle
@@ -19,7 +20,7 @@ LEAST, MOST = -(2**31), 2**31 - 1
 
 
 class Memory:
-    """An array as the module takes tensors."""
+    """An array with the tensor interface that the module reads."""
 
     def __init__(self, array):
         self.array, self.dtype = array.copy(), DTYPES.get(array.dtype.name)
@@ -38,7 +39,7 @@ class Memory:
 
 
 def argument(module, value, memory):
-    """What recorded.py has made data of."""
+    """Restores an argument from recorded.py's data."""
     if isinstance(value, list):
         return [argument(module, part, memory) for part in value]
     if not isinstance(value, tuple):
@@ -49,7 +50,7 @@ def argument(module, value, memory):
 
 
 def harm(numbers, before, after):
-    """The arrays with senseless indices, and numbers where these may be so, where a function only reads them."""
+    """Replaces hostile indices and numbers in the arrays that a function only reads."""
     for number, (array, changed) in enumerate(zip(before, after)):
         if array.tobytes() != changed.tobytes():
             continue
@@ -62,7 +63,7 @@ def harm(numbers, before, after):
 
 
 def same(found, expected):
-    """Whether values are those that were recorded; sums may have been added up in another order."""
+    """Returns whether values equal the recorded values; sums may differ by their order."""
     if found.dtype.kind != "f" or not found.size:
         return found.dtype.itemsize < 4 or np.array_equal(found, expected)
     size = max(np.abs(np.nan_to_num(expected, posinf=0, neginf=0)).max(), 1e-6)
@@ -74,11 +75,11 @@ def main(path, calls, kind="usual"):
     module.know_torch(DTYPES, (), None)
     with open(calls, "rb") as file:
         every = pickle.load(file)
-    for shared, hostile, made in every * (3 if kind == "hostile" else 1):
+    for shared, hostile, recorded_calls in every * (3 if kind == "hostile" else 1):
         if kind == "hostile" and not hostile:
             continue
         module.device(90, 120, shared)
-        for name, arguments, before, after in made:
+        for name, arguments, before, after in recorded_calls:
             before = list(before)
             if kind == "hostile":
                 harm(hostile == "numbers", before, after)

@@ -1,4 +1,4 @@
-"""Networks of layer tables on the CUDA kernels, which run on the CPU: each kind of product and of tile."""
+"""Networks of layer tables on the emulated CUDA kernels: each kind of product and of tile."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 
 EVERY = tuple(ALLOWED)
 TILES = (227, 40, 12)
-"""KiB of shared memory: tiles of 64 rows, of 32, and values in the workspace."""
+"""KiB of shared memory, for tiles of 64 rows, tiles of 32 rows, and values in the workspace."""
 SMOOTH = {
     "branched": (BRANCHED, [70, 0, 1, 150], 3, EVERY),
     "wide": (WIDE, [37, 3], 7, EVERY[:2]),
@@ -40,7 +40,7 @@ SMOOTH = {
     "dense": (DENSE, [37, 3], 7, EVERY[:1]),
     "no rows": (BRANCHED, [0, 0], 3, EVERY[:1]),
 }
-"""Networks whose gradients are compared too: a rounding moves no sample across a kink."""
+"""Networks whose gradients are compared too, since rounding switches no units."""
 RELU = {
     "skips": (SKIPS, [37, 290], 3, "float16"),
     "thick": (THICK, [300], 3, "bfloat16"),
@@ -70,7 +70,7 @@ def test_outputs_of_networks_with_kinks(name: str) -> None:
 @pytest.mark.parametrize("integrated", [False, True])
 @pytest.mark.parametrize(("octaves", "extent"), [(10, 4.0), (16, 3.0), (4, 1000.0), (12, 1e5)])
 def test_encodings_are_exact_to_the_rounding_of_operands(octaves: int, extent: float, integrated: bool) -> None:
-    """An identity shows them. The last extent has angles beyond those that are reduced fast, in some rows."""
+    """Reads encodings through an identity layer. The last extent has some angles that need the slow range reduction."""
     encoding = "integrated" if integrated else "frequency"
     width = 6 * octaves + (0 if integrated else 3)
     layers = MLP((Layer((POSITIONS,), width),), (0,), octaves, position_encoding=encoding)
@@ -92,7 +92,7 @@ def test_encodings_are_exact_to_the_rounding_of_operands(octaves: int, extent: f
 
 
 def test_rows_are_gathered_and_scattered_and_every_order_of_threads_gives_the_same() -> None:
-    """routed_mlp: samples lie anywhere, directions belong to rays."""
+    """Runs routed_mlp, whose samples are unsorted and whose directions belong to rays."""
     layers = NeRF(width=32, depth=2).layers
     given = case(layers, [60, 1, 39], 3, torch.bfloat16)
     centres = torch.rand(3, 3)
@@ -116,8 +116,8 @@ def test_rows_are_gathered_and_scattered_and_every_order_of_threads_gives_the_sa
 
 WHOLE = {
     "two parts": MLP((Layer((POSITIONS,), 40, "relu"), Layer((0,), 70, "relu"), Layer((1, 0), 5)), (2,)),
-    # From layer to layer in registers: one chunk and two, to one and to two; a sum of two and of three products; and
-    # what is read by the next layer, and by another one too.
+    # Values pass from layer to layer in registers: from one or two chunks to one or two, sums of two and three
+    # products, and values that the next layer and a later layer read.
     "in registers": MLP(
         (
             *(Layer((POSITIONS,), 64, "relu"), Layer((0,), 64, "relu"), Layer((1,), 32, "relu")),
@@ -133,7 +133,7 @@ WHOLE = {
 @pytest.mark.parametrize("precision", ["bfloat16", "float16", "tf32"])
 @pytest.mark.parametrize("name", WHOLE)
 def test_gradients_of_relu_are_exact_in_whole_numbers(name: str, precision: str, kib: int) -> None:
-    """Small whole numbers and weights of which few are not 0: no rounding moves a sample across a kink."""
+    """Uses small integers and sparse weights, so that no rounding occurs."""
     layers, most, likely = WHOLE[name], *((2, 2) if name == "two parts" else (1, 4))
     dtype, draw = torch.float32 if precision == "tf32" else getattr(torch, precision), torch.Generator().manual_seed(1)
 

@@ -1,4 +1,4 @@
-"""Programs by the CUDA kernels on the CPU, with threads in several orders, against the reference in float64."""
+"""Programs on the emulated CUDA kernels, with threads in several orders, against the reference in float64."""
 
 from __future__ import annotations
 
@@ -24,27 +24,29 @@ from test_grouped_program import NUMBERS, arguments, check, derivatives, offsets
 
 KIB = 1024
 TILES = [227 * KIB, 40 * KIB, 12 * KIB]
-"""Bytes of shared memory: enough for a warp with own rows, for a team that shares rows, and for neither."""
+"""Bytes of shared memory: enough for rows per warp, for rows shared by a team of warps, and for neither."""
 ALLOWED = {"float32": 2e-5, "tf32": 4e-3, "float16": 4e-3, "bfloat16": 3e-2}
-"""Norm of an error, in norms of what is right."""
+"""Allowed relative errors by norm."""
 LARGEST = 65504.0
-"""Of float16."""
+"""The largest number of float16."""
 
 
 def tensors_of(
     program: Program, sizes: list[int], strays: int = 0, rays: int = 5, shared: bool = False
 ) -> list[Tensor]:
-    """Inputs, then parameters; with ``shared`` every other one is of all cells."""
+    """Draws inputs, then parameters; with ``shared``, every other parameter is shared by all cells."""
     generator, n, k = torch.Generator().manual_seed(3), sum(sizes) + strays, len(sizes)
-    found = [torch.rand(rays if i in program.rays else n, w, generator=generator) for i, w in enumerate(program.inputs)]
+    tensors = [
+        torch.rand(rays if i in program.rays else n, w, generator=generator) for i, w in enumerate(program.inputs)
+    ]
     for i, shape in enumerate(program.parameters):
         few = 1 if shared and i % 2 == 0 else k
-        found.append(torch.randn(few, *shape, generator=generator) / shape[-1] ** 0.5)
-    return found
+        tensors.append(torch.randn(few, *shape, generator=generator) / shape[-1] ** 0.5)
+    return tensors
 
 
 def outcome(program: Program, tensors: list[Tensor], offsets: Tensor, products: str = "", **given: Any) -> list[Tensor]:
-    """Results and gradients; in float64 by the reference unless products are named."""
+    """Returns results and gradients; by the reference in float64 unless ``products`` is given."""
     count = len(program.inputs)
 
     def run(*leaves: Tensor) -> list[Tensor]:
@@ -76,7 +78,7 @@ def close(found: list[Tensor], exact: list[Tensor], allowed: float) -> None:
 
 
 def layers_of(widths: list[int]) -> Program:
-    """Layers with a smooth function between them, of any widths, and a second output of four columns."""
+    """Returns layers of given widths with smooth activations, and a second output of four columns."""
     b = Builder()
     x = h = b.input(widths[0])
     for i, (before, width) in enumerate(itertools.pairwise(widths)):
@@ -86,7 +88,7 @@ def layers_of(widths: list[int]) -> Program:
 
 
 def test_values_and_derivatives_of_second_order() -> None:
-    """Tiles of every kind; cells that are no multiple of one, and an empty one."""
+    """Covers every kind of tile, cells that are no multiple of a tile, and an empty cell."""
     for seed, shared_bytes in enumerate(TILES):
         order = torch.randperm(70, generator=torch.Generator().manual_seed(seed)).int() if seed == 1 else None
         with emulated(seed=seed, shared_bytes=shared_bytes):
@@ -98,7 +100,7 @@ def test_values_and_derivatives_of_second_order() -> None:
 @pytest.mark.parametrize("products", ALLOWED)
 @pytest.mark.parametrize("widths", [[3, 5, 1], [17, 70, 33, 66], [64, 64, 64, 4]], ids=str)
 def test_products_of_every_precision(products: str, widths: list[int], shared_bytes: int) -> None:
-    """Widths around those of a block and of a strip."""
+    """Covers widths around a block's and a strip's."""
     program, sizes = layers_of(widths), [65, 0, 31, 1]
     tensors = tensors_of(program, sizes)
     exact = outcome(program, tensors, offsets_of(sizes))
@@ -112,7 +114,7 @@ def test_products_of_every_precision(products: str, widths: list[int], shared_by
 @pytest.mark.parametrize(("capability", "compiled"), [(75, 120), (90, 75)])
 @pytest.mark.parametrize(("products", "exactly"), [("tf32", True), ("bfloat16", True), ("float16", False)])
 def test_products_before_ampere(products: str, exactly: bool, capability: int, compiled: int) -> None:
-    """Of tf32 and bfloat16 there are none: they are float32's. So it is in code for an older device."""
+    """Checks that tf32 and bfloat16 fall back to float32 products, also in code for an older device."""
     program, sizes = layers_of([17, 70, 33]), [40, 9]
     tensors = tensors_of(program, sizes)
     with emulated(capability=capability, compiled=compiled, shared_bytes=64 * KIB):
@@ -134,7 +136,7 @@ def test_sizes_around_tiles_and_tasks(products: str, n: int) -> None:
 
 
 def learning_a_table() -> Program:
-    """The gradient of a table is that of a value that the next product reads, and nothing else is between them."""
+    """Returns a program in which the gradient of a table is the gradient of a value that the next product reads."""
     b = Builder()
     x, d = b.input(3), b.input(8)
     e = b.encode("hash", x, b.grid(GRID.text), b.parameter(*GRID.table_shape))
@@ -145,7 +147,7 @@ def learning_a_table() -> Program:
 
 
 def reading_a_part() -> Program:
-    """A value that is read whole, and in the next product in part."""
+    """Returns a program in which one product reads a whole value, and the next product a part of it."""
     b = Builder()
     h = b.apply("relu", b.linear(b.input(32), b.parameter(32, 32), 32))
     whole = b.linear(h, b.parameter(48, 32), 48)
@@ -153,14 +155,14 @@ def reading_a_part() -> Program:
 
 
 def cut_by_its_input() -> Program:
-    """A product that is cut by the ReLU that it multiplies."""
+    """Returns a program with a product that is masked by the ReLU that it reads."""
     b = Builder()
     h = b.apply("relu", b.linear(b.input(128), b.parameter(128, 128), 128))
     return b.program([b.linear(b.binary("gate", b.linear(h, b.parameter(128, 128), 128), h), b.parameter(4, 128), 4)])
 
 
 def learning_nothing() -> Program:
-    """Without a step."""
+    """Returns a program without steps."""
     b = Builder()
     program = b.program([b.apply("step", b.linear(b.input(4), b.parameter(3, 4), 3))])
     return gradient(program, (False,), (True,), (True,), ())
@@ -178,14 +180,14 @@ def test_what_must_not_stay_in_registers(make: Callable[[], Program], products: 
         rows = plans.Rows(tensors[:count], tensors[count:], offsets, None, None)
         with emulated(shared_bytes=shared_bytes):
             found = plans.run(rows, plans.RunOptions(program.text, products=products))
-            close(found, right, 2 * ALLOWED[products])  # rounding moves a few samples across a kink
+            close(found, right, 2 * ALLOWED[products])  # rounding switches a few units
 
 
 @pytest.mark.parametrize("products", ["float32", "bfloat16"])
 @pytest.mark.parametrize("shared", [False, True], ids=["tables of cells", "one table"])
 @pytest.mark.parametrize("ordered", [False, True], ids=["sorted", "in any order"])
 def test_encodings_rays_and_tables(products: str, shared: bool, ordered: bool) -> None:
-    """All encodings, inputs and an output of rays, rows of no cell; gradients to all of them, tables included."""
+    """Covers all encodings, per-ray inputs and outputs, rows of no cell, and all gradients, tables included."""
     program, sizes = encoded(20), [37, 0, 70]
     n = sum(sizes) + 5
     generator = torch.Generator().manual_seed(1)
@@ -203,7 +205,7 @@ def test_encodings_rays_and_tables(products: str, shared: bool, ordered: bool) -
 
 
 def test_rows_of_no_cell_keep_nothing() -> None:
-    """Their looked-up values are 0, before the first cell and behind the last."""
+    """Checks that stored lookups of rows of no cell are 0, before the first cell and after the last."""
     b = Builder()
     e = b.encode("hash", b.input(3), b.grid(GRID.text), b.parameter(*GRID.table_shape))
     program = b.program([e])
@@ -217,7 +219,7 @@ def test_rows_of_no_cell_keep_nothing() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("features", [1, 2, 4, 8])
 def test_tables_of_every_kind(features: int, dtype: torch.dtype) -> None:
-    """Values, the gradient to the positions and to the table, which has the table's dtype."""
+    """Compares values and the gradients of positions and table; the table's gradient has the table's dtype."""
     grid = HashGrid(levels=11, features=features, log2_entries=10, base=3, finest=50)
     b = Builder()
     e = b.encode("hash", b.input(3), b.grid(grid.text), b.parameter(*grid.table_shape))
@@ -234,7 +236,7 @@ def test_tables_of_every_kind(features: int, dtype: torch.dtype) -> None:
 
 
 def test_what_was_looked_up_is_not_looked_up_again() -> None:
-    """The gradient program reads what was kept: with another table there, it gives the same but for the positions."""
+    """Checks that the gradient program reads stored lookups: a table of NaN does not change the weight's gradient."""
     b = Builder()
     e = b.encode("hash", b.input(3), b.grid(GRID.text), b.parameter(*GRID.table_shape))
     program = b.program([b.linear(e, b.parameter(5, e.width), 5)])
@@ -252,7 +254,7 @@ def test_what_was_looked_up_is_not_looked_up_again() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_types_in_memory(dtype: torch.dtype) -> None:
-    """What float32 gives for the rounded arguments, rounded."""
+    """Compares with the rounded results of float32 for the rounded arguments."""
     program = every_step()
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
     inputs = plans.Rows(rows, [p.float() for p in parameters], offsets, None, None)
@@ -263,7 +265,7 @@ def test_types_in_memory(dtype: torch.dtype) -> None:
 
 
 def test_every_function_and_turned_inputs() -> None:
-    """All functions in one program, of an input that lies column by column."""
+    """Covers all functions in one program, with a column-major input."""
     b = Builder()
     x = b.input(5)
     names = [(name, f.orders) for name, f in FUNCTIONS.items() if name != "stop"]
@@ -284,7 +286,7 @@ def test_every_function_and_turned_inputs() -> None:
 
 @pytest.mark.parametrize("products", ALLOWED)
 def test_results_are_the_same_in_every_order_of_threads(products: str) -> None:
-    """Bit for bit, sums over several tasks of a cell included."""
+    """Compares bit for bit, including sums over several tasks of a cell."""
     program, sizes, found = random_program(3), [150, 0, 9], []
     tensors = tensors_of(program, sizes)
     for seed in (0, 1, 2):
@@ -296,7 +298,7 @@ def test_results_are_the_same_in_every_order_of_threads(products: str) -> None:
 
 @pytest.mark.parametrize("shared_bytes", TILES)
 def test_rows_of_no_cell_and_unsound_indices(shared_bytes: int) -> None:
-    """Nothing outside is read or written, and what no cell has is 0."""
+    """Checks that no memory outside the tensors is accessed, and that rows of no cell are 0."""
     program = encoded()
     for offsets, strays in (([3, 20, 30], [*range(3), *range(30, 33)]), ([0, 40, 50], []), ([5, 2, 33], [])):
         tensors = tensors_of(program, [20, 13])
@@ -309,7 +311,7 @@ def test_rows_of_no_cell_and_unsound_indices(shared_bytes: int) -> None:
 
 
 def test_cells_that_overlap_stay_inside_the_workspace(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They have more tasks than there are partial sums; what lies behind those is no number, and is not read."""
+    """Checks cells with more tasks than partial sums: the NaN after the partial sums is not read."""
     program, n, beyond = smooth(), 600, 1 << 20
     sizes = []
     with emulated() as loaded:
@@ -343,7 +345,7 @@ def test_numbers_that_are_none_stay_in_their_rows() -> None:
 
 
 def test_float16_cuts_values_off_and_leaves_gradients() -> None:
-    """Values beyond the largest number enter products as that; gradients are infinite, for a GradScaler to see."""
+    """Checks that too large values are clamped in products, while gradients overflow for a GradScaler to see."""
     b = Builder()
     h = b.linear(b.input(1), b.parameter(16, 1), 16)
     program = b.program([b.linear(h, b.parameter(3, 16), 3)])
@@ -361,7 +363,7 @@ def test_float16_cuts_values_off_and_leaves_gradients() -> None:
 
 
 def test_a_planted_fault_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A layer that writes over what other threads still read."""
+    """Plants a layer that overwrites memory that other threads still read."""
     b = Builder()
     x = b.input(70)
     program = b.program([b.linear(x, b.parameter(70, 70), 70)])
@@ -391,7 +393,7 @@ def test_refuses_more_tensors_than_kernel_arguments_hold() -> None:
 
 
 def test_values_of_many_columns() -> None:
-    """Which no multiprocessor holds: they are in the workspace, and blocks take several tasks."""
+    """Covers values that exceed shared memory: they lie in the workspace, and blocks run several tasks."""
     b = Builder()
     x = b.input(2000)
     wide = b.program([b.binary("add", b.apply("exp", x), b.apply("tanh", x))])
@@ -402,7 +404,7 @@ def test_values_of_many_columns() -> None:
 
 
 def test_derivatives_again_on_the_device() -> None:
-    """The loop of the other tests, of second order and with deterministic sums, by its own helper."""
+    """Compares second derivatives with deterministic sums, by the other tests' helper."""
     program = random_program(2)
     given = arguments(program, [37, 0, 33], torch.float32)
     with emulated():

@@ -1,4 +1,4 @@
-"""Whole training steps on the emulated device: every CUDA kernel of a step, in the loop's own order and types."""
+"""Whole training steps on the emulated device: every CUDA kernel of a step, in the training loop's order and types."""
 
 import contextlib
 from unittest import mock
@@ -13,7 +13,7 @@ SMALL = {"nerf": {"depth": 2, "occupancy": False}, "hashgrid": {"field_options":
 
 
 class Losses(Callback):
-    """The loss of every step."""
+    """A callback that stores the loss of every step."""
 
     def __init__(self):
         self.losses = []
@@ -23,7 +23,7 @@ class Losses(Callback):
 
 
 def losses(field, precision, *, on_device):
-    """Of the steps of a run that splits in the middle."""
+    """Returns the losses of a run's steps; the run splits in the middle."""
     config = TrainConfig(
         field=field, **SMALL[field], steps=16, cells=(4,), split_at=(0.5,), width=16, rays=32, samples=(8,),
         lr=0.005, evaluations=1, precision=precision,

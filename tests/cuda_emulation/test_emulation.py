@@ -1,4 +1,4 @@
-"""What the emulation finds: every planted bug, by results, by its own checks, or by a sanitizer."""
+"""The emulation finds every planted bug: by results, by its checks, or by a sanitizer."""
 
 import os
 import pickle
@@ -33,7 +33,7 @@ BUGS = [
     ("9", "thread", "data race"),
     ("10", "thread", "data race"),
 ]
-"""Bug of planted.cu, sanitizer, and what must come out."""
+"""Number of a bug in planted.cu, sanitizer, and expected verdict."""
 
 
 def run(command, sanitizer=None):
@@ -50,7 +50,7 @@ def run(command, sanitizer=None):
 
 
 def script(name, sanitizer, *arguments):
-    """What a script of this folder says of the module under a sanitizer."""
+    """Runs a script of this folder on the module under a sanitizer; returns its output."""
     return run([str(HERE / name), str(build(sanitizer)), *arguments], sanitizer).stdout
 
 
@@ -76,14 +76,14 @@ def calls(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("given", [["address"], ["thread"], ["address", "hostile"]], ids=" ".join)
 def test_kernels_touch_nothing_outside_and_race_with_nobody(given, calls):
-    """On the arguments of the ops' cases, and on hostile ones whatever the offsets say."""
+    """Runs the recorded calls of the ops' cases, and hostile calls, under sanitizers."""
     found = script("sanitize.py", given[0], calls, *given[1:])
     assert found.splitlines() == ["clean"], found
 
 
 @pytest.mark.slow
 def test_operations_pass_their_tests_on_the_emulated_device():
-    """The tests of the operations themselves; ``make emulate-cuda`` takes more seeds."""
+    """Runs the tests of the operations; ``make emulate-cuda`` runs more seeds."""
     command = ["-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--emulate-cuda", "1", "-W", "ignore"]
     folders = dict.fromkeys(backends.folder(op) for op in backends.ops("native", "cuda"))
     files = [HERE.parent / "ops" / f"test_{folder}.py" for folder in (*folders, "every_op")]

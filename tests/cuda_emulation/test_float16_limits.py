@@ -1,8 +1,8 @@
-"""Networks on CUDA whose values come near float16's largest, and pass it: no NaN where float32 has none.
+"""Networks on CUDA with values near and above float16's largest: no NaN where float32 has none.
 
-Every activation, in tiles of 64 rows and with values in the workspace. What a value exceeds is cut off (65,504) where a
-layer reads it, what a gradient exceeds is infinite, for a GradScaler to see; the other samples and cells are as exact
-as ever.
+The tests cover every activation, in tiles of 64 rows and with values in the workspace. Values are clamped to 65,504
+when a layer reads them. Gradients overflow to infinity, for a GradScaler to see. Other samples and cells keep their
+precision.
 """
 
 import pytest
@@ -19,27 +19,30 @@ ROWS, CELLS = 40, 2
 
 
 def network(activation):
-    """A layer of large values, one that reads them, and outputs of both."""
+    """Returns a layer with large values, a layer that reads them, and the outputs of both."""
     return MLP((Layer((POSITIONS,), 16, activation), Layer((0,), 16, activation), Layer((1,), 3)), (2, 0))
 
 
 def given(layers, size):
-    """Positions, weights and biases, numbers of float16. An eighth of the rows has a first layer of this size, positive
-    in half of the columns; the other rows have one of 1."""
+    """Draws positions, weights and biases, exact in float16.
+
+    In an eighth of the rows, the first layer's values have magnitude ``size``, positive in half of the columns. In the
+    other rows they have magnitude 1."""
     torch.manual_seed(1)
     positions = torch.ones(ROWS, 3) / 4
     positions[::8, 0] = size
     shapes = layers.weight_shapes(3, 0)
     weights = [torch.randn(CELLS, o, i) / i**0.5 for o, i in shapes]
     weights[0][:, :, 0] = torch.tensor([1.0, -1.0]).repeat(8)
-    # What comes after the large values is small again.
+    # Layers after the large values scale them down.
     parameters = [weights[0], *(weight / 64 for weight in weights[1:]), *(torch.zeros(CELLS, o) for o, _ in shapes)]
     return [positions, *(parameter.half().float() for parameter in parameters)]
 
 
 def outcome(layers, parts, dtype, backend, scale=1.0):
-    """Output, gradients of positions, weights and biases, for a gradient of ``scale``; as in training, parameters are
-    in float32, and float16 is autocast's."""
+    """Returns the output and the gradients of positions, weights and biases, for an output gradient of ``scale``.
+
+    As in training, parameters are float32 and autocast computes in float16."""
     leaves = [part.to(dtype).requires_grad_() for part in parts]
     count, offsets = len(layers.layers), torch.tensor([0, 23, ROWS], dtype=torch.int32)
     with torch.autocast("cpu", torch.float16, enabled=backend == "native"):
@@ -57,7 +60,7 @@ def run(layers, parts, shared, scale=1.0):
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("size", [0.5 * LARGEST, LARGEST - 32, 65519.0, 65520.0, 2 * LARGEST, 1e6, 1e30])
 def test_values_up_to_the_limit_are_exact_and_those_beyond_cut_off(activation, size, shared):
-    """From 65,520 on they would round to infinity. Nothing is a NaN, and what is not large is as it should be."""
+    """Checks values around 65,520, where float16 rounds to infinity: no NaN, and small values stay exact."""
     layers = network(activation)
     parts = given(layers, size)
     found, right = run(layers, parts, shared), outcome(layers, parts, torch.float32, "reference")
@@ -65,7 +68,7 @@ def test_values_up_to_the_limit_are_exact_and_those_beyond_cut_off(activation, s
     usual = torch.arange(ROWS) % 8 != 0
     for part, expected in zip(found[:2], right):
         torch.testing.assert_close(part[usual].float(), expected[usual], rtol=5e-3, atol=5e-3)
-    if size < LARGEST and activation != "sine":  # of which the last digit of such an angle is all
+    if size < LARGEST and activation != "sine":  # a sine of such an angle has no correct digits
         for part, exact in zip(found, outcome(layers, parts, torch.float64, "reference")):
             assert part.isfinite().all()
             assert (part.double() - exact).norm() <= 4e-3 * exact.norm() + 1e-5, list(part.shape)
@@ -74,7 +77,7 @@ def test_values_up_to_the_limit_are_exact_and_those_beyond_cut_off(activation, s
 @WAYS
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_gradients_of_a_scaled_loss(activation, shared):
-    """They are the same for a power of 2, up to where float16 ends; beyond, not finite, for a GradScaler to see."""
+    """Checks that loss scales of powers of 2 give the same gradients, or gradients that are not finite on overflow."""
     layers = network(activation)
     parts = given(layers, 1.0)
     plain = run(layers, parts, shared)[1:]

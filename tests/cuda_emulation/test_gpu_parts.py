@@ -1,4 +1,4 @@
-"""The programs of ``make gpu-check`` on the CPU, so that their first run on a GPU does not end in a slip of theirs."""
+"""The programs of ``make gpu-check`` on the CPU, to find their mistakes before a run on a GPU."""
 
 import importlib.util
 import itertools
@@ -19,10 +19,10 @@ GPU = ROOT / "benchmarks" / "gpu"
 
 def program(name):
     if str(GPU) not in sys.path:
-        sys.path.append(str(GPU))  # as where it is run
+        sys.path.append(str(GPU))  # as when the program runs
     spec = importlib.util.spec_from_file_location(name, GPU / f"{name}.py")
     assert spec is not None and spec.loader is not None
-    loaded = sys.modules[name] = importlib.util.module_from_spec(spec)  # its dataclasses look for it there
+    loaded = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up there
     spec.loader.exec_module(loaded)
     return loaded
 
@@ -41,7 +41,7 @@ def check():
 @pytest.mark.slow
 @pytest.mark.native
 def test_the_first_call_on_the_emulated_device(tmp_path):
-    """Every case of it, small, in its own processes, and the verdict."""
+    """Runs every case in its small version, in separate processes, and checks the verdict."""
     command = [sys.executable, str(GPU / "gpu_check.py"), "first", "--emulated", "--parts", "cases", "counters"]
     result = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True)
     assert result.returncode == 0, result.stdout
@@ -81,7 +81,7 @@ def test_cases_by_name(parts, tmp_path):
 
 @pytest.mark.native
 def test_a_row_of_a_network_is_captured(parts, monkeypatch, tmp_path):
-    """With its gradients, which the emulated device takes too long for in the whole call; not what has an obstacle."""
+    """Captures a row with gradients, too slow for the whole emulated call; a row with an obstacle is not captured."""
     timings, journal = sys.modules["gpu_timings"], parts.Journal(tmp_path / "cases.json")
     monkeypatch.setattr(timings, "MOST_CALLS", 2)
     monkeypatch.setattr(timings, "MOST_REPEATS", 1)
@@ -94,15 +94,15 @@ def test_a_row_of_a_network_is_captured(parts, monkeypatch, tmp_path):
 
 
 def test_counted_launches(parts):
-    """One launch of this project's kernels each."""
+    """Checks that each entry launches a kernel of this project."""
     with emulated() as module:
-        made = parts.counted("cpu", 256)
-        for name, before, launch in made:
+        launches = parts.counted("cpu", 256)
+        for name, before, launch in launches:
             before()
             launched = module.launches()
             launch()
             assert module.launches() > launched, name
-    assert len(made) == 6
+    assert len(launches) == 6
 
 
 FAULTS = """
@@ -137,7 +137,7 @@ sys.exit(gpu_parts.main(sys.argv[1:]))
 
 
 def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(check, tmp_path):
-    """In processes that are truly started again, with a device that stays broken."""
+    """Restarts real processes, whose device stays broken."""
     (tmp_path / "faults.py").write_text(FAULTS.format(gpu=str(GPU)))
     command = [sys.executable, str(tmp_path / "faults.py"), "cases", str(tmp_path / "out"), "--parts", "small"]
     part = check.Part([command], 50, (), tmp_path / "out" / "cases.json")
@@ -157,7 +157,7 @@ def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(check, tmp_pat
 
 
 def test_cases_that_no_process_begins_any_more_are_not_tried_for_ever(check, tmp_path):
-    """Such a case may leave a device that no other process can use."""
+    """Checks a case after which no other process can use the device."""
     script = f"""
 import sys
 sys.path.insert(0, {str(GPU)!r})
@@ -174,7 +174,7 @@ sys.exit(7)
 
 
 def test_cases_that_the_time_is_too_short_for_are_left_out(parts, tmp_path):
-    """The second part has the time that the first one leaves; the third has none."""
+    """Checks three parts: the second inherits the first part's unused time, and the third has no time."""
     journal, slow = parts.Journal(tmp_path / "cases.json"), lambda: time.sleep(0.3)
     cases = [parts.Case(part, str(number), slow) for part, number in (("a", 1), ("b", 2), ("b", 3), ("c", 4))]
     assert parts.one_by_one(cases, {"a": 0.45, "b": 0.0, "c": 0.0}, lambda: None, journal) == 0
@@ -218,7 +218,7 @@ def test_a_part_that_hangs_is_ended_with_all_that_it_started(check, monkeypatch,
     child_pid = int((tmp_path / "pid").read_text())
     for _ in range(100):
         state = Path(f"/proc/{child_pid}/stat")
-        # One that has ended may still wait for whoever adopts it.
+        # An ended process may stay a zombie until its new parent reaps it.
         if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
             return
         time.sleep(0.05)
@@ -226,7 +226,7 @@ def test_a_part_that_hangs_is_ended_with_all_that_it_started(check, monkeypatch,
 
 
 def test_the_summary_has_all_that_a_part_has_found(check, monkeypatch, tmp_path):
-    """And nothing of an earlier run, nor less than it can where a part was ended in the middle of a line."""
+    """Checks that findings of an earlier run are removed, and that a partly written file gives what it can."""
     (tmp_path / "old.json").write_text('{"cases": ["of an earlier run"]}')
     write = "import sys; open(sys.argv[1], 'w').write(sys.argv[2]); print('done')"
 
@@ -248,7 +248,7 @@ def test_the_summary_has_all_that_a_part_has_found(check, monkeypatch, tmp_path)
 
 
 def test_calls_fit_their_time(check, parts, monkeypatch, tmp_path):
-    """The parts follow each other, the last one ends with the call, and what checks kernels leaves the card alone."""
+    """Checks that parts follow each other, the last one ends with the call, and no tool changes the card's settings."""
     monkeypatch.setattr(check.shutil, "which", lambda name, **_: f"/bin/{name}")
     for call, seconds in (("first", 390), ("second", 240)):
         known = check.parts(call, tmp_path, tmp_path, ["adam"], emulated=False)
@@ -260,7 +260,7 @@ def test_calls_fit_their_time(check, parts, monkeypatch, tmp_path):
             assert ("regex:program_kernel|hash_encode" in command) == (name == "counters")
             if name == "counters":
                 assert command[command.index("--clock-control") + 1] == "none"
-        # 20 s to link, 15 s for imports and a context.
+        # 20 s for linking, 15 s for imports and a CUDA context.
         assert call == "second" or sum(parts.BUDGETS.values()) + 35 <= known["cases"].until
 
 
@@ -317,7 +317,7 @@ def test_the_verdict_is_short_and_says_the_most_telling_first(check):
 
 
 def test_launches_that_ncu_counted(check, tmp_path):
-    """They are rows of its raw page, among lines of its own."""
+    """Parses ncu's raw page, whose rows stand among ncu's messages."""
     names = ["ID", "Kernel Name", "gpu__time_duration.sum", *(f"m{i}" for i in range(20))]
     lines = [names, ["", "", "ns", *[""] * 20], ["0", "voronerf::k(int, int)", "1,234", *["7"] * 20]]
     text = "==PROF== Connected\n" + "\n".join(",".join(f'"{each}"' for each in line) for line in lines)
@@ -330,7 +330,7 @@ def test_launches_that_ncu_counted(check, tmp_path):
 
 @pytest.mark.native
 def test_gradients_at_full_size_that_are_wrong_are_found(parts, monkeypatch):
-    """And so are rows of a task anywhere in a cell."""
+    """Checks that spoilt gradients, and lost rows of a task anywhere in a cell, are found."""
     large = sys.modules["gpu_large"]
     monkeypatch.setattr(large, "SUBSET", 16)
     with emulated():
@@ -373,7 +373,7 @@ default _C.so
 
 
 def test_objects_that_are_carried_are_linked_and_not_compiled(monkeypatch, tmp_path):
-    """With ninja; and those of other sources, or for another GPU, are refused."""
+    """Links by ninja; objects of other sources or for another GPU are refused."""
     prebuilt = program("prebuilt")
     monkeypatch.setattr(prebuilt, "module_name", lambda: "_C.so")
     (tmp_path / "a").mkdir()
@@ -403,12 +403,12 @@ def test_objects_that_are_carried_are_linked_and_not_compiled(monkeypatch, tmp_p
     with pytest.raises(SystemExit, match="must be for this GPU, sm_80, got sm_90"):
         prebuilt.link(build, tmp_path)
     (tmp_path / "made").write_text("90 0badf00d")
-    with pytest.raises(SystemExit, match="must be those of csrc and setup"):
+    with pytest.raises(SystemExit, match="must match csrc and setup"):
         prebuilt.link(build, tmp_path)
 
 
 def test_programs_of_a_bare_machine_import_what_it_has(tmp_path):
-    """torch, and what comes with Python: pytest, tyro, rich and warp may be absent until the tests themselves run."""
+    """Checks that imports need only torch and the standard library; pytest, tyro, rich and warp may be missing."""
     absent = ("pytest", "_pytest", "tyro", "rich", "warp", "scipy", "imageio_ffmpeg")
     code = f"""
 import sys

@@ -1,4 +1,4 @@
-"""A training step as a CUDA graph, on the emulated device: what it captures, and that replays are the same steps."""
+"""Training steps as CUDA graphs on the emulated device: what is captured, and that replays give the same steps."""
 
 import contextlib
 import gc
@@ -21,38 +21,38 @@ pytestmark = pytest.mark.native
 
 @pytest.fixture(autouse=True)
 def on_device(monkeypatch):
-    """Tensors of the emulation say that they are on a GPU."""
+    """Makes tensors of the emulation report a CUDA device."""
     monkeypatch.setattr(torch.Tensor, "is_cpu", False)
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
     monkeypatch.setattr(State, "read_output", lambda state, output: None)
-    monkeypatch.setattr(reference, "check_range", lambda *_: None)  # which reads on a CPU alone
+    monkeypatch.setattr(reference, "check_range", lambda *_: None)  # it reads only on a CPU
     for place, op in (
         (batches, "unseen_rays"),
         (terms, "sparse_depth_gradient"),
         (terms, "smooth_depth_gradient"),
         (terms, "surface_gradient"),
-    ):  # which have no kernels on CUDA
+    ):  # ops without CUDA kernels
         monkeypatch.setattr(place, op, in_torch(getattr(place, op)))
 
 
 def in_torch(op):
-    """An op by its reference, whatever its caller says."""
+    """Returns an op that always runs its reference."""
     return lambda *given, **options: op(*given, **{**options, "backend": "reference"})
 
 
 def built(**options):
-    """A small default run, which splits before the fifth step."""
+    """Builds a small default run, which splits before the fifth step."""
     config = TrainConfig(
         steps=16, field_options=("levels=2", "log2_entries=10"), cells=(4,), split_at=(0.25,), width=16,
         rays=32, samples=(8,), evaluations=1, **options,
     )  # fmt: skip
     state = build(config, builtin_scene(12))
-    state.strategy.backend = "reference"  # as on a GPU: torch keeps the samples for a split there
+    state.strategy.backend = "reference"  # as on a GPU, where torch collects the samples of a split
     return state
 
 
 def steps(state, count):
-    train(state, [Callback()], until=state.seconds + count, clock=itertools.count().__next__)  # one by one
+    train(state, [Callback()], until=state.seconds + count, clock=itertools.count().__next__)  # groups of one step
 
 
 def everything(state):
@@ -65,7 +65,7 @@ def everything(state):
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_replays_are_the_same_steps(precision, monkeypatch):
-    """With splits, rates that change, and other numbers of rays."""
+    """Compares replays with eager steps, with splits, changing learning rates and numbers of rays."""
     found, calls, pools = [], [], []
     for as_it_is in (False, True):
         with emulated(), graphs() as seen:
@@ -84,9 +84,9 @@ def test_replays_are_the_same_steps(precision, monkeypatch):
             pools = pools or [pool is not None for pool in seen.pools]
     assert len(found[0]) == len(found[1]) and state.router.num_cells == 4 and len(losses) == 13
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-    # One as it is, one that is captured, and two that are replayed, before the split; and so on.
+    # Before the split: an eager step, a captured step, and two replays; and so on.
     assert calls == [[*captured(2), *captured(3), *captured(3)], []]
-    assert pools == [False, False, True]  # other cells, and other rays
+    assert pools == [False, False, True]  # after a split, and with other numbers of rays
 
 
 def captured(replays):
@@ -100,7 +100,7 @@ PLACES = ("parameter", "gradient", "moment", "grid", "pictures", "centres", "pos
     ("which", "precision"), [*((place, "fp32") for place in PLACES), ("parameter", "bf16"), ("gradient", "bf16")]
 )
 def test_moved_memory_is_captured_anew(which, precision):
-    """The graph goes on with the addresses that it has, so what lies there is held, and no longer used."""
+    """Checks that the old graph's memory is kept alive, since the graph uses fixed addresses."""
     with emulated(), graphs() as seen:
         state = built(precision=precision)
         steps(state, 7)
@@ -135,19 +135,19 @@ def test_what_keeps_a_step_from_it():
         state = built()
         step = state.training_step
         steps(state, 1)
-        assert step.explain() == "step: runs as it is, since no step of its kind was made before"
+        assert step.explain() == "step: runs eagerly, since it needs a warm-up step before the capture"
         step.strategy = Reading({"field": state.router}, [])
         steps(state, 3)
         assert step.explain().endswith(f"since the host waits for the device, in test_graphs.py:{step.strategy.line}")
         step.strategy = None
         step.autocast, step.scaler = torch.float16, torch.amp.GradScaler("cpu")
         steps(state, 1)
-        assert step.explain() == "step: runs as it is, since a GradScaler scales its loss"
+        assert step.explain() == "step: runs eagerly, since a GradScaler scales its loss"
         step.autocast, step.scaler = None, None
         handle = state.router.module.colour.weight.register_hook(lambda slope: None)
         steps(state, 1)
         assert step.explain().endswith(
-            "since a hook of module.colour.weight runs in Python, which a CUDA graph does not make"
+            "since a hook of module.colour.weight runs in Python, which a CUDA graph cannot replay"
         )
         handle.remove()
         step.batches.place = torch.device("meta")
@@ -157,7 +157,7 @@ def test_what_keeps_a_step_from_it():
 
 @pytest.mark.parametrize("photograph", [False, True])
 def test_no_step_is_left_out_for_what_is_behind_the_last_sample(photograph):
-    """A captured step has room for more samples than there are: terms in torch see what lies there, too."""
+    """Checks that terms in torch ignore the spare rows of a captured step, which has room for more samples."""
     with emulated(), graphs() as seen:
         training = Training(cells=2, photograph=photograph)
         training.train(4)
@@ -165,18 +165,18 @@ def test_no_step_is_left_out_for_what_is_behind_the_last_sample(photograph):
 
 
 def test_precision_of_a_traced_field():
-    """Autocast rounds between its layers, so that the operations are separate then."""
+    """Checks that a traced field runs as separate operations under autocast, which rounds between layers."""
     with emulated(), graphs():
         training = Training(field=Scaled, cells=2, fuse=True)
         training.train(4)
         assert training.step.explain() == "step: captured and replayed as a CUDA graph"
         training.step.autocast = torch.bfloat16
         training.train(3)
-        assert training.step.explain() == "step: runs as it is, since Scaled.forward rounds as autocast does"
+        assert training.step.explain() == "step: runs eagerly, since Scaled.forward runs under autocast"
 
 
 def test_another_precision_is_captured_anew():
-    """The step is captured anew where its dtype, its scaler or the caller's autocast changes."""
+    """Checks that a change of dtype, scaler or the caller's autocast causes a new capture."""
     with emulated(), graphs() as seen:
         training = Training(cells=2)
 
@@ -204,14 +204,14 @@ def test_another_precision_is_captured_anew():
 
 
 def test_no_graph_of_autograd_outlives_a_step():
-    """Its nodes would hand gradients to a capture on the stream of an earlier step."""
+    """Checks that autograd tapes are freed; their nodes would run on the stream of an earlier step."""
     with emulated(), graphs() as seen:
         training, alive = Training(cells=2), list[weakref.ref]()
         training.step.autocast = torch.bfloat16
         learn = training.step._learn_scaled
 
         def marked(loss):
-            mark = contextlib.ExitStack()  # an object that can be referred to weakly
+            mark = contextlib.ExitStack()  # supports weak references
             alive.append(weakref.ref(mark))
             loss.grad_fn.metadata["mark"] = mark
             learn(loss)
@@ -223,4 +223,4 @@ def test_no_graph_of_autograd_outlives_a_step():
         finally:
             gc.enable()
         assert len(held) == 4 and "capture" in seen.calls
-        assert len(alive) == 3 and not any(each() is not None for each in alive[:2])  # an emulated graph holds tensors
+        assert len(alive) == 3 and not any(each() is not None for each in alive[:2])  # a graph holds tensors

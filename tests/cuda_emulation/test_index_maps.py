@@ -1,4 +1,4 @@
-"""The index maps of the CUDA kernels (csrc/common/index_maps.h), all of them: every element once, none out of range."""
+"""The index maps of the CUDA kernels (csrc/common/index_maps.h) cover every element once, none out of range."""
 
 import bisect
 import itertools
@@ -7,7 +7,7 @@ from emulated import module
 
 
 def test_a_lanes_sums_are_those_of_the_tile():
-    """A tile [16][8] of mma.sync, and pairs of neighbours, which the kernels write at once."""
+    """Checks that lanes cover a tile [16][8] of mma.sync, in pairs of neighbours that kernels write at once."""
     place = module().accumulator_place
     found = [place(lane, i) for lane in range(32) for i in range(4)]
     assert sorted(found) == list(itertools.product(range(16), range(8)))
@@ -18,14 +18,14 @@ def test_a_lanes_sums_are_those_of_the_tile():
 
 
 def test_a_tile_is_of_the_cell_that_counts_it():
-    """Every way in which up to four cells have up to three tiles each."""
+    """Checks all combinations of up to four cells with up to three tiles each."""
     for cells in range(1, 5):
         for tiles in itertools.product(range(4), repeat=cells):
             first = [0, *itertools.accumulate(tiles)]
             owners = [cell for cell, count in enumerate(tiles) for _ in range(count)]
             found = [module().last_not_above(first, cells, tile) for tile in range(first[-1])]
             assert found == owners
-    for cells in (31, 32, 33, 70, 1024, 1025, 2100):  # a probe for each, and several for some
+    for cells in (31, 32, 33, 70, 1024, 1025, 2100):  # one or several rounds of probes
         tiles = [cell * 7 % 3 for cell in range(cells)]
         first = [0, *itertools.accumulate(tiles)]
         owners = [cell for cell, count in enumerate(tiles) for _ in range(count)]

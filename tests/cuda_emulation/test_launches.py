@@ -1,4 +1,4 @@
-"""What a training step asks of a GPU, counted without one: launches, and reads of the host, which wait for it."""
+"""Counts the launches of a training step on a GPU, and its blocking reads by the host, without a GPU."""
 
 import itertools
 
@@ -12,7 +12,7 @@ from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
 
 LAUNCHES, READS = 23, 0
-"""Of a default step. The launches go down only."""
+"""The launches of a default step; the number may only be lowered."""
 
 
 def test_what_is_asked_is_counted():
@@ -30,15 +30,15 @@ def test_what_is_asked_is_counted():
 
 @pytest.fixture
 def on_device(monkeypatch):
-    """Tensors of the emulation say that they are on a GPU."""
+    """Makes tensors of the emulation report a CUDA device."""
     monkeypatch.setattr(torch.Tensor, "is_cpu", False)
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
 
 
 def trained(steps, monkeypatch, *, empty=False):
-    """A small default run after some steps, and the output of the last; the split is before the fifth step.
+    """Runs some steps of a small default run; returns its state and the last output. It splits before the fifth step.
 
-    ``empty``: most of space is. What a GPU's host reads at every fiftieth step alone is never read.
+    ``empty`` leaves most of space empty. The GPU host's reads at every fiftieth step do not occur.
     """
     config = TrainConfig(
         steps=16, field_options=("levels=2", "log2_entries=10"), cells=(4,), split_at=(0.25,), width=16,
@@ -50,14 +50,14 @@ def trained(steps, monkeypatch, *, empty=False):
         if empty:
             for table in (state.sampler.grid.density, state.sampler.grid.occupied):
                 table[:, :, 8:] = 0
-            state.step = 1  # voxels are evaluated again at the first step
-        train(state, [Callback()], until=steps - state.step, clock=itertools.count().__next__)  # one by one
+            state.step = 1  # the first step re-evaluates voxels
+        train(state, [Callback()], until=steps - state.step, clock=itertools.count().__next__)  # groups of one step
     return state, outputs[-1]
 
 
 @pytest.mark.native
 def test_rows_beyond_the_samples_change_nothing(monkeypatch, request):
-    """With one cell and with four: the host knows the number of samples, or the device alone."""
+    """Compares runs in which the host knows the number of samples, or only the device; with one and four cells."""
     found = []
     for known in (True, False):
         if not known:
@@ -68,17 +68,17 @@ def test_rows_beyond_the_samples_change_nothing(monkeypatch, request):
         assert (rows is None) == known and state.router.num_cells == 4
         reservoir = state.strategy.reservoir.samples()[1]
         found.append([*state.router.parameters(), state.sampler.grid.density, reservoir])
-    assert 0 < int(rows) < 32 * 8  # some rows were beyond
+    assert 0 < int(rows) < 32 * 8  # some rows have no sample
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
     monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 1)
     state.read_output(output)
-    assert 32 < state.rays <= 256  # as many more as the samples left out allow
+    assert 32 < state.rays <= 256  # empty space allows more rays
 
 
 @pytest.mark.native
 def test_a_default_step(monkeypatch, on_device):
-    """After the last split, without the cells that are looked at again every sixteenth step."""
+    """Counts a step after the last split, without the voxel evaluation of every sixteenth step."""
     with emulated():
         state, _ = trained(6, monkeypatch)
     monkeypatch.setattr(State, "read_output", lambda state, output: None)

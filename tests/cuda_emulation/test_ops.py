@@ -1,6 +1,6 @@
-"""Look-ups and sorts by the CUDA kernels on the CPU, with threads in three orders, against the reference.
+"""Lookups and sorts on the emulated CUDA kernels, with threads in three orders, against the reference.
 
-Sizes are small: a block of 256 threads is 256 fibers. The tests of the operations themselves run in test_emulation.py.
+Sizes are small: a block of 256 threads is 256 fibers. test_emulation.py runs the tests of the operations.
 """
 
 import pytest
@@ -33,7 +33,7 @@ def both(op, *args, **options):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_look_ups(dtype):
     for n, k in ((0, 3), (1, 1), (300, 17), (270, 700)):
-        # Integers: many ties, which go to the lowest index.
+        # Integers give many ties, which the lowest index wins.
         points, centres = (torch.randint(-3, 4, (count, 3)).to(dtype) for count in (n, k))
         assert torch.equal(*both(voronerf.nearest_centre, points, centres))
         assert torch.equal(*both(voronerf.nearest_centre, points, centres, index=index_centres(centres)))
@@ -55,7 +55,7 @@ SIZES = [(0, 2), (1, 1), (33, 5), (5000, 3), (4200, 600), (2100, 1022), (2100, 1
 
 
 def sorted_by(way, cells, k):
-    """Into memory that is poisoned."""
+    """Sorts into poisoned memory."""
     order, offsets = torch.full_like(cells, -7), torch.full((k + 1,), -7, dtype=torch.int32)
     sort_cells(cells, order, offsets, "cell_sort", way)
     return order, offsets
@@ -65,7 +65,7 @@ def sorted_by(way, cells, k):
 @pytest.mark.parametrize(("n", "k"), SIZES)
 def test_cell_sort(n, k, way):
     if way == "counting" and k > 1022:
-        with pytest.raises(RuntimeError, match="cell_sort: too many cells to be counted in shared memory"):
+        with pytest.raises(RuntimeError, match="cell_sort: too many cells for counting in shared memory"):
             sorted_by(way, torch.zeros(n, dtype=torch.int32), k)
         return
     cells = torch.randint(0, k, (n,), dtype=torch.int32)
@@ -80,7 +80,7 @@ def test_cell_sort_keeps_cells_that_are_none_at_the_ends(way, k):
     low, high = -(2**31), 2**31 - 1
     cells = torch.tensor([2, -1, 0, k, 1, low, high, k - 1, 65_536, -65_536, 1], dtype=torch.int32)
     order, offsets = sorted_by(way, cells, k)
-    # A stray among the others is one that a key cut to 16 bits would put into a cell.
+    # One invalid cell would become valid if its key were cut to 16 bits.
     keys = cells.clamp(-1, k)
     assert torch.equal(order.long(), keys.sort(stable=True).indices)
     assert torch.equal(offsets, (keys[None] < torch.arange(k + 1)[:, None]).sum(1).int())
@@ -111,7 +111,7 @@ def test_adam_leaves_out_a_step_that_is_not_finite(spoilt):
 
 
 def test_tables_and_gradients_that_are_not_aligned():
-    """Features are loaded several at a time, from multiples of 16 bytes: what begins elsewhere is copied."""
+    """Checks misaligned tables and gradients, which are copied because vector loads need multiples of 16 bytes."""
     grid, positions = voronerf.HashGrid(levels=2, features=4, log2_entries=10, finest=20), torch.rand(50, 3)
     table, gradient = torch.rand(grid.table_shape), torch.rand(50, 8)
     moved = [torch.cat([torch.zeros(1), x.flatten()])[1:].view(x.shape) for x in (table, gradient)]
@@ -132,7 +132,7 @@ def test_tables_and_gradients_that_are_not_aligned():
 
 @pytest.mark.parametrize("op", ["hash_encode", "grouped_mlp"])
 def test_atomic_sums_are_refused_where_deterministic_algorithms_are_asked_for(op):
-    """Of a table that is looked up by itself, and inside of a network."""
+    """Checks a table that is looked up directly, and inside a network."""
     grid = voronerf.HashGrid(levels=2, features=2, log2_entries=10, finest=20)
     table, positions = torch.rand(grid.table_shape, requires_grad=True), torch.rand(9, 3)
     if op == "hash_encode":

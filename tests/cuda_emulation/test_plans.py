@@ -1,4 +1,4 @@
-"""How cell_sort runs: which way, and what lies where in its workspace."""
+"""The plans of cell_sort: the kind of sort, and the layout of the workspace."""
 
 import itertools
 
@@ -18,7 +18,7 @@ def test_few_cells_are_counted_and_many_sorted_by_radix(k):
         assert module().cell_sort_plan(n, k, AUTOMATIC, 0)["radix"] == (k > 1022)
         assert module().cell_sort_plan(n, k, RADIX, 0)["radix"]
     if k > 1022:
-        refuses("too many cells to be counted", module().cell_sort_plan, 1, k, COUNTING, 0, error=RuntimeError)
+        refuses("too many cells for counting", module().cell_sort_plan, 1, k, COUNTING, 0, error=RuntimeError)
 
 
 @pytest.mark.parametrize("k", CELLS)
@@ -35,7 +35,7 @@ def test_parts_of_the_workspace_lie_side_by_side(way, k):
         if plan["radix"]:
             sizes = [n * plan["key_bytes"], n * plan["key_bytes"], 4 * n, temporary]
         else:
-            # Whole blocks of eight chunks, and none of no rows.
+            # Full blocks of eight chunks, which cover all rows.
             assert plan["chunks"] % 8 == 0 and plan["chunks"] * plan["chunk_rows"] >= n
             assert n > (plan["chunks"] - 8) * plan["chunk_rows"]
             counts = plan["chunks"] * (k + 2)

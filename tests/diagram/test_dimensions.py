@@ -159,5 +159,5 @@ def test_coords_must_be_as_many_as_the_centres_have(generator: torch.Generator) 
     with pytest.raises(ValueError, match=r"coords must have shape \[..., 2\], got \[9, 3\]"):
         router(torch.rand(9, 2), coords=torch.rand(9, 3))
     router.coords = "first3"
-    with pytest.raises(ValueError, match=r"what coords='first3' takes .* must have shape \[..., 2\]"):
+    with pytest.raises(ValueError, match=r"coords='first3' of the first tensor.* must have shape \[..., 2\]"):
         router(torch.rand(9, 4))

@@ -106,7 +106,7 @@ def test_the_reference_where_sums_do_not_rise(monkeypatch):
     sums = padded.cumsum(1)
     assert bool((sums[:, -1] > sums[:, 8]).any())
     leaves = draw_cell(points, centres, offsets, child, uniforms, 1.0)
-    # The last of the seven leaves, or by rounding the one before it.
+    # Each point draws the last of the seven leaves or, because of rounding, the leaf before it.
     assert int(leaves.min()) >= 5 and int(leaves.max()) == 6
 
 

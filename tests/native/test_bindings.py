@@ -46,7 +46,7 @@ def test_what_does_not_fit_a_signature_is_refused() -> None:
     with pytest.raises(TypeError, match="incompatible function arguments"):  # a result that is not contiguous
         compiled.nearest_centre(points, points, None, torch.empty(8, dtype=torch.int32)[::2], 4, 4, 3, 0, cpu)
     sizes = {"encoding": "frequency", "n": 4, "d": 3, "size": 1, "include_input": True, "width": 9}
-    with pytest.raises(TypeError, match=r"^Encoding: x is no const float32\*$"):
+    with pytest.raises(TypeError, match=r"^Encoding: x is not of type const float32\*$"):
         compiled.encode(compiled.Encoding(x=points.double(), variances=None, **sizes), torch.empty(4, 9), cpu)
     refuses("unexpected keyword argument 'y'", compiled.Encoding, y=points, variances=None, **sizes, error=TypeError)
 
@@ -64,7 +64,7 @@ def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(FUNCTIONS, "cube", Function(lambda x, a, b: x**3))
     b = Builder()
     program = b.program([b.apply("cube", b.input(3))])
-    with pytest.raises(TypeError, match="ProgramStep: function is no ProgramFunction"):
+    with pytest.raises(TypeError, match="ProgramStep: function is not of type ProgramFunction"):
         lowering.lower(program.text)
 
 

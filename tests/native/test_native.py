@@ -291,7 +291,7 @@ def test_peak_of_each_kind(isa: str) -> None:
     if isa in ("avx512_bf16", "amx"):
         assert _native.measure_peak("bfloat16", isa=isa, threads=1) > 1e8
     else:
-        with pytest.raises(ValueError, match=r"^measure_peak: kind must be one that the instruction set has, got bfl"):
+        with pytest.raises(ValueError, match=r"^measure_peak: the instruction set has no bfloat16 products"):
             _native.measure_peak("bfloat16", isa=isa)
 
 
@@ -299,8 +299,8 @@ def test_bfloat16_is_multiplied_in_what_is_faster(monkeypatch: pytest.MonkeyPatc
     monkeypatch.delenv("VORONERF_ISA", raising=False)
     monkeypatch.setattr(_native, "SUPPORTED_ISAS", ("portable", "avx512", "avx512_bf16"))
     for gain, chosen, text in [
-        (0.49, "avx512", "in float32: bfloat16 makes 0.49 x the operations of float32"),
-        (2.0, "avx512_bf16", "in bfloat16: bfloat16 makes 2 x the operations of float32"),
+        (0.49, "avx512", "in float32: bfloat16 has 0.49 times the throughput of float32"),
+        (2.0, "avx512_bf16", "in bfloat16: bfloat16 has 2 times the throughput of float32"),
     ]:
         monkeypatch.setattr(_native, "_bfloat16_gain", gain)
         assert _native._choose_isa() == chosen
@@ -315,7 +315,7 @@ def test_bfloat16_is_multiplied_in_what_is_faster(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("VORONERF_ISA", "avx512")  # forced
     assert _native._choose_isa() == "avx512"
     monkeypatch.setattr(_native, "_bfloat16_gain", 0.0)
-    assert _native.describe()["bfloat16 products"] == "in float32: this processor, or this build, has none"
+    assert _native.describe()["bfloat16 products"] == "in float32: the processor or the build has no bfloat16 products"
 
 
 def test_the_gain_of_bfloat16_is_the_same_each_time() -> None:

@@ -140,7 +140,7 @@ def test_cameras_that_come_of_others_share_their_tables():
 
 def test_tables_are_bounded(monkeypatch):
     monkeypatch.setattr(lenses, "MOST_BYTES", 3 * 30 * 20 * 8 - 1)
-    message = "the ray tables of 3 lenses of 30 x 20 pixels take 0.0 GiB, at most 0 GiB; reduce"
+    message = "the ray tables of 3 lenses of 30 x 20 pixels take 0.0 GiB, the limit is 0 GiB; reduce"
     refuses(message, getattr, mixed(), "lenses")
 
 

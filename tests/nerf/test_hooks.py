@@ -320,7 +320,7 @@ def test_no_behaviour_of_a_subclass_is_passed_over():
     assert in_python(strategy(training, Mixed), "step_post_backward")
     training.step.loss = Called(training.loss.renderer)
     training.train(5)
-    assert training.step.loss.calls == 5 and "Called may do in Python" in training.step.explain()
+    assert training.step.loss.calls == 5 and "Called may run Python code" in training.step.explain()
 
 
 @pytest.mark.parametrize(

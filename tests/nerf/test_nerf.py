@@ -85,7 +85,7 @@ def test_empty_batch():
         ({"depth": 0}, "depth must be at least 1, got 0"),
         ({"density_scale": 0.0}, "density_scale must be positive, got 0.0"),
         ({"position_octaves": -1}, "octaves must not be negative"),
-        ({"skips": (-1,)}, "skips must be trunk layers with another behind"),
+        ({"skips": (-1,)}, "skips must be indices of trunk layers before the last"),
         ({"depth": 4, "skips": (3,)}, "0..2, got (3,)"),
     ],
 )

@@ -163,4 +163,4 @@ def test_refusals():
     refuses("Stratified: samples must be >= 1, got 0", Stratified, 0)
     refuses("Hierarchical: fine_samples must be >= 1, got 0", Hierarchical, 3, 0)
     for space in (Space(sphere), Space(cones=True)):
-        refuses("grid must be of points, and in the space of the contraction", Occupancy, grid, 3, space=space)
+        refuses("grid requires point samples and the same contraction as the space", Occupancy, grid, 3, space=space)

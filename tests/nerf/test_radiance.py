@@ -206,7 +206,7 @@ def test_colours_that_would_learn_are_refused(monkeypatch):
     _, field = make("relu")
     for loss in losses(field, monkeypatch):
         batch = replace(batch_of(), background=torch.ones(3, requires_grad=True))
-        with pytest.raises(ValueError, match="RayLoss: background must need no gradient"):
+        with pytest.raises(ValueError, match="RayLoss: background must not require a gradient"):
             loss(batch)
 
 
@@ -342,7 +342,7 @@ def test_what_keeps_a_field_from_the_fast_step():
             return colour, density + F.embedding(positions[:, 0].long().abs() % 2, self.colour.weight[:, :1])[:, 0]
 
     centres, arguments = torch.rand(3, 3), {"coords": "first3", "way": "fused"}
-    assert why(lambda *arguments: make("table")[1](*arguments)) == "the field is a function, no router"
+    assert why(lambda *arguments: make("table")[1](*arguments)) == "the field is a function, not a VoronoiRouter"
     router, field = make("relu")
     assert why(field, first=False) == "Foreign.forward is traced at its first call"
     assert why(field) is None
@@ -354,14 +354,14 @@ def test_what_keeps_a_field_from_the_fast_step():
     looked = why(DirectionPerSample(VoronoiRouter(Looked(), centres, **arguments, fuse=True)))
     assert looked.startswith("Looked.forward is not one program: ") and "between them" in looked
     moved = DirectionPerSample(VoronoiRouter(Foreign(), centres, fuse=True, coords=lambda x, d: x + 1))
-    assert why(moved) == "other positions than those of the samples decide the cells"
+    assert why(moved) == "positions other than the samples' decide the cells"
     shared = DirectionPerSample(VoronoiRouter(Foreign(), centres, **arguments, fuse=True, share=["*"]))
     assert why(shared) == "all cells share all parameters"
     table, field = make("table")
     table.module.view.register_forward_hook(lambda module, args, output: output)
-    assert why(field) == "NeRF does more than its program says"
+    assert why(field) == "NeRF computes more than its program"
     cones = VoronoiRouter(MipNeRF(width=8, depth=1), centres)
-    assert why(cones, first=False) == "the field takes 6 numbers for a sample, and there are 3"
+    assert why(cones, first=False) == "the field takes 6 numbers per sample, got 3"
 
 
 def test_explains_the_step_in_one_way(monkeypatch):

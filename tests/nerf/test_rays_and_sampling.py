@@ -151,5 +151,5 @@ def test_the_last_rays_of_a_batch_may_be_triples_from_elsewhere():
     assert torch.equal(other.rays.origins[90:100], other.rays.origins[110:])
     apart = (other.rays.directions[90:100] - other.rays.directions[110:]).norm(dim=1)
     assert float(apart.min()) > 0 and float(apart.max()) < 0.15 * 3**0.5
-    message = "RayBatches: unseen must be 0 with a box, which rays from elsewhere may miss, got 0.3"
+    message = "RayBatches: unseen must be 0 with a box, since unseen rays may miss it, got 0.3"
     refuses(message, RayBatches, cameras, images, near=1.0, far=3.0, box=BOX, unseen=0.3)

@@ -143,14 +143,14 @@ def test_a_number_of_rows_that_is_no_count_is_refused():
     points, centres = torch.rand(6, 3), torch.rand(5, 3)
     with Recording() as recording:
         nearest_centre(points, centres)
-    assert recording.obstacle == "a number of rows lies in no memory, 6"
+    assert recording.obstacle == "a row count is a plain int that a replay cannot read again: 6"
     with Recording() as recording:
         taken = recording.take(points)
         taken.new_empty(taken.shape)
-    assert recording.obstacle.startswith("new memory of 6 rows is not counted, in test_step.py:")
+    assert recording.obstacle.startswith("memory of 6 rows was allocated without a RowCount, in test_step.py:")
     with Recording() as recording:
         spherical_harmonics(recording.take(points), 2)
-    assert recording.obstacle == "encode takes no number of rows that is counted"
+    assert recording.obstacle == "encode has no RowCount among its arguments"
 
 
 def test_torch_entry_by_entry_is_computed_again():
@@ -315,13 +315,13 @@ def test_recordings_that_are_never_replayed_are_made_less_often():
         new_data(training.batches.images)
         training.train(1)
         said.append(training.step.explain())
-    assert training.recorded < 8 and any("runs as it is 3 times more" in text for text in said), said
+    assert training.recorded < 8 and any("runs eagerly for 3 more steps" in text for text in said), said
     training.train(8)
     assert "recorded and replayed" in training.step.explain()
 
 
 def test_gradients_that_were_dropped_are_given_back():
-    """Dropped gradients come back, also if a loop has replaced a gradient, or set one where there was none."""
+    """After gradients were set to None, a step restores its tensors, even if a loop replaced or added a gradient."""
     one, other = Training(), Training()
     for training, as_it_is in ((one, False), (other, True)):
         list(training.router.parameters())[-2].requires_grad_(False)
@@ -385,7 +385,7 @@ def test_a_second_optimizer_learns(field):
         moved.append(values)
         prefix = "network.module." if field else "module."
         if not as_it_is:
-            says = f"step: runs as it is, since {prefix}{name} needs a gradient and is not the optimizer's"
+            says = f"step: runs eagerly, since {prefix}{name} needs a gradient but is not in the optimizer"
             assert training.step.explain() == says
             parameter.requires_grad_(False)
             training.train(2)
@@ -440,7 +440,7 @@ class Torch(torch.nn.Module):
 def test_a_field_of_torch_runs_as_it_is():
     training = Training(cells=2, field=Torch)
     training.train(8)
-    assert "runs as it is, since Torch.forward is not traced without fuse=True" in training.step.explain()
+    assert "runs eagerly, since Torch.forward is not traced without fuse=True" in training.step.explain()
     assert training.recorded == 0 and int(training.guard.skipped) == 0
 
 
@@ -474,7 +474,7 @@ def test_torch_in_a_step_is_named_and_tried_no_longer():
     training.step.strategy = Keeping(*arguments, generator=torch.Generator().manual_seed(0))
     training.train(8)
     explained = training.step.explain()
-    assert explained == f"step: runs as it is, since torch computes sum, in {__file__.split('/')[-1]}:{Keeping.line}"
+    assert explained == f"step: runs eagerly, since torch computes sum, in {__file__.split('/')[-1]}:{Keeping.line}"
     before = training.recorded
     training.train(100)
     assert training.recorded <= before + 7
@@ -486,7 +486,7 @@ def test_a_profiler_sees_the_operations():
     with torch.profiler.profile() as profile:
         training.train(2)
     assert any("voronerf::" in event.name for event in profile.events())
-    assert "watches" in training.step.explain()
+    assert "profiler of torch is active" in training.step.explain()
     training.train(3)
     assert "replayed" in training.step.explain()
 

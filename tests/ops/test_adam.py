@@ -78,17 +78,15 @@ def test_refuses_what_would_be_read_out_of_bounds():
         "adam: gradient must have shape [], got [2]": {"gradients": [torch.ones(2)]},
         "adam: mean must have shape [], got [1]": {"means": [torch.ones(1)]},
         "adam: square must have shape [], got [0]": {"squares": [torch.ones(0)]},
-        "adam: gradients must be as many as the 1 rules, got 2": {"gradients": 2 * [torch.ones(())]},
-        "adam: parameters must be as many as the 1 rules, got 0": {"parameters": []},
+        "adam: gradients must have length 1 like rules, got 2": {"gradients": 2 * [torch.ones(())]},
+        "adam: parameters must have length 1 like rules, got 0": {"parameters": []},
         "adam: step must have shape [], got [1]": {"rules": [rule._replace(step=torch.zeros(1))]},
         "adam: loss must come with a guard, got none": {"loss": torch.ones(())},
         "adam: found must have shape [], got [3]": {"guard": Guard(*torch.ones(3, 3))},
         "adam: loss must have shape [], got [1]": {"guard": Guard.on("cpu"), "loss": torch.ones(1)},
         "adam: epsilon must be positive, got 0.0": {"rules": [rule._replace(epsilon=0.0)]},
         "adam: betas must lie in [0, 1), got (0.9, 1.0)": {"rules": [rule._replace(betas=(0.9, 1.0))]},
-        "adam: square must be a tensor of its own (clone), got a negative view": {
-            "squares": [torch._neg_view(torch.ones(()))]
-        },
+        "adam: square must not be a negative view: clone it": {"squares": [torch._neg_view(torch.ones(()))]},
     }
     for message, changed in wrong.items():
         with refused(ValueError, message):

@@ -45,7 +45,8 @@ def test_a_struct_with_other_members_is_refused_at_once():
     kind = namedtuple("CellInputs", ["cells", "n", "threads"])
     op = declared("cell_sort")
     with pytest.raises(
-        NameError, match=r"cell_sort: CellInputs must have members of its declaration, got \['threads'\]"
+        NameError,
+        match=r"cell_sort: CellInputs must only have members that are arguments, letters or results, got \['threads'\]",
     ):
         op.inputs(kind)
     cells = torch.zeros(5, dtype=torch.int32)

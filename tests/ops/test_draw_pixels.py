@@ -102,10 +102,10 @@ def test_forged_runs_are_refused(change, message):
 def test_runs_that_do_not_fit_each_other_are_refused_where_they_are_made():
     runs = runs_of([2, 10, 50], [7, 100, 3])
     assert Runs(*runs) == runs
-    rising = "Runs: ends must rise from 1 or more to the total, 110, got "
+    rising = "Runs: ends must ascend from at least 1 to the total, 110, got "
     for ends in ([100, 7, 110], [7, 7, 110], [0, 107, 110], [7, 107, 111]):
         refuses(f"{rising}{ends}", Runs, torch.tensor(ends), *runs[1:])
-    refuses("Runs: ends must rise from 1 or more to the total, 9, got [7, 7, 9]", runs_of, [2, 10, 50], [7, 0, 2])
-    places = f"Runs: first must hold the run of each {1 << runs.bits}th of 110 pixels, got "
+    refuses("Runs: ends must ascend from at least 1 to the total, 9, got [7, 7, 9]", runs_of, [2, 10, 50], [7, 0, 2])
+    places = f"Runs: first must hold the run of every {1 << runs.bits}th of the 110 pixels, got "
     for first in (runs.first + 3, runs.first[:1], runs.first.flip(0)):
         refuses(f"{places}{first.tolist()}", Runs, runs.ends, runs.shift, first, runs.bits, runs.total)

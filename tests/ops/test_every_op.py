@@ -340,7 +340,7 @@ def test_refuses_offsets_that_are_no_offsets(op, backend):
             for place, wrong in ((0, -1), (last // 2, int(arguments[name][-1]) + 1), (last, 1000)):
                 bad = arguments[name].clone()
                 bad[place] = wrong
-                with pytest.raises(ValueError, match=rf"^\S+: {name} must rise[ ,].* number of .*, got "):
+                with pytest.raises(ValueError, match=rf"^\S+: {name} must ascend within 0 to .* number of .*, got "):
                     getattr(ops, case.call or op)(**{**arguments, name: bad}, backend=backend)
 
 

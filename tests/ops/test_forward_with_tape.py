@@ -192,13 +192,13 @@ def test_refuses_a_program_that_makes_no_sense(backend):
         "network must hold program, inputs and parameters, got no inputs": {"inputs": ...},
         "program must be a Program, got str": {"program": "x"},
         "unknown arguments layers": {"layers": TABLE},
-        "parameters must be 4 tensors (inputs at least one), got 1": {"parameters": arguments["parameters"][:1]},
+        "parameters must have 4 tensors, got 1": {"parameters": arguments["parameters"][:1]},
         "parameters[1] must have shape [k, 3, 10] with k = 3, got [2, 3, 10]": {
             "parameters": [arguments["parameters"][0], torch.ones(2, 3, 10), *arguments["parameters"][2:]]
         },
         "ray_index must be given for a program with inputs of rays, got None": {"ray_index": None},
         "frozen must have shape [k] with k = 3, got [2]": {"frozen": torch.zeros(2, dtype=torch.bool)},
-        "program must have one output [n, w] and inputs[0] [n, w], got others": {
+        "program must have one output [n, w], and inputs[0] with one row for each sample": {
             "program": replace(arguments["program"], outputs=2 * arguments["program"].outputs)
         },
     }

@@ -298,7 +298,7 @@ def test_refuses_what_is_no_program() -> None:
     rows, parameters, _ = arguments(every_step(), [6], torch.float32)
     for offsets in ([0, 7], [0, 3, 2], [-1, 6]):
         for backend in ("native", "reference"):
-            with pytest.raises(ValueError, match="grouped_program: offsets must rise from 0 or more to at most"):
+            with pytest.raises(ValueError, match="grouped_program: offsets must ascend within 0 to"):
                 wrong = torch.tensor(offsets, dtype=torch.int32)
                 grouped_program(rows, [p[:1] for p in parameters], wrong, program=every_step(), backend=backend)
 
@@ -324,7 +324,7 @@ def test_a_spread_parameter_in_what_a_linear_step_adds_is_refused():
     (linear,) = (step for step in program.steps if step.op == "linear")
     assert not linear.operands[1].spread  # the builder expands it to columns
     steps = tuple(step._replace(operands=(x, added)) if step is linear else step for step in program.steps)
-    rule = "Program: steps must be without spread columns in what a linear one adds, got Step(op='linear'"
+    rule = "Program: steps must be without spread columns in the addends of a linear step, got Step(op='linear'"
     refuses(rule, replace, program, steps=steps)
 
 
@@ -636,14 +636,14 @@ def test_refuses_rays_that_do_not_fit() -> None:
 def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
     """Every rule about encodings has its message."""
     program = encoded()
-    refuses("Program: rays must be numbers of inputs, each once, got (3,)", replace, program, rays=(3,))
-    refuses("Program: rays must be numbers of inputs, each once, got (2, 2)", replace, program, rays=(2, 2))
-    rule = "numbers of outputs, each once, of a program with rays"
+    refuses("Program: rays must be distinct indices of inputs, got (3,)", replace, program, rays=(3,))
+    refuses("Program: rays must be distinct indices of inputs, got (2, 2)", replace, program, rays=(2, 2))
+    rule = "distinct indices of outputs, in a program with per-ray inputs"
     refuses(f"Program: by_ray must be {rule}, got (2,)", replace, program, by_ray=(2,))
     refuses(f"Program: by_ray must be {rule}, got (1,)", replace, program, rays=())
     for grids in (("x",), ("{}",), (7,), ("[1]",), ("null",), GRID.text):
         refuses("Program: grids must be texts of hash grids, got ", replace, program, grids=grids)
-    refuses("Program: steps must be of values, parameters and sums that are there, got ", replace, program, grids=())
+    refuses("Program: steps must be made of existing values, parameters and sums, got ", replace, program, grids=())
     place, hashed = next((i, step) for i, step in enumerate(program.steps) if step.name == "hash")
 
     def changed(**fields: object) -> tuple[Step, ...]:
@@ -665,21 +665,23 @@ def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
         {"name": "spherical", "numbers": (5, 0, 0, 0)},
         {"name": "frequency", "numbers": (1, 1, 0, 0)},
     ):
-        refuses("Program: steps must be of values", replace, program, steps=changed(**fields))
+        refuses("Program: steps must be made of existing", replace, program, steps=changed(**fields))
     # A step reads a table only as a table, and a sum has one layout.
     b = Builder(program)
-    refuses("Program: steps must be of values", b.program, [b.binary("mul", of_a_ray, Columns(PARAMETER, 0, 0, 3))])
-    refuses("Program: outputs must be of values", replace, program, outputs=(Columns(PARAMETER, 0, 0, 3),))
+    refuses(
+        "Program: steps must be made of existing", b.program, [b.binary("mul", of_a_ray, Columns(PARAMETER, 0, 0, 3))]
+    )
+    refuses("Program: outputs must be made of existing", replace, program, outputs=(Columns(PARAMETER, 0, 0, 3),))
     first = gradient(program, *ALL)
     scatter = next(step for step in first.steps if step.op == "scatter")
     column = Step("columns", scatter.out, 3, (of_a_ray,), (0,))
     for steps in ((*first.steps, column), (first.steps[0], column._replace(out=scatter.out), *first.steps[1:])):
-        refuses("Program: steps must be of values", replace, first, steps=steps)
+        refuses("Program: steps must be made of existing", replace, first, steps=steps)
     # G_1 must read the encoding of its own x.
     back = next(step for step in first.steps if step.op == "encode" and step.numbers[3] and step.name == "hash")
     wrong = back._replace(operands=(*back.operands[:2], back.operands[1]))
     steps = tuple(wrong if step == back else step for step in first.steps)
-    refuses("Program: steps must be of values", replace, first, steps=steps)
+    refuses("Program: steps must be made of existing", replace, first, steps=steps)
 
 
 def test_texts_of_programs() -> None:

@@ -190,7 +190,7 @@ def test_errors():
         ({"features": 3}, "HashGrid: features must be 1, 2, 4 or 8, got 3"),
         ({"base": 64, "finest": 32}, "HashGrid: base and finest must be 1 <= base <= finest <= 2^20, got 64 and 32"),
         ({"finest": math.nan}, "HashGrid: base and finest must be 1 <= base <= finest <= 2^20, got 16 and nan"),
-        ({"box": ((0, 0, 0), (1, 0, 1))}, "HashGrid: box must be two corners ... got ((0, 0, 0), (1, 0, 1))"),
+        ({"box": ((0, 0, 0), (1, 0, 1))}, "HashGrid: box must be two corners, ... got ((0, 0, 0), (1, 0, 1))"),
         ({"interpolation": "cubic"}, "HashGrid: interpolation must be one of linear, smoothstep, got 'cubic'"),
         ({"convention": "ngp"}, "HashGrid: convention must be one of tiny-cuda-nn, ... nerfstudio, got 'ngp'"),
     ],

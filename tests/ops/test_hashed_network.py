@@ -176,7 +176,8 @@ def test_errors():
         grouped_mlp(x[:, :2], offsets, weights, biases, features=features, **arguments)
     with refused(ValueError, f"routed_mlp: features must be None for layers without a hash grid, got [{e}, 2]"):
         routed_mlp(x.repeat(1, 3), weights, biases, **{**arguments, "layers": table_of(None)}, features=features)
-    with refused(ValueError, "MLP: grid must come with the hash encoding, and without position_octaves, got hash ..."):
+    rule = 'MLP: grid must be set if and only if position_encoding is "hash", without position_octaves'
+    with refused(ValueError, f"{rule}, got hash ..."):
         MLP((Layer(("positions",), 4),), (0,), position_encoding="hash")
 
 

@@ -132,12 +132,13 @@ def test_errors():
     for backend in ("reference", "auto"):
         refuses("centres must have shape [k, d], d = 1 to 4, got [2, 5]", **many, backend=backend)
     if (other := index_centres(torch.rand(20, 3))) is not None:
-        refuses("index must be of these centres, float32 [2, 3], got int32 [240]", index=other)
-        refuses("index must be of these centres, float32 [2, 3], got int32 [0]", index=other[:0])
+        refuses("index must belong to these centres, float32 [2, 3], got int32 [240]", index=other)
+        refuses("index must belong to these centres, float32 [2, 3], got int32 [0]", index=other[:0])
         many = {"points": points, "centres": torch.rand(25, 3)}
-        refuses("index must be of these centres, float32 [25, 3], got one of float32 [20, 3]", index=other, **many)
+        rule = "index must belong to these centres, float32 [25, 3]"
+        refuses(f"{rule}, got an index of float32 [20, 3]", index=other, **many)
         double = {"points": points.double(), "centres": centres.double()}
-        refuses("index must be of these centres, float64 [2, 3], got int32 [64]", index=other[:64], **double)
+        refuses("index must belong to these centres, float64 [2, 3], got int32 [64]", index=other[:64], **double)
     for kind, arguments, message in (
         (ValueError, torch.rand(0, 3), "index_centres: centres must hold at least one centre, got none"),
         (ValueError, torch.rand(3), "index_centres: centres must have shape"),

@@ -42,7 +42,7 @@ def test_inference_tensors(backend):
         inside = composite(background=background, backend=backend)
     assert inside.colour.isfinite().all() and composite(background=background).colour.isfinite().all()
     points = POINTS.clone().requires_grad_()
-    message = "grouped_linear: offsets must be a copy where gradients are recorded, got an inference tensor"
+    message = "grouped_linear: offsets must not be an inference tensor while gradients are recorded: clone it"
     refuses(message, ops.grouped_linear, points, offsets, weight.clone(), backend=backend, error=TypeError)
     with torch.no_grad():
         ops.grouped_linear(points, offsets, weight, backend=backend)
@@ -84,4 +84,4 @@ def test_runs_that_are_not_of_the_samples_are_refused(op, backend):
         arguments = {**call, "samples": call["samples"]._replace(run_offsets=change.int())}
         if op == "run_gradients":
             arguments["answers"] = torch.zeros(len(change) - 1, 6)
-        refuses(f"{op}: run_offsets must rise from 0 to the", getattr(ops, op), **arguments, backend=backend)
+        refuses(f"{op}: run_offsets must strictly ascend from 0 to", getattr(ops, op), **arguments, backend=backend)

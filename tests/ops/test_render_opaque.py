@@ -122,7 +122,7 @@ def test_what_is_of_the_samples_is_refused():
         render_opaque(**{**arguments, "network": {"program": 3, "parameters": []}})
     layers = MLP((Layer(("positions",), 3),), outputs=(0,))
     program = {"program": layers.program(3, 0, None, (False,)), "parameters": [torch.zeros(1, 3, 3)]}
-    with refused(ValueError, "render_opaque: program must put out 4 numbers, colour and density, got 3"):
+    with refused(ValueError, "render_opaque: program must have outputs of 4 numbers, colour and density, got 3"):
         render_opaque(**{**arguments, "network": program})
     wide = {**arguments["network"], "parameters": [p.double() for p in arguments["network"]["parameters"]]}
     with refused(TypeError, "render_opaque: parameters must have dtype float32 or one of 16 bits, got float64"):

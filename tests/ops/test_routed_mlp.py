@@ -249,9 +249,7 @@ def test_errors():
     refuses("centres must have dtype ..., got int32", centres=centres.int())
     refuses("cells must have shape [n] with n = 61, got [60]", centres=None, cells=cells[1:])
     refuses("cells must have dtype int32, got int64", centres=None, cells=cells.long())
-    refuses(
-        "coords must come with centres, got none to compare them with", centres=None, cells=cells, coords=case.leaves[0]
-    )
+    refuses("coords require centres, got no centres", centres=None, cells=cells, coords=case.leaves[0])
     refuses("coords must have shape [n, 3] with n = 61, got [61, 2]", coords=case.leaves[0][:, :2])
     refuses("directions must be given for layers that read them, got None", directions=None, direction_index=None)
     refuses("weights must have one entry for each of 5 layers, got 0", weights=[])
@@ -263,7 +261,7 @@ def test_errors():
     refuses("centres must be on the device of positions, cpu, got meta", centres=centres.to("meta"))
     narrow = Case.make("raw")
     narrow.leaves[0], narrow.leaves[2] = narrow.leaves[0][:, :2], narrow.leaves[2][:, :, :2]
-    with refused(ValueError, f"{op}: coords must be given for positions of less than 3 features, got 2"):
+    with refused(ValueError, f"{op}: coords must be given for positions with fewer than 3 features, got 2"):
         narrow.run(narrow.leaves)
     integrated = Case.make("integrated")
     message = "positions must have 6 features, mean and variance, where they are integrated, got 3"

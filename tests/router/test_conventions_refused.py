@@ -153,7 +153,7 @@ MODULES: Errors = [
     (
         lambda: single(holding([threading.Lock()])),
         TypeError,
-        "but `1`, a Linear, keeps in `held` a list, which it refuses",
+        "but `1`, a Linear, keeps in `held` a list, which cannot be copied",
     ),
     (lambda: single(nn.Sequential(Compared())), TypeError, r"must be hashable, .* but a Compared .*\(eq=False\)"),
 ]
@@ -166,16 +166,16 @@ OPTIONS: Errors = [
     (lambda: routed("last3"), ValueError, "coords must be 'first1' to 'first4', a slice or a function, got 'last3'"),
     (lambda: routed(methods=["colour_of"]), ValueError, "methods must name methods of Field, got 'colour_of'"),
     (lambda: VoronoiRouter(Heads(), X[:, :3], methods=["cell"]), ValueError, "methods must name methods of Heads"),
-    (lambda: routed(methods=["train"]), ValueError, "methods must not name what a router has itself, got 'train'"),
+    (lambda: routed(methods=["train"]), ValueError, "methods must not name attributes of the router, got 'train'"),
     (lambda: routed(methods="density"), TypeError, "methods must be a list, got 'density'"),
     (lambda: routed(per_ray=["view"]), ValueError, "must name arguments of Field, one of x, z, note, got 'view'"),
     (lambda: routed(share=["out.*"]), ValueError, r"share must name parameters of Field, such as .*, got 'out\.\*'"),
     (lambda: routed(share="fc"), TypeError, "share must be a list, got 'fc'"),
 ]
 CALLS: Errors = [
-    (lambda: routed(None)(X), ValueError, "coords must say where the positions are.*coords=positions"),
-    (lambda: routed(slice(0, 4))(X), ValueError, r"coords=slice\(0, 4, None\) takes .* must have shape \[\.\.\., 3\]"),
-    (lambda: routed(lambda x: None)(X), TypeError, "what coords returns must be a tensor, got NoneType"),
+    (lambda: routed(None)(X), ValueError, "coords must name the positions.*coords=positions"),
+    (lambda: routed(slice(0, 4))(X), ValueError, r"coords=slice\(0, 4, None\) of .* must have shape \[\.\.\., 3\]"),
+    (lambda: routed(lambda x: None)(X), TypeError, "the result of coords must be a tensor, got NoneType"),
     (lambda: routed()(X, coords=X[:, :2]), ValueError, r"coords must have shape \[\.\.\., 3\], got \[6, 2\]"),
     (lambda: routed()(X, coords=torch.zeros(5, 3)), ValueError, "x must be per sample"),
     (lambda: routed()(X, coords=X[:, :3].long()), TypeError, "coords must be floating-point, got torch.int64"),
@@ -198,8 +198,8 @@ CALLS: Errors = [
 CELLS: Errors = [
     (lambda: routed().cell(4), IndexError, "index must be below 4, got 4"),
     (lambda: routed().load_cell(4, Field()), IndexError, "index must be below 4, got 4"),
-    (lambda: routed().load_cell(0, nn.Linear(7, 4)), ValueError, "module must have the parameters of the routed one"),
-    (lambda: routed().load_cell(0, other_buffer()), ValueError, "module's bands must be that of the routed one"),
+    (lambda: routed().load_cell(0, nn.Linear(7, 4)), ValueError, "module must have the parameters of the routed"),
+    (lambda: routed().load_cell(0, other_buffer()), ValueError, "module's bands must equal the router's"),
     (lambda: VoronoiRouter.from_modules([], X[:4, :3]), ValueError, "must hold a module for each cell, got none"),
     (lambda: VoronoiRouter.from_modules([Field()], X[:4, :3]), ValueError, "a module for each of 4 cells, got 1"),
     (

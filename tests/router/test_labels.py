@@ -129,7 +129,7 @@ def test_a_module_with_an_argument_of_this_name_gets_it(generator: torch.Generat
     x, cells = torch.rand(30, 3, generator=generator), drawn(generator, 30)
     router = routed(Own(), "grouped", torch.rand(K, 3, generator=generator), coords="first3")
     torch.testing.assert_close(router(x, cells=cells), masked_loop(router, router.diagram.locate(x), [x, cells])[0][0])
-    with pytest.raises(ValueError, match=r"Own.forward has an argument cells of its own, so labels cannot be told"):
+    with pytest.raises(ValueError, match=r"Own.forward has an argument cells itself, so a router without centres"):
         routed(Own(), "grouped")
 
     class Coords(nn.Linear):

@@ -138,7 +138,7 @@ def test_an_argument_that_is_called_coords() -> None:
     for _ in range(3):
         close(router(coords=x), module(x))
         close(router(x), module(x))
-    with pytest.raises(ValueError, match="coords must say where the positions are"):
+    with pytest.raises(ValueError, match="coords must name the positions"):
         VoronoiRouter(module, centres())(coords=x)
 
 

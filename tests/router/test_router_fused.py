@@ -405,7 +405,7 @@ def test_a_path_that_an_argument_chooses_is_refused() -> None:
             return super().forward(x, t) if t > 0 else x[:, :2]
 
     router = VoronoiRouter(Chooses(), torch.randn(4, 3), coords="first3", fuse=True)
-    with pytest.raises(ValueError, match=r"the truth of a tensor is read \(.* if t > 0 .*depends on values"):
+    with pytest.raises(ValueError, match=r"the truth value of a tensor is read \(.* if t > 0 .*depends on values"):
         router(uniform((90,)), torch.tensor([[0.2]]))
 
 
@@ -460,14 +460,14 @@ class Counted(Around):
     [
         (
             Scripted,
-            r"in Scripted.forward a tensor comes from what .*\(.*\), perhaps bend, which torch.jit has compiled; use",
+            r"in Scripted.forward a tensor was not computed .*\(.*\), perhaps bend, which torch.jit has compiled; use",
         ),
         (
             Foreign,
-            r"a tensor comes from what is no PyTorch function \(.*np.ones.*, write it",
+            r"a tensor was not computed by a PyTorch function \(.*np.ones.*, write it",
         ),
         (lambda step: nn.Sequential(Scripted(step), nn.Linear(2, 2)), r"perhaps bend, which torch.jit has"),
-        (Counted, r"__int__ is read \(.* so the path of the module depends on values"),
+        (Counted, r"__int__ is read \(.* so the module's control flow depends on values"),
         (Gridded, r"Product.apply \(.* is a custom function that takes parameters of cells; write it with functions"),
         (Assigned, r"__getitem__ \(.* which has no row for each of 37 samples.*as torch.where does"),
     ],

@@ -133,7 +133,7 @@ def test_shared_parameters_are_one_copy() -> None:
     assert cell.get_parameter(first) is not router.module.get_parameter(first)
     with torch.no_grad():
         cell.get_parameter(first).add_(1)
-    with pytest.raises(ValueError, match=f"module's {first} must be that of the routed one, since cells share it"):
+    with pytest.raises(ValueError, match=f"module's {first} must equal the router's, since all cells share it"):
         router.load_cell(0, cell)
 
 
@@ -202,12 +202,12 @@ def test_explain_names_each_method_and_the_step_in_the_way() -> None:
     assert router.explain() == "forward: not called yet\ndensity: not called yet"
     router.density(uniform((40,)))
     with pytest.warns(
-        UserWarning, match=r"Both.forward runs cell by cell: torch.nn.functional.bilinear meets param"
+        UserWarning, match=r"Both.forward runs cell by cell: torch.nn.functional.bilinear takes param"
     ) as said:
         router(uniform((40,)))
     forward, density = router.explain().split("\n")
     assert density == "density: grouped"
-    assert forward.startswith("forward: cell by cell: torch.nn.functional.bilinear meets parameters and has no rule")
+    assert forward.startswith("forward: cell by cell: torch.nn.functional.bilinear takes parameters, and has no rule")
     assert "test_router_promises.py:" in forward and "return self.mix(x, x)" in forward
     assert forward.partition("cell by cell: ")[2] in str(said[0].message)
     with pytest.raises(AttributeError, match=r"colour"):
@@ -239,11 +239,11 @@ def test_a_method_that_is_not_routed_names_the_remedy() -> None:
 
 def test_a_rule_of_ones_own_may_be_wrong(generator: torch.Generator) -> None:
     x, wrongly = torch.rand(50, 7, generator=generator), seen("wrongly")
-    with pytest.warns(UserWarning, match="wrongly meets parameters and has no rule"):
+    with pytest.warns(UserWarning, match="wrongly takes parameters, and has no rule"):
         VoronoiRouter(Scales(wrongly), centres(), coords="first3")(x)
     register(wrongly, lambda run, rows, factor: rows * run.rows_of(factor))
     wrong = perturb(VoronoiRouter(Scales(wrongly), centres(), coords="first3"), generator)
-    with pytest.warns(UserWarning, match="gives other results than on those of one cell"):
+    with pytest.warns(UserWarning, match="gives other results than the loop over cells"):
         equal_to_loop(wrong, x)
 
 

@@ -89,7 +89,7 @@ NUMBERS: dict[str, tuple[Callable[..., Tensor], list[Any]]] = {
 }
 
 
-@pytest.mark.filterwarnings("ignore:VoronoiRouter.*not fused any more")
+@pytest.mark.filterwarnings("ignore:VoronoiRouter.*no longer fused")
 @pytest.mark.parametrize("name", NUMBERS)
 def test_a_number_that_changes_becomes_an_input(name: str, traces: list[Any]) -> None:
     """A few traces serve all values, or the module runs grouped in the end; each value is followed."""
@@ -113,9 +113,9 @@ def test_a_number_that_chooses_a_path_ends_grouped(traces: list[Any]) -> None:
         for it in range(30):
             check(router, it)
     said = [str(w.message) for w in caught if "VoronoiRouter" in str(w.message)]
-    rule = "Scheduled.forward is not fused any more, since argument 1 changes from call to call, and a trace takes it"
+    rule = "Scheduled.forward is no longer fused, since argument 1 changes between calls but is a constant of the trace"
     assert len(said) == 1 and rule in said[0] and "test_router_schedules.py" in said[0]
-    assert router.explain().startswith("forward: grouped: not fused any more") and len(traces) == 11
+    assert router.explain().startswith("forward: grouped: no longer fused") and len(traces) == 11
 
 
 def written(net: Any, name: str, value: Any) -> None:
@@ -142,7 +142,7 @@ SCHEDULES: dict[str, tuple[Callable[..., Tensor], Callable[[Any, float], None]]]
 }
 
 
-@pytest.mark.filterwarnings("ignore:VoronoiRouter.*not fused any more")
+@pytest.mark.filterwarnings("ignore:VoronoiRouter.*no longer fused")
 @pytest.mark.parametrize("name", SCHEDULES)
 def test_schedules_of_the_module_are_followed(name: str, traces: list[Any]) -> None:
     use, change = SCHEDULES[name]

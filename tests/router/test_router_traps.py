@@ -111,7 +111,7 @@ def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Gen
         for _ in range(64):  # gradients may be accumulated; the first call finds none
             step()
     with pytest.warns(
-        UserWarning, match=r"no optimizer has changed the parameters.*make it of router.parameters\(\)"
+        UserWarning, match=r"no optimizer has changed the parameters.*construct it from router.parameters\(\)"
     ) as told:
         step()
     assert told[0].filename == __file__
@@ -199,7 +199,7 @@ def test_attributes_and_methods_of_the_module_are_pointed_to(generator: torch.Ge
         router.update_step(3)
     router.module.update_step(3)
     for name in ("bound", "layer", "box", "width"):
-        with pytest.raises(AttributeError, match=f"{name} of Model is router.module.{name}, where"):
+        with pytest.raises(AttributeError, match=f"{name} of Model is router.module.{name}, whose"):
             getattr(router, name)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         router.nothing  # noqa: B018
@@ -248,10 +248,10 @@ KEPT: dict[str, tuple[Any, str]] = {
     "data": (lambda m: m.a.data, "a view of the parameter `a`"),
     "list": (lambda m: [1, m.a[:2]], "a view of the parameter `a`"),
     "dict": (lambda m: {"x": (m.layer.weight.t(),)}, r"a view of the parameter `layer\.weight`"),
-    "function": (_function, "a function that holds the module"),
-    "functions": (lambda m: [_function(m)], "a function that holds the module"),
-    "default": (lambda m: lambda x, layer=m.layer: layer(x), "a function that holds the module|the part `layer`"),
-    "method": (lambda m: (lambda old: lambda x: old(x))(m.layer.forward), "holds the part `layer`"),
+    "function": (_function, "a function that refers to the module"),
+    "functions": (lambda m: [_function(m)], "a function that refers to the module"),
+    "default": (lambda m: lambda x, layer=m.layer: layer(x), "a function that refers to the module|the part `layer`"),
+    "method": (lambda m: (lambda old: lambda x: old(x))(m.layer.forward), "refers to the part `layer`"),
 }
 
 

@@ -398,7 +398,7 @@ def test_compile_checkpoint_and_functional_call(generator: torch.Generator) -> N
             torch.testing.assert_close(a, b)
     assert not torch.allclose(torch.func.functional_call(router, halves, (x,)), expected)
     torch._dynamo.reset()
-    with pytest.raises(Exception, match="a routed module runs as it is, between two graphs"):
+    with pytest.raises(Exception, match="a routed module runs eagerly between two graphs"):
         torch.compile(router, backend="eager", fullgraph=True)(x)
     torch.testing.assert_close(router(x), expected)
 
@@ -438,7 +438,7 @@ def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
         for parameter, gradient in zip(router.parameters(), wanted, strict=True):
             torch.testing.assert_close(parameter.grad, gradient)
         router.subdivide(2, points=x[:, :3])
-        with pytest.raises(RuntimeError, match="made for the parameters of before subdivide; wrap the router again"):
+        with pytest.raises(RuntimeError, match="wraps the parameters from before subdivide; wrap the router again"):
             wrapped(x)
         nn.parallel.DistributedDataParallel(router)(x).sum().backward()
     finally:

@@ -56,7 +56,7 @@ def test_a_cut_that_cannot_be_made():
     refuses("needs a scene with a box or --contraction", cut_space, replace(scene, box=None), 2, None)
     poses = scene.train.cameras.poses[:1].repeat(3, 1, 1)
     still = replace(scene.train, cameras=replace(scene.train.cameras, poses=poses))
-    refuses("at most the places that views of builtin look at", cut_space, replace(scene, train=still), 2, None)
+    refuses("at most the number of different places that the views", cut_space, replace(scene, train=still), 2, None)
     bent = cut_space(replace(scene, box=None), 2, Contraction(torch.zeros(3), 2.0))
     assert bent.boxes.abs().max() <= 4.0
 

@@ -150,7 +150,7 @@ def test_a_damaged_part(tmp_path, whole, resumed, harm):
         data[-5] ^= 1
         part.write_bytes(data[: len(data) // (1 if harm == "changed" else 2)])
     codes, texts = on_ranks(main, command(tmp_path / "run", "--resume"), folder=tmp_path)
-    assert codes == [0, 0] and "takes its place" in texts[0] and same(whole, tmp_path / "run")
+    assert codes == [0, 0] and "; using last-" in texts[0] and same(whole, tmp_path / "run")
 
 
 def test_no_checkpoint_is_left(tmp_path, resumed):
@@ -176,9 +176,9 @@ def test_a_full_disk(tmp_path):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--sampling", "hierarchical"], "--sampling must be stratified: no territory sees whole rays"),
+        (["--sampling", "hierarchical"], "--sampling must be stratified with --territories: a ray is split"),
         (["--territories", "1"], "--territories must be at least the 2 ranks, got 1"),
-        slow(["--no-occupancy"], "--occupancy must be on, in territories, got False"),
+        slow(["--no-occupancy"], "--occupancy must be on with --territories, got False"),
         slow(["--territories", "999"], "--territories must be at most the"),
     ],
 )
@@ -247,7 +247,7 @@ def test_a_start_that_failed_begins_again(tmp_path, monkeypatch):
         with torch.no_grad():
             state.router.module.density.bias.fill_(-30.0)
     train.train(town)
-    assert len(said) == 3 and "nothing is learnt by step 50: all space is empty" in said[0]
+    assert len(said) == 3 and "nothing is learnt by step 50: the field is empty everywhere" in said[0]
     for number, state in town.states.items():
         assert state.began == 50 and state.strategy.splits == 1
         outside = town.members[number].place.outside(state.sampler.grid)

@@ -115,7 +115,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def json_text(value: Any, *, indent: int | None = None) -> str:
-    """Returns a value as JSON; infinity and NaN become null, and their object gets an entry such as
+    """Returns a value as JSON; infinity and NaN become null, and an object that had them gets an entry such as
     ``"not_finite": {"psnr": "inf"}``."""
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 

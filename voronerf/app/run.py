@@ -29,7 +29,7 @@ from voronerf.nerf.samplers import Occupancy
 
 #: The file of a run's crop box, with its lowest and highest corner.
 CROP = "crop.json"
-#: The rule for boxes, for error messages.
+#: The description of a box in error messages.
 BOX = "x y z of a corner and of a larger one"
 
 
@@ -166,7 +166,7 @@ def shown_scene(
     downscale: int | None,
     allow_outside: bool,
 ) -> tuple[TrainConfig, Scene]:
-    """Returns a run's settings with the arguments of :func:`open_run`, and the scene, which is loaded if it is None."""
+    """Returns a run's settings, updated by arguments of :func:`open_run`, and the scene, which is loaded if None."""
     if scene is None and data is None:
         check_stored_paths(path, data=config.data)
     config = replace(
@@ -198,8 +198,8 @@ def open_run(
     Args:
         path: The run directory.
         scene: The scene, if it is loaded already.
-        data: Scene folder; None for the folder of the training. Since a run may be another person's, the latter must
-            lie in the run directory, the working directory or ``VORONERF_DATA``, or the user must have named it once.
+        data: Scene folder; None for the folder of the training. Since a run may be another person's, this folder must
+            lie in the run directory, the working directory or ``VORONERF_DATA``, unless the user has named it before.
         downscale: Downscale factor of the images; None for the factor of the training.
         allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray of each pass; None for the numbers of the training.

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-#: Other programs' names of settings, with the name here.
+#: Names of settings in other programs, each with its name in voronerf.
 SAID_ELSEWHERE = {
     **dict.fromkeys(("epochs", "iterations", "max-num-iterations"), "steps"),
     **dict.fromkeys(("input", "source-path"), "data"),
@@ -37,7 +37,7 @@ def did_you_mean(word: object, words: Iterable[str]) -> str:
 
 
 def nearest(word: str, words: Iterable[str]) -> str | None:
-    """Returns the word that other programs call so, or else the most similar of ``words``; None if none is similar."""
+    """Returns the setting that other programs call ``word``, or the most similar of ``words``, or None."""
     by_lower = {candidate.lower(): candidate for candidate in words}
     word = word.lower()
     synonym = SAID_ELSEWHERE.get(word.replace("_", "-"))

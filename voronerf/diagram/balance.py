@@ -2,11 +2,11 @@
 
 Letters: m samples, k centres, d coordinates (1 to 4), W [k] the total importance of the samples in each cell.
 
-Source: Elsner et al. 2023, "Adaptive Voronoi NeRFs", section 3.2. The figure of merit is the paper's: the population
-    standard deviation (divided by k, not k - 1) of `W / max W`; 0 is perfect balance.
+Source: Elsner et al. 2023, "Adaptive Voronoi NeRFs", section 3.2. The figure of merit, from the paper, is the
+    population standard deviation (divided by k, not k - 1) of `W / max W`; 0 is perfect balance.
 
 Everything runs on the CPU in a fixed order, so the same samples and the same generator give the same diagram on every
-machine. For ten thousand samples a GPU would not help. Coordinates are in scene units.
+machine. With ten thousand samples, a GPU would not be faster. Coordinates are in scene units.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from torch import Tensor
 from voronerf import ops
 from voronerf.ops._core import backends
 
-_STEPS = 200  # most steps of Lloyd's iteration
+_STEPS = 200  # maximum number of steps of Lloyd's iteration
 _TOLERANCE = 1e-5  # the iteration ends when a step lowers the energy by less than this fraction
 
 CENTRES = ("balanced", "random", "uniform", "centroidal")
@@ -60,7 +60,7 @@ def imbalance(weights: Tensor) -> float:
         weights: the importance of each cell, [k], k >= 1, at least one positive.
 
     Raises:
-        ValueError: wrong shape, or no positive value.
+        ValueError: The shape is wrong, or no value is positive.
 
     Examples:
         >>> import torch
@@ -107,17 +107,17 @@ def balance(
         points: floating [m, d], finite.
         importance: floating [m], finite, >= 0, not all 0.
         k: the number of cells, 1 <= k <= number of distinct points.
-        centres: "balanced", as published; "centroidal", the centroids of their cells, weighted by importance, which
-            makes compact cells of unequal importance (Du, Faber and Gunzburger 1999); "random", distinct samples, all
-            equally likely; or "uniform", `uniform_centres` over the bounding box of the samples.
+        centres: "balanced", as published; "centroidal", centres at the importance-weighted centroids of their cells,
+            which are then compact but of unequal importance (Du, Faber and Gunzburger 1999); "random", distinct samples
+            with equal probabilities; or "uniform", `uniform_centres` over the bounding box of the samples.
         steps: the number of updates of balanced centres.
-        generator: CPU generator of the draws; None for torch's global one.
+        generator: the CPU generator for random draws; None for torch's global generator.
         backend: the backend of the ops, see `voronerf.ops._core.backends`.
 
     Raises:
         ValueError: a wrong shape, an unknown choice, a value that is not finite, a negative importance, no importance
             at all, k below 1, or more cells than distinct points.
-        TypeError: points or importance that are not floating-point.
+        TypeError: points or importance are not floating-point.
 
     Examples:
         >>> import torch
@@ -168,15 +168,15 @@ def balance(
 
 
 def first_centres(samples: Tensor, masses: Tensor, k: int, centres: str, generator: torch.Generator | None) -> Tensor:
-    """Chooses first centres, float32 [k, d], from CPU samples float32 [m, d]; centroidal ones by masses [m]."""
+    """Draws initial centres, float32 [k, d], from CPU samples float32 [m, d]; masses [m] weight centroidal ones."""
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)
     if k > distinct.shape[0]:
         raise ValueError(f"balance: k must be at most the number of distinct points, {distinct.shape[0]}, got {k}")
     if centres == "uniform":
         return uniform_centres(torch.stack([samples.amin(0), samples.amax(0)]), k)
     # Sorting exponential variates divided by the weights draws without replacement in proportion to the weights
-    # (Efraimidis and Spirakis 2006). Only the first of several samples in one place counts, because two centres in one
-    # place would make an empty cell.
+    # (Efraimidis and Spirakis 2006). Of several samples at the same point, only the first counts, because two equal
+    # centres would make an empty cell.
     keys = torch.empty(samples.shape[0], dtype=torch.float64).exponential_(generator=generator)
     order = torch.argsort(keys / masses if centres == "centroidal" else keys, stable=True)
     place = torch.full((distinct.shape[0],), samples.shape[0], dtype=torch.int64)
@@ -189,8 +189,8 @@ def uniform_centres(box: Tensor, k: int) -> Tensor:
 
     The box is cut across its longest side: into 2 equal parts if k is even, into 3 if k is divisible by 3, otherwise
     into 2 parts in proportion to their numbers of centres. Each part is cut in the same way, until it holds one centre,
-    in its middle. All final parts have the same volume. In a cube, 8, 27, 64 ... give cubic grids, 12 gives 2 x 2 x 3,
-    and 16 gives 4 x 2 x 2.
+    which is placed in its middle. All final parts have the same volume. In a cube, 8, 27, 64 ... give cubic grids, 12
+    gives 2 x 2 x 3, and 16 gives 4 x 2 x 2.
 
     Args:
         box: floating [2, d], lowest and highest corner; flat boxes are allowed.
@@ -228,7 +228,7 @@ def uniform_centres(box: Tensor, k: int) -> Tensor:
         else:
             shares = [k // 2, k - k // 2]
         sides = [b - a for a, b in zip(low, high, strict=True)]
-        # Rounding must not decide between equal sides: they count as equal up to one part in a million.
+        # Sides count as equal up to one part in a million, so that rounding does not choose between equal sides.
         axis = next(i for i, side in enumerate(sides) if side >= max(sides) * (1 - 1e-6))
         centres: list[list[float]] = []
         start, done = low[axis], 0
@@ -247,8 +247,8 @@ def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "a
 
     Lloyd's iteration lowers the energy E = sum_j m_j min_i |x_j - v_i|^2 of samples x_j of mass m_j: samples go to the
     nearest centre, and centres to the centroids of their samples (Du, Faber and Gunzburger 1999, section 5; with
-    masses, section 2). A centre without mass in its cell is moved to the sample x_j with the largest share of the
-    energy; it stays in place if this share is 0.
+    masses, section 2). A centre without mass in its cell moves to the sample x_j that contributes most to the energy,
+    unless this contribution is 0.
     """
     k = centres.shape[0]
     precise, energy = samples.double(), float("inf")
@@ -275,7 +275,7 @@ def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "a
 def check_samples(op: str, points: Tensor, importance: Tensor) -> None:
     """Raises ValueError or TypeError unless points [m, d] and importance [m] are finite and floating-point.
 
-    Raises ValueError for a negative importance too.
+    Also raises ValueError for a negative importance.
     """
     if points.dim() != 2 or not 1 <= points.shape[1] <= 4:
         raise ValueError(f"{op}: points must have shape [m, d], d = 1 to 4, got {list(points.shape)}")
@@ -297,5 +297,5 @@ def in_space(points: Tensor) -> Tensor:
 
 
 def in_torch(op: str, points: Tensor) -> Callable[..., Any]:
-    """Returns the reference of an operation, which takes points of any number of coordinates."""
+    """Returns the reference implementation of an operation, which accepts any number of coordinates."""
     return backends.resolve(op, backend="reference", device=points.device, dtype=points.dtype)

@@ -1,4 +1,7 @@
-"""Draws leaves of a tree of diagrams at random by distances. n points, m centres of all diagrams, g diagrams."""
+"""Draws leaves of a tree of diagrams at random, by distance.
+
+Letters: n points, m centres of all diagrams, g diagrams.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,9 @@ from torch import Tensor
 from voronerf.ops.formulas import in_pieces
 
 _PIECE = {"cpu": 1 << 17}
-"""The most distances that a device holds at a time; on a CPU, they fit in a core's second-level cache."""
+"""The maximum number of distances in memory at a time; on a CPU, they fit in a core's second-level cache."""
 _LARGE_PIECE = 1 << 22
-"""The most distances on other devices, where few launches matter more."""
+"""The maximum number of distances on other devices, where fewer launches matter more than the cache."""
 
 
 @torch.no_grad()
@@ -19,9 +22,9 @@ def draw_cell(
 ) -> Tensor:
     """Draws a leaf for every point at random, by its distances to the centres, level by level.
 
-    On each level, the drawn centre is the first one up to which the probabilities sum to at least 1 - u, where u is the
-    point's uniform number of the level. A point that is not finite, or whose squared distances overflow, goes to the
-    first centre on every level.
+    On each level, it draws the first centre at which the cumulative probability reaches 1 - u, where u is the point's
+    uniform number for the level. A point that is not finite, or whose squared distances overflow, goes to the first
+    centre on every level.
 
     Args:
         points: float32 or float64 [n, d].
@@ -34,23 +37,24 @@ def draw_cell(
     Returns:
         int32 [n] leaf numbers.
     """
-    # The bounds keep it positive and finite in float32, so the nearest centre's mass is 1 at any temperature.
+    # The bounds keep the temperature positive and finite in float32, so the nearest centre's mass is 1 at any
+    # temperature.
     temperature = min(max(temperature, 1e-37), 3e38)
     table = torch.arange(centres.shape[0], dtype=torch.int32, device=centres.device)
     owner = torch.searchsorted(child_offsets, table, right=True) - 1
 
     def run(points: Tensor, uniforms: Tensor) -> Tensor:
         distance = (points[:, None] - centres).square().sum(2).sqrt()
-        # The share of the distribution that the drawn and all earlier centres must hold, in (0, 1].
+        # The cumulative probability that the drawn centre must reach, in (0, 1].
         wanted = (1 - uniforms.nan_to_num(0.0)).clamp(torch.finfo(torch.float32).eps / 2, 1)
-        # `state` is the diagram a point is in, or (negative) the leaf it has reached.
+        # `state` is the diagram that a point is in or, if negative, the leaf that the point has reached.
         state = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
         for level in range(uniforms.shape[1]):
             elsewhere = owner[None, :] != state[:, None]
             nearest = distance.masked_fill(elsewhere, torch.inf).amin(1, keepdim=True)
-            # Infinity and NaN have no mass.
+            # Centres at a distance of infinity or NaN get mass 0.
             mass = ((nearest - distance) / temperature).exp().masked_fill(elsewhere, 0).nan_to_num(0.0)
-            # A device sums as a tree with a different rounding at each place. A sum may be below the previous sum, and
+            # A device sums as a tree, with different rounding for each sum. A sum may be below the previous sum, and
             # the last sum above the sum at the last centre with mass. So only centres with mass are candidates.
             sums = mass.cumsum(1).masked_fill(mass == 0, 0)
             total = sums.amax(1, keepdim=True)

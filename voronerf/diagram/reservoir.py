@@ -1,8 +1,8 @@
-"""Keeps the samples with the largest errors of the picture.
+"""Keeps the samples that contribute most to the error of the rendered image.
 
-The importance of a sample is `w * E(r)`: its contribution to its ray times the squared error of the colour of the ray
-(Elsner et al. 2023, section 3.1). About 10,000 samples an epoch are kept: the same number of the heaviest samples from
-every batch, so that all batches count equally.
+The importance of a sample is `w * E(r)`: its weight in its ray times the squared colour error of the ray (Elsner et al.
+2023, section 3.1). About 10,000 samples are kept per epoch: the heaviest samples of every batch, in equal numbers, so
+that all batches count equally.
 """
 
 from collections.abc import Mapping
@@ -16,16 +16,17 @@ from voronerf.ops.keep_heaviest import keep_heaviest
 class SampleReservoir:
     """The heaviest samples of the last `batches` batches.
 
-    Every batch gives its `quota = ceil(capacity / batches)` heaviest samples, or all of its samples if they are fewer.
-    At most `batches * quota` samples of d coordinates are held; then each new batch replaces the oldest batch. Samples
-    with an importance of 0, or with a position or importance that is not finite, are not kept. A heavy sample with a
-    position that is not finite still counts towards the quota.
+    Every batch contributes its `quota = ceil(capacity / batches)` heaviest samples, or all of its samples if they are
+    fewer. At most `batches * quota` samples of d coordinates are held; then each new batch replaces the oldest batch.
+    Samples with an importance of 0, or with a position or importance that is not finite, are not kept. A heavy sample
+    with a position that is not finite still counts towards the quota.
 
-    `add` reads no device value on the host, so the host of a training loop can run ahead of its GPU.
+    `add` reads no device value on the host, so a training loop on the host can run ahead of the GPU.
 
     Attributes:
         capacity: the requested number of samples.
-        batches: the number of batches that share the capacity: the batches of one epoch, or between two subdivisions.
+        batches: the number of batches that share the capacity: the batches of one epoch, or the batches between two
+            subdivisions.
         quota: the number of samples kept of each batch.
 
     Examples:
@@ -47,7 +48,7 @@ class SampleReservoir:
         """Makes an empty reservoir of `capacity` samples with d coordinates, for `batches` batches.
 
         Raises:
-            ValueError: a number below 1.
+            ValueError: A number is below 1.
         """
         if min(capacity, batches, d) < 1:
             came = f"{capacity}, {batches} and {d}"
@@ -68,18 +69,18 @@ class SampleReservoir:
         ray_index: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
-        """Keeps the heaviest samples of one batch; among equal importances the first.
+        """Keeps the heaviest samples of one batch; ties go to the first sample.
 
         Args:
             points: floating [..., d], scene units.
-            importance: floating [...]; any scale, since only ratios count. With ``error``, the weights w, which are
-                multiplied by the ray's error.
+            importance: floating [...]; any scale, since only ratios count. With ``error``, the weights w, each of which
+                is multiplied by the error of its ray.
             error: floating [r], the error E of each ray; None for 1.
             ray_index: int32 [m], the ray of each of m samples; required with ``error``.
             backend: the backend of the op.
 
         Raises:
-            ValueError: shapes that do not match.
+            ValueError: Shapes do not match.
         """
         d = self._points.shape[-1]
         if points.dim() == 0 or points.shape[-1] != d or points.shape[:-1] != importance.shape:

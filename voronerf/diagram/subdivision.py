@@ -1,4 +1,4 @@
-"""Splits cells of a diagram by weighted samples, for the first split and for nested ones.
+"""Splits cells of a diagram by weighted samples; cells made by a split can be split again.
 
 Letters: m samples, k children of one cell.
 """
@@ -50,10 +50,10 @@ def split_diagram(
     backend: str = "auto",
     steps: int = 500,
 ) -> Split:
-    """Splits cells into k children each, every cell by the samples that lie in it.
+    """Splits cells into k children each, whose centres are placed by the samples in the cell.
 
-    A cell with fewer than `max(k, min_samples)` distinct samples stays as it is, and so do all cells for k = 1. The
-    first split starts from a diagram of one cell; its child becomes the root.
+    A cell with fewer than `max(k, min_samples)` distinct samples is not split; for k = 1, no cell is split. If the
+    diagram has a single cell, the diagram of its children becomes the root.
 
     Args:
         diagram: a diagram of any depth.
@@ -65,12 +65,13 @@ def split_diagram(
         min_samples: the number of distinct samples that a cell needs to be split.
         centres: "centroidal", "balanced", "random" or "uniform", see `balance`. Uniform centres may lie outside of
             their cell and have no samples. "random" and "uniform" are ablations of the paper.
-        generator: CPU generator of all draws; None for torch's global one. Cells use it in ascending order.
+        generator: the CPU generator for all random draws; None for torch's global generator. Cells use it in ascending
+            order.
         backend: the backend of the cell queries, see `voronerf.ops._core.backends`.
         steps: the number of steps of `balance`.
 
     Returns:
-        The split. Cells that are too small stay leaves; `balances` has an entry for each split cell.
+        The split. Cells with too few samples stay leaves; `balances` has an entry for each split cell.
 
     Raises:
         ValueError: samples that `balance` does not accept, an unknown choice, a cell number out of range or twice, or k
@@ -146,15 +147,15 @@ def finer_diagram(
     Args:
         present: The diagram that is refined.
         finer: The new diagram, or a number of children for each cell.
-        parents: With a diagram, the parent of each new cell, int64 [new cells]; None for the cells that hold the new
-            centres.
-        points: With a number of children, samples [m, d].
-        weights: With a number of children, the weights of the samples, [m]; None for 1 each.
+        parents: If ``finer`` is a diagram, the parent of each new cell, int64 [new cells]; None for the cells that hold
+            the new centres.
+        points: If ``finer`` is a number, samples [m, d].
+        weights: If ``finer`` is a number, the weights of the samples, [m]; None if all are 1.
         split: Options of :func:`split_diagram`.
 
     Raises:
-        ValueError: For parents that do not fit, or for points that are missing or not allowed.
-        TypeError: When ``finer`` is neither a diagram nor a number, or ``parents`` are not int64.
+        ValueError: If ``parents`` do not fit, or ``points`` are missing or not allowed.
+        TypeError: If ``finer`` is neither a diagram nor a number, or ``parents`` are not int64.
     """
     if not isinstance(finer, VoronoiDiagram):
         if isinstance(finer, bool) or not isinstance(finer, int):

@@ -4,8 +4,8 @@ Letters: n points, k centres of one diagram, m centres of all diagrams of a tree
 d coordinates, 1 to 4.
 
 A diagram gives each point of space to its nearest centre, `v(x) = argmin_i |x - v_i|` (Elsner et al. 2023, "Adaptive
-Voronoi NeRFs", section 3). A centre may be refined by a diagram of its own, on any number of levels. A query descends
-level by level to a centre that is not refined, a leaf. The leaves are the cells that own networks. They are numbered
+Voronoi NeRFs", section 3). A centre may be refined by another diagram, on any number of levels. A query descends level
+by level to a leaf, which is a centre that is not refined. The leaves are the cells that own networks. They are numbered
 depth-first, so the leaves of a refined cell are contiguous and take the place of their parent.
 
 Coordinates are in scene units, in the world frame of the query points.
@@ -27,15 +27,16 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.checks import check_integer
 
 MANY_CELLS = 2048
-"""The number of cells from which a flat diagram keeps an index."""
-_DECIDE, _DECIDE_CELL = 20_000, 4  # limits of points that `from_points` uses: in all, for each cell
+"""The minimum number of cells for which a flat diagram keeps an index."""
+_DECIDE, _DECIDE_CELL = 20_000, 4  # maximum number of points in `from_points`: in total or, if more, per cell
 
 
 class VoronoiDiagram(nn.Module):
     """A Voronoi diagram of any depth, stored as flat tables that `ops.locate_cell` reads.
 
-    No method changes a diagram in place: `refine` returns a new one. Its buffers stay float32 when a module around it
-    is converted to another dtype, because rounded centres would move samples to networks that never saw them.
+    No method changes a diagram in place: `refine` returns a new one. The buffers stay float32 when a module that holds
+    the diagram is converted to another dtype, because rounded centres would move samples to networks that never saw
+    them.
 
     Attributes:
         centres: float32 [m, d], the centres of all diagrams, diagram after diagram; diagram 0 is the root.
@@ -75,8 +76,8 @@ class VoronoiDiagram(nn.Module):
             centres: floating [k, d], k >= 1, d = 1 to 4, finite; copied to float32.
 
         Raises:
-            ValueError: wrong shape, no centre, or a value that is not finite.
-            TypeError: not a floating-point tensor.
+            ValueError: a wrong shape, no centre, or a value that is not finite.
+            TypeError: the centres are not a floating-point tensor.
         """
         super().__init__()
         _check_centres(centres)
@@ -116,16 +117,16 @@ class VoronoiDiagram(nn.Module):
         """Makes a flat diagram of k cells whose centres are placed by samples.
 
         Args:
-            points: floating [..., d], finite, in the coordinates of the field's positions, such as the samples of a few
-                training batches. At most max(20,000, 4 k) points are used, drawn at random.
+            points: finite points, floating [..., d], in the coordinates of the field's positions; for example, the
+                samples of a few training batches. At most max(20,000, 4 k) points are used, drawn at random.
             k: the number of cells, at most the number of distinct points.
             importance: floating [...], >= 0, the weight of each point; None for 1 each.
             centres: the method that places the centres, see `balance`.
-            generator: CPU generator of the draws; None for torch's global one.
+            generator: the CPU generator for random draws; None for torch's global generator.
 
         Raises:
             ValueError: more cells than distinct points, or other arguments that `balance` refuses.
-            TypeError: points or importance that are not floating-point.
+            TypeError: points or importance are not floating-point.
 
         Examples:
             >>> import torch
@@ -148,7 +149,7 @@ class VoronoiDiagram(nn.Module):
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], prefix: str = "") -> "VoronoiDiagram":
-        """Makes the diagram of a `state_dict`, of any size and depth.
+        """Makes a diagram of any size and depth from a `state_dict`.
 
         Args:
             state: the state dict of a diagram, or of a module that holds a diagram under `prefix`.
@@ -165,7 +166,7 @@ class VoronoiDiagram(nn.Module):
 
     @classmethod
     def without_centres(cls, k: int) -> "VoronoiDiagram":
-        """Makes a diagram of k cells without a place in space, `centres` [k, 0]: labels assign samples to cells.
+        """Makes a diagram of k cells without centres (`centres` [k, 0]); labels assign samples to cells.
 
         Args:
             k: the number of cells, at least 1.
@@ -217,7 +218,7 @@ class VoronoiDiagram(nn.Module):
         """Finds the leaf in which each point lies.
 
         Args:
-            points: floating [..., d]; half types are compared in float32, float64 points in float64.
+            points: floating [..., d]; half-precision points are compared in float32, float64 points in float64.
             backend: the backend of the op, see `voronerf.ops._core.backends`.
 
         Returns:
@@ -245,8 +246,8 @@ class VoronoiDiagram(nn.Module):
     def index(self) -> Tensor | None:
         """Returns an index of the centres (`voronerf.ops.index_centres`), which is cached for later calls.
 
-        The index is rebuilt if centres have changed. On the CPU their values are compared, 12 bytes a centre. On a GPU
-        only the version counter and the address are compared, to avoid a wait for the device.
+        The index is rebuilt if centres have changed. On the CPU, all values are compared (12 bytes per centre). On a
+        GPU, only the version counter and the address are compared, to avoid a wait for the device.
 
         Returns:
             int32 [w]; None for a nested diagram, fewer than `MANY_CELLS` cells, or traced centres.
@@ -278,9 +279,9 @@ class VoronoiDiagram(nn.Module):
             p_i = exp(-d_i / temperature) / sum_j exp(-d_j / temperature),     d_i = |x - v_i|.
 
         The probability of a leaf is the product of the probabilities along its path. The temperature is the same on
-        every level: a length in scene units, about the width of the band along borders in which cells mix. A
-        temperature of 0 gives `locate`. One uniform number in 0 to 1 is drawn for each point and level
-        (`diagram.drawing`).
+        every level. It is a length in scene units: about the width of the band along borders in which cells mix. A
+        temperature of 0 gives the same leaves as `locate`. One uniform number in 0 to 1 is drawn for each point and
+        level (`diagram.drawing`).
 
         Args:
             points: floating [..., d]; compared in float32.
@@ -314,8 +315,8 @@ class VoronoiDiagram(nn.Module):
         without an additional level.
 
         Args:
-            children: by leaf number, the centres [k, d] of the diagram inside the leaf, or a `VoronoiDiagram` of any
-                depth.
+            children: a mapping from leaf numbers to the centres [k, d] of the diagram inside the leaf, or to a
+                `VoronoiDiagram` of any depth.
 
         Returns:
             The refined diagram, and `parents`, int64 [new num_cells]: the old leaf in which each new leaf lies.
@@ -346,7 +347,7 @@ class VoronoiDiagram(nn.Module):
             copies = (table.to(device, copy=True) for table in (graft.centres, graft.child_offsets, graft.child))
             return VoronoiDiagram._from_tables(*copies), parents
 
-        # The grafts' rows and diagrams are appended, so only leaf numbers and links have to be shifted.
+        # The rows and diagrams of the grafts are appended, so only leaf numbers and links have to be shifted.
         first_leaf = (counts.cumsum(0) - counts).to(device, torch.int32)
         child = torch.where(self.child < 0, -1 - first_leaf[(-1 - self.child).clamp(min=0)], self.child)
         leaf_rows = self.leaf_rows.tolist()
@@ -364,7 +365,7 @@ class VoronoiDiagram(nn.Module):
         return VoronoiDiagram._from_tables(torch.cat(tables), torch.cat(offsets_all), torch.cat(links)), parents
 
     def part(self, cells: Tensor) -> "VoronoiDiagram":
-        """Returns a diagram with only some of the cells. Points in these cells are located in the same cells.
+        """Returns a diagram with only some of the cells. Points in these cells stay in the same cells.
 
         Args:
             cells: int64 [c], ascending cell numbers, at least one; they become 0 to c - 1.
@@ -403,7 +404,7 @@ class VoronoiDiagram(nn.Module):
     def _flatten(self, op: str, points: Tensor) -> Tensor:
         d = self.centres.shape[1]
         if d == 0:
-            raise ValueError(f"{op}: a diagram without centres has no places, its cells are told by labels")
+            raise ValueError(f"{op}: a diagram without centres cannot locate points; pass labels")
         if points.dim() == 0 or points.shape[-1] != d:
             raise ValueError(f"{op}: points must have shape [..., {d}], got {list(points.shape)}")
         if not points.is_floating_point():
@@ -421,7 +422,7 @@ class VoronoiDiagram(nn.Module):
         return self
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Adopts the size and the depth of the loaded diagram, which torch would refuse."""
+        """Loads a diagram of any size and depth; torch would refuse another size."""
         if prefix + "centres" in state_dict:
             device = self.centres.device
             loaded = VoronoiDiagram.from_state(state_dict, prefix)
@@ -430,7 +431,7 @@ class VoronoiDiagram(nn.Module):
 
 
 def _is_unchanged(seen: Tensor, centres: Tensor) -> bool:
-    """Returns whether centres are unchanged since an index was built; compares addresses on a GPU, else values."""
+    """Returns whether centres are as an index has seen them; compares values or, on a GPU, addresses."""
     if seen.device != centres.device or seen.shape != centres.shape:
         return False
     native = backends.compiled()
@@ -469,7 +470,7 @@ def _check_tree(centres: Tensor, child_offsets: Tensor, child: Tensor) -> tuple[
 
     depth, leaf = 0, 0
     seen = [False] * (len(offsets) - 1)
-    # Depth-first, first child first, as the leaves are numbered: rows are stacked in reverse.
+    # Rows are pushed in reverse, to visit leaves in the order of their numbers: depth-first, first child first.
     stack = [(row, 1) for row in reversed(range(offsets[0], offsets[1]))]
     seen[0] = True
     while stack:

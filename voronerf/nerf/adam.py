@@ -19,10 +19,10 @@ from voronerf.ops.adam import Guard, Rule, adam, average
 from voronerf.router import VoronoiRouter
 from voronerf.router.optimizers import trained_parts
 
-#: The largest window of an average as a fraction of the steps done, since weights move far in the first steps.
+#: The largest averaging window as a fraction of the steps done; weights move far in the first steps.
 WINDOW = 1 / 30
 #: The weight decay of tables, which removes unread entries such as early noise in empty space. With more than
-#: `DECAY_VIEWS` views it is divided by views / `DECAY_VIEWS`, since a point is then sampled less often.
+#: `DECAY_VIEWS` views, the decay is divided by views / `DECAY_VIEWS`, since a point is then sampled less often.
 TABLE_DECAY, DECAY_VIEWS = 0.1, 300
 #: The key of the averaged weights in an optimiser's state, beside Adam's moments.
 _AVERAGE = "average"
@@ -64,10 +64,10 @@ class Adam(torch.optim.Adam):
         True
     """
 
-    #: True since this optimiser skips frozen cells (`VoronoiRouter.freeze`) by itself.
+    #: True: this optimiser itself skips frozen cells (`VoronoiRouter.freeze`).
     leaves_frozen = True
 
-    # Unwrapped, since the wrappers of torch import its compiler in the first call, which takes over a second.
+    # Unwrapped: torch's wrappers import its compiler in the first call, which takes over a second.
     state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
     load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
 
@@ -101,7 +101,7 @@ class Adam(torch.optim.Adam):
             routers: The routers by name.
             lr: The learning rate.
             views: The number of training views; tables decay less with more views.
-            sparse: Name patterns of tables of which a step reads few entries; see ``FieldType``.
+            sparse: Name patterns of sparse tables: a step reads few of their entries. See ``FieldType``.
             average: Decay per step of the averaged weights.
             backend: The backend of the ops.
         """
@@ -112,7 +112,10 @@ class Adam(torch.optim.Adam):
         return cls(groups, lr=lr, average=average, backend=backend)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Clears the gradients like ``torch.optim.Adam``, but without a profiler record, which costs a small layer."""
+        """Clears the gradients like ``torch.optim.Adam``.
+
+        Unlike torch, it makes no profiler record, which would take as long as evaluating a small layer.
+        """
         if not set_to_none:
             inspect.unwrap(torch.optim.Adam.zero_grad)(self, False)
             return
@@ -173,14 +176,14 @@ class Adam(torch.optim.Adam):
                 average(shrunk, None, varying(functools.partial(_shrink_rate, group)), backend=self.backend)
 
     def _average_rate(self) -> float:
-        """Returns the fraction of the way by which averages move to the weights in this group of steps."""
+        """Returns the fraction by which averages move towards the weights in this group of steps."""
         return 1 - min(self.average, 1 - 1 / max(1, WINDOW * self.steps_done)) ** schedule.GROUP
 
     @torch.no_grad()
     def _average(self) -> None:
         if not self.average:
             return
-        # Only parameters with state: indexing `self.state` would create it.
+        # Skips parameters without state, since indexing `self.state` would create a state.
         parameters = [p for group in self.param_groups for p in group["params"] if self.state.get(p)]
         averages, weights = list[Tensor](), list[Tensor]()
         for parameter, parts in zip(parameters, trained_parts(parameters), strict=True):
@@ -193,7 +196,7 @@ class Adam(torch.optim.Adam):
             average(averages, weights, varying(self._average_rate), backend=self.backend)
 
     def drop_averages(self) -> None:
-        """Drops all averages; they start again from the weights at the next update."""
+        """Drops all averages; the next update starts new averages from the weights."""
         for state in self.state.values():
             state.pop(_AVERAGE, None)
 
@@ -212,7 +215,7 @@ class Adam(torch.optim.Adam):
 
     @torch.no_grad()
     def update(self, guard: Guard | None = None, loss: Tensor | None = None) -> None:
-        """Updates the parameters like :meth:`step`, but without hooks, which cost as much as a small layer.
+        """Updates the parameters like :meth:`step`, but skips hooks, since they take as long as a small layer.
 
         Args:
             guard: NaN guard, which may skip the step, see :func:`voronerf.ops.adam`; None for no guard.
@@ -233,7 +236,7 @@ class Adam(torch.optim.Adam):
             state = self._state(parameter)
             step, members = state["step"], (parameter, gradient, state["exp_avg"], state["exp_avg_sq"])
             for number, part in enumerate(parts):
-                rules.append(Rule(step.clone() if number else step, *rule))  # each parameter counts a step once
+                rules.append(Rule(step.clone() if number else step, *rule))  # a step counts once per parameter
                 tensors.append(members if part is ... else tuple(tensor[part] for tensor in members))
         if rules:
             adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)

@@ -16,9 +16,9 @@ from voronerf.ops._core.rows import following_count
 from voronerf.ops.draw_pixels import Known, Runs, draw_pixels
 from voronerf.ops.unseen_rays import unseen_rays
 
-#: The share of the rays that are drawn through the points of a sparse model, if there is one.
+#: The fraction of rays that are drawn through the points of a sparse model, if there is one.
 SPARSE = 0.25
-#: Triples of unseen rays for each ray of a batch, and the largest difference of their directions along each axis.
+#: The number of triples of unseen rays per ray of a batch, and the largest change of their directions along each axis.
 UNSEEN, TILT = 1 / 12, 0.15
 
 
@@ -57,10 +57,10 @@ class RaySource(Protocol):
 
 @replayed
 class RayBatches:
-    """A source of random rays through the pixels of pictures whose rays meet the box of the scene.
+    """A source of random rays through pixels of pictures; all its rays meet the box of the scene.
 
-    The networks learn nothing from a ray that misses the box, since it shows the background. Masked pixels are not
-    drawn either. All other pixels are equally likely.
+    The networks learn nothing from a ray that misses the box, since its pixel shows the background. Masked pixels are
+    not drawn either. All other pixels are equally likely.
 
     Args:
         cameras: c cameras.
@@ -72,13 +72,15 @@ class RayBatches:
         random_background: Whether to draw a background colour for each ray, for images with alpha and for photographs
             without a background. A translucent surface then never has the right colour, so surfaces become opaque.
         masks: bool [c, h, w], False for pixels that are not drawn; None for no masks.
-        sparse: int64 [s], flat indices of pixels over all images that show points of a sparse model, and float32 [s],
-            the distances of the points. The share `SPARSE` of the rays is drawn from them. None for no sparse model.
-        unseen: The largest distance along each axis between a camera and the origins of unseen rays, which are triples
-            of neighbours at the end of a batch (`UNSEEN` per ray); 0 for no unseen rays. There must be no box.
+        sparse: The pixels that show points of a sparse model (int64 [s], flat indices over all images), and the
+            distances of the points (float32 [s]). The fraction `SPARSE` of the rays is drawn from these pixels. None
+            for no sparse model.
+        unseen: The largest offset of an unseen ray's origin from its camera, along each axis; 0 for no unseen rays. A
+            batch ends with `UNSEEN` triples of neighbouring unseen rays for each of its other rays. Not allowed with a
+            box.
         views: int64, the indices of the pictures to draw from; None for all.
         cones: Whether the rays have radii.
-        fetch: Function that is called with the pixels int64 [r] of a batch before they are read, for images on disk.
+        fetch: Function for images on disk; it gets the pixels int64 [r] of a batch before they are read.
         device: The device of the batches; None for the device of the images.
         backend: The backend of the ops.
 
@@ -118,7 +120,7 @@ class RayBatches:
         self.random_background = random_background and (images.shape[-1] == 4 or background is None)
         self.cones, self.fetch, self.backend = cones, fetch, backend
         if unseen and box is not None:
-            message = "RayBatches: unseen must be 0 with a box, which rays from elsewhere may miss"
+            message = "RayBatches: unseen must be 0 with a box, since unseen rays may miss it"
             raise ValueError(f"{message}, got {unseen}")
         self.unseen = unseen
         self.useful = self._useful_pixels(masks, views)

@@ -5,7 +5,7 @@ c cameras, r rays, b chosen pixels, n points.
 Frames. A pose maps camera to world coordinates. Camera axes are OpenGL's: x right, y up, the camera looks along -z. The
 world is z up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the first pixel
 is at (0.5, 0.5). Distortion acts on image-plane coordinates u = (x - cx) / fx, v = (y - cy) / fy. See
-`voronerf.nerf.lenses.distort` for its models.
+`voronerf.nerf.lenses.distort` for the distortion models.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ __all__ = [
     "turntable_cameras",
 ]
 
-#: The largest median of `axis_misses` of cameras around an object: 24 degrees, within the pictures of most lenses.
-#: Captures around an object have 0.06 to 0.13, captures aimed 12 degrees off 0.22; 1 % of random walks are below 0.4.
+#: Cameras count as standing around an object up to this median of `axis_misses`: 24 degrees, which is inside the
+#: pictures of most lenses. The median is 0.06 to 0.13 for captures around an object, 0.22 for captures aimed 12 degrees
+#: off, and below 0.4 for 1 % of random walks.
 AROUND = 0.4
 
 
@@ -81,7 +82,8 @@ class Cameras:
         intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
         width: The width of the images in pixels; of the widest image if they differ.
         height: The height of the images in pixels; of the highest image if they differ.
-        distortion: float32 [c, 8], coefficients of the lenses, see `voronerf.nerf.lenses.distort`; None for none.
+        distortion: float32 [c, 8], coefficients of the lenses, see `voronerf.nerf.lenses.distort`; None for no
+            distortion.
         models: int32 [c], the model of each camera: 0 perspective, 1 fisheye, 2 FOV, 3 equirectangular (360 degrees);
             requires `distortion`. None if all are perspective.
         sizes: int64 [c, 2], (width, height) of each image, or None if all have one size. See `size`.
@@ -202,7 +204,7 @@ class Cameras:
         return self._mapped(lambda tensor: tensor.to(device))
 
     def _mapped(self, change: Callable[[Tensor], Tensor]) -> Cameras:
-        """Returns cameras with every tensor replaced by `change` of it; the tables of the lenses are shared."""
+        """Applies `change` to every tensor, and returns the resulting cameras; they share the lens tables."""
         members = ((field.name, getattr(self, field.name)) for field in fields(self))
         changed: dict[str, Any] = {name: change(value) for name, value in members if isinstance(value, Tensor)}
         return replace(self, **changed)._with_lenses(change(self.lenses[0]), self.lenses[1])
@@ -213,7 +215,7 @@ class Cameras:
 
     @cached_property
     def lenses(self) -> tuple[Tensor, LensTables | None]:
-        """The index of each camera's lens, int32 [c], -1 for no distortion, and the tables of the distinct lenses.
+        """The lens index of each camera (int32 [c], -1 for no distortion), and the tables of the distinct lenses.
 
         Cameras share the tables with the cameras that they were indexed, moved or copied from.
 
@@ -291,10 +293,10 @@ class Cameras:
             image_index: integer [b], the camera of each pixel, or one camera for all.
             x: [b], columns. Integers are pixels (the ray goes through the centre), floats are positions in the image.
             y: [b], rows, from the upper edge; integers or floats, as for ``x``.
-            cones: Whether the rays have radii, 2 / sqrt(12) of the width of a pixel. The variance of a cone across its
-                axis is then the variance of the pixel (Barron et al. 2021, section 3.1). A pixel away from the optical
-                axis appears narrower, except for fisheye and equirectangular cameras, whose pixels all cover the same
-                angle. The effect of lens distortion on the pixel width is ignored.
+            cones: Whether the rays have radii of 2 / sqrt(12) pixel widths. The variance of a cone across its axis is
+                then the variance of the pixel (Barron et al. 2021, section 3.1). A pixel away from the optical axis
+                appears narrower, except for fisheye and equirectangular cameras, whose pixels all cover the same angle.
+                The effect of lens distortion on the pixel width is ignored.
         """
         x, y = _position(x).to(self.poses.dtype), _position(y).to(self.poses.dtype)
         camera = torch.full_like(x, image_index, dtype=torch.int64) if isinstance(image_index, int) else image_index
@@ -319,7 +321,7 @@ class Cameras:
         return PERSPECTIVE if self.models is None else int(self.models[index])
 
     def radii(self, directions: Tensor, camera: Tensor) -> Tensor:
-        """Returns the radii [b] of cones along `directions` [b, 3] of the cameras `camera` int [b]."""
+        """Returns the radii [b] of cones with `directions` [b, 3] from the cameras `camera`, int [b]."""
         widths = self.intrinsics[:, :2].prod(-1).rsqrt() * (2 / math.sqrt(12))
         slant = (directions * self.forward[camera]).sum(-1)
         if self.models is not None:
@@ -360,8 +362,8 @@ class Cameras:
 
         Returns:
             (pixels [n, 2], depth [n]): positions (x, y) in the image, and distances along the optical axis in world
-            units. Points with depth <= 0 are behind the camera; their pixels are meaningless except for a fisheye. For
-            an equirectangular camera, depth is the distance from the camera.
+            units. Points with depth <= 0 are behind the camera; only a fisheye has meaningful pixels for them. For an
+            equirectangular camera, depth is the distance from the camera.
         """
         pose = self.poses[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -409,8 +411,8 @@ def focus_point(cameras: Cameras) -> Tensor | None:
 def axis_misses(cameras: Cameras, point: Tensor) -> Tensor:
     """Returns [c], the distance between a point and each optical axis, divided by the camera's distance from the point.
 
-    It is 0 for a camera that looks at the point, 0.5 if the point is 30 degrees off the axis, and 1 if the point is
-    behind the camera.
+    The result is 0 for a camera that looks at the point, 0.5 if the point is 30 degrees off the axis, and 1 if the
+    point is behind the camera.
 
     Examples:
         >>> import torch
@@ -429,8 +431,8 @@ def axis_misses(cameras: Cameras, point: Tensor) -> Tensor:
 def shared_focus(cameras: Cameras) -> Tensor | None:
     """Returns the `focus_point` [3] of cameras that stand around an object, or None for other cameras.
 
-    If a person walks and looks around, the focus point lies ahead of most cameras by chance, but they do not look at
-    it. Only cameras around an object look at it.
+    If a person walks and looks around, the focus point lies ahead of most cameras by chance, but few cameras look at
+    it.
     """
     focus = focus_point(cameras)
     return focus if focus is not None and float(axis_misses(cameras, focus).median()) < AROUND else None

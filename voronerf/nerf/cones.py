@@ -1,4 +1,4 @@
-"""Gaussians that approximate the conical frustums of cones. r rays, s frustums a ray.
+"""Gaussians that approximate the conical frustums of cones. r rays, s frustums per ray.
 
 A Gaussian has 6 numbers: its mean in world units, and the diagonal of its covariance in squared world units. Source:
 Barron et al. 2021, "Mip-NeRF", section 3.1.
@@ -14,14 +14,14 @@ from voronerf.nerf.contraction import Contraction, Perspective
 
 
 def frustum_moments(edges: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns mean and variances of conical frustums along their ray (equation 7 in its stable form, and equation 8).
+    """Returns the means and variances of conical frustums (equation 7 in its stable form, and equation 8).
 
     Args:
         edges: [r, s + 1] ascending distances along the ray.
         radii: [r], the radius of each cone at distance 1.
 
     Returns:
-        (mean distance, variance along the ray, variance across it), each [r, s].
+        (mean distance, variance along the ray, variance across the ray), each [r, s].
     """
     middle, half = (edges[:, 1:] + edges[:, :-1]) / 2, edges.diff(dim=1) / 2
     middle2, half2 = middle.square(), half.square()

@@ -18,7 +18,7 @@ class Contraction:
     """The map ``c + R f((x - c) / R)`` with ``f(x) = x`` up to length 1 and ``(2 - 1 / |x|) x / |x|`` beyond.
 
     Attributes:
-        centre: [3], c. If it is not on the device of the points, it is copied in each call.
+        centre: [3], c, best on the device of the points: otherwise each call copies it.
         radius: R > 0, in world units.
 
     Raises:
@@ -68,7 +68,7 @@ class Contraction:
 
     @property
     def numbers(self) -> Tensor:
-        """The tensor [4] of centre and radius for `voronerf.ops.march_rays`."""
+        """The centre and the radius as a tensor [4], for `voronerf.ops.march_rays`."""
         return torch.cat((self.centre, self.centre.new_tensor([self.radius])))
 
     @property
@@ -113,7 +113,7 @@ class Perspective:
 
     Attributes:
         centre: [3], the position of the camera.
-        axes: [3, 3], whose rows are the directions right, up and ahead.
+        axes: [3, 3]; the rows are the directions right, up and ahead.
         near: The depth of the near plane, > 0, in world units.
         slopes: (a, b), half the width and half the height of the view at depth 1.
 
@@ -150,7 +150,7 @@ class Perspective:
 
     @property
     def numbers(self) -> Tensor:
-        """The tensor [5, 3] of centre, axes, and near with the slopes, for `voronerf.ops.march_rays`."""
+        """The tensor [5, 3] for `voronerf.ops.march_rays`: the centre, the axes, and a row of near and slopes."""
         last = self.centre.new_tensor([[self.near, *self.slopes]])
         return torch.cat((self.centre[None], self.axes.to(self.centre), last))
 

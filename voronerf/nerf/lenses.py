@@ -1,7 +1,7 @@
 """Lens models: the maps between image positions and directions, and tables of the directions of all pixels.
 
-No other module knows the models. n points, l lenses of images of h x w pixels. u and v are image-plane coordinates,
-u = (x - cx) / fx to the right and v = (y - cy) / fy downwards.
+Other modules do not depend on the formulas of the models. n points, l lenses of images of h x w pixels. u and v are
+image-plane coordinates, u = (x - cx) / fx to the right and v = (y - cy) / fy downwards.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ __all__ = ["EQUIRECTANGULAR", "FISHEYE", "FOV", "PERSPECTIVE", "LensTables", "di
 #: The camera models; their values are used in `Cameras.models`.
 PERSPECTIVE, FISHEYE, FOV, EQUIRECTANGULAR = range(4)
 NEWTON_STEPS = 12
-#: The step length at which Newton's method stops. It converges quadratically, so the error is then below float64's.
+#: The step length at which Newton's method stops. It converges quadratically, so the remaining error is below the
+#: precision of float64.
 SETTLED = 1e-9
-#: The smallest length that divides, to avoid a division by zero.
+#: The lower limit of lengths in denominators, to avoid a division by zero.
 TINY = 1e-12
 #: Tolerance in radians at the border of an equirectangular picture.
 ROUNDED = 1e-6
@@ -27,7 +28,7 @@ ROUNDED = 1e-6
 FLAT = 1e-9
 #: The largest reprojection error, in pixels, of a valid inverse.
 MISSED = 1e-3
-#: The most bytes of the tables of one scene. A table has 8 bytes a pixel, an RGB picture 3.
+#: The maximum size of the tables of one scene in bytes. A table has 8 bytes per pixel, an RGB picture 3.
 MOST_BYTES = 4 << 30
 
 
@@ -37,12 +38,12 @@ def distort(u: Tensor, v: Tensor, coefficients: Tensor, model: int = PERSPECTIVE
     For perspective and FOV lenses, (u, v) lies on the plane at distance 1. For a fisheye, the length of (u, v) is the
     angle to the optical axis. With r = |(u, v)| the models are
 
-    - perspective, OpenCV's rational one: the factor (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+    - perspective, OpenCV's rational model: the factor (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
       and the tangential terms of p1 and p2;
     - fisheye, COLMAP's THIN_PRISM_FISHEYE: the factor 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, the tangential terms,
-      s1 r^2 and s2 r^2. OpenCV's fisheye has k1 to k4 alone;
-    - FOV, COLMAP's: the factor atan(2 r tan(omega / 2)) / (r omega);
-    - equirectangular: no distortion. (u, v) are the angles to the right and downwards, so fx and fy are in pixels a
+      s1 r^2 and s2 r^2. OpenCV's fisheye has only k1 to k4;
+    - FOV, as in COLMAP: the factor atan(2 r tan(omega / 2)) / (r omega);
+    - equirectangular: no distortion. (u, v) are the angles to the right and downwards, so fx and fy are in pixels per
       radian.
 
     Source: OpenCV, "Camera Calibration and 3D Reconstruction" and "Fisheye camera model"; COLMAP, "Camera Models";
@@ -69,7 +70,7 @@ def fold(terms: Sequence[float], model: int) -> float:
     """Returns the length of (u, v) at which the model folds over, or infinity if it never does.
 
     Beyond the fold, the radial factor moves points back towards the middle. Coefficients are fitted inside an image.
-    Beyond the image, the polynomial may turn, and directions far outside would appear in the image again.
+    Beyond the image, the distorted radius may decrease again, and directions far outside would appear in the image.
 
     Args:
         terms: The coefficients of `distort`, except for an FOV lens, which never folds.
@@ -90,9 +91,9 @@ def fold(terms: Sequence[float], model: int) -> float:
 
 
 def _inverse_roots(factors: Sequence[float]) -> Tensor:
-    """Returns 1 / root for all roots of a polynomial, complex128, from its coefficients, the constant 1 first.
+    """Returns complex128, 1 / root for all roots of a polynomial; its first coefficient is the constant 1.
 
-    The inverses are the eigenvalues of a matrix that needs no division, so tiny coefficients do no harm.
+    The results are eigenvalues of a matrix whose entries need no division, so tiny coefficients do no harm.
     """
     matrix = torch.diag(torch.ones(len(factors) - 1, dtype=torch.float64), -1)[:-1, :-1]
     matrix[:1] -= torch.tensor(factors[1:], dtype=torch.float64)
@@ -156,7 +157,7 @@ def unproject(
 
     Returns:
         (float64 [n, 3], unit directions in the camera's OpenGL axes; bool [n], whether a position has a direction).
-        A model that folds over inside the image, or a fisheye in its corners, has no direction for some positions.
+        Some positions have no direction if the model folds over inside the image, or in the corners of a fisheye.
     """
     fx, fy, cx, cy = intrinsics.double().tolist()
     u, v = (x.double() - cx) / fx, (y.double() - cy) / fy
@@ -191,8 +192,8 @@ class LensTables:
         size = 8 * len(lenses) * width * height
         if size > MOST_BYTES:
             raise ValueError(
-                f"the ray tables of {len(lenses)} lenses of {width} x {height} pixels take {size / 2**30:.1f} GiB, at "
-                f"most {MOST_BYTES >> 30} GiB; reduce the images (--downscale), or give all pictures one lens"
+                f"the ray tables of {len(lenses)} lenses of {width} x {height} pixels take {size / 2**30:.1f} GiB, the "
+                f"limit is {MOST_BYTES >> 30} GiB; reduce the images (--downscale), or use one lens for all pictures"
             )
         self._lenses, self._width, self._height = lenses.double().cpu(), width, height
         self._by_device: dict[torch.device, Tensor] = {}
@@ -219,6 +220,6 @@ class LensTables:
             directions, valid = unproject(x, y, lens[:4], lens[4:12], int(lens[12]))
             mask.copy_(valid)
             right, up, back = directions.unbind(-1)
-            # A position without a valid direction may be NaN or infinite.
+            # The projection of a position without a valid direction may be NaN or infinite.
             table.copy_((torch.stack((right, -up), dim=-1) / (1 - back)[..., None]).nan_to_num(0.0, 0.0, 0.0))
         return tables

@@ -32,7 +32,7 @@ from voronerf.ops.render_loss import render_loss_gradient
 
 @replayed
 class RayLoss:
-    """The mean squared or robust error of rays rendered from random samples, and further terms.
+    """The loss of rays rendered from random samples: their mean squared or robust error, and further terms.
 
     If possible (:meth:`why_not_fused`), networks, colours, loss and gradients are fused into one operation for the
     forward and one for the backward pass. Otherwise torch differentiates the networks; all other parts are the same.
@@ -41,9 +41,10 @@ class RayLoss:
         renderer: The networks and the sampler.
         terms: Further terms of the loss: a :class:`Term`, such as :class:`SparseDepth` or :class:`Surface`, or a
             function of :class:`Seen` rays and their :class:`Batch` that returns a scalar, which torch differentiates.
-            Only the networks learn from it. A term gets all rays; the last ``3 * batch.unseen`` have no target colour.
-        robust: The scale of errors above which the loss of a ray is not squared; see `voronerf.ops.render_loss`.
-            Differences between pictures, such as exposure, then cause less fog. 0 is off.
+            Its gradients go only to the networks. A term gets all rays; the last ``3 * batch.unseen`` have no target
+            colour.
+        robust: The scale of errors above which the loss is linear instead of squared; see `voronerf.ops.render_loss`.
+            Differences between pictures, such as exposure, then cause less fog. 0 for the squared error.
 
     Examples:
         >>> import torch
@@ -107,7 +108,7 @@ class RayLoss:
             field: The result of :meth:`radiance`.
             generator: Random generator of the samples.
             backward: Whether to add the gradients at once, as in :meth:`__call__`.
-            now: Function that gives a stage in Python the current rows of a recorded tensor.
+            now: Function from a recorded tensor to its currently valid rows, for stages that run in Python.
         """
         sampler = self.renderer.sampler
         if isinstance(field, str):
@@ -128,13 +129,14 @@ class RayLoss:
     def why_not_fused(self) -> str | None:
         """Returns the reason why networks, colours, loss and gradients are not fused; None if they are.
 
-        A module with ``fuse=True`` is traced by its first step, so its result is known only after this step.
+        The first step traces a module with ``fuse=True``, so the answer for such a module is known only after this
+        step.
         """
         radiance = self.radiance()
         return radiance if isinstance(radiance, str) else None
 
     def radiance(self, samples: tuple[Tensor, Tensor] | None = None) -> Radiance | str:
-        """Returns the program of the field, or why the operations are separate; samples are as in `radiance_of`."""
+        """Returns the field's program, or the reason why nothing is fused; for ``samples`` see `radiance_of`."""
         renderer = self.renderer
         if renderer.sampler.grid is None:
             return "empty space is not skipped"
@@ -149,7 +151,7 @@ class RayLoss:
         renderer = self.renderer
         network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index)
         tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
-        # Samples that almost no light reaches learn nothing, and are left out of the backward pass.
+        # If almost no light reaches a sample, it learns nothing and is left out of the backward pass.
         along = self._along(tape.raw, field.rule, batch, samples, HIDDEN)
         return {"along": along, "learning": (self._learn_fused, tape)}
 
@@ -165,20 +167,18 @@ class RayLoss:
         return {"samples": samples, "before": before}
 
     def _evaluate_unfused(self, batch: Batch, samples: Samples, before: Sequence[Rendered]) -> dict[str, Any]:
-        """Does the same as `_evaluate` if torch differentiates the networks."""
+        """Does the same as `_evaluate` for networks that torch differentiates."""
         values = evaluate_field(self.renderer.field, batch.rays, samples, self.renderer.sampler.space)
         raw = torch.cat((values[0], values[1][:, None]), 1).detach()
         along = self._along(raw, {"activated": True}, batch, samples, 0.0)
         return {"along": along, "learning": (self._learn_unfused, values, batch, before)}
 
     def _along(self, raw: Tensor, rule: dict[str, Any], batch: Batch, samples: Samples, hidden: float) -> LossAlongRays:
-        """Computes the loss of the colours and its gradient to the raw outputs."""
+        """Computes the loss of the colours and its gradient with respect to the raw outputs."""
         backend = self.renderer.backend
         for name in ("target", "background"):
             if (colours := getattr(batch, name)) is not None and colours.requires_grad:
-                raise ValueError(
-                    f"RayLoss: {name} must need no gradient, which the networks alone have, got one that does"
-                )
+                raise ValueError(f"RayLoss: {name} must not require a gradient; only the networks are trained")
         result, gradient = render_loss_gradient(
             raw,
             samples.deltas,
@@ -224,7 +224,7 @@ class RayLoss:
         return run_backward(loss, defer)
 
     def explain(self) -> str:
-        """Describes, in a few lines, how a step is computed and why not faster."""
+        """Describes how a step is computed, and what keeps it from being faster, in a few lines."""
         renderer = self.renderer
         lines = [f"samples: {renderer.sampler.explain()}"]
         if (obstacle := self.why_not_fused()) is not None:

@@ -1,6 +1,6 @@
 """An occupancy grid, which marks the empty voxels of a scene's box so that rays can skip them.
 
-x, y, z voxels of the grid along each axis, q voxels to update, r rays, s strata of a ray. Densities are per world unit.
+x, y, z voxels along the axes of the grid, q voxels to update, r rays, s strata per ray. Densities are per world unit.
 With a contraction, the densities that a grid stores are per unit of contracted space, so a far and a near voxel that
 absorb the same light have the same density.
 Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (voxels keep the largest recent density,
@@ -31,34 +31,34 @@ from voronerf.ops.render_opaque import RaysSeen, render_opaque
 
 #: Voxels of a grid along each axis, for a box and for contracted space, which holds the whole world.
 RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
-#: The opacity of an average stratum below which its voxel is empty. A larger value would remove thin things: masts,
-#: ropes and water.
+#: A voxel is empty if an average stratum in it has less than this opacity. A larger value would remove thin things:
+#: masts, ropes and water.
 OPACITY = 0.02
-#: The opacity of a whole voxel of contracted space below which it is empty.
+#: A voxel of contracted space is empty if the whole voxel has less than this opacity.
 CONTRACTED_OPACITY = 0.1
-#: The number of samples in a row that empty a new voxel. 8 samples take about thirty steps, in which the field learns
-#: something about most voxels. Contracted space needs fewer: occupied voxels in front of the cameras keep fog that
-#: explains one view and spoils the others.
+#: The number of consecutive empty samples that empty a new voxel. 8 samples take about thirty steps; in this time the
+#: field learns something about most voxels. In contracted space fewer are better: occupied voxels in front of the
+#: cameras keep fog that explains one view and spoils the others.
 PATIENCE, CONTRACTED_PATIENCE = 8, 4
-#: The factor on the stored density of a voxel for each sample of a batch in it, in a training.
+#: The factor by which each sample of a training batch reduces the stored density of its voxel.
 DECAY = 0.8
 CHUNK = 1 << 17  # points in one evaluation of a field
-HIDDEN = 1e-3  # a sample is hidden if less than this share of the light reaches it
-# A hole is an empty voxel with at least HOLE_NEIGHBOURS occupied voxels in its 3 x 3 x 3 block, in which HOLE_POINTS
-# random points all have a density of at least HOLE_DENSITY thresholds.
+HIDDEN = 1e-3  # a sample is hidden if at most this fraction of the light reaches it
+# A hole is an empty voxel whose 3 x 3 x 3 block has at least HOLE_NEIGHBOURS occupied voxels, and whose density is at
+# least HOLE_DENSITY thresholds at all of HOLE_POINTS random points.
 HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 9, 2, 2.0
 
 
 class OccupancyGrid:
-    """A grid of the largest recent densities in a box, whose dense voxels are occupied.
+    """A grid that stores the largest recent densities in a box; its dense voxels are occupied.
 
-    A new grid is occupied everywhere; `update` and `observe` empty voxels.
+    A new grid is occupied everywhere; `update` and `observe` mark voxels as empty.
 
     Attributes:
         box: float32 [2, 3], lowest and highest corner.
         density: float32 [x, y, z], the stored density of each voxel.
         occupied: bool [x, y, z], density >= threshold.
-        threshold: The density from which a voxel is occupied, in the unit of `density`.
+        threshold: The minimum density of an occupied voxel, in the unit of `density`.
         contraction: The contraction of the space of the box, or None.
 
     Examples:
@@ -89,9 +89,9 @@ class OccupancyGrid:
         Args:
             box: [2, 3], the lowest and the highest corner.
             resolution: The number of voxels along each axis, one number for all axes or three numbers.
-            threshold: The density from which a voxel is occupied, in the unit of `density`, > 0 and finite.
-            remembered: The density of a new voxel, in thresholds, >= 1. The larger it is, the more empty samples it
-                takes to empty a voxel.
+            threshold: The minimum density of an occupied voxel, in the unit of `density`, > 0 and finite.
+            remembered: The density of a new voxel, in thresholds, >= 1. A larger density takes more empty samples to
+                empty the voxel.
             contraction: The contraction of the space of box and positions, or None. Rays stay in world coordinates.
             device: The device of the grid; None for the device of the box.
         """
@@ -122,10 +122,10 @@ class OccupancyGrid:
         opacity: float = OPACITY,
         device: torch.device | str | None = None,
     ) -> OccupancyGrid:
-        """Returns a grid with the threshold of a training, over a box or over the cube of a contraction.
+        """Returns a grid with a threshold for training, over a box or over the cube of a contraction.
 
-        At the threshold, an average stratum has opacity ``opacity``; its length is the box's diagonal divided by the
-        samples of a ray. In contracted space, at the threshold a whole voxel has opacity `CONTRACTED_OPACITY`.
+        At the threshold, an average stratum has opacity ``opacity``; the average length is the box's diagonal divided
+        by ``samples``. In contracted space, a whole voxel has opacity `CONTRACTED_OPACITY` at the threshold.
 
         Args:
             box: [2, 3], the box of the scene; not used with a contraction.
@@ -158,7 +158,7 @@ class OccupancyGrid:
 
     @property
     def share(self) -> float:
-        """The share of occupied voxels, 0..1. The host waits for the device."""
+        """The fraction of occupied voxels, 0..1. The host waits for the device."""
         return float(self.occupied.float().mean())
 
     def points(self, voxels: Tensor, uniforms: Tensor | None = None) -> Tensor:
@@ -173,7 +173,7 @@ class OccupancyGrid:
         """
         shape = torch.tensor(self.occupied.shape, dtype=torch.float32, device=self.box.device)
         _, y, z = self.occupied.shape
-        # Computes in float64, since torch divides integers slowly, and axis by axis, since rows of three are slow.
+        # Computed in float64, since torch divides integers slowly, and axis by axis, since rows of three are slow.
         voxels = voxels.double()
         line = (voxels / z).floor()
         plane = (line / y).floor()
@@ -192,7 +192,7 @@ class OccupancyGrid:
         generator: torch.Generator | None = None,
         backend: str = "auto",
     ) -> None:
-        """Evaluates a field at a random point of each voxel, and stores the larger of new and decayed old density.
+        """Evaluates a field at a random point of each voxel, and stores the maximum of new and decayed old density.
 
         Args:
             field: The field, which is called without gradients.
@@ -202,7 +202,7 @@ class OccupancyGrid:
             backend: The backend of the op.
 
         Raises:
-            ValueError: The decay is out of range, or, on the CPU, a voxel is.
+            ValueError: The decay or a voxel is out of range (voxels are checked on the CPU only).
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.update: decay must lie in 0..1, got {decay}")
@@ -219,7 +219,7 @@ class OccupancyGrid:
     def revisit(
         self, field: Field, count: int, seed: Tensor, *, fixed: Tensor | None = None, backend: str = "auto"
     ) -> None:
-        """Evaluates a field at random points in the grid, and stores the larger of new and old density of their voxels.
+        """Evaluates a field at random points in the grid, and stores the maximum of new and old density per voxel.
 
         Args:
             field: The field, which is called without gradients.
@@ -245,9 +245,9 @@ class OccupancyGrid:
     ) -> None:
         """Updates voxels, in place, from samples that were already rendered.
 
-        A sample that less than the share `HIDDEN` of the light reaches counts as density 0. So the inside of an opaque
-        object becomes empty, which changes no picture. A surface that few of the rays through its voxel see is emptied
-        too, until `update` evaluates it again.
+        If at most the fraction `HIDDEN` of the ray's light reaches a sample, its density counts as 0. The inside of an
+        opaque object thus becomes empty, which changes no picture. The voxel of a surface is emptied too if few rays
+        through it see the surface, until `update` evaluates it again.
 
         Args:
             positions: float32 [m, 3] in the box; a position outside counts for the nearest voxel at the border.
@@ -270,8 +270,8 @@ class OccupancyGrid:
     def fill_holes(self, field: Field, *, generator: torch.Generator | None = None) -> None:
         """Fills holes in surfaces: occupies empty voxels in which a field is dense and many neighbours are occupied.
 
-        Call it after the training, since filled voxels would cost samples in every step. The field can be dense by
-        chance where no ray samples it, so voxels without occupied neighbours, or with thin points, stay empty.
+        Call it after the training, since filled voxels would cost samples in every step. Where no ray samples the
+        field, it can be dense by chance, so voxels without enough occupied neighbours, or with thin points, stay empty.
 
         Args:
             field: The trained field, which is called without gradients.
@@ -293,7 +293,7 @@ class OccupancyGrid:
         self.occupied.view(-1)[holes] = True
 
     def drop_specks(self) -> None:
-        """Empties groups of one or two occupied voxels that touch no other occupied voxel; they look like dust."""
+        """Empties isolated groups of one or two occupied voxels, which look like dust in pictures."""
         neighbours = (self._neighbours() * self.occupied)[None]
         most = torch.nn.functional.max_pool3d(neighbours, 3, 1, 1)[0]
         specks = self.occupied & (most <= 2)
@@ -314,12 +314,12 @@ class OccupancyGrid:
         return voxels_of(points, self.box, self.occupied.shape)
 
     def march(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> March:
-        """Returns the samples of rays in occupied voxels; the options are as in `voronerf.ops.march_rays`."""
+        """Returns the samples of rays in occupied voxels; for the options see `voronerf.ops.march_rays`."""
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return march_rays(*arguments, contraction=self._numbers, **rule)
 
     def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaysSeen:
-        """Renders rays by networks in occupied voxels; the options are as in `voronerf.ops.render_opaque`."""
+        """Renders rays from networks in occupied voxels; for the options see `voronerf.ops.render_opaque`."""
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return render_opaque(*arguments, contraction=self._numbers, **rule)
 

@@ -61,7 +61,7 @@ class Radiance(NamedTuple):
         return {"program": self.networks.program, "parameters": self.cells.parameters, **tensors, **places}
 
     def density(self, points: Tensor) -> Tensor | None:
-        """Returns the density [n] of points [n, 3] without the colour layers; None if it depends on the direction."""
+        """Returns the density [n] of points [n, 3] without evaluating colours; None if it depends on the direction."""
         router, program = self.router, self.networks.density
         if program is None:
             return None
@@ -80,7 +80,7 @@ def radiance_of(field: Field, samples: tuple[Tensor, Tensor] | None = None, *, i
     """
     router = router_of(field)
     if router is None:
-        return f"the field is a {type(field).__name__}, no router"
+        return f"the field is a {type(field).__name__}, not a VoronoiRouter"
     first = router.diagram.centres
     cells = router.program(*(samples or _example(inputs, first.device)), trace=samples is not None)
     if isinstance(cells, str):
@@ -103,7 +103,7 @@ def _example(inputs: int, device: torch.device) -> tuple[Tensor, Tensor]:
 
 @functools.lru_cache(maxsize=256)
 def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], ...], inputs: int) -> Networks | str:
-    """Returns the networks of a `CellProgram`, or why it is no radiance field."""
+    """Returns the networks of a `CellProgram`, or the reason why it is no radiance field."""
     program = Program.parse(text)
     if len(shapes) != 2 or shapes[0] != (3,) or shapes[1] not in ((), (1,)):
         return (
@@ -112,7 +112,7 @@ def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], 
     if 0 not in reads:
         return "the field does not depend on positions"
     if (width := program.inputs[reads.index(0)]) != inputs:
-        return f"the field takes {width} numbers for a sample, and there are {inputs}"
+        return f"the field takes {width} numbers per sample, got {inputs}"
     colour, density = program.outputs
     raw = _before_activations(program.steps, colour, density)
     outputs, scale = raw if raw is not None else ([colour, density], None)
@@ -139,7 +139,7 @@ def _without_moves(program: Program) -> Program:
 
 
 def _field_program(program: Program, outputs: Sequence[Columns], reads: tuple[int, ...], width: int) -> Program:
-    """Returns a program with the inputs positions and, if used, directions of rays, and with one output."""
+    """Returns a program that maps positions and, if used, the directions of rays to one output."""
     needed, b = pruned(Builder(program).program(outputs)), Builder()
     read = {int(step.numbers[0]) for step in needed.steps if step.op == "input"}
     arguments = [b.input(width)]

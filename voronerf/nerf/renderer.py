@@ -49,14 +49,14 @@ class RenderedImage(NamedTuple):
 
 @replayed
 class Renderer:
-    """Renders the rays of a scene by fields, evaluated at the samples of a sampler.
+    """A renderer of rays, which evaluates fields at the samples of a sampler.
 
     Attributes:
         fields: The fields by name.
         sampler: The sampler, which can be replaced at any time.
 
     Args:
-        fields: The fields under the names of the sampler's networks; "field" gives the colours.
+        fields: The fields by the names of the sampler's networks; "field" gives the colours.
         sampler: The sampler, which chooses the points along each ray.
         backend: The backend of the ops.
 
@@ -125,7 +125,7 @@ class Renderer:
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Rendered, ...]:
-        """Renders rays, with one result for each pass; the last has the final colours. Differentiable.
+        """Renders rays and returns one result for each pass; the last has the final colours. Differentiable.
 
         Args:
             rays: r rays, with radii for cones.
@@ -189,8 +189,8 @@ class Renderer:
             box: [2, 3], the box of the scene. Rays that miss it show the background and do not evaluate the field.
             background: [3], the colour behind the scene; None is black.
             heaviest: Whether to find the samples with the largest weights; else `heaviest` of the result is undefined.
-            chunk: The number of rays rendered at a time, which bounds the memory. Default 4,096, or 131,072 with a
-                grid, which leaves few samples a ray.
+            chunk: The number of rays rendered at a time, which bounds the memory. Default 4,096; 131,072 with a grid,
+                since its rays have few samples.
         """
         if chunk is None:
             chunk = 4096 if self.occupancy is None else 131_072
@@ -242,7 +242,7 @@ def render_rays(
         far: End of the integral, [r] or one for all. A ray with far == near gets the background.
         samples: s, the number of strata with one sample each; or a sampler, such as `Occupancy`.
         background: [3] or [r, 3], the colour behind the scene; None is black.
-        jitter: Whether samples are random in their strata, else in the middles.
+        jitter: Whether samples are at random positions in their strata, else in the middles.
         generator: Random generator of the jitter.
 
     Examples:

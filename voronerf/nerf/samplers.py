@@ -1,6 +1,6 @@
-"""Samplers, which choose the points along rays at which a field is evaluated.
+"""Samplers, which choose the points along rays where a field is evaluated.
 
-A new sampler is a class here and a line in `SAMPLERS`. r rays, m samples of all rays (packed), s samples a ray.
+A new sampler is a class here and a line in `SAMPLERS`. r rays, m samples of all rays (packed), s samples per ray.
 """
 
 from __future__ import annotations
@@ -41,27 +41,29 @@ from voronerf.ops.resample import resample
 COARSE_SHARE = 0.1
 #: The divisor of the number of strata while an occupancy grid settles.
 SETTLING_PART = 4
-#: The number of first steps in which the grid learns nothing, in a contracted sphere; elsewhere it is `WARMUP_STEPS`.
+#: The number of first steps in which the grid of a contracted sphere learns nothing; for other grids, `WARMUP_STEPS`.
 #: An untrained field is thin everywhere: the grid would take it for empty, and emptied voxels learn no more. The more
 #: samples a step has, the sooner the whole grid would be empty.
 SETTLING_STEPS = 400
-#: The share of the voxels that are evaluated at random before each `GROUP` of steps, and the most such voxels, which is
-#: about the number of samples of a few steps.
+#: The fraction of voxels that are evaluated at random before each `GROUP` of steps, and the maximum number of these
+#: voxels: about the number of samples of a few steps.
 REVISITED, MOST_REVISITED = 1 / 8, 32_768
-#: The factor on the strata of a ray in pictures, since training samples are jittered and cover each stratum over time;
-#: and the most strata. Twice the 256 strata of a long training would make no picture more than 0.05 dB better.
+#: The factor on the strata of a ray for pictures, and their maximum number. A training needs fewer strata, since its
+#: jittered samples cover each stratum over time. Twice the 256 strata of a long training would improve no picture by
+#: more than 0.05 dB.
 PICTURE_SAMPLES, MOST_PICTURE_SAMPLES = 2, 384
-#: The transmittance below which a ray of a picture ends; the rest of the ray counts as having the colour so far.
+#: The transmittance below which a ray of a picture ends; the ray then counts as opaque with its colour so far.
 OPAQUE = 0.05
-#: Samples of a ray in a wave. Small waves have more overhead, large waves evaluate samples behind the surface in vain.
-#: Pictures of contracted space, photographs, have more rays, so the overhead of a wave counts less.
+#: The samples per ray of a wave, in a box and in contracted space. Small waves have more overhead, large waves evaluate
+#: samples behind the surface in vain. Photographs need contracted space and have more rays, so the overhead of a wave
+#: counts less.
 WAVE, CONTRACTED_WAVE = 12, 8
-#: Samples of a ray in a wave if one operation runs all waves, whose overhead is then negligible.
+#: The samples per ray of a wave if one operation runs all waves; the overhead of a wave is then negligible.
 FINE_WAVE = 4
-#: Strata of a ray through contracted space, by the least training time in seconds. Shorter strata make steps slower at
-#: first, and pictures sharper in the end.
+#: The strata of a ray through contracted space, by the minimum training time in seconds. Shorter strata make steps
+#: slower, but pictures sharper in the end.
 CONTRACTED_SAMPLES = {0.0: 128, LONG: 256, 90.0: 384}
-#: A training in a box is long from this many seconds per pixel along the box; it then has at most this many strata.
+#: The minimum time of a long training in a box, in seconds per pixel along the box, and its maximum number of strata.
 LONG_IN_BOX, LONG_SAMPLES = 0.45, 256
 #: A function that renders samples with the field of a name.
 RenderPass = Callable[[str, Samples], Rendered]
@@ -72,29 +74,29 @@ class Sampler:
     """A rule that chooses the sample points of rays, and may learn from the steps of a training.
 
     A subclass defines :meth:`sample`. A subclass with several passes also defines :meth:`draw` and
-    :meth:`loss_before`. One that learns defines :meth:`step_pre_backward` and :meth:`step_post_backward`. One that
-    skips empty space defines ``grid``. No code checks the class of a sampler.
+    :meth:`loss_before`. A subclass that learns defines :meth:`step_pre_backward` and :meth:`step_post_backward`. A
+    subclass that skips empty space defines ``grid``. The library uses only these members, never the class of a sampler.
 
     Each training step calls :meth:`step_pre_backward`, then :meth:`sample` after drawing its rays, then
     :meth:`step_post_backward` after the optimiser. These hooks may change the sampler and its grid; changes to other
     objects take effect in the next step. The tensors that a hook receives belong to the step, and must be read before
-    the hook returns. A replayed step calls the hooks that a subclass overrides, and replays the calls of the others.
+    the hook returns. A replayed step calls the hooks that a subclass overrides, and replays the other hooks.
 
     Attributes:
         passes: The number of passes over a ray, each with its own number of samples.
         skips: Whether `Occupancy` replaces this sampler if there is a grid.
-        samples: s, the samples a ray of the first pass.
+        samples: s, the number of samples per ray in the first pass.
         space: The coordinates in which rays are sampled and the field is evaluated.
         backend: The backend of the ops.
         settling_steps: The number of first training steps in which the grid learns nothing.
 
     Args:
-        samples: s, the samples a ray of the first pass, at least 1.
+        samples: s, the number of samples per ray in the first pass, at least 1.
         space: The coordinates of samples and field; None for world coordinates with even spacing.
         backend: The backend of the ops.
 
     Raises:
-        ValueError: There are fewer samples than 1.
+        ValueError: ``samples`` is below 1.
 
     Examples:
         >>> import torch
@@ -130,7 +132,7 @@ class Sampler:
 
     @property
     def strata(self) -> int:
-        """The most samples a ray of the first pass of the next training step."""
+        """The maximum number of samples per ray in the first pass of the next training step."""
         return self.samples
 
     def explain(self) -> str:
@@ -182,7 +184,7 @@ class Sampler:
     def see(
         self, field: Field, rays: Rays, near: Tensor, far: Tensor, *, background: Tensor | None, heaviest: bool
     ) -> RayColours | None:
-        """Renders rays of a picture if that needs fewer samples than :meth:`draw`; else returns None.
+        """Renders rays of a picture with fewer samples than :meth:`draw`; returns None if this is not possible.
 
         Args:
             field: The field that gives the colours.
@@ -247,7 +249,7 @@ class Sampler:
 
 @replayed
 class Stratified(Sampler):
-    """One sample in each of s strata of a ray (NeRF, section 4).
+    """A sampler with one sample in each of s strata of a ray (NeRF, section 4).
 
     Examples:
         >>> import torch
@@ -282,27 +284,27 @@ class Stratified(Sampler):
 
 @replayed
 class Occupancy(Sampler):
-    """Stratified samples without the samples in empty voxels of a grid, so rays differ in their number of samples.
+    """A stratified sampler that skips the empty voxels of a grid, so rays differ in their number of samples.
 
     In a training the grid learns from the samples of each step. Before each `GROUP` of steps the field is evaluated in
     random voxels, which restores voxels that were emptied by mistake.
 
     Attributes:
         grid: The occupancy grid; all space outside its box is empty.
-        settling: Whether the grid has not learnt yet. A training step then uses a part of the strata, since no space is
-            skipped, and since an untrained field finds its surfaces sooner with fewer and longer strata.
+        settling: Whether the grid has not learnt yet. A training step then uses only a fraction of the strata: no space
+            is skipped yet, and an untrained field finds its surfaces sooner with fewer and longer strata.
 
     Args:
         grid: The occupancy grid, in contracted space if there is a contraction. It can be replaced at any time.
         samples: s, strata of a ray.
-        picture_samples: Strata of a ray of a picture; None for `PICTURE_SAMPLES` times ``samples``. Rays of a picture
-            end at the first surface, so additional strata cost little.
+        picture_samples: Strata of a ray of a picture; None for `PICTURE_SAMPLES` times ``samples``. Since rays of a
+            picture end at the first surface, additional strata cost little.
         space: The coordinates in which rays are sampled and the field is evaluated.
         empty: bool [v], voxels that stay empty in a training; None for none.
         backend: The backend of the ops.
 
     Raises:
-        ValueError: The space has cones, or a contraction that the grid does not have, or the other way round.
+        ValueError: The space has cones, or only one of the grid and the space has a contraction.
 
     Examples:
         >>> import torch
@@ -329,7 +331,7 @@ class Occupancy(Sampler):
     ) -> None:
         super().__init__(samples, space=space, backend=backend)
         if self.space.cones or (grid.contraction is None) != (self.space.contraction is None):
-            raise ValueError("Occupancy: grid must be of points, and in the space of the contraction")
+            raise ValueError("Occupancy: grid requires point samples and the same contraction as the space")
         self.empty = None if empty is None else empty.view(grid.occupied.shape)
         self.grid = grid
         self.picture_samples = picture_samples or max(min(PICTURE_SAMPLES * samples, MOST_PICTURE_SAMPLES), samples)
@@ -352,12 +354,12 @@ class Occupancy(Sampler):
 
     @property
     def strata(self) -> int:
-        """The strata of a ray in a training step: `samples`, or a part of them while the grid settles."""
+        """The strata of a ray in a training step: `samples`, or a fraction of this number while the grid settles."""
         return max(1, self.samples // SETTLING_PART) if self.settling else self.samples
 
     def explain(self) -> str:
-        """Describes the sampler and the occupied share of its grid in one line."""
-        return f"{super().explain()}, of which {self.grid.share:.0%} of the grid are left"
+        """Describes the sampler and the occupied fraction of its grid in one line."""
+        return f"{super().explain()}; {self.grid.share:.0%} of the grid is occupied"
 
     @torch.no_grad()
     def see(
@@ -409,7 +411,7 @@ class Occupancy(Sampler):
         return RayColours(seen.colour, seen.opacity, seen.depth, positions)
 
     def _network_arguments(self, field: Field, rays: Rays) -> dict[str, Any] | None:
-        """Returns the arguments of a field for `render_opaque`; None for fields that it cannot run, Warp and CUDA."""
+        """Returns a field's arguments for `render_opaque`; None if the op cannot run the field, or for Warp or CUDA."""
         router = router_of(field)
         if router is None or not rays.origins.is_cpu or "warp" in (self.backend, router.backend):
             return None
@@ -444,7 +446,7 @@ class Occupancy(Sampler):
         return step >= self.settling_steps and step % schedule.GROUP == 0
 
     def steps_alike(self, step: int) -> int:
-        """Returns the steps up to the next evaluation of voxels; see :meth:`Sampler.steps_alike`."""
+        """Returns the number of steps up to the next evaluation of voxels; see :meth:`Sampler.steps_alike`."""
         settling = self.settling_steps - step
         return settling if settling > 0 else schedule.GROUP - step % schedule.GROUP
 
@@ -458,7 +460,7 @@ class Occupancy(Sampler):
     def finish(self, field: Field, seed: int) -> None:
         """Removes specks from the grid of a box, and fills holes in surfaces of a contracted sphere.
 
-        See `OccupancyGrid.drop_specks` and `OccupancyGrid.fill_holes`. Other grids gain nothing by either.
+        See `OccupancyGrid.drop_specks` and `OccupancyGrid.fill_holes`. Other grids gain nothing from either method.
 
         Args:
             field: The trained field.
@@ -481,7 +483,7 @@ class Occupancy(Sampler):
         generator: torch.Generator | None = None,
     ) -> Samples:
         """Returns the samples of the occupied strata of each ray; see :meth:`Sampler.sample`."""
-        # The jitter of a ray is seeded with the seed plus the number of the ray.
+        # The seed of a ray's jitter is ``seed`` plus the number of the ray.
         seed = draw_seed(near.device, generator) if jitter else None
         return self.march(rays, near, far, seed=seed)[0]
 
@@ -496,7 +498,9 @@ class Occupancy(Sampler):
         most: int | None = None,
         picture: bool = False,
     ) -> tuple[Samples, Tensor]:
-        """Returns the samples in occupied voxels, and the stratum [r] after each ray's last; see `ops.march_rays`.
+        """Returns the samples in occupied voxels, and the stratum [r] after the last sample of each ray.
+
+        See `ops.march_rays`.
 
         Args:
             rays: r rays.
@@ -504,7 +508,7 @@ class Occupancy(Sampler):
             far: [r], the distances at which the rays end.
             seed: int32 [1], the seed of random samples; None for the middles of the strata.
             start: int32 [r], the first stratum of each ray; None for 0.
-            most: The most samples a ray; None for no limit.
+            most: The maximum number of samples per ray; None for no limit.
             picture: Whether rays have ``picture_samples`` strata instead of ``strata``.
         """
         samples = self.picture_samples if picture else self.strata
@@ -519,14 +523,15 @@ class Occupancy(Sampler):
 
 @replayed
 class Hierarchical(Stratified):
-    """Two passes: the second samples by the weights of the first (NeRF, section 5.2; mip-NeRF, section 3.2).
+    """A sampler with two passes; the first pass gives the weights that the second draws from.
 
-    For points, a network "coarse" renders the first pass, and the second pass evaluates the points of both. For cones,
-    "field" is evaluated twice, the second time in new intervals, and the loss of the first pass counts a tenth.
+    Source: NeRF, section 5.2; mip-NeRF, section 3.2. For points, a network "coarse" renders the first pass, and the
+    second pass evaluates the points of both. For cones, "field" is evaluated twice, the second time in new intervals,
+    and the loss of the first pass counts a tenth.
 
     Args:
-        samples: s, the samples a ray of the first pass.
-        fine_samples: The new samples a ray of the second pass.
+        samples: s, the number of samples per ray in the first pass.
+        fine_samples: The number of new samples per ray in the second pass.
         space: The coordinates in which rays are sampled and the fields are evaluated.
         backend: The backend of the ops.
 
@@ -604,11 +609,11 @@ def evaluating(field: Field) -> Iterator[None]:
 
 
 def usual_samples(pixels: float, *, contracted: bool = False, seconds: float = 0.0) -> int:
-    """Returns the strata of a ray for a field on a hash grid whose empty space is skipped.
+    """Returns the number of strata per ray for a hash-grid field with an occupancy grid.
 
-    In a box the strata grow with the square root of its pixels: 64 for the 100 x 100 images of Lego, 128 for images of
-    400 x 400. More strata cost time; strata longer than a pixel cost sharpness. A long training, from 40 seconds at
-    100 x 100 and from 160 seconds at 400 x 400, has twice as many strata, at most 256. Contracted space has 128 strata,
+    In a box, the number grows with the square root of ``pixels``: 64 for the 100 x 100 images of Lego, 128 for images
+    of 400 x 400. More strata cost time; strata longer than a pixel cost sharpness. A long training (at least 40 seconds
+    at 100 x 100, or 160 seconds at 400 x 400) has twice as many strata, at most 256. Contracted space has 128 strata,
     256 in a training of at least 25 seconds, or 384 in a training of at least 90 seconds.
 
     Args:

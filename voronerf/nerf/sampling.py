@@ -1,4 +1,4 @@
-"""Sample depths along rays, and the loss of their colours. r rays, s samples a ray; distances in world units."""
+"""Sample depths along rays, and the loss of their colours. r rays, s samples per ray; distances in world units."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def stratified_depths(
             have to wait for the device. A ray with near == 0 gets finite depths, all 0 except for the far end.
         far: [r], the end of each ray, >= near.
         samples: s, >= 1.
-        jitter: Whether a sample is uniformly random in its stratum, else in the middle (for "disparity", the middle in
-            disparity).
+        jitter: Whether each sample is uniformly random in its stratum; else it is in the middle (for "disparity", the
+            middle in disparity).
         spacing: "linear" for strata of equal length, or "disparity" for equal steps of 1 / distance, which are dense
             near the camera and suit scenes with a far background.
         generator: Random generator of the jitter, on any device; its numbers are moved to the device of the rays.
@@ -39,7 +39,7 @@ def stratified_depths(
         far - near.
 
     Raises:
-        ValueError: A wrong shape, an unknown spacing, or fewer samples than 1.
+        ValueError: A shape is wrong, the spacing is unknown, or ``samples`` is below 1.
 
     Examples:
         >>> import torch
@@ -83,7 +83,7 @@ def stratified_edges(
         near: [r], the start of each ray, as for `stratified_depths`.
         far: [r], the end of each ray.
         samples: s, >= 1.
-        jitter: Whether each inner edge is uniformly random between the middles of its two strata, else the edges are
+        jitter: Whether each inner edge is uniformly random between the middles of its two strata; else the edges are
             evenly spaced.
         spacing: "linear" or "disparity".
         generator: Random generator of the jitter, on any device.
@@ -101,7 +101,7 @@ def stratified_edges(
 
 
 def random_uniforms(rows: int, columns: int, like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Returns random numbers [rows, columns] in 0..1, drawn on the generator's device and moved to `like`'s."""
+    """Returns random numbers [rows, columns] in 0..1, drawn on the generator's device and moved to `like.device`."""
     device = like.device if generator is None else generator.device
     return torch.rand(rows, columns, device=device, dtype=like.dtype, generator=generator).to(like.device)
 
@@ -111,7 +111,7 @@ def strata_uniforms(
 ) -> Tensor | None:
     """Returns random numbers [r, count] in 0..1, one in each of `count` strata; None without jitter (the middles).
 
-    The numbers are spread more evenly than independent ones, and have the same distribution.
+    The numbers cover 0..1 more evenly than independent numbers, with the same distribution.
     """
     if not jitter:
         return None
@@ -132,7 +132,7 @@ def blurred_weights(weights: Tensor) -> Tensor:
 def union_depths(
     depths: Tensor, edges: Tensor, weights: Tensor, count: int, *, uniforms: Tensor | None = None, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """Returns the samples of a first pass and new ones drawn by their weights (NeRF, section 5.2).
+    """Returns the samples of a first pass and new samples drawn by the first samples' weights (NeRF, section 5.2).
 
     Args:
         depths: [r, s], the depths of the first pass.

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 
 #: The number of steps that are replayed in one call. The learning rate, the number of rays, the averaged weights and
-#: the revisited voxels change only between such groups. Longer groups gain little: 3 % of the time is spent in between.
+#: the revisited voxels change only between such groups. Longer groups gain little: 3 % of the time is spent between
+#: groups.
 GROUP = 16
-#: The most steps of the warm-up, in which the learning rate rises. Densities stay low while the rate is small. An
-#: occupancy grid forgets in eight to thirty steps, and would empty all voxels for good, so it learns only afterwards.
+#: The maximum number of warm-up steps, in which the learning rate rises. Densities stay low while the rate is small. An
+#: occupancy grid forgets in eight to thirty steps and would empty all voxels for good, so it learns only after the
+#: warm-up.
 WARMUP_STEPS = 100
 #: The longest warm-up as a fraction of the training.
 WARMUP = 0.02
 #: The learning rate at the end, as a fraction of the rate at the start.
 FINAL = 0.05
-#: The target share of a step's samples in occupied space, relative to the first step's samples; see `next_rays`.
-#: The share grows with the samples of a ray beyond `FILL_SAMPLES`, or `CONTRACTED_FILL_SAMPLES` in contracted space:
+#: The target number of a step's samples in occupied space, as a fraction of the first step's samples; see `next_rays`.
+#: The fraction grows with the samples of a ray beyond `FILL_SAMPLES`, or `CONTRACTED_FILL_SAMPLES` in contracted space:
 #: fields with more samples have larger tables, whose update costs less per ray in a larger batch.
 FILL, FILL_SAMPLES, CONTRACTED_FILL_SAMPLES = 0.25, 64, 128
 
@@ -23,13 +25,13 @@ FILL, FILL_SAMPLES, CONTRACTED_FILL_SAMPLES = 0.25, 64, 128
 def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0, began: int = 0) -> float:
     """Returns the learning rate of a step: a linear warm-up over `WARMUP`, then ``lr``, then exponential decay.
 
-    The warm-up takes at most `WARMUP_STEPS`, and exactly as many after a restart of the training.
+    The warm-up takes at most `WARMUP_STEPS` steps; after a restart of the training, exactly `WARMUP_STEPS`.
 
     Args:
         lr: The highest rate.
         fraction: The completed fraction of the training, 0..1.
         step: The number of steps done.
-        hold: Fraction of the training after which the rate falls, down to ``lr * FINAL`` at the end.
+        hold: The fraction of the training after which the rate falls; it reaches ``lr * FINAL`` at the end.
         began: The step at which the training was restarted; 0 for never.
     """
     warmup = max((step - began) / WARMUP_STEPS, 0.0 if began else fraction / WARMUP)
@@ -43,10 +45,10 @@ def next_rays(now: int, taken: int, *, rays: int, samples: int, growth: float, c
 
     Args:
         now: The number of rays of the last step.
-        taken: The number of its samples in occupied space.
+        taken: The number of samples of the last step in occupied space.
         rays: The number of rays of the first step, which is the minimum.
         samples: Strata of a ray of the last step.
-        growth: The most rays, as a multiple of ``rays``.
+        growth: The maximum number of rays, as a multiple of ``rays``.
         contracted: Whether space is contracted.
     """
     limit = CONTRACTED_FILL_SAMPLES if contracted else FILL_SAMPLES

@@ -17,7 +17,7 @@ from voronerf.ops._core.recording import Recording, entries_of, mapped
 
 T = TypeVar("T", bound=type)
 
-#: The most calls that run eagerly after a recording that no call could replay; the number doubles from 1.
+#: The maximum number of eager calls after a recording that could not be replayed; the number starts at 1 and doubles.
 MAX_BACKOFF = 64
 _REPLAYED = set[type]()
 _HARMLESS = {
@@ -31,8 +31,9 @@ def replayed(kind: T) -> T:
 
     Its methods must compute only with ops and elementwise functions of torch, and data that changes from step to step
     must lie in tensors. Other Python code runs only once, while the step is recorded. All classes of this package are
-    marked. If an unmarked subclass overrides a hook, this hook is called in each step; if it overrides anything else,
-    all its hooks are called. A step tracks the attributes of objects, not of classes.
+    marked. If an unmarked subclass overrides a hook, this hook is called in each step; if it overrides another member
+    that hooks may use, all its hooks are called. A step detects changes of instance attributes, but not of class
+    attributes.
 
     Examples:
         >>> from voronerf.nerf import SplitStrategy, replayed
@@ -49,14 +50,14 @@ def replayed(kind: T) -> T:
 
 
 def in_python(part: Any, hook: str = "") -> bool:
-    """Returns whether a hook (or "": any hook) of an object must be called in each step, not being `replayed`."""
+    """Returns whether a hook of an object (any hook for "") must be called in each step instead of being replayed."""
     kind: Any = type(part)
     return hook in getattr(part, "__dict__", ()) or _overrides(kind, hook)
 
 
 @functools.lru_cache(maxsize=256)
 def _overrides(kind: Any, hook: str) -> bool:
-    """Returns whether a class overrides a hook of a `replayed` class, or a member that the hook may use."""
+    """Returns whether a class overrides a hook of a `replayed` class, or another member that this hook may use."""
     replayed_base = next((base for base in kind.__mro__ if base in _REPLAYED), None)
     if replayed_base is None:
         return True
@@ -79,7 +80,7 @@ def free_names(part: Any) -> list[str]:
 
 @functools.lru_cache(maxsize=256)
 def _names_read(kind: Any) -> frozenset[str]:
-    """Returns the attributes of `self` that the code of the `replayed` classes among a class and its bases uses."""
+    """Returns the attributes of `self` that a class and its bases use; only `replayed` classes count."""
     names, codes = set[str](), list[types.CodeType]()
     for base in filter(_REPLAYED.__contains__, kind.__mro__):
         for value in vars(base).values():
@@ -101,9 +102,9 @@ class Stage(NamedTuple):
     Attributes:
         name: The name that users see.
         function: Function from results of earlier stages to new results by name, or to None.
-        reads: The names of the results that it takes.
-        python: Whether it is called in each step; else it may be replayed.
-        lazy: Whether a stage in Python gets the recorded results, and asks for their current rows itself.
+        reads: The names of the results that the function takes.
+        python: Whether the function is called in each step; else it may be replayed.
+        lazy: Whether the function of a stage in Python gets recorded results, and itself takes their current rows.
     """
 
     name: str
@@ -127,7 +128,7 @@ class SegmentResult(NamedTuple):
     Attributes:
         value: The result of the recorded call, or of this call.
         recording: The recording that holds the result; None if this call ran eagerly.
-        times: The number of times that the calls were made.
+        times: The number of times that this call ran or replayed the function.
     """
 
     value: Any
@@ -135,7 +136,7 @@ class SegmentResult(NamedTuple):
     times: int = 1
 
     def now(self, value: Any) -> Any:
-        """Returns the value or a part of it with the rows that this call has filled."""
+        """Returns ``value``, the value or a part of it, with only the rows that this call has filled."""
         return value if self.recording is None else self.recording.now(value)
 
 
@@ -146,7 +147,7 @@ class Segment:
         recording: The recorded calls; None if there is no recording.
         replayed: Whether the last call was replayed.
         obstacle: The reason why the last recording cannot be replayed; "" for none.
-        eager_calls: The number of next calls that run eagerly, since the last recordings were not replayed.
+        eager_calls: The number of upcoming calls that run eagerly: the back-off after recordings without a replay.
 
     Examples:
         >>> import torch
@@ -172,12 +173,13 @@ class Segment:
         self._results, self._key = list[Any](), list[Any]()
 
     def __call__(self, function: Callable[..., Any], *arguments: Any, times: int = 1) -> SegmentResult:
-        """Returns the result of a function, by a replay if possible.
+        """Returns the result of a function; replays the recorded calls of the function if possible.
 
         Args:
             function: The function, which does the same in each call apart from its arguments.
-            arguments: Results of other segments (`SegmentResult`), read in place; row counts; or tensors in tuples,
-                dictionaries and dataclasses, which are copied. Their numbers of rows may change from call to call.
+            arguments: Results of other segments (`SegmentResult`), which are read in place; row counts; or tensors in
+                tuples, dictionaries and dataclasses, which are copied. The numbers of rows may change from call to
+                call.
             times: The number of replays in a row; without a replay the function is called once.
         """
         tensors, key = _flatten(arguments)

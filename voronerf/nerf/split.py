@@ -1,4 +1,4 @@
-"""Cell splits in a training: samples are kept, the diagram is refined, new cells inherit their networks.
+"""Cell splits in a training: kept samples refine the diagram, and new cells inherit their networks.
 
 m samples, k cells.
 """
@@ -19,11 +19,11 @@ from voronerf.nerf.segment import replayed
 from voronerf.nerf.volume import RenderOutput
 from voronerf.router import VoronoiRouter
 
-#: Default times of splits as fractions of the training: a single split, and the first and last of several splits.
+#: Default times of splits as fractions of the training: for a single split, and for the first and the last of several.
 ONLY, FIRST, LAST = 0.2, 0.15, 0.5
 #: A cell with fewer kept samples is not split further.
 MIN_SAMPLES = 64
-#: The number of kept samples (Elsner et al. 2023, section 3.1), and of the latest batches that they come from.
+#: The number of kept samples (Elsner et al. 2023, section 3.1), and the number of latest batches that they come from.
 RESERVOIR, BATCHES = 10_000, 500
 #: Steps between attempts to split the worst cell while no cell holds enough samples.
 TRY_EVERY = 5
@@ -36,7 +36,7 @@ class PlannedSplit:
     Attributes:
         at: The time of the split: a fraction of the training if below 1, else a number of steps.
         children: Number of new cells for each split cell.
-        cells: The cells to split: "all", or only the "worst", which has the largest accumulated error.
+        cells: "all" to split all cells, or "worst" to split only the cell with the largest accumulated error.
         most: Largest number of cells after the split, or None for no limit.
 
     Examples:
@@ -90,7 +90,7 @@ class SplitDone(NamedTuple):
     """The result of a split.
 
     Attributes:
-        split: The refined diagram, parents and balances; without balances no cell held enough samples.
+        split: The refined diagram, parents and balances; if there are no balances, no cell held enough samples.
         points: [m, 3], the samples from which the new cells were computed.
         importance: [m], the importance of each sample.
     """
@@ -104,11 +104,11 @@ class SplitDone(NamedTuple):
 class Strategy:
     """The base class of rules for splitting cells in a training; it never splits a cell.
 
-    Before each step the loop checks :meth:`is_due`, and :meth:`has_samples` if the split can wait. If a split is due,
-    it calls :meth:`step_pre_backward`, the only hook that may change networks and optimiser. After the optimiser, each
-    step calls :meth:`step_post_backward`, which may change only the strategy itself. The tensors of its argument belong
-    to the step, and must be read before the hook returns. A replayed step calls the hooks that a subclass overrides,
-    and replays the calls of the others.
+    Before each step the loop checks :meth:`is_due`. A loop that can postpone the split also checks :meth:`has_samples`.
+    If a split is due, the loop calls :meth:`step_pre_backward`, the only hook that may change networks and optimiser.
+    After the optimiser, each step calls :meth:`step_post_backward`, which may change only the strategy itself. The
+    tensors that the hook receives belong to the step, and must be read before the hook returns. A replayed step calls
+    the hooks that a subclass overrides, and replays the other hooks.
 
     Attributes:
         inherit: Whether new cells start as copies of their parent.
@@ -176,7 +176,7 @@ class Strategy:
 
 @replayed
 class SplitStrategy(Strategy):
-    """A strategy that splits cells at planned times by their samples' errors (Elsner et al. 2023, section 3).
+    """A strategy that splits cells at planned times, guided by sample errors (Elsner et al. 2023, section 3).
 
     Call :meth:`step_pre_backward` before each step of a training and :meth:`step_post_backward` after its loss.
 
@@ -191,7 +191,7 @@ class SplitStrategy(Strategy):
         inherit: Whether new cells start as copies of their parent, else from random parameters.
         min_samples: A cell with fewer kept samples is not split further.
         reservoir: The number of samples to keep.
-        batches: The number of latest batches that the kept samples come from.
+        batches: The number of latest batches from which samples are kept.
         generator: CPU generator of random choices; None for torch's global generator.
         backend: The backend of the ops.
 
@@ -240,7 +240,7 @@ class SplitStrategy(Strategy):
 
     @property
     def planned(self) -> PlannedSplit | None:
-        """The next split; None after the last split, from which on no samples are kept."""
+        """The next split; None after the last split, when no more samples are kept."""
         return self.plan[self.splits] if self.splits < len(self.plan) else None
 
     @property
@@ -249,7 +249,7 @@ class SplitStrategy(Strategy):
         return len(self.plan) - self.splits
 
     def has_samples(self) -> bool:
-        """Returns whether there is a sample for each new cell of the first split; later splits wait by themselves."""
+        """Returns whether the first split has at least one kept sample per child; always True for later splits."""
         return self.splits > 0 or len(self.reservoir) >= (self.planned.children if self.planned else 0)
 
     def is_due(self, fraction: float, step: int) -> bool:
@@ -284,8 +284,8 @@ class SplitStrategy(Strategy):
         points, importance = self.reservoir.samples()
         if len(points) < children and self.splits == 0:
             raise ValueError(
-                f"SplitStrategy: more cells than samples: {children} cells are asked for, {len(points)} samples were "
-                f"kept in {step} steps; split later"
+                f"SplitStrategy: {children} cells need at least {children} samples, got {len(points)} after {step} "
+                f"steps; split later"
             )
         split = Split(self.diagram, torch.arange(cells), {})
         if len(points) >= children:

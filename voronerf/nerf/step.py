@@ -86,15 +86,15 @@ class TrainingStep:
     """A training step: draws rays, computes loss and gradients, updates networks, sampler and split strategy.
 
     The first step records its calls of the compiled module, and later steps replay them, several steps in one call. No
-    Python runs in between, and threads are woken once. The results are the same to the bit.
+    Python runs in between, and threads are woken once per call. The results are bit-identical to eager steps.
 
     A user's hook of a `Sampler`, a `Strategy`, a source of rays or a term of the loss is called in each step, between
-    two replayed segments; see `replayed`. If it changes other objects, the next step uses the changes. On CUDA, a step
-    without such hooks is captured in a CUDA graph after a warm-up step; another number of rays is captured again.
+    two replayed segments; see `replayed`. If the hook changes other objects, the next step uses the changes. On CUDA, a
+    step without such hooks is captured in a CUDA graph after a warm-up step; a new number of rays needs a new capture.
 
-    A step that cannot be replayed runs eagerly; :meth:`explain` tells why. For example, a parameter may need a gradient
-    but belong to another optimiser. Changed attributes of the objects are detected, and so is a tensor that moves to
-    other memory (``x.data = y``). After other changes inside an object, call :meth:`forget`.
+    A step that cannot be replayed runs eagerly; :meth:`explain` tells why. One reason is a parameter that needs a
+    gradient but belongs to another optimiser. Changed attributes of the objects are detected, and so is a tensor that
+    moves to other memory (``x.data = y``). After other changes inside an object, call :meth:`forget`.
 
     Args:
         batches: The source of rays: `RayBatches`, or another :class:`RaySource`.
@@ -105,7 +105,7 @@ class TrainingStep:
         generator: Random generator of the step.
         autocast: The dtype of the networks under autocast; None for float32. With autocast, a step is captured on CUDA,
             and runs eagerly on the CPU.
-        scaler: GradScaler for float16, with which a step is not captured; None for none.
+        scaler: GradScaler for float16, which prevents the capture of a step; None for no scaler.
 
     Examples:
         >>> import torch
@@ -167,7 +167,7 @@ class TrainingStep:
         self._obstacle = ""
 
     def explain(self) -> str:
-        """Describes whether steps are replayed, and if not why, and lists the hooks that run in Python."""
+        """Describes whether steps are replayed or why they are not, and lists the hooks that run in Python."""
         if self._capture is not None:
             return "step: captured and replayed as a CUDA graph"
         segments = [each for name, each in self._segments.items() if name not in ("before", "after")]
@@ -175,15 +175,16 @@ class TrainingStep:
         obstacle = obstacle or next((each.obstacle for each in segments if each.obstacle), "")
         recorded = [each.recording for each in segments if each.recording is not None]
         if obstacle and not recorded:
-            return f"step: runs as it is, since {obstacle}"
+            return f"step: runs eagerly, since {obstacle}"
         if not obstacle and (eager := max((self._eager_steps, *(each.eager_calls for each in segments)))):
-            return f"step: runs as it is {eager} times more, since the last recordings were not replayed"
+            steps = f"{eager} more step{'s' * (eager > 1)}"
+            return f"step: runs eagerly for {steps}, since the last recordings could not be replayed"
         if not recorded:
             return "step: will be recorded"
         calls, several = sum(map(len, recorded)), f" in {len(recorded)} segments" if len(recorded) > 1 else ""
         lines = [f"step: recorded and replayed, {calls} calls{several}"]
         others = [each.obstacle for each in self._segments.values() if each.obstacle]
-        lines += [f"another segment runs as it is, since {each}" for each in others]
+        lines += [f"another segment runs eagerly, since {each}" for each in others]
         spent = self._spent.items()
         lines += [f"in Python: {name}, {1e3 * seconds / calls:.3f} ms a call" for name, (seconds, calls) in spent]
         return "\n".join(lines)
@@ -196,13 +197,14 @@ class TrainingStep:
             steps: The number of steps, at least 1.
             at: The number of steps done before, or None if the loop calls the hooks itself. If set, the step also calls
                 the sampler's ``step_pre_backward``, as often as ``steps_alike`` demands or, with user hooks, before
-                each step. It calls the optimiser's ``after_step`` after each multiple of `GROUP`. Both are recorded.
+                each step. It calls the optimiser's ``after_step`` after each multiple of `GROUP` steps. Both hooks are
+                recorded.
 
         Returns:
             The result of the last step.
 
         Raises:
-            ValueError: There are fewer steps than 1.
+            ValueError: ``steps`` is below 1.
         """
         if steps < 1:
             raise ValueError(f"TrainingStep: steps must be >= 1, got {steps}")
@@ -224,10 +226,10 @@ class TrainingStep:
                 self._run_or_replay_hook("after", functools.partial(self.optimizer.after_step, at))
         return output
 
-    # Segments of a step that an outer loop drives, since the host computes something in between -----------------------
+    # Segments of a step that an outer loop runs, with host code in between --------------------------------------------
 
     def begin(self, at: int) -> None:
-        """Begins a step whose segments are driven by an outer loop, with host code in between.
+        """Begins a step of segments that an outer loop runs, with host code in between.
 
         Calls the sampler's ``step_pre_backward``. The loop then calls :meth:`do` for each segment, and :meth:`end`.
 
@@ -346,7 +348,7 @@ class TrainingStep:
             groups = itertools.groupby(stages, operator.attrgetter("python"))
             self._groups = [(python, f"step {place}", [*group]) for place, (python, group) in enumerate(groups)]
             for name in self._segments.keys() - {"before", "after", *(name for _, name, _ in self._groups)}:
-                del self._segments[name]  # segments between other hooks
+                del self._segments[name]  # these segments lie between other hooks
             self._note_dependencies()  # before the hooks, whose changes the next step uses
         self._last, hook_results = SegmentResult({}), dict[str, Any]()
         for python, name, stages in self._groups:
@@ -381,7 +383,7 @@ class TrainingStep:
             return run_stages(stages, {**earlier, **hook_results, "rays": rays})
 
     def _settle_gradients(self, segment: Segment) -> None:
-        """Sets ``grad`` of all parameters to the memory that replays write; eager steps or the loop may change it."""
+        """Sets ``grad`` of all parameters to the memory that replays write; eager steps or the loop may replace it."""
         if segment.replayed:
             for parameter, gradient in self._gradients:
                 if parameter.grad is not gradient:
@@ -393,7 +395,7 @@ class TrainingStep:
                     recording.hold(gradient)
 
     def _run_or_replay_hook(self, name: str, function: Callable[[], None]) -> None:
-        """Calls a hook outside the step, or replays its calls."""
+        """Calls a hook outside the step, or replays the calls that the hook has recorded."""
         if self._last.recording is not None and self._is_unchanged():
             self._segments.setdefault(name, Segment())(function)
         else:
@@ -410,7 +412,7 @@ class TrainingStep:
         """Does the same as `_run_or_replay` by a CUDA graph, which is captured after a warm-up step."""
         if self._calls_hooks():
             self.forget()
-            self._obstacle = "Python runs in it, which a CUDA graph does not make"
+            self._obstacle = "it calls a Python hook, which a CUDA graph cannot replay"
             return 1, StepOutput(*self._run_eagerly(rays))
         self._rays, capture = rays, self._capture
         if capture is not None and is_unchanged and (times := capture.replay(backends.threads(), steps)):
@@ -423,7 +425,7 @@ class TrainingStep:
             return 1, StepOutput(*self._run_eagerly(rays))
         self.forget()
         if not is_unchanged:
-            result, self._obstacle = self._run_eagerly(rays), "no step of its kind was made before"
+            result, self._obstacle = self._run_eagerly(rays), "it needs a warm-up step before the capture"
         else:
             self._eager_steps, self._backoff = self._backoff, min(2 * self._backoff or 1, MAX_BACKOFF)
             result = self._capture_step(capture)
@@ -439,7 +441,7 @@ class TrainingStep:
             self._captured = capture.capture(lambda: self._run_eagerly(capture.count(lambda: self._rays)))
             self._capture, self._gradients = capture, self._with_gradients()
         self._obstacle = capture.obstacle or ""
-        for parameter, gradient in gradients:  # of the eager step
+        for parameter, gradient in gradients:  # the gradients of the eager step
             parameter.grad = gradient
         return result
 
@@ -490,9 +492,9 @@ class TrainingStep:
         scaler.update()
 
     def _standing_obstacle(self) -> str | None:
-        """Returns the reason why no step can be replayed, or None; checks everything except the calls of a step."""
+        """Returns the reason why no step can be replayed, or None; does not check the calls of a step."""
         if is_watched():
-            return "a mode, a transform or a profiler of torch watches"
+            return "a mode, a transform or a profiler of torch is active"
         renderer, device = self.loss.renderer, self.batches.device
         place = getattr(self.batches, "place", device)
         if device.type not in ("cpu", "cuda"):
@@ -509,7 +511,7 @@ class TrainingStep:
             return "a GradScaler scales its loss"
         for part in (self.loss, renderer, self.optimizer):
             if in_python(part):
-                return f"{type(part).__name__} may do in Python what is not seen"
+                return f"{type(part).__name__} may run Python code that a recording does not see"
         with self._in_precision():  # under autocast a traced field has no program
             reason = self.loss.why_not_fused()
         if reason is not None:
@@ -517,9 +519,9 @@ class TrainingStep:
         learning = {id(p) for group in self.optimizer.param_groups for p in group["params"]}
         for name, parameter in cast(nn.Module, renderer.field).named_parameters():
             if parameter.requires_grad and id(parameter) not in learning:  # another optimiser reads its gradient
-                return f"{name} needs a gradient and is not the optimizer's"
+                return f"{name} needs a gradient but is not in the optimizer"
             if self._on_gpu() and (parameter._backward_hooks or parameter._post_accumulate_grad_hooks):
-                return f"a hook of {name} runs in Python, which a CUDA graph does not make"
+                return f"a hook of {name} runs in Python, which a CUDA graph cannot replay"
         return None
 
     def _note_dependencies(self) -> None:
@@ -543,7 +545,7 @@ class TrainingStep:
         for part in parts:
             guard.contents(vars(part), free_names(part))
         dictionaries: list[dict[Any, Any]] = [renderer.fields, *([] if grid is None else [vars(grid)])]
-        for module in field.modules():  # the router, which may be wrapped
+        for module in field.modules():  # the field is the router or a module around it
             for name, members in vars(module).items():
                 if name in ("_parameters", "_buffers", "_modules") or name.endswith("_hooks"):
                     dictionaries.append(members)
@@ -566,7 +568,7 @@ class TrainingStep:
             for hooks in (getattr(parameter, name) for name in _HOOKS):
                 if hooks is not None:
                     guard.contents(hooks)
-        kind = self.batches.device.type  # the caller's autocast, outside the step's
+        kind = self.batches.device.type  # for the autocast of the caller, not of the step
         for query in (
             backends.threads,
             compiled.isa,

@@ -22,19 +22,19 @@ from voronerf.ops.surface_gradient import surface_gradient
 
 
 class LossAlongRays(NamedTuple):
-    """The loss of rays and its gradient to the raw outputs of the networks: the input of a :class:`Term`.
+    """The loss of rays and its gradient with respect to the raw network outputs: the input of a :class:`Term`.
 
     Attributes:
         loss: [], the loss, to which terms add.
-        gradient: [m, 4], the gradient to ``raw``, to which terms add.
+        gradient: [m, 4], the gradient with respect to ``raw``, to which terms add.
         raw: [m, 4], the outputs of the networks: colour and density, before their activations or ``activated``.
-        rule: The option of `voronerf.ops.render_loss` for reading ``raw``: ``density_scale`` or ``activated``.
+        rule: The option that tells `voronerf.ops.render_loss` how to read ``raw``: ``density_scale`` or ``activated``.
         colour: [r, 3], the colours of the rays, background included.
         weights: [m], contributions of the samples to their rays.
         density: [m], the density at each sample per scene unit.
         error: [r], the squared error of the colour of each ray, summed over the channels.
         samples: The samples at which the networks were evaluated.
-        hidden: The share of the light up to which a sample counts as hidden and needs no gradient.
+        hidden: The largest transmittance at a hidden sample, which needs no gradient.
         backend: The backend of the ops.
 
     Examples:
@@ -60,8 +60,8 @@ class LossAlongRays(NamedTuple):
 
         Args:
             batch: The rays.
-            slopes: The gradients to ``colour`` [r, 3], ``opacity`` [r], unnormalised ``depth`` [r], ``weights`` [m],
-                ``rgb`` [m, 3] and ``density`` [m].
+            slopes: The gradients with respect to ``colour`` [r, 3], ``opacity`` [r], unnormalised ``depth`` [r],
+                ``weights`` [m], ``rgb`` [m, 3] and ``density`` [m].
         """
         samples = self.samples
         lengths = self.density, samples.depths, samples.deltas, self.weights, samples.ray_offsets
@@ -109,7 +109,7 @@ class SparseDepth:
     See `voronerf.ops.sparse_depth_gradient`.
 
     Args:
-        factor: The factor on the mean over the rays through points.
+        factor: The factor on the mean of this loss over the rays through points.
 
     Examples:
         >>> from voronerf import NeRF
@@ -136,7 +136,7 @@ class SmoothDepth:
     See `voronerf.ops.smooth_depth_gradient`.
 
     Args:
-        factor: The factor on the mean over the triples of rays.
+        factor: The factor on the mean of this loss over the triples of rays.
 
     Examples:
         >>> from voronerf import NeRF
@@ -159,11 +159,11 @@ class SmoothDepth:
 
 @replayed
 class Surface:
-    """A loss on light along a ray that does not come from one surface; see `voronerf.ops.surface_gradient`.
+    """A loss on the light of a ray that does not come from one surface; see `voronerf.ops.surface_gradient`.
 
     Args:
-        distortion: The factor on the mean over the rays of the distortion loss of mip-NeRF 360.
-        orientation: The factor on the mean over the rays of an orientation loss after Ref-NeRF.
+        distortion: The factor on the distortion loss of mip-NeRF 360, a mean over the rays.
+        orientation: The factor on an orientation loss after Ref-NeRF, a mean over the rays.
 
     Examples:
         >>> from voronerf import NeRF
@@ -250,8 +250,8 @@ class Seen:
 class DifferentiatedTerm:
     """A term that torch differentiates: a function of `Seen` rays and their batch.
 
-    Python runs, and torch differentiates, only the function itself. An op backpropagates its gradients further, and a
-    step replays this op.
+    Only the function itself runs in Python and is differentiated by torch. A replayable op then backpropagates the
+    resulting gradients to the networks' outputs.
 
     Args:
         function: The function, which returns a scalar.
@@ -261,7 +261,7 @@ class DifferentiatedTerm:
         self.function = function
 
     def differentiate(self, now: Callable[[Any], Any], along: LossAlongRays, batch: Batch) -> dict[str, Tensor]:
-        """Adds the term to the loss; returns its gradients to the attributes that it has read, by name."""
+        """Adds the term to the loss; returns its gradients with respect to the attributes that it has read, by name."""
         seen = Seen(along, batch, now)
         with torch.enable_grad():
             term = self.function(seen, now(batch))
@@ -286,7 +286,7 @@ def stages_of(number: int, term: Term | Callable[[Seen, Batch], Tensor], now: Ca
     Args:
         number: The index of the term.
         term: The term of :class:`RayLoss`.
-        now: Function that gives a stage in Python the current rows of a recorded tensor.
+        now: Function from a recorded tensor to its currently valid rows, for stages that run in Python.
     """
     if hasattr(term, "add"):
         return [Stage(f"{type(term).__name__}.add", term.add, ("along", "batch"), in_python(term, "add"))]

@@ -1,6 +1,6 @@
 """Volume rendering: colours of rays from a field evaluated at their samples.
 
-r rays, m samples of all rays (packed), s samples a ray where all rays have the same number. Colours are in 0..1,
+r rays, m samples of all rays (packed), s samples per ray if all rays have the same number. Colours are in 0..1,
 distances in world units along unit directions, densities per unit length.
 """
 
@@ -22,7 +22,7 @@ from voronerf.ops.composite import composite
 
 
 class Samples(NamedTuple):
-    """The samples of a batch of rays, ray after ray and near to far: the output of a sampler, the input of a field.
+    """The samples of a batch of rays, ordered by ray and distance: the output of a sampler, the input of a field.
 
     Attributes:
         inputs: [m, 3] points, or [m, 6] Gaussians, in the space of the field.
@@ -31,7 +31,8 @@ class Samples(NamedTuple):
         depths: [m], the distances of the samples.
         deltas: [m], the lengths of the intervals that the samples stand for.
         edges: [r, s + 1], the ends of these intervals if all rays have s samples; else None.
-        rows: int32 [1] on the device, the number of samples that belong to rays, not read by the host; None for all.
+        rows: int32 [1] on the device, the number of samples that belong to rays, if the host does not know it; None if
+            all samples belong to rays.
 
     Examples:
         >>> import torch
@@ -56,7 +57,7 @@ class Samples(NamedTuple):
         return self.inputs if self.inputs.shape[1] == 3 else self.inputs[:, :3]
 
     def counted(self) -> Samples:
-        """Returns the samples without the rows that belong to no ray; the host waits for their number."""
+        """Returns only the rows that belong to rays; the host waits for their number."""
         if self.rows is None:
             return self
         count = int(self.rows)
@@ -86,10 +87,10 @@ class Space:
     Args:
         contraction: The contraction of space for the field; None for world coordinates.
         spacing: Spacing of the strata of a ray, "linear" or "disparity".
-        cones: Whether the field is evaluated on Gaussians [m, 6], the frustums of cones, in place of points [m, 3].
+        cones: Whether the field is evaluated on Gaussians [m, 6] of cone frustums instead of points [m, 3].
         full_gradient: The distance below which the gradients of samples are scaled by (distance / full_gradient)^2;
-            None for no scaling. The space in front of a camera is sampled more densely by that camera than by others,
-            so without the scaling fog would be learnt there that only one view shows.
+            None for no scaling. A camera samples the space close in front of it most densely. Without the scaling,
+            floaters would form there, each seen by one view only.
 
     Examples:
         >>> from voronerf.nerf import Space, Stratified
@@ -102,14 +103,14 @@ class Space:
     full_gradient: float | None = None
 
     def samples(self, rays: Rays, depths: Tensor, edges: Tensor) -> Samples:
-        """Returns the samples of rays at depths [r, s], which stand for the intervals between edges [r, s + 1]."""
+        """Returns the samples of rays at depths [r, s], one for each interval between edges [r, s + 1]."""
         r, s = depths.shape
         if self.cones:
             inputs = frustum_gaussians(rays, edges, self.contraction)
         else:
             inputs = torch.addcmul(rays.origins[:, None, :], depths[:, :, None], rays.directions[:, None, :])
             inputs = inputs if self.contraction is None else self.contraction.points(inputs)
-        # Copies an expanded view, since repeat_interleave would gather.
+        # Copies an expanded view, which is faster than the gather of repeat_interleave.
         index = torch.arange(r, device=depths.device, dtype=torch.int32)[:, None].expand(-1, s).reshape(-1)
         offsets = torch.arange(0, r * s + 1, s, device=depths.device, dtype=torch.int32)
         inputs, deltas = inputs.reshape(r * s, inputs.shape[-1]), edges.diff(dim=-1).reshape(-1)
@@ -181,10 +182,10 @@ class Batch:
     Attributes:
         rays: Origins and unit directions; radii for cones.
         near: [r], the depth at which each ray enters the scene.
-        far: [r], the depth at which it leaves the scene.
+        far: [r], the depth at which each ray leaves the scene.
         target: [r, 3], the colour of each ray's pixel over the background.
         background: [3], or [r, 3] if it was drawn for each ray; None for black.
-        sparse_depths: [s], the distances of the points of a sparse model at which the first s rays end, or None.
+        sparse_depths: [s], the distances at which the first s rays meet points of a sparse model, or None.
         unseen: The number of triples of `voronerf.ops.unseen_rays` at the end of the batch; they have no target colour.
 
     Examples:
@@ -238,9 +239,9 @@ class RenderOutput(NamedTuple):
 
 
 def evaluate_field(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tensor, Tensor]:
-    """Returns colours [m, 3] and densities [m] of samples, cast to the dtype of the depths (autocast changes it).
+    """Returns colours [m, 3] and densities [m] of samples, in the dtype of the depths even under autocast.
 
-    Their gradients are scaled near the camera by `Space.full_gradient`.
+    Near the camera, the gradients of the results are scaled, see `Space.full_gradient`.
     """
     outputs = field(samples.inputs, rays.directions, samples.ray_index)
     rgb, density = (values.to(samples.depths.dtype) for values in outputs)
@@ -253,7 +254,7 @@ def evaluate_field(field: Field, rays: Rays, samples: Samples, space: Space) -> 
 
 
 def gradient_factors(depths: Tensor, full: float) -> Tensor:
-    """Returns the factors [m] on the gradients of samples: squared relative distances from the camera, at most 1.
+    """Returns [m], a factor on the gradient of each sample: (depth / full)^2, at most 1.
 
     Source: Philip and Deschaintre 2023, "Floaters No More: Radiance Field Gradient Scaling for Improved Near-Camera
     Training".
@@ -301,7 +302,7 @@ def composite_rays(
 
 
 def normalised(depth: Tensor, opacity: Tensor, far: Tensor) -> Tensor:
-    """Returns [r], sums of weight times depth divided by the opacities; the far end for rays with opacity 0."""
+    """Returns [r], the depth sums of rays divided by their opacities; the far end for rays with opacity 0."""
     seen = opacity > 0
     return torch.where(seen, depth / torch.where(seen, opacity, 1), far)
 

@@ -4,8 +4,9 @@ Letters used throughout: n samples or points, k cells, d features, r rays, s sam
 octaves. Index tensors are int32. ``offsets`` is always [k + 1]: cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``
 of arrays sorted by cell.
 
-Each operation raises ValueError for shapes, devices, numbers out of range and an unknown backend, TypeError for dtypes,
-and `BackendUnavailable` if the named backend cannot run. Further errors are documented at the operation.
+Each operation raises ValueError for wrong shapes or devices, numbers out of range and unknown backends, TypeError for
+wrong dtypes, and `BackendUnavailable` if the named backend cannot run. Further errors are documented for each
+operation.
 """
 
 import sys
@@ -103,9 +104,9 @@ __all__ = [
 
 
 class _Package(ModuleType):
-    """The package of an op. It copies its submodules to the function of the same name, which hides the package here.
+    """The package of an op. The function of the same name hides it here, so its submodules are copied to the function.
 
-    ``import voronerf.ops.adam.reference as reference`` reads ``reference`` from ``voronerf.ops.adam``, the function.
+    ``import voronerf.ops.adam.reference as reference`` looks up ``reference`` in the function ``voronerf.ops.adam``.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

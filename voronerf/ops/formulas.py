@@ -18,7 +18,7 @@ from voronerf.ops.composite import Composite
 def in_pieces(run: Callable[..., Tensor], rows: int, *tensors: Tensor) -> Tensor:
     """Calls ``run`` on slices of ``rows`` rows and concatenates the results.
 
-    A compiler would unroll the loop, so under one ``run`` gets all rows at once.
+    In a compiled graph, ``run`` gets all rows at once, because the compiler would unroll the loop.
     """
     if torch.compiler.is_compiling() or tensors[0].shape[0] <= rows:
         return run(*tensors)
@@ -50,14 +50,14 @@ def meet_box(origins: Tensor, directions: Tensor, box: Tensor, near: float, far:
     """
     low, high = (box[0] - origins) / directions, (box[1] - origins) / directions
     first, last = torch.minimum(low, high), torch.maximum(low, high)
-    # NaN and infinity guard: a ray parallel to a slab is inside it at all distances or at none.
+    # NaN and infinity guard: a ray parallel to a slab is inside the slab at all distances or at none.
     parallel = directions == 0
     if not parallel.is_cpu or torch.compiler.is_compiling() or bool(parallel.any()):
         inside = (origins >= box[0]) & (origins <= box[1])
         infinity = torch.full_like(first, float("inf"))
         first = torch.where(parallel, torch.where(inside, -infinity, infinity), first)
         last = torch.where(parallel, torch.where(inside, infinity, -infinity), last)
-    (a, b, c), (x, y, z) = first.unbind(-1), last.unbind(-1)  # takes half the time of amax and amin
+    (a, b, c), (x, y, z) = first.unbind(-1), last.unbind(-1)  # half the time of amax and amin
     enter = a.maximum(b).maximum(c).clamp(near, far)
     return enter, torch.maximum(enter, x.minimum(y).minimum(z).clamp(near, far))
 
@@ -73,7 +73,7 @@ def voxels_of(points: Tensor, box: Tensor, shape: torch.Size) -> Tensor:
 
 
 def activate(raw: Tensor, density_scale: float = 1.0, activated: bool = False) -> tuple[Tensor, Tensor]:
-    """Returns colours [m, 3] and densities [m] of the networks' outputs [m, 4]; `activated` skips the activations."""
+    """Returns colours [m, 3] and densities [m] from the networks' outputs [m, 4]; `activated` skips the activations."""
     if activated:
         return raw[:, :3], raw[:, 3]
     return torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
@@ -85,7 +85,7 @@ class RaysSeen(NamedTuple):
     Attributes:
         colour: [r, 3], with the background. The colour of a terminated ray is divided by its accumulated opacity.
         opacity: [r], 1 for a terminated ray.
-        depth: [r], the mean depth of the samples by weight; the far end for a ray of opacity 0.
+        depth: [r], the weighted mean depth of the samples; the far end for a ray of opacity 0.
         light: [r], the remaining transmittance, 0 to 1.
         heaviest: [r], the depth of the sample with the largest weight; the far end for a ray without samples.
 
@@ -106,11 +106,11 @@ class Wave(NamedTuple):
     """One wave of samples, composited.
 
     Attributes:
-        seen: The composite of these samples alone.
+        seen: The result of compositing these samples alone.
         ray_index: int32 [m], the ray of each sample.
-        ray_offsets: int32 [rays + 1], the first sample of each ray, and m.
+        ray_offsets: int32 [rays + 1], the first sample of each ray, then m.
         depths: [m], the distances of the samples along the rays.
-        stop: int32 [rays], the strata at which the rays continue.
+        stop: int32 [rays], the stratum at which each ray continues.
     """
 
     seen: Composite
@@ -133,12 +133,12 @@ def walk(
     """Renders rays in waves of samples, each ray until it is opaque.
 
     Args:
-        look: A function that evaluates the next wave. It takes the rays, int64, and their first strata, int32 or None
-            for 0.
+        look: A function that evaluates the next wave. Its arguments are the indices of the rays (int64) and their first
+            strata (int32, or None for 0).
         far: [r], the far ends of the rays.
         samples: The number of strata of a ray, s.
         wave: The largest number of samples of a ray in a wave.
-        opaque: The transmittance at or below which a ray ends after a wave.
+        opaque: A ray ends after a wave if its transmittance is at most this value.
         background: [3] or [r, 3]; None is black.
         heaviest: Whether to find the heaviest samples.
     """
@@ -171,7 +171,7 @@ def walk(
 def _heaviest(wave: Wave, most: int) -> tuple[Tensor, Tensor]:
     """Returns weight and depth [r] of the heaviest sample of each ray; both are -1 for a ray without samples.
 
-    A ray has at most `most` samples.
+    `most` is the largest number of samples of a ray.
     """
     weights, rays = wave.seen.weights, len(wave.stop)
     row = torch.arange(len(weights), device=weights.device) - wave.ray_offsets[wave.ray_index]
@@ -182,13 +182,13 @@ def _heaviest(wave: Wave, most: int) -> tuple[Tensor, Tensor]:
 
 
 class Composed(NamedTuple):
-    """Rays composed of runs."""
+    """Rays composited from runs of samples."""
 
     colour: Tensor  # [r, c], without a background
-    through: Tensor  # [r], the transmittance of all runs of a ray
+    through: Tensor  # [r], the transmittance of each ray's runs together
     before: Tensor  # [q], the optical depth in front of each run
     place: Tensor  # int64 [q], the index of each run in a flat table with one row for each ray
-    width: int  # the columns of the table
+    width: int  # the number of columns of the table
 
     @property
     def front(self) -> Tensor:
@@ -196,12 +196,12 @@ class Composed(NamedTuple):
         return torch.exp(-self.before)
 
     def behind(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
-        """Returns [q], the part of the loss, to first order, due to light from behind each run.
+        """Returns [q], the part of the loss due to light from behind each run, to first order.
 
         Args:
             colour: [q, c], the colours of the runs.
             ray: int64 [q], the rays of the runs.
-            slopes: [r, c], the gradient of the loss to each ray's colour over its background.
+            slopes: [r, c], the loss gradient of each ray's colour, background included.
             background: [r, c], the colours behind the rays.
         """
         table = slopes.new_zeros(len(slopes), self.width)
@@ -211,10 +211,10 @@ class Composed(NamedTuple):
 
 
 def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed:
-    """Composes rays from their runs, without an autograd function of its own.
+    """Composites rays from their runs, with torch operations that autograd differentiates.
 
     Args:
-        colour: [q, c], the colours of the runs as if nothing were in front of them.
+        colour: [q, c], the unoccluded colours of the runs.
         optical: [q], the optical depths of the runs.
         ray: int64 [q], the ray of each run, ascending; the runs of a ray are in order from near to far.
         rays: The number of rays, r.
@@ -225,13 +225,13 @@ def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed
     place = ray * width + slot
     table = optical.new_zeros(rays, width)
     table.view(-1)[place] = optical
-    # The exclusive sum is a shifted one: subtracting each last term would give inf - inf for an opaque run.
+    # Shifting makes the sum exclusive: subtracting each last term would give inf - inf for an opaque run.
     before = F.pad(table[:, :-1], (1, 0)).cumsum(1).view(-1)[place]
     total = colour.new_zeros(rays, colour.shape[1]).index_add(0, ray, torch.exp(-before)[:, None] * colour)
     return Composed(total, torch.exp(-table.sum(1)), before, place, width)
 
 
 def along_rays(ray: Tensor, start: Tensor) -> Tensor:
-    """Returns int64 [q], the order that sorts runs by ray and then by start, which is >= 0."""
-    bits = start.float().view(torch.int32)  # has the order of the non-negative floats
+    """Returns int64 [q], the order that sorts runs by ray, then by start (>= 0)."""
+    bits = start.float().view(torch.int32)  # floats >= 0 sort like their bits
     return ((ray << 32) + bits).argsort(stable=True)

@@ -1,7 +1,7 @@
-"""A cache of calls that are one program: the first call of a kind stores how later calls of this kind run.
+"""A cache for calls that run as one program: the first call of a kind stores what later calls of this kind need.
 
-n samples, k cells, d coordinates. A later call neither analyses its arguments nor sorts its samples: two operations
-find the cells and compute the results.
+Letters: n samples, k cells, d coordinates. A later call neither analyses its arguments nor sorts its samples: two
+operations find the cells and compute the results.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _VALUES = {type(None), bool, int, float, str}
 
 
 def call_key(method: str, training: bool, args: Sequence[Any], kwargs: dict[str, Any], coords: Any) -> Any:
-    """Returns the cache key of a call, without the number of samples; None if the call has no compact key."""
+    """Returns the cache key of a call, for any number of samples; None if the call has no compact key."""
     key: list[Any] = [method, training, torch.is_grad_enabled(), *kwargs]
     device = None
     for value in (*args, *kwargs.values(), coords):
@@ -51,10 +51,10 @@ def call_key(method: str, training: bool, args: Sequence[Any], kwargs: dict[str,
 
 
 class CachedCall:
-    """The cached form of calls of one kind, made from the first of them and its plan.
+    """The cached form of all calls of one kind, made from the first call and its plan.
 
     Attributes:
-        unchanged: A guard that tells whether the module is as it was at the first call.
+        unchanged: A guard that tells whether the module has not changed since the first call.
     """
 
     unchanged: Any
@@ -89,7 +89,7 @@ class CachedCall:
 
     @staticmethod
     def of(plan: CallPlan, call: Call, grouping: Grouping) -> CachedCall | None:
-        """Makes the cached form of a call; None if the call is more than one program of the compiled module."""
+        """Makes the cached form of a call; None if the compiled module cannot run the call as one program."""
         fused, layout, device = plan.fused, call.layout, grouping.device
         whole_program = "" if fused is None else fused.whole_program
         if fused is None or isinstance(whole_program, str) or fused.module is not call.module:
@@ -107,7 +107,7 @@ class CachedCall:
         """Returns the results of a call of a router; None if this call cannot run in the cached form."""
         arguments = (*args, *kwargs.values()) if kwargs else args
         compiles = torch.compiler.is_compiling()
-        if coords is None and type(router.coords) is str:  # the router's own rule, as in the first call
+        if coords is None and type(router.coords) is str:  # the router's own `coords`, as in the first call
             positions, d = arguments[self._tensors[0]], router._d
             shape = positions.shape
             positions = positions if shape[-1] == d else positions[..., :d]
@@ -136,7 +136,7 @@ class CachedCall:
         for i in self._reads:
             x = arguments[i] if arguments[i].dim() == 2 else arguments[i].reshape(n, -1)
             x = x if x.dtype is torch.float32 else x.float()
-            # Autograd can tell whether the gradient of a view is needed, but not for a leaf tensor.
+            # Autograd can tell whether a view needs a gradient, but not whether a leaf tensor does.
             rows.append(x.view_as(x) if x.requires_grad and self._learns else x)
         parameters = self._parameters(k, rows[0].device, router.backend)
         if self._shares:

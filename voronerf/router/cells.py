@@ -23,7 +23,7 @@ _OP = "VoronoiRouter"
 
 
 def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
-    """Returns a deep copy, even if the module keeps results of its last call, which torch does not copy."""
+    """Returns a deep copy, even of a module that keeps results of its last call, which ``deepcopy`` refuses."""
     memo = {} if memo is None else memo
     detach_results(module, memo)
     initial = dict(memo)
@@ -34,9 +34,9 @@ def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
             for attribute, value in vars(part).items():
                 if attribute not in ("_parameters", "_buffers", "_modules") and not _is_copied(value, dict(initial)):
                     raise TypeError(
-                        f"{_OP}: module must be one that copy.deepcopy takes, but {_named(name, part)} keeps in "
-                        f"`{attribute}` a {type(value).__name__}, which it refuses ({error}); make it outside of the "
-                        "module, or give its class __deepcopy__"
+                        f"{_OP}: module must support copy.deepcopy, but {_named(name, part)} keeps in "
+                        f"`{attribute}` a {type(value).__name__}, which cannot be copied ({error}); make it outside of "
+                        "the module, or give its class __deepcopy__"
                     ) from error
         raise
 
@@ -54,7 +54,7 @@ def _named(name: str, part: nn.Module) -> str:
 
 
 def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
-    """Adds detached copies of the results that a module keeps to the memo of ``copy.deepcopy``."""
+    """Adds to the memo of ``copy.deepcopy`` detached copies of the results that a module keeps."""
     for part in module.modules():
         for value in vars(part).values():
             if isinstance(value, Tensor) and not value.is_leaf:
@@ -79,7 +79,7 @@ def check_module(module: nn.Module) -> None:
 
 
 def _check_reach(module: nn.Module) -> None:
-    """Raises TypeError if code reaches parameters other than by name, because cells replace parameters by name."""
+    """Raises TypeError if code accesses parameters other than by name; cells replace them by name."""
     owner = {address: name for name, p in module.named_parameters() if (address := _address(p))}
     objects = {id(p): f"parameter `{name}`" for name, p in module.named_parameters()}
     objects |= {id(part): f"part `{name}`" if name else "module" for name, part in module.named_modules()}
@@ -95,7 +95,7 @@ def _check_reach(module: nn.Module) -> None:
                         f"a view of the parameter `{owner[_address(leaf)]}`, which cells replace (make it in forward)"
                     )
                 elif isinstance(leaf, types.FunctionType) and (target := _held_by(leaf, objects)):
-                    reason = f"a function that holds the {target}, of which cells have their own (make it a method)"
+                    reason = f"a function that refers to the {target}, which differs for each cell (make it a method)"
                 if reason:
                     raise TypeError(
                         f"{_OP}: module must reach parameters by name, but {_named(name, part)} keeps in `{attribute}` "
@@ -112,7 +112,7 @@ def _address(tensor: Tensor) -> int:
 
 
 def _leaves(value: Any) -> list[Any]:
-    """Lists the leaves of a nested value, such as tensors and functions, without modules."""
+    """Lists the leaves of a nested value that are not modules, such as tensors and functions."""
     leaves, seen, level = [], set[int](), [value]
     for _ in range(DEEPEST):
         items = [item for item in level if id(item) not in seen and not isinstance(item, nn.Module)]
@@ -124,7 +124,7 @@ def _leaves(value: Any) -> list[Any]:
 
 
 def _held_by(function: types.FunctionType, objects: dict[int, str]) -> str:
-    """Returns the description of an object that a function refers to, or an empty text; copies keep the reference."""
+    """Returns the description of an object that a function (and any copy of it) refers to, or an empty text."""
     names = function.__code__.co_names
     values = [function.__globals__[name] for name in names if name in function.__globals__]
     for cell in function.__closure__ or ():
@@ -143,7 +143,7 @@ def _refusal(part: nn.Module) -> str:
     if isinstance(part, nn.modules.batchnorm._BatchNorm):
         return "mixes the samples of a batch (use LayerNorm)"
     if isinstance(part, nn.RNNBase):
-        return "is recurrent, with weights that cannot be one set for each cell"
+        return "is recurrent, and its weights cannot be stacked, one set for each cell"
     if isinstance(part, torch.jit.ScriptModule) and next(part.parameters(), None) is not None:
         return "is compiled by torch.jit, and cannot take the parameters of a cell (wrap the Python module)"
     if any(type(one).__name__.endswith("SpectralNorm") for one in (part, *part._forward_pre_hooks.values())):
@@ -156,7 +156,7 @@ def _refusal(part: nn.Module) -> str:
 
 
 def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
-    """Stacks every parameter of a module k times, in place, except the parameters that match ``share``."""
+    """Replaces every parameter of a module by a stack of k copies, except parameters that match ``share``."""
     named = list(module.named_parameters(remove_duplicate=False))
     for pattern in share:
         if not any(fnmatch.fnmatchcase(name, pattern) for name, _ in named):
@@ -183,13 +183,13 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
     ours, theirs = routed.state_dict(keep_vars=True), module.state_dict()
     odd = sorted(ours.keys() ^ theirs.keys())
     if odd:
-        raise ValueError(f"{op}: module must have the parameters of the routed one, got a difference in {odd[0]!r}")
+        raise ValueError(f"{op}: module must have the parameters of the routed module, got a difference in {odd[0]!r}")
     for name, tensor in ours.items():
         shape, value = tensor.shape[id(tensor) in stacked :], theirs[name]
         if value.shape != shape:
             raise ValueError(f"{op}: module's {name} must have shape {list(shape)}, got {list(value.shape)}")
         if id(tensor) not in stacked and not torch.equal(value.to(tensor), tensor):
-            raise ValueError(f"{op}: module's {name} must be that of the routed one, since cells share it")
+            raise ValueError(f"{op}: module's {name} must equal the router's, since all cells share it")
     for name, tensor in ours.items():
         if id(tensor) in stacked:
             tensor[index] = theirs[name].to(tensor)
@@ -198,8 +198,8 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
 def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
     """Gives a parameter values of another shape.
 
-    Autograd's accumulator from an earlier call, if still alive, would reduce new gradients to the old shape. With
-    another dtype in between, torch drops it.
+    A gradient accumulator from an earlier call, if still alive, would reduce new gradients to the old shape. A
+    temporary change of dtype makes torch drop the accumulator.
     """
     if values.is_floating_point():
         other = torch.float32 if values.dtype == torch.float64 else torch.float64
@@ -208,16 +208,16 @@ def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
 
 
 def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | None) -> dict[str, Tensor]:
-    """Draws new parameters [k, ...] of a plain module, by name."""
+    """Draws the parameters of a plain module k times; returns them as [k, ...], by name."""
     parts = {"": template} if hasattr(template, "reset_parameters") else dict(template.named_modules())
     for name, part in parts.items():
         if not hasattr(part, "reset_parameters") and any(p is not None for p in part._parameters.values()):
             raise ValueError(
                 f"{_OP}.subdivide: inherit=False needs a field with reset_parameters(), or layers that have it; "
-                f"`{name}`, a {type(part).__name__}, has not"
+                f"`{name}`, a {type(part).__name__}, has none"
             )
     draws: dict[str, list[Tensor]] = {name: [] for name, _ in template.named_parameters()}
-    # fork_rng also saves the GPUs' states, which manual_seed changes. Without a generator, torch's own is used.
+    # fork_rng also saves the GPUs' states, because manual_seed changes them. Without a generator, torch's is used.
     with torch.random.fork_rng() if generator is not None else contextlib.nullcontext():
         if generator is not None:
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator, device=generator.device)))
@@ -240,7 +240,7 @@ def plain_cell(routed: nn.Module, index: int) -> nn.Module:
 
 
 def apply_to_cells(routed: nn.Module, k: int, function: Callable[[nn.Module], Any]) -> None:
-    """Applies a function to the modules of each of k cells, and keeps its changes of parameters and buffers.
+    """Applies a function to the modules of each of k cells, and keeps the changes of parameters and buffers.
 
     Shared parameters and buffers get their values from the first cell.
     """
@@ -264,8 +264,8 @@ def renew_cells(
 
     Args:
         routed: The module with stacked parameters.
-        parents: The present cell whose values each new cell gets, int64 [new cells].
-        fresh: Values [new cells, ...] by parameter name, for the cells of ``new``; None for copies alone.
+        parents: The old cell from which each new cell is copied, int64 [new cells].
+        fresh: Values [new cells, ...] by parameter name, for the cells of ``new``; None if all cells are copies.
         new: The mask of the new cells that get ``fresh`` values, bool [new cells].
     """
     names = {id(p): name for name, p in routed.named_parameters()}

@@ -1,8 +1,8 @@
-"""Runs routed calls: fused, grouped or cell by cell.
+"""Runs routed calls in one of three ways: fused, grouped or cell by cell.
 
-The loop over cells defines the result. The first call of a kind makes a :class:`CallPlan` with the ways that agree with
-the loop (:mod:`voronerf.router.probe`). Each call runs in the way that was fastest for the first batch of about its
-size, or in the way that ``way=`` names.
+The loop over cells defines the result. The first call of a kind makes a :class:`CallPlan` with the ways whose results
+agree with the loop (:mod:`voronerf.router.probe`). A call runs in the way that was fastest for the first batch of about
+the same size, or in the way that the user has chosen (``way=``).
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from voronerf.router.transforms import aside, is_watched, outside, recorded
 from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup
 
 _OP = "VoronoiRouter"
-_PLANS = 256  # most kinds of calls that have plans
-_TRACES = 8  # most traces of a kind of call; a module that changes more often runs grouped
-_TURNS, _SECONDS = 8, 0.08  # most timings of each way, and seconds after which no timing begins
-_BEHIND = 1.5  # a loop slower than the fastest by this factor is not timed again
-_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # lost timings that end the fused way, seconds between them, factor of a loss
-_EQUAL = 1.02  # factor of the least time within which the plan's earlier way is chosen
+_PLANS = 256  # maximum number of kinds of calls with plans
+_TRACES = 8  # maximum number of traces for a kind of call; a module that changes more often runs grouped
+_TURNS, _SECONDS = 8, 0.08  # maximum number of timings of each way, time in seconds after which none begins
+_BEHIND = 1.5  # a loop that is slower than the fastest way by this factor is not timed again
+_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # losses that rule out the fused way, seconds between them, time ratio of a loss
+_EQUAL = 1.02  # times within this factor of the least count as equal; the plan's first such way is chosen
 _OF_DTYPES = re.compile("same dtype|expected scalar type|Input type")  # PyTorch's messages about dtypes
 _LIBRARY_FOLDERS = tuple(
     str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1))
@@ -61,8 +61,8 @@ class Dispatch:
         return Dispatch, ()
 
     def forget(self) -> None:
-        """Drops all plans, after a change of dtype, device or parameters' names."""
-        self.plans: dict[Any, list[CallPlan]] = {}  # the latest first; one for each trace
+        """Drops all plans after a change of the dtype, the device or the names of parameters."""
+        self.plans: dict[Any, list[CallPlan]] = {}  # by key: one plan for each trace, the latest first
         self._refused_inputs: dict[Any, tuple[set[Source], str]] = {}  # values that cannot be inputs, and why
         self.cached: dict[Any, CachedCall] = {}  # by `call_key`
         self._parts: Any = unchanged()  # guard of the parameters and parts at the last call
@@ -73,7 +73,7 @@ class Dispatch:
         self._latest_ways: dict[str, dict[str, str]] = {}
 
     def explain(self, methods: tuple[str, ...], default_ways: Mapping[str, str]) -> str:
-        """Returns a line for each method: its latest ways, and why; ``default_ways`` are for uncalled methods."""
+        """Returns a line for each method: its latest ways and the reasons, or its default way before any call."""
         latest = [(m, self._latest_ways.get(m, {default_ways.get(m, "not called yet"): ""})) for m in methods]
         ways = [(method, *way) for method, ways in latest for way in list(ways.items())]
         return "\n".join(f"{method}: {name}{f': {why}' if why else ''}" for method, name, why in ways)
@@ -85,7 +85,7 @@ class Dispatch:
 
         Args:
             call: The call.
-            grouping: Its samples by cell, for a trace if no earlier call was traced; None for no trace.
+            grouping: The samples of the call by cell, to trace it if no earlier call was traced; None to trace nothing.
             device: The device of the samples.
             k: The number of cells.
             options: The user's options.
@@ -94,7 +94,7 @@ class Dispatch:
         if not options.fuse:
             return f"{call.name} is not traced without fuse=True"
         if torch.is_autocast_enabled(device.type):
-            return f"{call.name} rounds as autocast does"
+            return f"{call.name} runs under autocast"
         self._check_parameters(call, k, options.names)
         constants = call.constants()
         plans = [plan for plan in self.plans.get(_plan_key(call, device), []) if plan.fused or not plan.few]
@@ -111,13 +111,13 @@ class Dispatch:
         return CellProgram(encoded, program.reads, shapes, plan.fused.parameters(k, device, backend))
 
     def evaluate(self, call: Call, grouping: Grouping, options: Options, frozen: Tensor | None) -> Results:
-        """Runs a call on the samples of all cells, or on two placeholders.
+        """Runs a call on the samples of all cells, or on two placeholders if there are no samples.
 
         Args:
             call: The call.
-            grouping: Its samples by cell.
+            grouping: The samples of the call by cell.
             options: The user's options.
-            frozen: The mask of frozen cells, bool [k], evaluated without gradients; None for no cells.
+            frozen: The mask of frozen cells, bool [k], which are evaluated without gradients; None for no cells.
         """
         self._check_parameters(call, grouping.k, options.names)
         call = self._plain(call)
@@ -134,7 +134,7 @@ class Dispatch:
         return results
 
     def _plain(self, call: Call) -> Call:
-        """Returns the call with plain tensors; raises TypeError, the first time, if the module needs a subclass."""
+        """Returns the call with plain tensors; for new tensor types, raises TypeError if the module needs them."""
         if (plain := call.plain()) is not call:
             key = call.method, frozenset(map(type, tensors_of((call.args, call.kwargs))))
             if key not in self._subclasses:
@@ -143,7 +143,7 @@ class Dispatch:
         return plain
 
     def find(self, key: Any, k: int) -> CachedCall | None:
-        """Returns the cached call of a key if the module has not changed, which is not checked during compilation."""
+        """Returns the cached call of a key, or None if the module has changed (not checked during compilation)."""
         entry = self.cached.get(key)
         if entry is None or torch.compiler.is_compiling():
             return entry
@@ -152,7 +152,7 @@ class Dispatch:
         if not entry.unchanged.holds():
             if not self._parts.holds() or entry.plan.watch.changed():
                 return None
-            self._guard(entry)  # equal values, or parameters of the same kind
+            self._guard(entry)  # new values are equal, new parameters are of the same kind
         return entry
 
     def _guard(self, entry: CachedCall) -> None:
@@ -162,7 +162,7 @@ class Dispatch:
 
     @staticmethod
     def _note_parts(guard: Any, module: nn.Module) -> None:
-        """Makes a guard check which parameters and parts a module has."""
+        """Makes a guard check that a module has the same parameters and submodules."""
         for part, name, _ in owned_parameters(module):
             guard.kind(part._parameters, name)
         for part in parts_of(module).values():
@@ -170,7 +170,7 @@ class Dispatch:
                 guard.contents(part._modules)
 
     def _check_parameters(self, call: Call, k: int, names: Collection[str]) -> None:
-        """Raises TypeError or ValueError if the module lacks its parameters, or if they are not of k cells.
+        """Raises TypeError if the module lacks parameters, and ValueError if stacked ones are not [k, ...].
 
         With a parametrisation or another shape, kernels would access memory outside of the parameters.
         """
@@ -196,7 +196,7 @@ class Dispatch:
         self._note_parts(self._parts, call.module)
 
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
-        """Returns the plan of calls of this kind; the first call and a call with changed values make a plan."""
+        """Returns the plan for calls of this kind; a first call, or a call with changed constants, makes a plan."""
         layout, key = call.layout, _plan_key(call, grouping.device)
         constants, few = call.constants() if options.fuse else {}, layout.n < FEWEST
         plans = [plan for plan in self.plans.get(key, []) if few or not plan.few]
@@ -223,7 +223,7 @@ class Dispatch:
             except (TypeError, ValueError) as error:
                 if not few or isinstance(error, Forbidden):
                     raise
-                ways, may_group = [Loop()], False  # a tensor [1, f] of one sample may also be shared
+                ways, may_group = [Loop()], False  # with one sample, a tensor [1, f] may also be shared
             if few and isinstance(ways[0], Loop) and options.way != "loop":
                 ways[0].why = f"first calls of fewer than {FEWEST} samples"
         if len(self.plans) >= _PLANS:
@@ -246,7 +246,7 @@ class Dispatch:
     def _inputs(
         self, call: Call, constants: dict[str, Any], plans: list[CallPlan], key: Any
     ) -> tuple[list[Inputs], str]:
-        """Returns the values that a new trace may take as inputs; or none, if they changed too often, and why."""
+        """Lists the inputs to try for a new trace; if values changed too often, lists none, and gives the reason."""
         fused = plans[0].fused
         assert fused is not None
         changed, parts = plans[0].changed(constants), list(parts_of(call.module).values())
@@ -259,9 +259,9 @@ class Dispatch:
 
         if len(plans) >= _TRACES:
             names = " and ".join(dict.fromkeys(map(named, changed)))
-            rule = "changes from call to call, and a trace takes it as fixed"
+            rule = "changes between calls but is a constant of the trace"
             self._latest_ways.pop(call.method, None)
-            return [], f"not fused any more, since {names} {rule}{f': as an input of the trace {why}' if why else ''}"
+            return [], f"no longer fused, since {names} {rule}{f': as an input of the trace {why}' if why else ''}"
 
         def value(source: Source) -> Any:
             return constants.get(source) if isinstance(source, str) else lookup(parts[source[0]], source[1])
@@ -273,7 +273,7 @@ class Dispatch:
         return [*tried, *present, Inputs()], ""
 
     def _choose(self, plan: CallPlan, call: Call, grouping: Grouping) -> tuple[Way, str]:
-        """Returns the way of a call, and the reason."""
+        """Returns the way in which a call runs, and the reason."""
         n, k = call.layout.n, grouping.k
         ways = [way for way in plan.ways if k > 1 or not isinstance(way, Grouped)]
         if plan.skip:
@@ -288,7 +288,7 @@ class Dispatch:
         if size not in plan.chosen:
             with self._lock, aside(call) as copied:
                 times = measure(ways, copied, grouping)
-            fused = isinstance(ways[0], Fused)  # kept unless it is clearly slower each time
+            fused = isinstance(ways[0], Fused)  # the fused way is kept unless it is clearly slower each time
             is_slower = fused and times[0] > _CLEAR * min(times)
             losses += is_slower
             first = next(i for i, seconds in enumerate(times) if seconds <= _EQUAL * min(times))
@@ -373,7 +373,7 @@ class Dispatch:
 
 
 def _misfit(error: Exception, call: Call) -> Exception | None:
-    """Returns the error to raise instead of PyTorch's if arguments do not fit the module's layers, or None."""
+    """Returns a clearer error than PyTorch's if arguments do not fit the module's layers, else None."""
     if not isinstance(error, RuntimeError):
         return None
     tensors = {n: v for n, v in zip(call.names, (*call.args, *call.kwargs.values())) if isinstance(v, Tensor)}
@@ -392,13 +392,13 @@ def _misfit(error: Exception, call: Call) -> Exception | None:
         shapes = ", ".join(str(list(tensor.shape)) for tensor in tensors.values())
         rule = f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {x.shape[-1]} features"
         fits = any(tensor.shape[-1:] == x.shape[-1:] for tensor in tensors.values())
-        remedy = "; pass what the module itself takes, and positions that are no part of it as coords=" if fits else ""
+        remedy = "; pass the module's own arguments, and separate positions as coords=" if fits else ""
         return ValueError(f"{rule}, got {shapes}{remedy}")
     return None
 
 
 def _plan_key(call: Call, device: torch.device) -> Any:
-    """Returns the key of a call's plans: modes, and kinds, types and sizes of arguments without the number of samples.
+    """Returns the key of a call's plans: modes, and the kinds, types and sizes of arguments for any number of samples.
 
     Raises ValueError for tensors that are neither per sample nor per ray, or could be both.
     """
@@ -417,7 +417,7 @@ def _plan_key(call: Call, device: torch.device) -> Any:
 
 
 class _Constant(torch.autograd.Function):
-    """Values that depend on parameters in the autograd tape, without gradients."""
+    """An identity that records a dependence on parameters in the autograd tape, but passes no gradients."""
 
     @staticmethod
     def forward(values: Tensor, *parameters: Tensor) -> Tensor:
@@ -433,17 +433,17 @@ class _Constant(torch.autograd.Function):
 
 
 def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
-    """Returns the seconds that each way takes for a part of a batch, forward and, with gradients on, backward.
+    """Returns each way's time in seconds for a part of a batch: forward and, if gradients are on, backward.
 
-    The ways take turns, and the least time of each counts; a much slower loop has one turn. A double of the module gets
-    the written values and the gradients, and the state of random generators is restored.
+    The ways take turns, and the least time of each way counts; a much slower loop has one turn. The ways run on a
+    double of the module, so the module gets no writes and no gradients. The state of random generators is restored.
     """
     most, times = measured_samples(ways), _least_times(ways, call, grouping, SLICE, 2)
     return _least_times(ways, call, grouping, most, 1) if min(most, call.layout.n) > 2 * SLICE else times
 
 
 def _least_times(ways: list[Way], call: Call, grouping: Grouping, most: int, fewest: int) -> list[float]:
-    """Returns each way's least time in at least ``fewest`` turns, on at most ``most`` samples."""
+    """Returns each way's least time in seconds over at least ``fewest`` turns, on at most ``most`` samples."""
     k, device, selection = grouping.k, grouping.device, call.part(most) if grouping.rows is None else None
     if selection is not None:
         call, rows = selection
@@ -470,7 +470,7 @@ def _least_times(ways: list[Way], call: Call, grouping: Grouping, most: int, few
         start = clock()
         outputs = [t for t in way.run(timed, grouping.anew()).unsorted if t.requires_grad and t.is_floating_point()]
         if outputs and leaves:
-            # A sum, because torch imports sympy if each output has a gradient.
+            # The outputs are summed, because torch imports sympy if several outputs get a gradient each.
             total = torch.stack([(t * torch.ones_like(t)).sum().float() for t in outputs]).sum()
             torch.autograd.grad(total, leaves, allow_unused=True)
         if cuda:

@@ -1,4 +1,4 @@
-"""A double of a routed module: a copy that runs in its place with other tensors as parameters.
+"""A double of a routed module: a copy that runs instead of the module, with other tensors as parameters.
 
 The module itself never changes, so other threads may save, copy or call it at any time.
 """
@@ -21,9 +21,9 @@ from voronerf.router.layout import Call, map_tree
 
 _OP = "VoronoiRouter"
 _PLAIN = {type(None), bool, int, float, str, type, torch.dtype, torch.device, torch.Size, types.FunctionType, Tensor}
-_LAYERS = "torch.nn.modules."  # modules of these classes assign nothing in ``forward``
+_LAYERS = "torch.nn.modules."  # modules from this package assign no attributes in ``forward``
 _REGISTRIES, _OF_HOOKS = ("_parameters", "_buffers", "_modules"), (OrderedDict, dict, set)
-_SEARCHED = 1000  # most objects in an attribute that are searched for submodules
+_SEARCHED = 1000  # maximum number of objects in an attribute that are searched for submodules
 
 
 class Forbidden(TypeError):
@@ -33,11 +33,12 @@ class Forbidden(TypeError):
 class Double:
     """A copy of a module tree that shares its buffers and has its own registries of parameters.
 
-    Each run starts with the module's attributes, so attributes that ``forward`` assigns last for one run.
+    Each run starts with the module's attributes; attributes assigned by ``forward`` are dropped after the run.
 
     Args:
         module: The routed module, or a field.
-        reads: A set that collects (place of the submodule, name) of attributes that runs read; None for no recording.
+        reads: A set to which runs add (place of the submodule, name) of each attribute that they read; None to record
+            nothing.
     """
 
     def __init__(self, module: nn.Module, reads: set[tuple[int, str]] | None = None) -> None:
@@ -67,7 +68,7 @@ class Double:
             self._registries.append((twin, registry, set(registry)))
 
     def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any], mode: Any = None) -> Any:
-        """Runs a call with other rows as arguments and other tensors as parameters, by the parameters' ids.
+        """Runs a call with ``rows`` as arguments and with ``values``, found by parameter id, as parameters.
 
         The ``mode`` is active only while the method runs.
 
@@ -97,7 +98,7 @@ class Double:
                 raise Forbidden(f"{_OP}: {name} must not {action}, but does so with {key!r}")
 
     def _restore_attributes(self) -> None:
-        """Restores the attributes of the submodules from before the run."""
+        """Gives the submodules the attributes that they had before the run."""
         for twin, members in self._assignable:
             attributes = vars(twin)
             if attributes.keys() != members.keys() or not all(map(operator.is_, attributes.values(), members.values())):
@@ -105,7 +106,7 @@ class Double:
                 attributes.update(members)
 
     def fill(self, values: Mapping[int, Any]) -> list[tuple[dict[str, Any], str, Any]]:
-        """Replaces parameters by tensors, by the parameters' ids; lists (registry, name, tensor) of each."""
+        """Replaces each parameter whose id is in ``values``; lists (registry, name, tensor) of the replacements."""
         placed = [(registry, name, values[key]) for registry, name, key in self._places if key in values]
         for registry, name, value in placed:
             registry[name] = value
@@ -117,7 +118,7 @@ class Double:
             part._buffers = {name: None if b is None else b.clone() for name, b in part._buffers.items()}
 
     def end(self) -> None:
-        """Removes the parameters, so that code that runs again in the backward pass fails."""
+        """Removes the parameters, so that code fails if the backward pass runs it again."""
         for registry, _, _ in self._places:
             registry.clear()
 
@@ -142,7 +143,7 @@ class _Unregistered:
 
 
 def _recording_class(kind: type[nn.Module], place: int, reads: set[tuple[int, str]]) -> type[nn.Module]:
-    """Makes a subclass that collects (place, name) of the attributes that are read."""
+    """Makes a subclass that adds (place, name) of each accessed attribute to ``reads``."""
 
     def getattribute(self: nn.Module, name: str) -> Any:
         reads.add((place, name))
@@ -155,7 +156,7 @@ def _recording_class(kind: type[nn.Module], place: int, reads: set[tuple[int, st
 
 
 def _versions(placed: list[tuple[dict[str, Any], str, Any]]) -> list[int]:
-    """Lists the version counters of tensors. This is fast, since a loop over cells calls it some hundred times."""
+    """Lists the version counters of tensors; it must be fast, because a loop over cells calls it hundreds of times."""
     try:
         return [value._version for _, _, value in placed]
     except RuntimeError:  # inference-mode tensors have no version counter
@@ -187,7 +188,7 @@ def _reaches(value: Any, parts: Mapping[int, nn.Module]) -> bool:
 
 
 def _moved(value: Any, twins: Mapping[int, nn.Module]) -> Any:
-    """Returns the value with twins in the place of submodules."""
+    """Returns the value with its submodules replaced by their twins."""
 
     def change(name: str, leaf: Any, nested: bool) -> Any:
         if isinstance(leaf, nn.Module):

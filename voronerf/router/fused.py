@@ -1,8 +1,8 @@
-"""Fuses a module whose ``forward`` is fixed: into one program, or into several runs.
+"""Fuses a module whose ``forward`` is fixed: its functions become one program, or several programs.
 
 The module is traced once (:mod:`voronerf.router.trace`). Functions that can be steps of a program (``router/lower.py``)
 are joined into the largest possible runs, and each run is one operation. Functions between runs, such as look-ups, run
-in PyTorch for the rows of all cells at once. If they take parameters of cells, they run by the rules of
+in PyTorch for the rows of all cells at once. Functions between runs that take parameters of cells run by the rules of
 :mod:`voronerf.router.rules`.
 
 Letters: n samples, k cells, w columns.
@@ -30,7 +30,7 @@ from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiab
 from voronerf.router.watch import Inputs, lookup
 from voronerf.router.waves import with_encodings
 
-HALF = (torch.bfloat16, torch.float16)  # dtypes that a run computes in float32 and rounds at its end
+HALF = (torch.bfloat16, torch.float16)  # a run computes these dtypes in float32, and rounds at its end
 
 
 class ParameterEntries:
@@ -42,7 +42,7 @@ class ParameterEntries:
         every = torch.arange((of.meta["value"] if isinstance(of, fx.Node) else of).numel())
         self._is_whole = torch.equal(numbers, every)
         self._is_transposed = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
-        self._numbers = numbers.clone()  # a copy can be saved for a backward pass, an inference tensor cannot
+        self._numbers = numbers.clone()  # a copy, because an inference tensor cannot be saved for a backward pass
 
     def constants(self) -> list[float] | None:
         """Returns the entries as numbers if the source is a constant, or None."""
@@ -52,13 +52,13 @@ class ParameterEntries:
         return values
 
     def resolve(self, values: Mapping[Any, Any]) -> Tensor:
-        """Returns the source itself if all of its entries are selected in its own shape; else as `select`."""
+        """Returns the source itself if all entries are selected in its own shape; else the result of `select`."""
         value: Tensor = values.get(self.of, self.of)
         whole = self._is_whole and value.shape[self._is_of_cells :] == self._shape
         return value if whole else self.select(values)
 
     def select(self, values: Mapping[Any, Any]) -> Tensor:
-        """Returns the entries, [k, ...], or [1, ...] if cells share the source."""
+        """Returns the selected entries, [k, ...], or [1, ...] if cells share the source."""
         value = values.get(self.of, self.of)
         flat = value.reshape(value.shape[0] if self._is_of_cells else 1, -1)
         if self._is_whole:
@@ -70,7 +70,7 @@ class ParameterEntries:
 
 @dataclass
 class Segment:
-    """One program with the sources of its inputs and parameters, and its outputs."""
+    """One program with its outputs and the sources of its inputs and parameters."""
 
     program: Program
     inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier runs
@@ -79,7 +79,7 @@ class Segment:
 
 
 class WholeProgram(NamedTuple):
-    """A call as one program: the numbers of its arguments, and the shape and dtype of each result for one sample."""
+    """A call as one program, the numbers of its arguments, and the shape and dtype of each result per sample."""
 
     program: Program
     reads: tuple[int, ...]
@@ -87,7 +87,7 @@ class WholeProgram(NamedTuple):
 
 
 class Fused:
-    """A call of the routed module as runs of programs, and the functions between them.
+    """A call of the routed module as runs of programs with PyTorch functions between them.
 
     The call is traced on rows of its arguments, for ``rows_for`` samples. Raises :class:`Unfusable` if nothing can be
     fused, or if a step cannot be repeated for other samples.
@@ -110,8 +110,8 @@ class Fused:
         self._recorded = torch.is_grad_enabled() or any(node.meta.get("grad") for node in trace.graph.nodes)
         self._differentiates = any(node.target is torch.autograd.grad for node in trace.graph.nodes)
         self._lowering = Lowering(trace.rows)
-        self._entries: dict[fx.Node, Entries] = {}  # by value that steps compute or move
-        self._ready: dict[fx.Node, int] = {}  # by value of PyTorch: the first run that can read it
+        self._entries: dict[fx.Node, Entries] = {}  # entries of each value that steps compute or move
+        self._ready: dict[fx.Node, int] = {}  # the first run that can read each value of PyTorch
         self._reasons: dict[fx.Node, str] = {}
         for node in trace.graph.nodes:
             self._add(node)
@@ -128,7 +128,7 @@ class Fused:
         self._writes = any(node.meta.get("inplace") for node in self._between)
         self._runs = self._cut()
         if not any(run.parameters for run in self._runs.values()):
-            first = next(iter(self._reasons.values()), "nothing that is returned comes from a layer")
+            first = next(iter(self._reasons.values()), "no result depends on a layer")
             raise Unfusable(f"no layer can be part of a run: {first}")
         self._sorted = any(_meets_cells(node) for node in self._between)
         lines: dict[str, dict[str, None]] = {}  # functions that are not steps, by line of the module
@@ -148,11 +148,11 @@ class Fused:
     # Cutting ----------------------------------------------------------------------------------------------------------
 
     def _add(self, node: fx.Node) -> None:
-        """Decides whether steps or PyTorch, between runs, compute a node."""
+        """Decides whether steps compute a node, or PyTorch does between runs."""
         if node.meta["on"] != SAMPLES or node.op == "placeholder" or isinstance(node.meta.get("value"), int):
             self._ready[node] = 0
             return
-        if "results" not in node.meta:  # one of several results of a function
+        if "results" not in node.meta:  # the node is one of several results of a function
             return
         try:
             self._lower(node)
@@ -160,7 +160,7 @@ class Fused:
                 ready = max(self._ready[source] for source in node.all_input_nodes)
                 self._ready.update(dict.fromkeys((node, *node.meta["results"]), ready))
         except Exception as error:  # NotAStep, or an unforeseen form of arguments
-            self._reasons[node] = f"{name_of(node.target)}{node.meta['line']}, which is no step: {error}"
+            self._reasons[node] = f"{name_of(node.target)}{node.meta['line']}, which cannot be a step: {error}"
             self._ready[node] = max((self._at(source) for source in node.all_input_nodes), default=0)
             for value in node.meta["results"]:
                 self._ready[value] = self._ready[node]
@@ -203,7 +203,7 @@ class Fused:
             return value
 
         if _is_custom(node):
-            raise NotAStep("a custom function, whose backward is its own; write it with functions of PyTorch")
+            raise NotAStep("a custom function with its own backward; write it with functions of PyTorch")
         if node.target in (torch.autograd.grad, differentiable):
             raise NotAStep("a gradient")
         args, kwargs = map_arg((node.args, node.kwargs), value_of)
@@ -214,7 +214,7 @@ class Fused:
         function: Any = node.target
         written: Any = node.args[0] if node.meta["inplace"] else None
         old_entries = written and Entries(self._entries_of(written).codes.clone(), self._entries_of(written).of)
-        # A plain dict, because map_tensors makes changed copies of its type.
+        # A plain dict, because map_tensors makes its result of the same type, and map_arg returns an immutable dict.
         result, args, entries = self._lowering.run(function, args, dict(kwargs), entries_of)
         entry_list = [entries(tensor) for tensor in ([args[0]] if written else tensors_of(result))]
         if written:  # the codes of views of the tensor change too
@@ -271,7 +271,7 @@ class Fused:
         return columns if columns.index not in self._lowering.sources else self._lowering.builder.apply("copy", columns)
 
     def _cut(self) -> dict[int, Segment]:
-        """Groups the steps into runs, by their level."""
+        """Groups the steps into runs by the steps' levels."""
         lowering, steps = self._lowering, self._lowering.builder.steps
         live = self._live
         level = {value: lowering.level(value) for value in live}
@@ -296,7 +296,7 @@ class Fused:
         call = self._with_inputs(call, grouping.device)
         rows, shared = call.arranged(grouping if sort else None), call.shared()
         owned, places = self._owned, self._places
-        if call.module is not self.module:  # the call is of a copy of the module
+        if call.module is not self.module:  # the call is on a copy of the module
             owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
             parts = list(parts_of(call.module).values())
             places = [(parts[i], i, name) for _, i, name in places]
@@ -345,7 +345,7 @@ class Fused:
 
     @functools.cached_property
     def _sources(self) -> list[tuple[dict[str, Any], str, ParameterEntries | None]]:
-        """(registry, name, selected entries) of each parameter of :attr:`whole_program`; None: the parameter itself."""
+        """(registry, name, selected entries or None for all) of each parameter of :attr:`whole_program`."""
         (run,) = self._runs.values()
         sources = list[tuple[dict[str, Any], str, ParameterEntries | None]]()
         for entries in run.parameters:
@@ -370,7 +370,7 @@ class Fused:
         for node, place in self._parameters.items():
             owner, name = self._owned[place]
             values[node] = owner._parameters[name]
-        cells = torch.zeros(2, dtype=torch.int32, device=device)  # placeholders: weights depend on no samples
+        cells = torch.zeros(2, dtype=torch.int32, device=device)  # placeholders, since weights do not depend on samples
         grouped = GroupedRun(Grouping(cells, 2, k, device, backend), {})
         for node in self._weights:
             if node not in values:
@@ -379,7 +379,7 @@ class Fused:
         return [entries.resolve(values).float() for entries in run.parameters]
 
     def _with_inputs(self, call: Call, device: torch.device) -> Call:
-        """Returns the call with tensors in the place of the numbers that are inputs."""
+        """Returns the call with the numbers that are inputs replaced by tensors."""
         names = {source for source in self.inputs.sources if isinstance(source, str)}
         return call.with_tensors(names, lambda value: self.inputs.tensor(value, device)) if names else call
 
@@ -403,7 +403,7 @@ class Fused:
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
         half = torch.is_autocast_enabled(grouping.device.type) or any(x.dtype in HALF for x in rows)
         parameters = [recordable(entries.select(values).to(dtype)) for entries in run.parameters]
-        with torch.autocast(grouping.device.type, enabled=False):  # rounded below, as in cached calls
+        with torch.autocast(grouping.device.type, enabled=False):  # results are rounded below, as in cached calls
             outputs = grouped_program(
                 [x.to(dtype) for x in rows],
                 parameters,
@@ -421,7 +421,7 @@ class Fused:
 
 
 def _renumbered(steps: list[Step], results: list[Columns], lowering: Lowering, outputs: list[Any]) -> Segment:
-    """Makes a program of some of the steps, with its own numbering of values and parameters."""
+    """Makes a program of some of the steps, with new numbers for its values and parameters."""
     b, run = Builder(), Segment(Program((), (), (), ()), outputs=outputs)
     values: dict[int, int] = {}
     parameters: dict[int, int] = {}
@@ -454,7 +454,7 @@ def _meets_cells(node: fx.Node) -> bool:
 
 
 def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None:
-    """Calls the function of a node, for all cells at once if it takes their parameters."""
+    """Calls a node's function; a function of the cells' parameters is called for all cells at once."""
     meets_cells = _meets_cells(node)
 
     def argument(source: fx.Node) -> Any:
@@ -471,14 +471,14 @@ def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None
         with grouped if meets_cells else contextlib.nullcontext(), torch.set_grad_enabled(is_recorded):
             result = node.target(*args, **kwargs)  # type: ignore[operator]
     except Ungroupable:
-        message = f"{name_of(node.target)}{node.meta['line']} meets parameters and has no rule for all cells at once"
+        message = f"{name_of(node.target)}{node.meta['line']} takes parameters, and has no rule for all cells at once"
         raise Unfusable(message) from None
     written = args[0] if node.meta.get("inplace") else result
     values[node] = map_tensors(written, lambda item: item.stacked if isinstance(item, PerCell) else item)
 
 
 def _flat(value: Tensor, n: int) -> Tensor:
-    """Reshapes a tensor to [n, w]; its first dimension is n * m, or another dimension is n."""
+    """Reshapes a tensor with n * m rows, or with n in another dimension, to [n, w]."""
     if value.shape[:1] != (n,) and (not value.shape or n == 0 or value.shape[0] % n):
         dim = next(d for d, size in enumerate(value.shape) if size == n)
         value = value.movedim(dim, 0)

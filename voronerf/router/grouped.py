@@ -3,10 +3,10 @@
 The rows are sorted by cell, and :class:`PerCell` tensors replace the module's parameters. :class:`GroupedRun`
 intercepts every PyTorch function. A function of rows and parameters runs by a rule (:func:`register`), a function of
 parameters alone is mapped over cells, and any other function runs unchanged. Tensors that depend on the samples are
-marked. By the marks, rules tell rows from constants, and host reads of samples' values are detected. If a step has no
-rule, :class:`Ungroupable` names it, and the call becomes a loop over cells.
+marked. The marks tell rows from constants, and reveal host reads of samples' values. If a step has no rule,
+:class:`Ungroupable` names the step, and the call becomes a loop over cells.
 
-Letters: n samples, k cells; a tensor of rows is [n * m, ...], the m entries of a sample next to each other.
+Letters: n samples, k cells; a tensor of rows is [n * m, ...], with the m entries of each sample next to each other.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _RULES: dict[Any, Rule] = {}
 
 
 def find(names: str, *places: Any) -> frozenset[Any]:
-    """Returns the functions of these names in some modules or classes."""
+    """Returns the functions with these names in some modules or classes."""
     functions = (getattr(place, name, None) for place in places for name in names.split())
     return frozenset(function for function in functions if function is not None)
 
@@ -103,8 +103,8 @@ def register(function: Any, rule: Rule) -> None:
         function: The function as PyTorch's function modes see it, such as ``torch.nn.functional.linear``, an operator
             of ``torch.ops``, or a function of your own that calls ``torch.overrides.handle_torch_function``.
         rule: ``rule(run, *args, **kwargs)`` with the :class:`GroupedRun` and the function's own arguments: tensors of
-            rows are sorted by cell, and a parameter is a :class:`PerCell`, whose ``stacked`` is [k, ...]. It returns
-            rows, or ``NotImplemented`` for arguments that it does not support.
+            rows are sorted by cell, and a parameter is a :class:`PerCell`, whose ``stacked`` is [k, ...]. The rule
+            returns rows, or ``NotImplemented`` for arguments that it does not support.
 
     Examples:
         >>> import torch
@@ -134,27 +134,27 @@ class Ungroupable(Exception):
 
     def __init__(self, reason: str, of_batch: bool = False) -> None:
         super().__init__(reason)
-        self.of_batch = of_batch  # another batch may be groupable
+        self.of_batch = of_batch  # whether another batch may be groupable
 
 
 class PerCell(torch.Tensor):
-    """A stand-in for a parameter in a routed module: k tensors, one for each cell, that look like a single one.
+    """A stand-in for a parameter in a routed module: k tensors, one for each cell, that look like one tensor.
 
     It has the shape of a single cell's tensor and no storage.
 
     Attributes:
         stacked: The tensors of all cells, [k, ...].
-        origin: The larger tensor that ``stacked`` is a part of, and the part's first cell in it.
+        origin: The tensor of which ``stacked`` is a slice, and the first cell of the slice.
     """
 
     stacked: Tensor
     origin: tuple[Tensor, int]
-    # The wrapper itself has the shape and the dtype.
+    # Not needed, because the wrapper itself has the shape and the dtype.
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     @staticmethod
     def __new__(cls, stacked: Tensor, origin: tuple[Tensor, int] | None = None) -> PerCell:
-        """Wraps [k, ...]."""
+        """Wraps ``stacked`` [k, ...] as a tensor [...]."""
         wrapper: PerCell = torch.Tensor._make_wrapper_subclass(
             cls, stacked.shape[1:], dtype=stacked.dtype, device=stacked.device, requires_grad=stacked.requires_grad
         )
@@ -193,7 +193,7 @@ def for_all_cells(func: Any, args: Any, kwargs: Any, fail: Callable[[str], Excep
 
 
 def _weight_norm(v: Tensor, g: Tensor, dim: int = 0) -> Tensor:
-    """Computes ``torch._weight_norm`` by functions that support vmap."""
+    """Computes ``torch._weight_norm`` with functions that support vmap."""
     others = [d for d in range(v.dim()) if d != dim]
     return v * (g / torch.linalg.vector_norm(v, dim=others, keepdim=True))
 
@@ -219,7 +219,7 @@ def user_frame() -> FrameType | None:
         file = frame.f_code.co_filename
         is_ours = file.startswith(_HERE)
         if is_ours and has_left_router:
-            return None  # the router that called the module
+            return None  # this is the router that called the module
         has_left_router = has_left_router or not is_ours
         if has_left_router and not is_ours and not file.startswith(_TORCH):
             return frame
@@ -240,14 +240,14 @@ class GroupedRun(TorchFunctionMode):
     """A mode that is active while a module runs on the n sorted rows of all cells; rules get it as ``run``.
 
     Attributes:
-        tables: The tables that the call has looked up, shared by all parts of its rows.
+        tables: The look-up tables that the call has used; all parts of its rows share them.
         failed: The reason why the results are invalid, even if the module caught the error; None if they are valid.
-        widest: The bytes of the largest tensor of rows in the run.
+        widest: The size in bytes of the largest tensor of rows in the run.
     """
 
     def __init__(self, grouping: Grouping, tables: dict[Any, Any], quiet: bool = False) -> None:
         super().__init__()
-        self.quiet = quiet  # random numbers are 0
+        self.quiet = quiet  # whether random numbers are 0
         self.grouping, self.n, self.tables = grouping, grouping.n, tables
         self.failed: Ungroupable | None = None
         self.widest = 1
@@ -260,7 +260,7 @@ class GroupedRun(TorchFunctionMode):
         return isinstance(value, Tensor) and getattr(value, _MARK, (None,))[0] is self._token
 
     def entries(self, rows: Tensor) -> int:
-        """Returns m of a tensor of rows [n * m, ...]."""
+        """Returns m, the number of entries per sample, of a tensor of rows [n * m, ...]."""
         if rows.dim() == 0 or not rows.shape[0] or rows.shape[0] % self.n:
             shape = list(rows.shape)
             reason = f"parameters meet a tensor of shape {shape}, which has no row for each of {self.n} samples"
@@ -268,7 +268,7 @@ class GroupedRun(TorchFunctionMode):
         return rows.shape[0] // self.n
 
     def rows_of(self, parameter: PerCell, m: int = 1) -> Tensor:
-        """Returns, for each row, the parameter of its cell: [n * m, ...]."""
+        """Returns the parameter of each row's cell, [n * m, ...]."""
         return self.grouping.expand(parameter.stacked, m)
 
     # Marks ------------------------------------------------------------------------------------------------------------
@@ -313,7 +313,7 @@ class GroupedRun(TorchFunctionMode):
         return result
 
     def _check_read(self, func: Any, result: Any, source: Tensor) -> None:
-        """Raises for a host read of samples' values, which a loop over cells reads separately for each cell."""
+        """Raises for a host read of samples' values, because a loop over cells reads them separately for each cell."""
         if result is None or isinstance(result, (str, torch.dtype, torch.device, torch.Size)):
             return
         # A false "any" or a true "all" of all samples holds for the samples of each cell too.
@@ -325,12 +325,12 @@ class GroupedRun(TorchFunctionMode):
         for tensor in operands:
             is_unmarked = type(tensor) is not PerCell and not hasattr(tensor, _MARK) and tensor.shape[:1] == (self.n,)
             if is_unmarked and not isinstance(tensor, torch.nn.Parameter):
-                raise self.fail(f"{name_of(func)} takes rows that no PyTorch function was seen to make")
+                raise self.fail(f"{name_of(func)} takes rows that were not computed by a recorded PyTorch function")
         rule = _RULES.get(func)
         result = NotImplemented if rule is None else rule(self, *args, **kwargs)
         if result is NotImplemented:
             if marked:
-                raise self.fail(f"{name_of(func)} meets parameters and has no rule for all cells at once")
+                raise self.fail(f"{name_of(func)} takes parameters, and has no rule for all cells at once")
             return for_all_cells(func, args, kwargs, self.fail)
         for tensor in tensors_of(result):
             if type(tensor) is not PerCell:
@@ -358,21 +358,21 @@ class Way(Protocol):
 class Grouped:
     """The grouped way: the module's own ``forward`` runs once for the rows of all cells.
 
-    On a CPU it runs on pieces of rows whose tensors fit in the cache.
+    On a CPU, ``forward`` runs on pieces of the rows, so that its tensors fit in the cache.
     """
 
-    piece: int = 1 << 16  # rows
+    piece: int = 1 << 16  # maximum number of rows in a piece
     name: str = "grouped"
     why: str = ""
     quiet: bool = False  # whether random numbers are 0, to compare two runs
-    widest: int = 1  # bytes of the largest tensor of rows in the last call
+    widest: int = 1  # size in bytes of the largest tensor of rows in the last call
 
     def run(self, call: Call, grouping: Grouping) -> Results:
         """Returns results in the order of the grouping; raises :class:`Ungroupable`."""
         arguments = call.arranged(grouping)
         parts = grouping.parts(self.piece) if grouping.device.type == "cpu" else [grouping]
-        # Parameters are split once for all parts, so their gradient is concatenated once. The gradient of a slice would
-        # be a zero-filled tensor of all cells for each part. Parts of one cell share a piece.
+        # Parameters are split once for all parts, so their gradients are concatenated once. If each part took a slice,
+        # each gradient would be a zero-filled tensor of all cells. Parts of one cell share a piece.
         sizes, pieces = {part.start: part.k for part in parts}, []
         for p in cell_parameters(call.module):
             pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
@@ -398,8 +398,8 @@ class Grouped:
 class Loop:
     """The loop: the module runs once for each cell that has samples. It defines the result of a routed call.
 
-    If the module's code runs ``again`` in the backward pass (``torch.utils.checkpoint``), every cell has a double that
-    keeps the cell's parameters.
+    ``again`` is for modules whose code runs again in the backward pass (``torch.utils.checkpoint``): every cell then
+    has its own double, which keeps the cell's parameters.
     """
 
     why: str = ""

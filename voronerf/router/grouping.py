@@ -1,7 +1,7 @@
 """Samples and parameters by cell: sorted rows and stacked tensors.
 
-n samples, k cells, e entries of a table. A sorted tensor may have m entries a sample: its first dimension is then
-n * m, sample after sample.
+Letters: n samples, k cells, e entries of a table. A sorted tensor may have m entries per sample: its first dimension is
+then n * m, sample after sample.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from voronerf import ops
 from voronerf.ops._core.memory import LARGE, on_huge_pages
 
 SHARED = "_voronerf_shared"
-"""The attribute in which a submodule keeps the names of its parameters that all cells share."""
+"""The attribute of a submodule that holds the names of its shared parameters."""
 
 
 class Grouping:
@@ -32,14 +32,14 @@ class Grouping:
         rows: The sample of each entry, int64 [n]; samples may be missing or repeated. None: entry i is sample i.
 
     Attributes:
-        offsets: The first sorted row of each cell and, last, n, int32 [k + 1].
+        offsets: int32 [k + 1], the first sorted row of each cell, followed by n.
     """
 
     def __init__(
         self, cells: Tensor | None, n: int, k: int, device: torch.device, backend: str, rows: Tensor | None = None
     ) -> None:
         self.cells, self.n, self.k, self.device, self.backend, self.rows = cells, n, k, device, backend, rows
-        self.start = 0  # first cell, if this is one of several parts
+        self.start = 0  # the first cell, if this is one of several parts
         self._order: Tensor | None = None
         if cells is None:
             self.offsets = torch.tensor([0, n], dtype=torch.int32, device=device)
@@ -96,11 +96,11 @@ class Grouping:
         return parts
 
     def cells_of_rows(self, m: int) -> Tensor:
-        """Returns the cell of each row of tensors with m entries a sample, int64 [n * m]."""
+        """Returns the cell of each row of tensors with m entries per sample, int64 [n * m]."""
         return self.sorted_cells if m == 1 else self.sorted_cells.repeat_interleave(m)
 
     def scaled_offsets(self, m: int) -> Tensor:
-        """Returns the ``offsets`` of tensors with m entries a sample."""
+        """Returns the ``offsets`` for tensors with m entries per sample."""
         return self.offsets if m == 1 else self.offsets * m
 
     def sort(self, x: Tensor) -> Tensor:
@@ -110,7 +110,7 @@ class Grouping:
         return self._permute(x) if self.rows is None else x.index_select(0, self.source)
 
     def unsort(self, x: Tensor) -> Tensor:
-        """Restores the order of the entries of rows [n, ...] that are sorted by cell."""
+        """Returns rows [n, ...], which are sorted by cell, in the order of the entries."""
         return x if self.source is None else self._permute(x, back=True)
 
     def _permute(self, x: Tensor, back: bool = False) -> Tensor:
@@ -122,8 +122,8 @@ class Grouping:
         return x.index_select(0, self._inverse if back else order)
 
     def expand(self, stacked: Tensor, m: int = 1) -> Tensor:
-        """Repeats the tensor of each row's cell: [k, ...] -> [n * m, ...]."""
-        # The rows must be exact copies, which a product in TF32 would round.
+        """Returns the tensor of each row's cell: [k, ...] -> [n * m, ...]."""
+        # The rows must be exact copies, but a product in TF32 would round them.
         rounds = stacked.is_cuda and torch.backends.cuda.matmul.fp32_precision == "tf32"
         if not stacked.is_floating_point() or stacked[0].numel() == 0 or rounds:
             return stacked.index_select(0, self.cells_of_rows(m))
@@ -136,7 +136,7 @@ class Grouping:
 
 
 class _Permute(torch.autograd.Function):
-    """A permutation of rows whose backward is a gather too, while the backward of indexing is a scatter-add."""
+    """A permutation of rows whose backward is also a gather; the backward of indexing would be a scatter-add."""
 
     generate_vmap_rule = True
 
@@ -174,7 +174,7 @@ class Assigned(NamedTuple):
 
 
 def parts_of(module: nn.Module, parts: dict[int, nn.Module] | None = None) -> dict[int, nn.Module]:
-    """Returns all submodules by id, in the order of ``modules()``, which takes three times as long."""
+    """Returns all submodules by id, in the order of ``modules()``, which itself takes three times as long."""
     parts = {} if parts is None else parts
     if id(module) not in parts:
         parts[id(module)] = module
@@ -208,7 +208,7 @@ def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
 
 
 class _Cells(torch.autograd.Function):
-    """Splits a stacked tensor by cell; the gradients are joined in memory of `on_huge_pages`."""
+    """A split of a stacked tensor by cell; its backward joins the gradients in memory of `on_huge_pages`."""
 
     generate_vmap_rule = True
 

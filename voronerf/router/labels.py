@@ -18,8 +18,8 @@ class Labels(NamedTuple):
     """The cells of a call's samples.
 
     Attributes:
-        cells: The labels as int32 [..., 1], in the place of positions [..., d].
-        checked: Whether all labels have been found to be 0 to k - 1.
+        cells: The labels as int32 [..., 1], passed on instead of positions [..., d].
+        checked: Whether all labels are known to lie in 0 to k - 1.
     """
 
     cells: Tensor
@@ -29,17 +29,17 @@ class Labels(NamedTuple):
     def of(cells: Any, k: int, device: torch.device) -> Labels:
         """Checks the labels of a call; on a GPU this waits for the device.
 
-        Compiled and captured graphs do not read the labels. There the operations raise for invalid labels on the CPU,
-        and give results of 0 on a GPU.
+        Compiled and captured graphs do not check the labels here. In such a graph, the operations raise for invalid
+        labels on the CPU, and return 0 on a GPU.
 
         Args:
             cells: The labels, int32 or int64 [...], one for each sample, 0 to k - 1.
             k: The number of networks.
-            device: The device of their parameters.
+            device: The device of the networks' parameters.
 
         Raises:
-            TypeError: For anything but an int32 or int64 tensor.
-            ValueError: For a tensor without dimensions, on another device, or with other values.
+            TypeError: If ``cells`` is not an int32 or int64 tensor.
+            ValueError: If ``cells`` has no dimensions, is on another device, or has labels out of range.
         """
         if not isinstance(cells, Tensor) or cells.dtype not in (torch.int32, torch.int64):
             got = cells.dtype if isinstance(cells, Tensor) else type(cells).__name__
@@ -55,15 +55,15 @@ class Labels(NamedTuple):
         return Labels(as_plain(cells).int().unsqueeze(-1), True)
 
     def ensure(self, k: int) -> None:
-        """Raises ValueError for labels out of range that a graph, which ended before the call, did not check."""
+        """Raises ValueError for labels out of range; checks them only if a graph left them unchecked."""
         if not self.checked:
             _check_values(self.cells, k)
 
     def widen(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Returns the arguments with the first one expanded to a row for each label, if one row serves several labels.
+        """Returns the arguments; if the first one has a single row, it is expanded to one row for each label.
 
         Raises:
-            ValueError: For labels that cannot have the leading shape of the first argument.
+            ValueError: If the shape of the labels does not fit the first argument.
         """
         first, lead = args[0] if args else None, self.cells.shape[:-1]
         if not isinstance(first, Tensor) or first.dim() < len(lead):

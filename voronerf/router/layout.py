@@ -1,7 +1,7 @@
 """The arguments of a call: their relation to its samples, their rows sorted by cell, and the order of its results.
 
 Letters: n samples in leading dimensions ``lead``, for example (rays, samples of a ray); f features. Arguments and
-results may be of any structure: lists, tuples, named tuples, dicts, dataclasses, other objects.
+results may have any structure: lists, tuples, named tuples, dicts, dataclasses, other objects.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from voronerf.router.grouping import Grouping
 
 _OP = "VoronoiRouter"
-DEEPEST = 6  # objects within objects that are searched for tensors
+DEEPEST = 6  # maximum depth to which nested objects are searched for tensors
 _LEAVES = {type(None), type(...), bool, int, float, str, torch.Size, torch.dtype, torch.device}
 AS_TENSOR = "pass torch.as_tensor(points, dtype=torch.float32)"
 SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
@@ -31,7 +31,7 @@ SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
 
 
 def map_tree(value: Any, change: Callable[..., Any], name: str = "", nested: bool = False, depth: int = 0) -> Any:
-    """Returns the structure with every leaf changed; the same object if no leaf changes.
+    """Applies ``change`` to every leaf of a structure; returns the same object if no leaf changes.
 
     ``change`` gets a leaf's name ("x", "samples.origins", "views.0"), the leaf, and whether it is inside an object.
     """
@@ -98,12 +98,12 @@ def _collect(items: Iterable[Any], tensors: list[Tensor], depth: int) -> None:
 
 
 def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:
-    """Returns the structure with every tensor changed."""
+    """Applies ``change`` to every tensor of a structure, and returns the structure."""
     return map_tree(value, lambda _, leaf, nested: change(leaf) if isinstance(leaf, Tensor) else leaf)
 
 
 def as_plain(value: Any) -> Any:
-    """Returns a tensor of a subclass as a plain one; other values, and tensors with a dispatch of their own, stay."""
+    """Converts a tensor of a subclass to a plain tensor, unless the subclass has its own dispatch."""
     kind = type(value)
     if kind is Tensor or kind is nn.Parameter or not isinstance(value, Tensor):
         return value
@@ -128,7 +128,7 @@ class Layout:
     """
 
     lead: tuple[int, ...]  # leading dimensions of a tensor with an entry for each sample
-    per_ray: frozenset[str] | None  # names of the arguments with an entry for each ray; None: by shapes
+    per_ray: frozenset[str] | None  # names of the arguments with an entry for each ray; None: shapes decide
     shared: frozenset[str]  # names of the arguments that are the same for all samples
     flat: bool = False  # whether the module gets [n, f]
 
@@ -138,10 +138,10 @@ class Layout:
         return math.prod(self.lead)
 
     def kind(self, name: str, tensor: Tensor, nested: bool) -> str:
-        """Returns the kind of a tensor: an entry for each sample, for each ray, broadcast, or shared.
+        """Returns the kind of a tensor: per sample, per ray, broadcast or shared.
 
-        Raises ValueError for an ambiguous shape, and for a shape of no kind unless the tensor is ``nested`` in an
-        object.
+        Raises ValueError for an ambiguous shape. A shape that fits no kind also raises, but counts as shared if the
+        tensor is ``nested`` in an object.
         """
         shape, lead, d = tuple(tensor.shape), self.lead, len(self.lead)
         if not shape or _named(name, self.shared):
@@ -178,7 +178,7 @@ class Layout:
         )
 
     def flatten(self, tensor: Tensor, kind: str) -> Tensor:
-        """Returns [n, ...] for a tensor per sample, [rays, ...] for a tensor per ray."""
+        """Reshapes a tensor per sample to [n, ...], and a tensor per ray to [rays, ...]."""
         d = len(self.lead)
         if kind == RAY:
             return tensor.reshape(math.prod(self.lead[:-1]), *tensor.shape[d - 1 :])
@@ -232,13 +232,13 @@ class Call:
         return f"{type(self.module).__name__}.{self.method}"
 
     def run(self, rows: Iterable[Tensor]) -> Any:
-        """Calls the method on other rows than its arguments'; ``forward`` runs with the module's hooks."""
+        """Calls the method with ``rows`` instead of its arguments' rows; ``forward`` runs with the module's hooks."""
         following = iter(rows)
         args, kwargs = self.changed(lambda tensor, kind: next(following))
         return (self.module if self.method == "forward" else getattr(self.module, self.method))(*args, **kwargs)
 
     def changed(self, change: Callable[[Tensor, str], Tensor]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        """Returns the arguments with every tensor that has rows changed; ``change`` gets a tensor and its kind."""
+        """Applies ``change`` (of a tensor and its kind) to every tensor that has rows; returns the arguments."""
 
         def changed(name: str, value: Any, nested: bool) -> Any:
             if not isinstance(value, Tensor):
@@ -265,7 +265,7 @@ class Call:
         return constants
 
     def with_tensors(self, names: Container[str], make: Callable[[Any], Tensor]) -> Call:
-        """Returns the call with shared tensors in the place of the named numbers."""
+        """Returns the call with the named numbers replaced by shared tensors."""
         arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
         values = [map_tree(v, lambda name, leaf, _: make(leaf) if name in names else leaf, n) for n, v in arguments]
         args, kwargs = tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
@@ -280,9 +280,9 @@ class Call:
         return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)
 
     def part(self, most: int) -> tuple[Call, Tensor] | None:
-        """Returns a call with at most ``most`` of the samples and their numbers, int64 [m]; None if all are few enough.
+        """Returns a call on at most ``most`` samples, and their numbers, int64 [m]; None if no selection is needed.
 
-        The samples are spread evenly along the longest leading dimension, so that many rays stay complete.
+        The samples are evenly spaced along the longest leading dimension, so that many rays stay complete.
         """
         lead = self.layout.lead
         if self.layout.n <= most:
@@ -327,9 +327,9 @@ class Call:
 
         def arrange(tensor: Tensor, kind: str) -> Tensor:
             rows = recordable(layout.flatten(tensor, kind))
-            if not layout.n:  # placeholders give the shapes of results, since no module runs without rows
+            if not layout.n:  # placeholders, because no module runs without rows; the shapes of results are needed
                 empty = rows.new_full((n, *rows.shape[1:]), 0.5 if rows.is_floating_point() else 0)
-                rows = torch.cat([rows[:0], empty])  # joined, so that the autograd tape has the argument
+                rows = torch.cat([rows[:0], empty])  # concatenated, so that the autograd tape contains the argument
             elif kind == RAY:
                 rows = rows.index_select(0, ray_rows(rows.device))
             elif grouping is not None:
@@ -342,7 +342,7 @@ class Call:
 
 
 def recordable(tensor: Tensor) -> Tensor:
-    """Returns a tensor that autograd can save: a copy if the tensor is of inference mode and the mode is off."""
+    """Returns a tensor that autograd can save: outside of inference mode, a copy of an inference tensor."""
     return tensor.clone() if tensor.is_inference() and not torch.is_inference_mode_enabled() else tensor
 
 
@@ -353,18 +353,18 @@ def split_rows(rows: list[Tensor], sizes: list[int]) -> list[Sequence[Tensor]]:
 
 @dataclasses.dataclass
 class Results:
-    """The results of a method for rows."""
+    """The results of a method on rows of samples."""
 
-    value: Any  # of any structure
-    tensors: list[Tensor]  # its tensors, [n, ...]
+    value: Any  # the results, of any structure
+    tensors: list[Tensor]  # the tensors in ``value``, [n, ...]
     order: Grouping | None = None  # the grouping that sorted the rows; None: in the order of the call
 
     @staticmethod
     def joined(values: list[Any], counts: list[int], order: Grouping | None) -> Results:
-        """Joins the results of a method for parts of the rows."""
+        """Concatenates the results of a method on parts of the rows."""
         parts = [tensors_of(value) for value in values]
         if any(len(part) != len(parts[0]) for part in parts):
-            raise ValueError(f"{_OP}: module must return as many tensors for every cell, got different numbers")
+            raise ValueError(f"{_OP}: module must return equally many tensors for every cell, got different numbers")
         for tensor, n in ((tensor, n) for part, n in zip(parts, counts, strict=True) for tensor in part):
             if tensor.shape[:1] != (n,):
                 raise ValueError(
@@ -395,10 +395,10 @@ def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
 
 
 def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: int = 3) -> Tensor:
-    """Returns the positions of a call's samples, [..., d], found by the rule ``coords`` or given as its tensor."""
+    """Returns the positions of a call's samples, [..., d]; ``rule`` is the ``coords`` rule or their tensor."""
     if rule is None:
         raise ValueError(
-            f"{_OP}: coords must say where the positions are, since a module's arguments do not: pass "
+            f"{_OP}: coords must name the positions among the module's arguments: pass "
             f"coords='first{d}', a slice of the features or a function of the arguments to the router, or "
             f"coords=positions [..., {d}] to this call"
         )
@@ -421,9 +421,9 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: in
         positions = source if whole else source[..., : int(rule[5:])] if isinstance(rule, str) else source[..., rule]
     if isinstance(positions, Tensor) and positions.shape[-1:] == (d,) and positions.is_floating_point():
         return positions
-    what = "coords" if isinstance(rule, Tensor) else "what coords returns"
+    what = "coords" if isinstance(rule, Tensor) else "the result of coords"
     if source is not None:
-        what = f"what coords={rule!r} takes from the first tensor, {list(source.shape)},"
+        what = f"coords={rule!r} of the first tensor, {list(source.shape)},"
     if not isinstance(positions, Tensor):
         raise TypeError(f"{_OP}: {what} must be a tensor, got {type(positions).__name__}")
     if positions.shape[-1:] != (d,):
@@ -431,14 +431,14 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: in
     raise TypeError(f"{_OP}: {what} must be floating-point, got {positions.dtype}")
 
 
-_MANY = 4  # fewest cells for a warning that one of them has nearly all samples
+_MANY = 4  # minimum number of cells for the warning that one cell has nearly all samples
 
 
 @torch.no_grad()
 def position_warning(rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor, centres: Tensor) -> str:
-    """Returns the reason why positions [n, d] taken by a rule may not be positions, or an empty text.
+    """Returns the reason why a rule's positions [n, d] may be another quantity, or an empty text.
 
-    ``source`` is the call's first tensor; ``counts``, [k], are the numbers of samples in each cell.
+    ``source`` is the call's first tensor; ``counts`` [k] is the number of samples in each cell.
     """
     flat, k, d = positions.detach().flatten(0, -2), len(counts), positions.shape[-1]
     if isinstance(rule, str) and source is not None:

@@ -1,9 +1,9 @@
 """Lowers PyTorch functions to steps of a program.
 
-A function of the trace runs once on a few samples, and its ATen calls are recorded. Every entry of a tensor that
-depends on samples has a code: the numbers of its sample and of its column. Functions that only move entries (views,
-``cat``, ``permute``) run on the codes. The code of a parameter's entry is its number. Computed entries of a sample
-become columns of a new value of the program.
+Each function of the trace runs once on a few samples, while its ATen calls are recorded. If a tensor depends on
+samples, each of its entries has a code: the numbers of its sample and of its column. Functions that only move entries
+(views, ``cat``, ``permute``) run on the codes. The code of a parameter's entry is the entry's number. The computed
+entries of a sample become columns of a new value of the program.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from voronerf.router.grouped import find
 from voronerf.router.layout import map_tensors, tensors_of
 
 _LOW = (1 << 32) - 1
-_FEW, _PRODUCTS = 3, 16  # most parts of an input that a layer reads separately, most layers of a function
-_SMALL = 64  # most multiplications of two matrices of samples
+_FEW, _PRODUCTS = 3, 16  # maximum number of separately read parts of a layer's input, and of layers of a function
+_SMALL = 64  # maximum number of multiplications in a product of two matrices of samples
 
 _MOVERS = frozenset(
     """
@@ -65,7 +65,7 @@ _FUNCTIONS: dict[str, Callable[..., list[tuple[str, float, float]]]] = {
     "logical_not": lambda: [("affine", -1, 1)],
     "bitwise_not": lambda: [("affine", -1, 1)],
 }
-"""Functions of one tensor and numbers, as a sequence of the program's functions (name, a, b)."""
+"""Functions of one tensor and numbers, as sequences of the program's functions (name, a, b)."""
 _BINARY = {
     **{name: name for name in ("add", "sub", "mul", "div")},
     **dict.fromkeys(("bitwise_and", "logical_and"), "mul"),
@@ -78,7 +78,7 @@ _EMPTY = find("empty empty_like new_empty", torch, torch.Tensor)
 
 
 def _reduced(combine: Callable[[Tensor, Tensor], Tensor], x: Tensor, dims: Any = None, keep: bool = False) -> Tensor:
-    """Reduces dimensions by a binary function, pairwise: one half with the other, repeatedly."""
+    """Reduces dimensions by a binary function, which repeatedly combines one half with the other."""
     dims = [dims] if isinstance(dims, int) else list(dims or ())
     if not dims:
         raise NotAStep("it mixes samples")
@@ -119,7 +119,7 @@ def _norm(x: Tensor, order: float = 2, dim: Any = None, keepdim: bool = False, *
         return x.abs().sum(dim, keepdim=keepdim)
     if order != 2:
         raise NotAStep(f"a norm of order {order}")
-    squares = x.square().sum(dim, keepdim=keepdim)  # at 0 the gradient is 0, not that of the root
+    squares = x.square().sum(dim, keepdim=keepdim)  # at 0 the gradient is 0, while the gradient of the root is infinite
     return torch.where(squares > 0, torch.where(squares > 0, squares, 1.0).sqrt(), 0.0)
 
 
@@ -138,7 +138,7 @@ def _layer_norm(x: Tensor, shape: Sequence[int], weight: Any, bias: Any, eps: fl
 
 
 def _convolution(x: Tensor, weight: Tensor, bias: Any, *rule: Any) -> Tensor:
-    """Writes out a convolution of [n, c, ...] whose kernel has one place, or covers all places and gives one."""
+    """Writes a convolution of [n, c, ...] as a linear layer; its kernel has one place, or covers the whole input."""
     (stride, padding, dilation, transposed, _, groups), size, more = rule, weight.shape[2:], x.shape[2:]
     covers_all = size == more and set(dilation) == {1}
     if transposed or groups != 1 or any(padding) or not (covers_all or set(size) == {1}):
@@ -151,7 +151,7 @@ def _convolution(x: Tensor, weight: Tensor, bias: Any, *rule: Any) -> Tensor:
 
 
 def _written(x: Tensor, indices: Sequence[Any], value: Tensor, accumulate: bool = False) -> Tensor:
-    """Writes out ``x[mask] = number``."""
+    """Writes ``x[mask] = number`` as ``torch.where``."""
     mask = indices[0]
     if len(indices) != 1 or mask.dtype != torch.bool or value.numel() != 1 or accumulate:
         raise NotAStep("a write at places that depend on values, unless x[mask] = number; write it with torch.where")
@@ -195,11 +195,11 @@ _DECOMPOSED: dict[str, Callable[..., Any]] = {
     "index_put": _written,
     "mv": lambda x, y: torch.mm(x, y.unsqueeze(1)).squeeze(1),
 }
-"""ATen functions, written out by other functions."""
+"""ATen functions, and the functions that replace them."""
 
 
 class NotAStep(Exception):
-    """An error for a function that is no step of a program; the message says why."""
+    """An error for a function that cannot be a step of a program; the message says why."""
 
 
 class Entries:
@@ -207,8 +207,8 @@ class Entries:
 
     Attributes:
         codes: A code for each entry, in the tensor's shape: (sample << 32) + column for a tensor of samples, else the
-            number of the parameter's entry.
-        of: The parameter, a node of the trace or a tensor; None for a tensor of samples.
+            entry's number in the parameter.
+        of: The parameter, which is a node of the trace or a tensor; None for a tensor of samples.
     """
 
     def __init__(self, codes: Tensor, of: Any = None) -> None:
@@ -222,7 +222,7 @@ class Lowering:
         rows: The number of samples of the trace.
         levels: The number of the run that computes each value.
         sources: The node of the trace whose rows each input reads.
-        columns: (value, column in it), by the column's number in codes.
+        columns: (value, column in the value), by the number of the column in codes.
         parameters: The source of each parameter of the program: a node or tensor, and the numbers of its entries.
     """
 
@@ -240,7 +240,7 @@ class Lowering:
     # Values -----------------------------------------------------------------------------------------------------------
 
     def input(self, node: Any, shape: Sequence[int], level: int) -> Entries:
-        """Adds the rows of a node as an input of the program, [rows * m, ...] for m entries of a sample."""
+        """Adds the rows of a node as an input of the program, [rows * m, ...] for m entries per sample."""
         if not shape or shape[0] % self.rows or math.prod(shape) == 0:
             at = next((d for d, size in enumerate(shape) if size == self.rows), None)
             if at is None or math.prod(shape) == 0:
@@ -270,7 +270,7 @@ class Lowering:
         return self.levels[value]
 
     def order(self, codes: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the flat places of a tensor's entries by sample, [rows, w], and the numbers of their columns, [w]."""
+        """Returns the flat indices of each sample's entries in a tensor, [rows, w], and their column numbers, [w]."""
         rows = (codes >> 32).flatten()
         if rows.numel() % self.rows or not rows.numel():
             raise NotAStep("entries of a tensor do not belong to single samples")
@@ -280,15 +280,15 @@ class Lowering:
             raise NotAStep("entries of a tensor do not belong to single samples")
         columns = numbers & _LOW
         if not (columns == columns[:1]).all():
-            raise NotAStep("the samples of a tensor differ in more than their values")
+            raise NotAStep("the tensor's layout differs between samples")
         return places, columns[0]
 
     def values(self, codes: Tensor) -> set[int]:
-        """Returns the values whose columns a tensor of samples has."""
+        """Returns the values of the program to which the columns of a tensor of samples belong."""
         return {self.columns[number][0] for number in (codes & _LOW).unique().tolist()}
 
     def parts(self, numbers: Tensor) -> list[tuple[Columns, int]]:
-        """Lists the pieces of columns, given by their numbers, each with its place; as few pieces as possible."""
+        """Divides columns, given by their numbers, into as few pieces as possible; lists each piece with its place."""
         parts: list[tuple[Columns, int]] = []
         for at, number in enumerate(numbers.tolist()):
             value, column = self.columns[number]
@@ -304,7 +304,7 @@ class Lowering:
         return parts
 
     def operand(self, numbers: Tensor) -> Columns:
-        """Returns columns, given by their numbers, as an operand."""
+        """Returns the columns with these numbers as an operand."""
         parts = self.parts(numbers)
         return parts[0][0] if len(parts) == 1 else self.builder.move(len(numbers), parts)
 
@@ -330,7 +330,7 @@ class Lowering:
     def run(
         self, function: Callable[..., Any], args: Any, kwargs: Any, entries_of: Callable[[Any], Entries | None]
     ) -> Any:
-        """Runs a function and returns its result, the copied arguments, and a function from a tensor to its entries.
+        """Runs a function; returns its result, the copied arguments, and a function that returns a tensor's entries.
 
         ``entries_of`` returns the entries of a tensor among the arguments. Raises :class:`NotAStep`.
         """
@@ -357,11 +357,11 @@ class Lowering:
 
 
 class _EntryMode(TorchDispatchMode):
-    """A mode that records the ATen functions that a function calls, as steps."""
+    """A mode that records, as steps, the ATen functions that a function calls."""
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        """Returns False, because True, the default, imports torch.compile at the first call, which takes a second."""
+        """Returns False, because the default, True, imports torch.compile at the first call, which takes a second."""
         return False
 
     def __init__(self, lowering: Lowering) -> None:
@@ -407,7 +407,7 @@ class _EntryMode(TorchDispatchMode):
         for tensor, entries in zip(tensors_of(result), result_entries, strict=True):
             old_entries = self.entries(tensor)
             if inplace and old_entries is not None and entries is not None:
-                old_entries.codes.copy_(entries.codes)  # also changes the tensor of which this is a view
+                old_entries.codes.copy_(entries.codes)  # this also changes the base of a view
             else:
                 self.keep(tensor, entries)
         return result
@@ -429,7 +429,7 @@ class _EntryMode(TorchDispatchMode):
         if name in ("copy", "fill") and result is args[0]:
             return [self._overwritten(args[0], args[1])]
         if not isinstance(result, Tensor):
-            raise NotAStep(f"{name} is no step")
+            raise NotAStep(f"no kind of step computes {name}")
         if name in ("mm", "linear", "addmm", "bmm", "baddbmm"):
             return [self._product(name, args, kwargs, result)]
         numbers = [v for v in args if not isinstance(v, Tensor)]
@@ -442,7 +442,7 @@ class _EntryMode(TorchDispatchMode):
             return [self._where(args, result)]
         if name == "sum":
             return [self._summed(args[0], args[1] if len(args) > 1 else kwargs.get("dim"), result)]
-        raise NotAStep(f"{name} is no step")
+        raise NotAStep(f"no kind of step computes {name}")
 
     def _sample_entries(self, tensor: Tensor) -> Entries:
         """Returns the entries of a tensor of samples; raises NotAStep for others."""
@@ -479,14 +479,14 @@ class _EntryMode(TorchDispatchMode):
         return [Entries(t, of) for t in tensors_of(func(*args, **kwargs))]
 
     def of_samples(self, tensor: Tensor, entries: Entries | None) -> Entries:
-        """Returns a parameter or a constant that is equal for all samples as a tensor of samples."""
+        """Expands a parameter or constant, equal for all samples, to a tensor of samples; returns its entries."""
         shape, rows = tensor.shape, self.lowering.rows
         at = next((d for d, size in enumerate(shape) if size and size % rows == 0), None)
         if at is None or not tensor.numel() or not (tensor.is_floating_point() or tensor.dtype == torch.bool):
             raise NotAStep("a constant without samples")
         by_sample = (tensor if entries is None else entries.codes).movedim(at, 0).reshape(rows, -1)
         if not (by_sample == by_sample[:1]).all():
-            raise NotAStep("a constant with other numbers for each sample")
+            raise NotAStep("a constant that differs between samples")
         if entries is None and bool((by_sample == by_sample[0, 0]).all()):
             column = self.b.apply("affine", self.b.move(1, []), 0.0, float(by_sample[0, 0]))
         else:
@@ -510,7 +510,7 @@ class _EntryMode(TorchDispatchMode):
         return self.of_samples(value.expand(target.shape), entries)
 
     def _placed(self, value: Columns, places: Tensor, shape: Sequence[int]) -> Entries:
-        """Returns a value's columns as the entries of a tensor at ``places``."""
+        """Returns the entries of a tensor that holds a value's columns at ``places``."""
         codes = torch.empty(math.prod(shape), dtype=torch.int64)
         columns = self.b.rows(value)
         codes[places] = self.lowering._codes(columns).expand(places.shape) if columns.width > 0 else 0
@@ -521,14 +521,14 @@ class _EntryMode(TorchDispatchMode):
             raise NotAStep(f"a function that gives {result.dtype}")
         for name, a, b in functions:
             if not all(isinstance(v, (int, float)) for v in (a, b)):
-                raise NotAStep("a function with other than numbers")
+                raise NotAStep("a function with arguments that are not numbers")
             if name == "affine" and (a, b) == (1, 0):
                 continue
             x = self.b.apply(name, x, min(max(a, -3e38), 3e38), min(max(b, -3e38), 3e38))
         return self._placed(x, places, result.shape)
 
     def _operands(self, tensors: Sequence[Any], shape: Sequence[int]) -> tuple[list[Columns], Tensor]:
-        """Returns operands of one width from tensors broadcast to a shape, and the places of their entries."""
+        """Broadcasts tensors to a shape; returns them as operands of one width, and the places of their entries."""
         columns: list[Columns] = []
         first = next(e for t in tensors if isinstance(t, Tensor) and (e := self.entries(t)) and e.of is None)
         places, _ = self.lowering.order(first.codes.expand(list(shape)))
@@ -544,7 +544,7 @@ class _EntryMode(TorchDispatchMode):
                 entries = self._constant(tensor)
             by_sample = entries.codes.expand(list(shape)).flatten()[places]
             if not (by_sample == by_sample[:1]).all():
-                raise NotAStep("a constant with other numbers for each sample")
+                raise NotAStep("a constant that differs between samples")
             columns.append(self.lowering.vector(entries, by_sample[0]))
         return columns, places
 
@@ -587,7 +587,7 @@ class _EntryMode(TorchDispatchMode):
         return self._placed(column, places, result.shape)
 
     def _summed(self, tensor: Tensor, dims: Any, result: Tensor) -> Entries:
-        """Sums over entries of a sample; the terms of a sum become adjacent columns first."""
+        """Sums over entries of a sample; first moves the terms of each sum to adjacent columns."""
         dims = [dims] if isinstance(dims, int) else dims or range(tensor.dim())
         dims = [d % tensor.dim() for d in dims]
         kept = [d for d in range(tensor.dim()) if d not in dims]
@@ -599,11 +599,11 @@ class _EntryMode(TorchDispatchMode):
         places, _ = self.lowering.order((rows << 32)[:, 0])
         numbers = codes[places] & _LOW  # [rows, m, group]
         if not (numbers == numbers[:1]).all():
-            raise NotAStep("the samples of a tensor differ in more than their values")
+            raise NotAStep("the tensor's layout differs between samples")
         return self._placed(self.b.total(self.lowering.operand(numbers[0].flatten()), group), places, result.shape)
 
     def _product(self, name: str, args: Any, kwargs: Any, result: Tensor) -> Entries:
-        """Multiplies rows by a matrix of the cell, for all ATen functions of products."""
+        """Multiplies rows by the cell's matrix; handles all ATen functions for such products."""
         bias = None
         if name == "linear":
             x, weight, bias = (*args, None)[:3]
@@ -614,7 +614,7 @@ class _EntryMode(TorchDispatchMode):
         else:
             x, weight = args[:2]
         x_entries, weight_entries = self.entries(x), self.entries(weight)
-        if x_entries is None and x.shape[0] == self.lowering.rows:  # for example the zeros of a first state
+        if x_entries is None and x.shape[0] == self.lowering.rows:  # for example, the zeros of an initial state
             x_entries = self.of_samples(x, None)
         if x_entries is None or x_entries.of is not None:  # W x^T
             if name != "mm" or weight_entries is None or weight_entries.of is not None:
@@ -656,7 +656,7 @@ class _EntryMode(TorchDispatchMode):
         places, _ = self.lowering.order((rows << 32)[:, 0])
         numbers = flat[places] & _LOW  # [rows, m, i]
         if m > _PRODUCTS or not (numbers == numbers[:1]).all():
-            raise NotAStep("the samples of a tensor differ in more than their values")
+            raise NotAStep("the tensor's layout differs between samples")
         weight, (width, _) = self.lowering.parameter(matrix, matrix=True), matrix.codes.shape
         table = torch.empty(len(flat), width, dtype=torch.int64)
         for i in range(m):

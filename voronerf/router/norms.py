@@ -18,7 +18,7 @@ from voronerf.router.transforms import transformed
 def native_layer_norm(
     input: Tensor, normalized_shape: Sequence[int], weight: Tensor | None, bias: Tensor | None, eps: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns ``torch.native_layer_norm`` of the same arguments; for half precision this is PyTorch's function."""
+    """Computes ``torch.native_layer_norm``; for half precision, it calls PyTorch's function."""
     dtypes = {tensor.dtype for tensor in (input, weight, bias) if tensor is not None}
     plain = torch.is_autocast_enabled(input.device.type) or dtypes not in ({torch.float32}, {torch.float64})
     if plain or not torch.is_grad_enabled():
@@ -36,7 +36,7 @@ def layer_norm(
     eps: float = 1e-5,
     cudnn_enable: bool = True,
 ) -> Tensor:
-    """Returns ``torch.layer_norm`` of the same arguments; see :func:`native_layer_norm`."""
+    """Computes ``torch.layer_norm``; see :func:`native_layer_norm`."""
     return native_layer_norm(input, normalized_shape, weight, bias, eps)[0]
 
 
@@ -49,7 +49,7 @@ EXACT: dict[Any, Any] = {
 
 
 class _LayerNorm(torch.autograd.Function):
-    """A layer norm whose gradient is PyTorch's own, unless it is differentiated again."""
+    """A layer norm whose gradient is PyTorch's own, unless the gradient is differentiated again."""
 
     generate_vmap_rule = True
 

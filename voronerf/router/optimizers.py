@@ -1,4 +1,4 @@
-"""The state of optimisers for the parameters of cells, when cells are split, loaded or frozen."""
+"""Updates the state of optimisers when cells are split, loaded or frozen."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from torch import Tensor, nn
 from voronerf.router.grouping import cell_parameters
 
 _OP = "VoronoiRouter"
-PATIENCE = 64  # calls without a step; gradient accumulation makes several calls a step
+PATIENCE = 64  # calls before a check ends; gradient accumulation makes several calls per step
 
 
 def check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, method: str) -> None:
     """Raises ValueError for an optimiser that holds none of a module's parameters."""
     ours, groups = set(map(id, module.parameters())), [] if optimizer is None else optimizer.param_groups
     if groups and ours and ours.isdisjoint(id(parameter) for group in groups for parameter in group["params"]):
-        raise ValueError(f"{_OP}.{method}: optimizer must hold the router's parameters, got one of others")
+        raise ValueError(
+            f"{_OP}.{method}: optimizer must hold the router's parameters, got an optimizer of other parameters"
+        )
 
 
 def move_state(
@@ -29,14 +31,15 @@ def move_state(
 ) -> None:
     """Gives every new cell its parent's optimiser state.
 
-    The parameters have their new shapes already. If some state has no row for each cell, all state is reset.
+    The parameters have their new shapes already. If any state tensor does not have one row per cell, all state is
+    reset.
 
     Args:
         optimizer: The optimiser.
         module: The routed module.
         parents: The parent of each new cell among the k old cells, int64 [new cells].
         k: The number of old cells.
-        fresh: The new cells whose state becomes 0, bool [new cells]; None for no cells.
+        fresh: The mask of new cells whose state becomes 0, bool [new cells]; None for no cells.
     """
     is_reset = False
     for parameter in cell_parameters(module):
@@ -51,18 +54,18 @@ def move_state(
     if is_reset:
         _begin_anew(optimizer)
         warnings.warn(
-            f"{_OP}.subdivide: the state of {type(optimizer).__name__} cannot be inherited by cells and begins anew",
+            f"{_OP}.subdivide: the state of {type(optimizer).__name__} cannot be inherited by cells and is reset",
             stacklevel=4,
         )
 
 
 def drop_state(optimizer: torch.optim.Optimizer) -> None:
-    """Resets the optimiser state of the parameters whose shapes it does not match."""
+    """Resets the optimiser state of each parameter whose shape does not match the state."""
     for group in optimizer.param_groups:
         for parameter in group["params"]:
             if is_stale(optimizer, parameter):
                 optimizer.state.pop(parameter)
-                if isinstance(optimizer, torch.optim.Adagrad):  # it creates its state in its constructor
+                if isinstance(optimizer, torch.optim.Adagrad):  # Adagrad creates its state in its constructor
                     total = torch.full_like(parameter, group["initial_accumulator_value"])
                     optimizer.state[parameter].update(step=torch.tensor(0.0), sum=total)
     if isinstance(optimizer, torch.optim.LBFGS):
@@ -72,7 +75,7 @@ def drop_state(optimizer: torch.optim.Optimizer) -> None:
 def _begin_anew(optimizer: torch.optim.Optimizer) -> None:
     optimizer.state.clear()
     if isinstance(optimizer, torch.optim.LBFGS):
-        optimizer._numel_cache = None  # the number of entries of all parameters together
+        optimizer._numel_cache = None  # the cached total number of parameter entries
 
 
 def is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
@@ -82,7 +85,7 @@ def is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
 
 
 def watch_optimizers(module: nn.Module, line: str) -> list[Any]:
-    """Makes the optimisers of a module raise at their next step if their state does not match its number of cells.
+    """Makes a module's optimisers raise at their next step if their state has another number of cells.
 
     PyTorch's fused optimisers would write past the end of stale state. PyTorch keeps no list of optimisers, so the
     garbage collector's objects are searched. The error suggests the code ``line``. Returns the hooks' handles.
@@ -106,10 +109,10 @@ def watch_optimizers(module: nn.Module, line: str) -> list[Any]:
 
 
 class Untrained:
-    """A check whether a module gets gradients but no optimiser changes it.
+    """A check for a module that gets gradients, but is not changed by any optimiser.
 
-    The usual cause is an optimiser of the parameters from before the module was wrapped. The check runs in each call,
-    since a hook on a parameter would prevent gradients from being accumulated in place.
+    The usual cause is an optimiser of the original module's parameters, made before the module was wrapped. The check
+    runs in each call, since a hook on a parameter would prevent gradients from being accumulated in place.
 
     Args:
         module: The routed module.
@@ -127,21 +130,21 @@ class Untrained:
         have = any(parameter.grad is not None for parameter in self._parameters)
         if have and all(torch.equal(_some(p), was) for p, was in zip(self._parameters, self._initial, strict=True)):
             message = (
-                f"no optimizer has changed the parameters in {PATIENCE} calls, but they have gradients; make it of "
-                "router.parameters(), since those that the module had before it was wrapped are not trained"
+                f"no optimizer has changed the parameters in {PATIENCE} calls, but they have gradients; construct "
+                "it from router.parameters(); the module's parameters from before wrapping are not trained"
             )
             warn("untrained", message)
         return True
 
 
 def _some(parameter: Tensor) -> Tensor:
-    """Returns up to about two thousand of a parameter's values."""
+    """Returns at most about two thousand of a parameter's values."""
     return parameter.detach().flatten()[:: max(1, parameter.numel() // 1000)]
 
 
 # Frozen cells ---------------------------------------------------------------------------------------------------------
 
-#: The frozen cells of each routed module that has some, bool [k], and slices of its other cells.
+#: For each routed module with frozen cells: their mask, bool [k], and slices of the other cells.
 _FROZEN: weakref.WeakKeyDictionary[nn.Module, tuple[Tensor, list[slice]]] = weakref.WeakKeyDictionary()
 #: The optimisers whose steps restore frozen cells.
 _KEEPING: weakref.WeakSet[torch.optim.Optimizer] = weakref.WeakSet()
@@ -151,8 +154,8 @@ def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
     """Records the frozen cells of a routed module, bool [k]; None for no cells.
 
     A stacked parameter is one tensor to an optimiser, which changes all of its cells: weight decay and momentum also
-    change cells without a gradient. An optimiser with an attribute ``leaves_frozen`` skips frozen cells by itself; for
-    other optimisers there is :func:`keep_frozen`.
+    change cells without a gradient. An optimiser with an attribute ``leaves_frozen`` skips frozen cells by itself;
+    other optimisers need :func:`keep_frozen`.
     """
     if frozen is None:
         _FROZEN.pop(module, None)
@@ -205,11 +208,11 @@ def _cell_state(optimizer: torch.optim.Optimizer, parameter: Tensor) -> list[Ten
 
 
 class FrozenRows:
-    """A check whether an optimiser that was not passed to ``freeze`` changes frozen cells.
+    """A check for frozen cells that are changed by an optimiser which was not passed to ``freeze``.
 
     Args:
         module: The routed module.
-        frozen: The mask of its frozen cells, bool [k].
+        frozen: The mask of the module's frozen cells, bool [k].
     """
 
     def __init__(self, module: nn.Module, frozen: Tensor) -> None:

@@ -1,4 +1,7 @@
-"""The plan of calls of one kind: the ways that give the same results, and their timings. n samples, k cells."""
+"""The plan for calls of one kind: the ways that give the same results, and their timings.
+
+Letters: n samples, k cells.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,12 @@ from voronerf.router.grouped import Way
 from voronerf.router.probe import FEWEST
 from voronerf.router.watch import Source, Watch, same
 
-SLICE = 8192  # samples of a timing
+SLICE = 8192  # maximum number of samples in a timing
 
 
 @dataclass
 class CallPlan:
-    """A plan of the calls of one kind.
+    """A plan for the calls of one kind.
 
     Attributes:
         ways: The ways that agree with the loop, the most promising first and the loop last.
@@ -23,9 +26,10 @@ class CallPlan:
         open: Whether another batch may run grouped although the first did not.
         few: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another plan.
         chosen: The number of the fastest way and the reason, by the size of a batch and the number of cells.
-        lost: The lost timings of the fused way, by the same key: count, time of the next timing, explanation.
+        lost: The timings that the fused way has lost, by the same key: their count, the time of the next timing, and an
+            explanation.
         constants: The arguments of the traced call that are not tensors, by name; only for the fused way.
-        watch: The values of the module that its trace read.
+        watch: The values of the module that the trace has read.
         skip: The number of calls that run cell by cell before another way is tried again.
         wait: The value of ``skip`` after the next batch that cannot be grouped.
     """
@@ -76,5 +80,5 @@ class CallPlan:
 
 
 def measured_samples(ways: list[Way]) -> int:
-    """Returns the most samples of a timing: more for fused runs, between which tensors outgrow the cache."""
+    """Returns the sample limit of a timing: higher for fused runs, since tensors between runs outgrow the cache."""
     return SLICE * 8 if any(way.name == "fused in runs" for way in ways) else SLICE

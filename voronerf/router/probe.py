@@ -25,10 +25,10 @@ from voronerf.router.trace import Unfusable, rows_for
 from voronerf.router.watch import Inputs
 
 _OP = "VoronoiRouter"
-FEWEST = 8  # samples; a smaller batch is probed with more samples near its own
+FEWEST = 8  # minimum number of samples in a probe; a smaller batch is extended by similar samples
 _SAMPLES, _CELLS = (41, 43, 47, 53), 3  # candidate numbers of samples of a probe, and its number of cells
 _FEW = 8  # rows for the check whether a module needs a subclass of tensors
-_PIECE = 8 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones leave the cache
+_PIECE = 8 << 20  # bytes of the largest tensor in a piece of rows on a CPU; larger tensors outgrow the cache
 
 Outcome = tuple[Results, list[Tensor]]  # results and gradients
 
@@ -38,13 +38,13 @@ class Options:
     """The user's options."""
 
     fuse: bool  # user promises that ``forward`` is a pure function
-    way: str  # "fastest", or a way without timing: "fused", "grouped" or "loop"
-    several: bool  # whether several methods are routed; then one that cannot be fused is no error
+    way: str  # "fastest"; or "fused", "grouped" or "loop" without timing
+    several: bool  # whether several methods are routed; if so, a method that cannot be fused is no error
     names: tuple[str, ...]  # names of the parameters that the module was wrapped with
 
 
 class Probe:
-    """A copy of a module and a few samples of a call, in cells of their own whose parameters differ."""
+    """A copy of a module with three cells of different parameters, and a few samples of a call in these cells."""
 
     def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
         self._source = call, grouping
@@ -75,12 +75,12 @@ class Probe:
     ) -> tuple[list[Way], bool]:
         """Returns the ways that agree with the loop, the loop last, and whether another batch may run grouped.
 
-        The module is fused with the first of ``inputs`` that is possible. If ``too_many``, a reason, is not empty, the
-        module is not fused.
+        The module is fused with the first of ``inputs`` that succeeds. If ``too_many`` is a reason, not an empty text,
+        the module is not fused.
 
         Raises:
             TypeError: If the module changes its parameters or mixes samples.
-            ValueError: If the only method must be fused and cannot be.
+            ValueError: If fusion is required, but fails for the only method.
         """
         call = self._call
         for loop in (Loop(), Loop(again=True)):
@@ -89,7 +89,7 @@ class Probe:
                 break
             except Forbidden:
                 raise
-            except Exception as error:  # perhaps code runs again in the backward pass
+            except Exception as error:  # perhaps because code runs again in the backward pass
                 why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
         else:
             return [Loop(why)], False
@@ -114,7 +114,7 @@ class Probe:
                     piece = min(max(_PIECE * self._n // grouped.widest, 1 << 10), 1 << 16)
                     ways.append(Grouped(piece, why=unfused))
                 else:
-                    loop.why = "its forward on the samples of all cells gives other results than on those of one cell"
+                    loop.why = "its forward on the samples of all cells gives other results than the loop over cells"
             except BackendUnavailable:
                 raise
             except Ungroupable as error:
@@ -128,7 +128,7 @@ class Probe:
         return [*ways, loop], may_group and not ways
 
     def is_groupable(self) -> bool:
-        """Returns whether the module runs for all cells at once on this batch, whatever the results."""
+        """Returns whether the module runs without error for all cells at once on this batch."""
         try:
             with torch.no_grad():
                 self._run(Grouped(quiet=True))
@@ -138,7 +138,7 @@ class Probe:
 
     def _run(self, way: Way) -> Results:
         """Returns the results of a way, with random numbers of 0."""
-        with NoRandomness() if isinstance(way, Loop) else contextlib.nullcontext():  # a fused network draws none
+        with NoRandomness() if isinstance(way, Loop) else contextlib.nullcontext():  # fused networks draw no numbers
             return way.run(self._call, self._entries)
 
     def _outcome(self, way: Way) -> Outcome:
@@ -161,8 +161,8 @@ class Probe:
     def _agrees(self, way: Way, loop: Way, expected: Outcome) -> bool:
         """Returns whether a way agrees with the loop, if necessary without autocast or in float64.
 
-        Rounding by autocast exceeds the tolerance. In a deep network of fast sines, rounding errors reach the size of
-        the results.
+        Rounding errors exceed the tolerance with autocast; in a deep network of fast sines, they are as large as the
+        results.
         """
         outcome, device = self._outcome(way), self._entries.device.type
         if _same(outcome, expected):
@@ -227,7 +227,7 @@ def _kinds(outcome: Outcome) -> list[tuple[torch.Size, torch.dtype]]:
 
 @torch.no_grad()
 def _widened(call: Call, generator: torch.Generator) -> Call:
-    """Returns a call of at least ``FEWEST`` different samples, near the samples of a smaller call.
+    """Extends a smaller call to at least ``FEWEST`` different samples, near its own samples.
 
     Identical samples could not show that a module mixes samples.
     """
@@ -268,9 +268,9 @@ def check_rays(call: Call) -> None:
             continue
         if len(whole) != len(alone) or not all(agree(b.flatten(), a.flatten()) for a, b in zip(whole, alone)):
             raise ValueError(
-                f"{_OP}: module must give for [n, 1, f] what it gives for [rays, samples, f], but "
+                f"{_OP}: module must give the same results for [n, 1, f] as for [rays, samples, f], but "
                 f"{type(call.module).__name__} does not: it mixes the samples of a ray, or squeezes or flattens its "
-                "arguments; for that, layout='flat' calls it with [n, f]"
+                "arguments; in that case, layout='flat' calls it with [n, f]"
             )
         return
 

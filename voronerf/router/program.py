@@ -1,6 +1,6 @@
 """The program of a routed call: given by the field's method ``program``, or traced from a module.
 
-n samples, r rays, k cells, w columns.
+Letters: n samples, r rays, k cells, w columns.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from voronerf.router.transforms import outside
 from voronerf.router.watch import HOOKS, Inputs, Watch
 
 _OP = "VoronoiRouter"
-_ROWS = (37, 31)  # samples of a trace; at least one of them does not divide the width
+_ROWS = (37, 31)  # numbers of samples of a trace; at least one of them does not divide the width
 
 
 class CellProgram(NamedTuple):
@@ -40,8 +40,8 @@ class CellProgram(NamedTuple):
         program: The program. Its outputs are the tensors that the call returns, in their order, [n, w] each.
         reads: The number of the call's argument that each input of the program reads.
         shapes: The shape, for one sample, of each tensor that the call returns.
-        parameters: The parameters [k, ...], without k if all cells share them: the module's own or views of them. For a
-            traced module they may also be computed from its parameters.
+        parameters: The parameters [k, ...], or [...] if all cells share them: the module's own parameters or views of
+            them. For a traced module, they may also be computed from the module's parameters.
         activate: A function from the outputs to the call's results; None if the outputs are the results.
 
     Examples:
@@ -63,7 +63,7 @@ class CellProgram(NamedTuple):
 def layered_program(
     layers: MLP, linears: Sequence[nn.Linear], activate: Callable[[Tensor], Any], features: Tensor | None = None
 ) -> CellProgram:
-    """Returns the program of a field that is a layer table, for its method ``program``.
+    """Returns the program of a field that is a layer table; the field's method ``program`` can return it.
 
     Args:
         layers: The layer table, which reads positions and possibly directions.
@@ -96,7 +96,7 @@ def layered_program(
 
 
 def _steps_of(function: Callable[..., Any], width: int) -> tuple[Program, tuple[tuple[int, ...], ...]]:
-    """Returns a function of rows [n, width] as a program, and the shapes of its results for one row."""
+    """Traces a function of rows [n, width]; returns its program, and the shapes of its results for one row."""
     rows = next(rows for rows in _ROWS if width % rows)
     x = torch.linspace(-2, 2, rows * width).reshape(width, rows).t().contiguous()
     lowering = Lowering(rows)
@@ -109,25 +109,25 @@ def _steps_of(function: Callable[..., Any], width: int) -> tuple[Program, tuple[
     offsets = torch.tensor([0, rows], dtype=torch.int32)
     results = grouped_program([x], [], offsets, program=program, backend="reference")
     if not all(agree(a.reshape(b.shape), b) for a, b in zip(results, tensors_of(result), strict=True)):
-        raise NotAStep("a function that gives something else as steps")
+        raise NotAStep("a function whose steps give other results")
     return program, tuple(tuple(tensor.shape[1:]) for tensor in tensors_of(result))
 
 
 class FieldProgram:
     """The program of a field with a method ``program``, which returns a :class:`CellProgram`.
 
-    The program describes ``forward(positions, directions=None, ray_index=None)`` or a part of these arguments. It is
-    unused if a subclass overrides ``forward`` alone, or if hooks or parametrisations (weight normalisation) change what
-    layers compute.
+    The program describes ``forward(positions, directions=None, ray_index=None)`` or a ``forward`` with some of these
+    arguments. It is not used if a subclass overrides ``forward`` alone, or if hooks or parametrisations (weight
+    normalisation) change what layers compute.
     """
 
     def __init__(self) -> None:
-        self._program: CellProgram | str = "its program is not known before its first call"
+        self._program: CellProgram | str = "its program is unknown until the first call"
         self._seen_field: nn.Module | None = None  # the field whose program is cached
         self._ray_program: Program | None = None  # the program with a direction for each ray
         self._unchanged: Any = Never()
         self._steps_key: Any = None  # field, activation and shapes of ``_steps``
-        self._steps: tuple[Program, tuple[tuple[int, ...], ...]] | None = None  # the activation, and result shapes
+        self._steps: tuple[Program, tuple[tuple[int, ...], ...]] | None = None  # activation's program, result shapes
         self._watch: Watch | None = None  # watches the attributes that the activation reads
         self._steps_unchanged: Any = Never()
 
@@ -136,7 +136,7 @@ class FieldProgram:
 
     @staticmethod
     def of(field: nn.Module) -> FieldProgram | None:
-        """Makes one for a field with a method ``program`` that takes no arguments; None for other fields."""
+        """Returns a FieldProgram if the field has a method ``program`` without arguments, else None."""
         method = getattr(type(field), "program", None)
         parameters = [None] * 2 if not callable(method) else list(inspect.signature(method).parameters)
         return FieldProgram() if len(parameters) == 1 else None
@@ -148,12 +148,12 @@ class FieldProgram:
         if field is not self._seen_field or not self._unchanged.holds():
             self._seen_field = field
             name, field_type, parts = type(field).__name__, cast(Any, type(field)), [*parts_of(field).values()]
-            self._program = f"{name} does more than its program says"
+            self._program = f"{name} computes more than its program"
             if _describes(field_type) and "forward" not in vars(field) and all(map(_is_plain, parts)):
                 self._program = _checked(name, cast(Any, field).program())
                 ids = {id(p if p._base is None else p._base) for p in self._program.parameters}
                 if any(id(p) not in ids for p in cell_parameters(field)):
-                    self._program = f"{name} has parameters of cells that are none of its program"
+                    self._program = f"{name} has cell parameters that its program does not use"
             if isinstance(self._program, CellProgram):
                 self._ray_program = _by_ray(self._program.program.text, self._program.reads)
             self._unchanged = guard = unchanged()
@@ -161,7 +161,7 @@ class FieldProgram:
             for part in parts:
                 guard.contents(vars(part))
                 for value in vars(part).values():
-                    if isinstance(value, (dict, list, set)):  # parameters, parts and hooks among them
+                    if isinstance(value, (dict, list, set)):  # such as parameters, submodules and hooks
                         guard.contents(value)
         return self._program
 
@@ -173,7 +173,7 @@ class FieldProgram:
         key = field, layers.activate, layers.shapes
         if key != self._steps_key or (not self._steps_unchanged.holds() and cast(Watch, self._watch).changed()):
             self._steps_key, self._steps, reads = key, None, set[tuple[int, str]]()
-            with contextlib.suppress(Exception), outside():  # if any code fails, PyTorch computes it
+            with contextlib.suppress(Exception), outside():  # if tracing fails, PyTorch computes the activation
                 double = cast(Any, Double(field, reads).module).program()
                 reads.clear()
                 traced, parts = _steps_of(double.activate, layers.shapes[0][0]), [*parts_of(field).values()]
@@ -184,7 +184,7 @@ class FieldProgram:
             self._steps_unchanged = unchanged()
             cast(Watch, self._watch).note(self._steps_unchanged)
         if self._steps is None:
-            return f"activate of {type(field).__name__} computes more than steps of a program"
+            return f"activate of {type(field).__name__} cannot be written as steps of a program"
         steps, shapes = self._steps
         return CellProgram(_with_steps(layers.program.text, steps.text), layers.reads, shapes, layers.parameters)
 
@@ -209,7 +209,7 @@ class FieldProgram:
         else:
             program = cast(Program, self._ray_program)
         k, parameters = router.num_cells, layers.parameters
-        if all(p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)):  # all are shared
+        if all(p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)):  # cells share all parameters
             parameters = [parameters[0].expand(k, *parameters[0].shape), *parameters[1:]]
         rows = [(positions, directions)[number] for number in layers.reads]
         places = router.places(positions, router._positions(args, kwargs, coords))
@@ -229,7 +229,7 @@ def _checked(field_name: str, program: Any) -> CellProgram:
     if not isinstance(program, CellProgram):
         raise TypeError(f"{_OP}: program of {field_name} must give a CellProgram, got {type(program).__name__}")
     if program.reads not in ((0,), (0, 1)) or not program.parameters:
-        rule = "read positions, or these and directions, and have parameters"
+        rule = "read positions, or positions and directions, and have parameters"
         raise ValueError(f"{_OP}: program of {field_name} must {rule}, got reads {program.reads}")
     return program
 
@@ -266,7 +266,7 @@ def _by_ray(text: str, reads: tuple[int, ...]) -> Program:
 
 @functools.lru_cache(maxsize=64)
 def _with_steps(text: str, steps: str) -> Program:
-    """Returns a program of one output followed by other steps, both given as texts."""
+    """Returns a program that appends steps to a program of one output; both are given as texts."""
     program, b = Program.parse(text), Builder()
     inputs = {number: b.input(width) for number, width in enumerate(program.inputs)}
     return b.program(b.replay(Program.parse(steps), {0: b.replay(program, inputs)[0]}))

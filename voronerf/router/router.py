@@ -61,17 +61,17 @@ from voronerf.router.program import CellProgram, FieldProgram, each_direction
 from voronerf.router.transforms import outside, refuse_transforms, transformed, unwrapped
 
 _NO_GRAPH = (
-    "VoronoiRouter: a routed module runs as it is, between two graphs of torch.compile; omit fullgraph=True, or call a "
+    "VoronoiRouter: a routed module runs eagerly between two graphs of torch.compile; omit fullgraph=True, or call a "
     "router with fuse=True once beforehand, with gradients on or off as in the graph"
 )
 _READ = ("backend", "coords", "layout", "methods", "per_ray", "shared", "way")  # attributes that cached calls depend on
-_LARGE = 512  # fewest samples of a batch whose positions are checked
+_LARGE = 512  # minimum number of samples for a check of the positions
 Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first1", "first2", "first3", "first4"] | slice | Callable[..., Tensor]
 
 
 class VoronoiRouter(nn.Module):
-    """k copies of a module, one for each cell of a Voronoi diagram or label; a sample is evaluated by its cell's copy.
+    """k copies of a module, one for each Voronoi cell or label; each sample is evaluated by its cell's copy.
 
     ``router(...)`` takes the arguments of the module's ``forward`` and returns what it returns, in the same order and
     with the same leading dimensions. Every cell starts as a copy of the module (the inheritance of Adaptive Voronoi
@@ -79,38 +79,44 @@ class VoronoiRouter(nn.Module):
     split. The parameters of all copies are stacked, ``[k, ...]``, under the module's own names with the prefix
     ``module.``: an optimiser sees as many tensors as for one module. Buffers are shared by all cells.
 
-    A loop that runs every cell's copy on its samples defines the result. A call runs in the fastest of these ways; for
-    each kind of call, its results are compared with the loop once. :meth:`explain` reports the way, the reason and the
-    measured times:
+    The reference is a loop over the cells, which runs each copy on its samples. A call uses the fastest of the
+    following ways, whose results are compared with the reference once for each kind of call. :meth:`explain` reports
+    the way, the reason and the measured times:
 
     - fused: one operation for the whole network. This needs a field with a method ``program``
       (:func:`voronerf.router.layered_program`), or ``fuse=True``.
     - grouped: the module's own ``forward`` runs once, on the samples of all cells sorted by cell. Functions that take
       parameters have a rule for all cells at once: linear layers (also ``F.linear``, ``@``, ``einsum``), embeddings,
       normalisation layers, scales. :func:`voronerf.router.register` adds a rule.
-    - cell by cell: the module runs once for each cell that has samples. A warning names the step that has no faster
+    - cell by cell: the module runs once for each cell that has samples. A warning names the step that prevents a faster
       way.
 
     A module that mixes samples (BatchNorm, attention across samples) is refused.
 
-    With a number of networks instead of a diagram, cells have no centres. Every call passes the cell of each sample,
+    If ``diagram`` is the number of networks, cells have no centres. Every call then passes the cell of each sample,
     ``router(x, cells=labels)``, such as its speaker, station, object or image. A router with a diagram accepts
-    ``cells=`` too, and then looks up no cells. Labels have the leading shape of the samples, ``[n]`` beside ``[n, f]``.
+    ``cells=`` too, and then skips the look-up. Labels have the leading shape of the samples, ``[n]`` for ``[n, f]``.
     With labels ``[images]``, a row of ``[images, pixels, f]`` is one sample, which the module gets as a whole. With
     labels ``[n, m]``, ``x[:, None]`` gives each of n rows to m networks; results are ``[n, m, ...]``.
 
-    Arguments are per sample ``[..., f]``; per ray ``[rays, f]`` beside ``[rays, samples, f]``; numbers, flags, None and
-    tensors of one element, which are passed on; and objects that hold tensors, such as nerfstudio's ``RaySamples``.
+    An argument may be:
+
+    - per sample, ``[..., f]``;
+    - per ray, ``[rays, f]`` beside ``[rays, samples, f]``;
+    - a number, flag, None or tensor of one element, which is passed unchanged;
+    - an object that holds tensors, such as nerfstudio's ``RaySamples``.
+
     Tensors of a subclass are converted to plain tensors; a module whose results would change is refused.
 
     Args:
         module: Any ``nn.Module`` that treats samples one by one; it is copied and never changed.
         diagram: A VoronoiDiagram (:meth:`VoronoiDiagram.from_points` places its centres), or centres [k, d], in the
-            coordinates of the positions; or k, the number of networks that labels choose from.
-        coords: The place of the positions: ``"first3"``, the first three features of the first tensor (``"first2"`` for
-            d = 2 and so on); a slice of its features; or a function of the call's arguments that returns positions
-            [..., d]. A call can pass positions instead, ``router(x, coords=positions)``, unless the module itself has
-            an argument ``coords``. For a field with a ``program`` they are its first argument.
+            coordinates of the positions; or k, the number of networks, which are then chosen by labels.
+        coords: The rule that finds the positions in a call's arguments: ``"first3"``, the first three features of the
+            first tensor (``"first2"`` for d = 2 and so on); a slice of its features; or a function of the arguments
+            that returns positions [..., d]. A call can pass positions instead, ``router(x, coords=positions)``, unless
+            the module itself has an argument ``coords``. For a field with a ``program`` the positions are its first
+            argument.
         per_ray: Names or numbers of the arguments that have one row for each ray. If None, shapes decide, and ambiguous
             shapes are refused.
         shared: Names or numbers of tensor arguments that are the same for all samples.
@@ -124,8 +130,8 @@ class VoronoiRouter(nn.Module):
             attributes and buffers take effect.
         way: "fastest" times the ways on a part of the first batch of each kind of call and each size (within a factor
             of four). It keeps the fused way unless another one is clearly faster in three measurements, at least a
-            second apart. "fused", "grouped" and "loop" choose a way without timing; if it is impossible, the next one
-            in this order runs.
+            second apart. "fused", "grouped" and "loop" choose a way without timing; if this way is impossible, the next
+            way in this order runs.
         layout: The shape in which the module gets samples ``[rays, samples, f]``: "rays" for ``[n, 1, f]``, with
             per-ray arguments as ``[n, f]``; "flat" for ``[n, f]``, for modules that squeeze or flatten.
         assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell at random by the
@@ -203,7 +209,9 @@ class VoronoiRouter(nn.Module):
         conflicts = [name for name, arguments in self._argument_names.items() if "cells" in arguments]
         if conflicts and not cells.centres.shape[1]:
             where = f"{type(module).__name__}.{conflicts[0]}"
-            raise ValueError(f"VoronoiRouter: {where} has an argument cells of its own, so labels cannot be told")
+            raise ValueError(
+                f"VoronoiRouter: {where} has an argument cells itself, so a router without centres cannot pass labels"
+            )
         self._dispatch = Dispatch()
         self._assigned: Assigned | None = None  # cells of the last batch, if several methods are routed
         self._positions_unchecked = True  # until the first large training batch
@@ -225,7 +233,8 @@ class VoronoiRouter(nn.Module):
             **options: The options of the constructor.
 
         Raises:
-            ValueError: For other than k modules, or modules that differ in parameters' names or shapes or in buffers.
+            ValueError: If there are not exactly k modules, or if they differ in the names or shapes of parameters, or
+                in buffers.
         """
         modules, rule = list(modules), "VoronoiRouter.from_modules: modules must hold a module for each"
         if not modules:
@@ -289,10 +298,11 @@ class VoronoiRouter(nn.Module):
         self._drop_frozen_checks()
 
     def apply(self, fn: Callable[[nn.Module], Any]) -> VoronoiRouter:
-        """Applies a function to the modules of each cell in turn, such as one that initialises layers.
+        """Applies a function, such as one that initialises layers, to the modules of each cell in turn.
 
         The function gets the weights of one cell, [o, i]. ``router.module.apply`` would pass stacked weights, [k, o,
-        i], from which initialisers compute the fans of a convolution. Only changes of parameters and buffers are kept.
+        i], which initialisers would take for the weights of a convolution. Only changes of parameters and buffers are
+        kept.
 
         Raises:
             ValueError: If the function changes names or shapes of parameters.
@@ -364,7 +374,7 @@ class VoronoiRouter(nn.Module):
             self._training_checks.append(FrozenRows(self.module, self.frozen_cells))
 
     def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
-        """Unfreezes cells, which keep the optimiser's moments from before; takes cells as `freeze` does."""
+        """Unfreezes cells, given as in `freeze`; they keep the optimiser's moments from before."""
         self._set_frozen(self.frozen & ~self._mask("unfreeze", cells))
 
     def _mask(self, method: str, cells: Sequence[int] | Tensor | None) -> Tensor:
@@ -404,20 +414,20 @@ class VoronoiRouter(nn.Module):
     ) -> Tensor:
         """Replaces the diagram by a finer one; every new cell starts as a copy of its parent.
 
-        Parameters are copied from the parent. With ``optimizer``, so is the state of Adam, AdamW, RAdam, SGD and
-        similar optimisers; the state of other optimisers is reset, with a warning. The parameter objects stay the same,
-        so groups, learning rates and schedules continue. A wrapper with parameters of its own, such as
-        ``DistributedDataParallel``, has to be made again.
+        Parameters are copied from the parent. With ``optimizer``, the state of Adam, AdamW, RAdam, SGD and similar
+        optimisers is copied too; the state of other optimisers is reset, with a warning. The parameter objects stay the
+        same, so groups, learning rates and schedules continue. A wrapper with parameters of its own, such as
+        ``DistributedDataParallel``, must be made again.
 
         Args:
             diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children of each
                 cell that has enough samples (:func:`voronerf.split_diagram`). A router without centres takes
                 :meth:`VoronoiDiagram.without_centres` together with ``parents``.
-            parents: The present cell that each new cell lies in, int64 [new cells]; None for the cell that holds the
+            parents: The present cell that contains each new cell, int64 [new cells]; None for the cell that holds the
                 new centre.
             optimizer: The optimiser that holds this router's parameters.
             inherit: Whether children start as copies. If False, the children of a split cell get newly drawn parameters
-                and zero moments: the ablation that shows ghosting.
+                and zero moments, an ablation that causes ghosting.
             points: Samples [m, d] in scene units, if ``diagram`` is a number of children.
             weights: The importance of the samples, [m], by which the new cells are balanced; None for 1 each.
             **split: Further options of ``split_diagram``, such as cells, centres, min_samples.
@@ -446,10 +456,10 @@ class VoronoiRouter(nn.Module):
         if not self._d and (has_centres or parents is None):
             raise ValueError(
                 "VoronoiRouter.subdivide: diagram must be VoronoiDiagram.without_centres(k) for a router without "
-                "centres, with parents, the present label of each new one"
+                "centres, with parents, the old label of each new label"
             )
         if self._d and not has_centres:
-            raise ValueError("VoronoiRouter.subdivide: diagram must have centres, as the router's has, got none")
+            raise ValueError("VoronoiRouter.subdivide: diagram must have centres like the router's, got none")
         finer, parents = finer_diagram(self.diagram, diagram, parents, points, weights, split)
         # Marks the children of split cells. Other cells keep their values, with or without inheritance.
         new = torch.bincount(parents, minlength=k)[parents] > 1
@@ -484,10 +494,10 @@ class VoronoiRouter(nn.Module):
         Args:
             state_dict: The ``state_dict()`` of a router around the same module.
             strict: See ``nn.Module``.
-            assign: See ``nn.Module``; parameters are new objects then.
-            optimizer: The optimiser that holds this router's parameters. If the number of cells changes, its state is
-                reset; its own ``load_state_dict`` can then restore one. An optimiser that is not passed and has state
-                of the old cells raises at its next step.
+            assign: See ``nn.Module``; if True, parameters are new objects.
+            optimizer: The optimiser that holds this router's parameters. If the number of cells changes, the
+                optimiser's state is reset; restore it afterwards with ``optimizer.load_state_dict``. An optimiser with
+                state of the old cells that was not passed raises at its next step.
 
         Returns:
             Missing and unexpected keys.
@@ -513,7 +523,7 @@ class VoronoiRouter(nn.Module):
             if names and any(all(f"{prefix}{part}{name}" in state_dict for name in names) for part in ("", "module.")):
                 raise ValueError(
                     f"VoronoiRouter.load_state_dict: state_dict is of a plain {type(self.module).__name__}, without "
-                    "cells; load it into the module before that is wrapped, or, loaded, give the module to cells by "
+                    "cells; load it into the module before wrapping it, or load the module into cells with "
                     "router.load_cell(i, module)"
                 )
         else:
@@ -547,12 +557,12 @@ class VoronoiRouter(nn.Module):
         Args:
             *args: The arguments of the module's ``forward``. A field with a ``program`` takes positions [n, 3] in scene
                 units and directions, unit vectors [n, 3]. Directions may be [r, 3] instead, together with ray_index,
-                int32 [n]: the row of ``directions`` of each sample.
+                int32 [n], the row of ``directions`` for each sample.
             coords: Positions [..., d] in scene units that choose the cells, instead of the router's own rule.
             cells: The cell of each sample, 0 to k - 1, int32 or int64 [...], instead of positions. On a GPU the check
                 of the values waits for the device. In compiled and captured graphs the operations check labels: invalid
-                ones raise on the CPU, and give results of 0 on a GPU. If the module's method has an argument ``cells``
-                itself, it gets this one; the same holds for ``coords``.
+                ones raise on the CPU, and give results of 0 on a GPU. If the module's method has its own argument
+                ``cells`` (or ``coords``), the value is passed to it and does not choose cells.
             **kwargs: The keyword arguments of the module's ``forward``.
 
         Returns:
@@ -588,7 +598,7 @@ class VoronoiRouter(nn.Module):
     def _check_positions(
         self, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None
     ) -> None:
-        """Warns, at the first large batch of a training, if the positions look like another quantity or unit."""
+        """Warns, at the first large batch of training, if the positions look like another quantity or unit."""
         few = positions.numel() < _LARGE * positions.shape[-1]
         if few or not torch.is_grad_enabled() or torch.compiler.is_compiling():
             return
@@ -642,12 +652,12 @@ class VoronoiRouter(nn.Module):
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
         """Returns the program of ``forward``, or the reason why it is unknown.
 
-        A field's method ``program`` gives it at once. For a module with ``fuse=True`` it is known after a first call
-        with arguments of the same kind, which traces the module.
+        A field's method ``program`` defines the program. For a module with ``fuse=True``, the program is known after
+        the first call with arguments of the same kind, which traces the module.
 
         Args:
             *args: Tensors [n, w] as ``forward`` gets them, n >= 2.
-            trace: Whether to trace a module that has not been traced, on these arguments; needs n >= 8.
+            trace: Whether to trace the module on these arguments if it has not been traced; needs n >= 8.
 
         Examples:
             >>> import torch
@@ -662,7 +672,7 @@ class VoronoiRouter(nn.Module):
         if not self._d:
             return "labels decide the cells"
         if callable(self.coords) or isinstance(self.coords, slice):
-            return "other positions than those of the samples decide the cells"
+            return "positions other than the samples' decide the cells"
         k, dispatch = self.num_cells, self._dispatch
         program = "" if self._field_program is None else self._field_program.with_activation(self.module)
         if isinstance(program, str) and (self.fuse or self._field_program is None):
@@ -697,7 +707,7 @@ class VoronoiRouter(nn.Module):
         return self._dispatch.explain(("forward", *self.methods), default_ways)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Raises AttributeError for attributes of the module, which would have no effect on the router."""
+        """Sets an attribute, but raises AttributeError for the module's attributes, which the router would not use."""
         members = self.__dict__
         is_own = hasattr(type(self), name) or any(name in names for names in (members, self._modules, self._buffers))
         if "_field_program" in members and not is_own and hasattr(self.module, name):
@@ -724,7 +734,7 @@ class VoronoiRouter(nn.Module):
                 raise
             has, place = f"VoronoiRouter: {name} of {type(module).__name__}", f"router.module.{name}"
             if not callable(inspect.getattr_static(module, name, None)):
-                raise AttributeError(f"{has} is {place}, where parameters are of all cells, [k, ...]") from None
+                raise AttributeError(f"{has} is {place}, whose parameters are stacked, [k, ...]") from None
             raise AttributeError(
                 f"{has} is not routed; pass methods={[*methods, name]!r} to the router if it evaluates samples, else "
                 f"call {place}"
@@ -785,7 +795,7 @@ class VoronoiRouter(nn.Module):
         expected = wrapper._get_ddp_logging_data()["total_parameter_size_bytes"]
         if expected != sum(p.numel() * p.element_size() for p in wrapper._module_parameters if p.requires_grad):
             raise RuntimeError(
-                "VoronoiRouter: DistributedDataParallel has been made for the parameters of before subdivide; wrap the "
+                "VoronoiRouter: DistributedDataParallel wraps the parameters from before subdivide; wrap the "
                 "router again, on all ranks"
             )
         self._resized = False
@@ -793,7 +803,7 @@ class VoronoiRouter(nn.Module):
     def _route_as_it_is(
         self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None
     ) -> Any:
-        """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
+        """Arranges the arguments, runs the call, and restores the order and the shape of the results."""
         refuse_transforms()
         self._run_training_checks()
         if isinstance(coords, Labels):
@@ -848,7 +858,7 @@ class VoronoiRouter(nn.Module):
         """Groups the samples by cell; methods that are called with the same positions share the grouping."""
         labelled, centres = not positions.is_floating_point(), self.diagram.centres
         drawn = self.assignment == "stochastic" and self.training and not labelled
-        version = object() if centres.is_inference() else centres._version  # no version counter
+        version = object() if centres.is_inference() else centres._version  # inference tensors have no version
         key = self.diagram, version, drawn, labelled, self.temperature, self.backend
         keeps = bool(self.methods) and not transformed()
         assigned = self._assigned if keeps else None
@@ -895,7 +905,7 @@ class VoronoiRouter(nn.Module):
 
 
 def _diagram_of(cells: Any) -> VoronoiDiagram:
-    """Returns the router's own diagram, from a diagram, centres [k, d] or a number of cells."""
+    """Makes the router's own diagram from a diagram, centres [k, d] or a number of cells."""
     count = None if isinstance(cells, bool) else cells
     if isinstance(count, numbers.Integral):
         return VoronoiDiagram.without_centres(int(count))
@@ -938,7 +948,7 @@ def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> 
         if not callable(getattr(module, name, None)):
             raise ValueError(f"VoronoiRouter: methods must name methods of {kind}, got {name!r}")
         if hasattr(VoronoiRouter, name):
-            raise ValueError(f"VoronoiRouter: methods must not name what a router has itself, got {name!r}")
+            raise ValueError(f"VoronoiRouter: methods must not name attributes of the router, got {name!r}")
     accepted = accepted_names(getattr(module, name) for name in ("forward", *methods))
     for item in (*(lists["per_ray"] or ()), *lists["shared"]):
         if isinstance(item, str) and accepted is not None and item.split(".")[0] not in accepted:

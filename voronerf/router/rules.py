@@ -31,7 +31,7 @@ _ELEMENTWISE = """
     __mod__ __pow__ __rpow__ __lt__ __le__ __gt__ __ge__ __eq__ __ne__
 """
 _INTEGERS = (torch.int32, torch.int64)
-_FEW = 1 << 12  # most values a cell that planes give in one joint look-up
+_FEW = 1 << 12  # maximum number of values per cell for one joint look-up in planes
 
 
 def rule(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -72,12 +72,12 @@ def linear(run: GroupedRun, input: Tensor, weight: Tensor, bias: Tensor | None =
         y = F.linear(flat, weight)
     if bias is not None and not is_joint:
         y = y + (run.rows_of(bias, m) if isinstance(bias, PerCell) else bias)
-    # No view if the shape is right already, because writes into a view make the backward slow.
+    # No view if the shape is already right, because writes into a view make the backward slow.
     return y if input.dim() == 2 else y.reshape(*input.shape[:-1], weight.shape[0])
 
 
 def _product(run: GroupedRun, x: Tensor, m: int, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """Multiplies rows [n * m, i] by weights [k, o, i] and adds biases [k, o]; complex as real of twice the features."""
+    """Multiplies rows [n * m, i] by weights [k, o, i] and adds biases [k, o]; complex features become real pairs."""
     offsets, backend = run.grouping.scaled_offsets(m), run.grouping.backend
     if not weight.is_complex():
         return grouped_linear(x, offsets, weight, bias, backend=backend)
@@ -102,7 +102,7 @@ register(torch.Tensor.__rmatmul__, lambda run, other, input: matmul(run, input, 
 
 @rule(torch.addmm, torch.Tensor.addmm)
 def addmm(run: GroupedRun, input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: float = 1, alpha: float = 1) -> Any:
-    """Multiplies rows [n * m, i] by a matrix [i, o] and adds a shift, without factors."""
+    """Multiplies rows [n * m, i] by a matrix [i, o] and adds a shift; supports no factors."""
     product = matmul(run, mat1, mat2) if beta == alpha == 1 else NotImplemented
     return product if product is NotImplemented else _elementwise(torch.add, run, run.mark(product), input)
 
@@ -112,7 +112,7 @@ _PAIR = re.compile(r"(\w+),(\w+)->(\w+)")
 
 @rule(torch.einsum)
 def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
-    """Multiplies rows by a parameter, with all common letters summed or kept: ``"bid,iod->bo"``, ``"bi,oi->bio"``."""
+    """Multiplies rows by a parameter; sums all or none of their common letters: ``"bid,iod->bo"``, ``"bi,oi->bio"``."""
     operands = tuple(operands[0]) if isinstance(operands[0], (list, tuple)) else operands
     match = _PAIR.fullmatch(equation.replace(" ", ""))
     if match is None or len(operands) != 2:
@@ -154,7 +154,7 @@ def convolution(
     dilation: Any = 1,
     groups: int = 1,
 ) -> Any:
-    """Convolves rows [n * m, i, ...] with kernels of one place; [i, ...] or [1, i, ...] have n in another dimension."""
+    """Convolves rows [n * m, i, ...] with kernels of one place; inputs [i, ...] or [1, i, ...] have n elsewhere."""
     places, channel = weight.dim() - 2, input.dim() - weight.dim() + 1
     if not run.is_rows(input) or set(weight.shape[2:]) != {1} or groups != 1:
         return NotImplemented
@@ -203,7 +203,7 @@ for _function in _spellings(_ELEMENTWISE):
 
 @rule(*_spellings("expand broadcast_to"))
 def expand(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
-    """Repeats a parameter once a sample, ``p.expand(n, -1)``."""
+    """Repeats a parameter once per sample, ``p.expand(n, -1)``."""
     sizes = tuple(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes
     if not isinstance(source, PerCell) or len(sizes) <= 1 or sizes[0] != run.n:
         return NotImplemented
@@ -228,7 +228,7 @@ def data(run: GroupedRun, source: Tensor) -> Any:
 
 @rule(torch.Tensor.repeat, torch.tile, torch.Tensor.tile)
 def repeat(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
-    """Repeats a parameter once a sample, ``p.repeat(n, 1)``."""
+    """Repeats a parameter once per sample, ``p.repeat(n, 1)``."""
     counts = tuple(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes
     rows = expand(run, source, *counts[:1], *[-1] * (len(counts) - 1))
     return rows if rows is NotImplemented else rows.repeat(1, *counts[1:])
@@ -273,7 +273,7 @@ def _look_up(run: GroupedRun, table: PerCell, index: Tensor, lowest: int) -> Ten
 
 
 def _gather(run: GroupedRun, table: PerCell, c: int, index: Tensor) -> Tensor:
-    """Gathers entries [m, c] of tables of e * c numbers a cell, for indices [m] that count through all cells.
+    """Gathers entries [m, c] of tables with e * c numbers per cell; indices [m] count through the tables of all cells.
 
     A field reads a table many times in one forward pass: the eight corners of a voxel, for several levels. The gradient
     of each look-up has the size of the whole table, so all look-ups of one table accumulate in one buffer.
@@ -293,7 +293,7 @@ def _gather(run: GroupedRun, table: PerCell, c: int, index: Tensor) -> Tensor:
 
 
 class _Source(torch.autograd.Function):
-    """A table [k * e, c] whose gradient is the buffer in which its look-ups accumulate in a backward pass."""
+    """A table [k * e, c]; its gradient is the buffer in which its look-ups accumulate their gradients."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, buffer: list[Tensor]) -> Tensor:
@@ -341,7 +341,7 @@ def _as_moved(rows: Tensor) -> Tensor:
 
 @rule(F.embedding)
 def embedding(run: GroupedRun, input: Tensor, weight: Tensor, *, norm_type: float = 2.0, **options: Any) -> Any:
-    """Looks up rows of indices in a table [e, c], without options."""
+    """Looks up rows of indices in a table [e, c]; supports no options."""
     if not isinstance(weight, PerCell) or weight.dim() != 2 or not run.is_rows(input):
         return NotImplemented
     if any(value is not None and value is not False for value in options.values()):
@@ -359,10 +359,10 @@ def getitem(run: GroupedRun, source: Tensor, index: Any) -> Any:
 
 @rule(F.grid_sample)
 def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) -> Any:
-    """Samples p planes [p, c, h, w] or volumes [p, c, d, h, w] a cell at rows [p, ..., 2] or [p, ..., 3].
+    """Samples each cell's p planes [p, c, h, w] or volumes [p, c, d, h, w] at rows [p, ..., 2] or [p, ..., 3].
 
-    Large batches are sampled cell by cell. For small batches, one look-up of all cells reads and writes only the
-    corners.
+    Large batches are sampled cell by cell. For small batches, one look-up for all cells reads and writes only the
+    corners around the points.
     """
     sample_dims = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
     if not isinstance(input, PerCell) or not run.is_rows(grid) or len(sample_dims) != 1 or len(grid) != len(input):
@@ -382,7 +382,7 @@ def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) ->
 def _bilinear(
     run: GroupedRun, planes: PerCell, i: int, grid: Tensor, cells: Tensor, zeros: bool, align_corners: bool
 ) -> Tensor:
-    """Samples plane i of [p, c, h, w] of ``cells`` [a, b] at points [a, b, 2], like ``F.grid_sample``: [1, c, a, b]."""
+    """Samples plane i of each point's cell at points [a, b, 2], like ``F.grid_sample``; returns [1, c, a, b]."""
     p, c, h, w = planes.shape
     size = grid.new_tensor([w, h]).view(2, 1, 1)
     x = grid.movedim(-1, 0).contiguous() + 1  # [2, a, b]
@@ -393,7 +393,7 @@ def _bilinear(
     high, corner = x - low, torch.stack([low, low + 1])
     inside = (corner >= 0) & (corner < size)
     corner, share = corner.where(inside, 0).int(), torch.stack([1 - high, high]) * inside  # [2, 2, a, b]
-    along = 1 if w == 1 and align_corners else 2  # a line has two corners, at 0 across
+    along = 1 if w == 1 and align_corners else 2  # a line has two corners, both at x = 0
     index = (corner[:, None, 1] * w + corner[:along, 0]).flatten(0, 1)[:, None]
     channel = torch.arange(c, dtype=torch.int32, device=cells.device).view(-1, 1, 1)
     first = ((cells.int() * p + i) * c + channel) * (h * w)

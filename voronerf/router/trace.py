@@ -25,14 +25,14 @@ from voronerf.router.grouping import cell_parameters, owned_parameters, parts_of
 from voronerf.router.layout import Call, rebuild, tensors_of
 from voronerf.router.watch import Inputs, lookup
 
-CONSTANTS, CELLS, SAMPLES = range(3)  # dependence of a value: the largest of its operands'
+CONSTANTS, CELLS, SAMPLES = range(3)  # dependence of a value: the maximum over its operands
 _PRIMES = (37, 31, 29, 23)  # numbers of samples of a trace, see `rows_for`
 _LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
 _TOTALS = find("any all sum", torch, torch.Tensor)  # their scalar results may be used for a gradient only
 
 
 def differentiable(value: Tensor) -> Tensor:
-    """Returns a differentiable view or detached copy of a tensor; later values are computed from it."""
+    """Returns a differentiable view or a detached leaf of a tensor; later values are computed from the result."""
     return value.view_as(value) if value.requires_grad else value.detach().requires_grad_()
 
 
@@ -41,7 +41,7 @@ class Unfusable(Exception):
 
 
 class _Begun(NamedTuple):
-    """A function between its start and the record of its results."""
+    """A function that has begun, and whose results are not recorded yet."""
 
     node: fx.Node
     function: Any
@@ -51,7 +51,7 @@ class _Begun(NamedTuple):
 
 
 def rows_for(module: nn.Module, tensors: list[Tensor], primes: tuple[int, ...] = _PRIMES) -> int:
-    """Returns a prime number of samples of which no size of the module or its arguments is a multiple."""
+    """Returns a prime number of samples that divides no size of the module or its arguments."""
     sizes = {size for tensor in (*module.parameters(), *module.buffers()) for size in tensor.shape}
     sizes.update(size for tensor in tensors for size in tensor.shape[1:])
     return next((rows for rows in primes if all(size % rows or not size for size in sizes)), primes[0])
@@ -67,11 +67,11 @@ class Trace(TorchFunctionMode):
     - ``line``: its line in the module;
     - ``grad``: whether gradients were on;
     - ``inplace``: whether the function writes to its first argument, which is then the value;
-    - ``counts``: whether it has no rows but numbers derived from the number of samples, such as
+    - ``counts``: whether it holds numbers derived from the number of samples, and no rows, such as
       ``torch.tensor(x.shape)``.
 
-    ``tensors`` are rows of the arguments, ``inputs`` the values that each call looks up, and ``reads`` the attributes
-    that were read. Raises :class:`Unfusable` for a step that cannot be repeated for other samples.
+    ``tensors`` are rows of the arguments, ``inputs`` are the values that each call looks up, and ``reads`` are the
+    attributes that were read. Raises :class:`Unfusable` for a step that cannot be repeated for other samples.
     """
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
@@ -81,10 +81,10 @@ class Trace(TorchFunctionMode):
         self._cell_ids = set(map(id, single.values()))
         self._places = {id(single.get(id(p), p)): i for i, (_, _, p) in enumerate(owned_parameters(module))}
         self.graph = fx.Graph()
-        self.parameters: dict[fx.Node, int] = {}  # the index in ``owned_parameters`` of each
+        self.parameters: dict[fx.Node, int] = {}  # the index of each parameter in ``owned_parameters``
         self._running, self._line = False, ""
-        self._code: tuple[tuple[str, ...], dict[str, Any]] = (), {}  # the names and the globals of the line's code
-        self._nodes: dict[int, fx.Node] = {}  # by the id of their tensor, which ``meta`` keeps alive
+        self._code: tuple[tuple[str, ...], dict[str, Any]] = (), {}  # the line's code: its names and its globals
+        self._nodes: dict[int, fx.Node] = {}  # by the id of the node's tensor, which ``meta`` keeps alive
         self.rows = rows_for(module, tensors)
         self.n = self._new(self.rows)
         self.inputs = [self._new(tensor) for tensor in tensors]
@@ -107,7 +107,7 @@ class Trace(TorchFunctionMode):
                 raise Unfusable(node.meta["mixes"])
 
     def _new(self, value: Any, node: fx.Node | None = None, on: int = SAMPLES) -> fx.Node:
-        """Gives a value a node; without ``node``, a new input of the graph."""
+        """Assigns a node to a value; without ``node``, adds a new input of the graph."""
         node = self.graph.placeholder("given") if node is None else node
         node.meta.update(value=value, on=on)
         if isinstance(value, Tensor):
@@ -142,7 +142,7 @@ class Trace(TorchFunctionMode):
                 if names
                 else "write it with functions of PyTorch, or call it in a torch.autograd.Function"
             )
-            raise Unfusable(f"a tensor comes from what is no PyTorch function{self._line}, {remedy}")
+            raise Unfusable(f"a tensor was not computed by a PyTorch function{self._line}, {remedy}")
         return value
 
     def _compiled(self) -> str:
@@ -170,7 +170,7 @@ class Trace(TorchFunctionMode):
         """Records the custom functions of autograd that this thread calls."""
         code, calls = torch.autograd.Function.apply.__func__.__code__, dict[FrameType, _Begun]()  # type: ignore[attr-defined]
         old_profile: Any = sys.getprofile()
-        in_c = old_profile is not None and not callable(old_profile)  # cProfile's, which has methods to stop and resume
+        in_c = old_profile is not None and not callable(old_profile)  # cProfile has methods to stop and resume
         if in_c and not hasattr(old_profile, "enable"):
             yield
             return
@@ -203,7 +203,7 @@ class Trace(TorchFunctionMode):
         operands = tensors_of((args, kwargs))
         if func is torch.Tensor.type_as:
             func, args = torch.Tensor.to, (args[0], args[1].device, args[1].dtype)
-        if func is torch.autograd.grad:  # one graph, where a loop over cells has one for each call
+        if func is torch.autograd.grad:  # all cells have one graph; in a loop, each has its own
             kwargs = {**kwargs, "retain_graph": True}
         node = self.graph.call_function(func, *map_aggregate((args, kwargs), self._argument))
         node.meta["inplace"] = writes_in_place(func) or bool(kwargs.get("inplace"))
@@ -220,11 +220,11 @@ class Trace(TorchFunctionMode):
         if used and func in RANDOM and not is_identity:
             raise Unfusable(f"{name_of(func)} draws random numbers{line}; pass them as an argument")
         counts = all(s.meta.get("counts") or type(s.meta["value"]) is int for s in used)
-        from_n = counts and type(result) is int and result and result % self.rows == 0  # a node where it is used
+        from_n = counts and type(result) is int and result and result % self.rows == 0  # becomes a node at its use
         if used and not outputs and result is not None and not from_n:
-            name = "the truth of a tensor" if isinstance(result, bool) else name_of(node.target)
+            name = "the truth value of a tensor" if isinstance(result, bool) else name_of(node.target)
             raise Unfusable(
-                f"{name} is read{line}, so the path of the module depends on values; write it with torch.where"
+                f"{name} is read{line}, so the module's control flow depends on values; write it with torch.where"
             )
         for source in used:
             if "mixes" in source.meta and func is not torch.autograd.grad:
@@ -243,7 +243,7 @@ class Trace(TorchFunctionMode):
         node.meta["on"] = on
 
     def _separate_gradients(self) -> None:
-        """Inserts a tensor between runs for each value that gradients are taken of; its users read the tensor."""
+        """Inserts a tensor between runs for each variable of a differentiation; the variable's users read it."""
         for node in list(self.graph.nodes):
             if node.target is not torch.autograd.grad:
                 continue

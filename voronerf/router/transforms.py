@@ -30,20 +30,20 @@ def refuse_transforms() -> None:
     if torch.jit.is_tracing():
         raise NotImplementedError(
             f"{_OP}: torch.jit.trace and torch.onnx.export(dynamo=False) would keep the cells of one batch; "
-            f"{_ALONE}, which they take"
+            f"{_ALONE}, which can be traced"
         )
     active = set[str]()
     if transformed():
         active = {interpreter.key().name for interpreter in torch._C._functorch.get_interpreter_stack() or ()}
     if "Vmap" in active:
         raise NotImplementedError(
-            f"{_OP}: torch.func.vmap, jacrev and hessian take samples apart, which the cells are sorted by; call the "
-            "router on the whole batch, where torch.autograd.grad(y[:, i].sum(), x, create_graph=True) gives the "
-            "derivative of each sample, and once more the second"
+            f"{_OP}: torch.func.vmap, jacrev and hessian split the batch of samples, which must be sorted by cell; "
+            "call the router on the whole batch, where torch.autograd.grad(y[:, i].sum(), x, create_graph=True) gives "
+            "the derivative of each sample, and a second call the second derivative"
         )
     if "Jvp" in active or forward_ad._current_level >= 0:
         raise NotImplementedError(
-            f"{_OP}: forward-mode derivatives (jvp, jacfwd, dual numbers) are not supported; take torch.func.vjp or "
+            f"{_OP}: forward-mode derivatives (jvp, jacfwd, dual numbers) are not supported; use torch.func.vjp or "
             "torch.autograd.grad, twice for a product with the Jacobian"
         )
 
@@ -73,7 +73,7 @@ def unwrapped(tensor: Tensor) -> Tensor:
 def aside(call: Call) -> Iterator[Call]:
     """Yields a copy of a call for a probe or a timing, hidden from transforms and saved-tensor hooks.
 
-    ``torch.utils.checkpoint`` counts the tensors that a call saves, and compares this with the recomputation.
+    ``torch.utils.checkpoint`` counts the tensors that a call saves, and compares the number with the recomputation.
     """
     if not transformed():
         with torch.autograd.graph.saved_tensors_hooks(_identity, _identity) if recorded() else contextlib.nullcontext():
@@ -87,7 +87,7 @@ def aside(call: Call) -> Iterator[Call]:
 
 
 def recorded() -> bool:
-    """Returns whether saved-tensor hooks are active. The call may then run again, and must take the same way."""
+    """Returns whether saved-tensor hooks are active. The call may then run again, and must run in the same way."""
     return _hooks(False) is not None
 
 

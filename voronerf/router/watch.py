@@ -21,7 +21,7 @@ Source = str | tuple[int, str]
 """An argument by its name, or an attribute by (index of its submodule in ``modules()``, name)."""
 
 NUMBERS = (torch.float64, torch.float32, torch.int64)
-"""The dtypes of inputs, tried in turn: float64 rounds nothing, float32 promotes like a number, int64 may index.
+"""The dtypes of inputs, tried in turn: float64 does not round, float32 promotes like a number, int64 can be an index.
 """
 
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module())) - {"training"}
@@ -88,14 +88,14 @@ class Watch:
         registry = next((entries for entries in (vars(part), part._buffers, part._modules) if name in entries), None)
         if registry is None:
             if not isinstance(getattr(type(part), name, None), (bool, int, float, str, FunctionType)):
-                return  # a property or none
-            registry = vars(part)  # a value here would precede the class's
+                return  # a property, or no attribute
+            registry = vars(part)  # a value set here would override the class attribute
         value = registry.get(name, _MISSING)
         self.sources.append(source)
         self._values.append(value)
         self._dicts.append((registry, name))
         if isinstance(value, Tensor):
-            if not value.is_inference():  # without a version counter
+            if not value.is_inference():  # inference tensors have no version counter
                 self._tensors.append(value)
                 self._versions.append(value._version)
                 self._tensor_sources.append(source)

@@ -1,7 +1,7 @@
 """Replaces sines and cosines of octaves in a program by one step, the frequency encoding.
 
-One step takes less time than separate waves, and concatenations in its order need no copy. Its second derivatives run
-in PyTorch, so this is for programs that are differentiated once.
+One step takes less time than separate waves, and concatenations in the step's order need no copy. The step's second
+derivatives run in PyTorch, so the replacement is for programs that are differentiated once.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from voronerf.ops._core.program import PARAMETER, VALUE, Columns, Program, Step,
 _Column = tuple[int, int]  # (value, column in it)
 _Waves = dict[_Column, dict[float, dict[int, list[_Column]]]]  # column: {factor: {0 for sine or 1 for cosine: copies}}
 _PHASES = {0.0: 0, round(math.pi / 2, 6): 1}
-_FEW = 3  # most parts of a layer's input that are read separately
-_CLOSE = 3e-7  # largest relative error of an octave
+_FEW = 3  # maximum number of parts of a layer's input that are read separately
+_CLOSE = 3e-7  # maximum relative error of an octave
 
 
 class _Group(NamedTuple):
-    """Adjacent columns of a value whose waves are octaves."""
+    """Adjacent columns of a value; the frequencies of their waves double from one to the next."""
 
     columns: list[_Column]
     factors: list[float]
 
 
 def with_encodings(program: Program, constants: Mapping[int, Sequence[float]]) -> Program:
-    """Returns the program with ``encode`` steps in the place of waves.
+    """Returns the program with waves replaced by ``encode`` steps.
 
     Args:
-        program: The program, without sums over rows.
+        program: The program, which must not have sums over rows.
         constants: The entries of constant parameters, by their index.
     """
     steps_by_value = {step.out: step for step in program.steps}
@@ -88,7 +88,7 @@ def _by_parts(step: Step, moves: Mapping[int, Step], new: int) -> list[Step]:
 
 
 def _waves(program: Program, steps_by_value: Mapping[int, Step], constants: Mapping[int, Sequence[float]]) -> _Waves:
-    """Finds the waves of each column that is not itself a x + b of another column."""
+    """Finds the waves of each column that is not itself an affine function of another column."""
     waves: _Waves = {}
     for step in program.steps:
         if step.name != "sine" or step.numbers[0] or len(step.operands) > 1:
@@ -158,7 +158,7 @@ def _outputs(waves: _Waves, group: _Group) -> Iterator[int]:
 
 
 def _elsewhere(c: Columns, places: Mapping[_Column, _Column]) -> Columns:
-    """Returns the new place of columns if they are adjacent there too, else the same columns."""
+    """Returns columns at their new places if they are adjacent there too, else the same columns."""
     if c.of != VALUE or (c.index, c.start) not in places:
         return c
     value, start = places[c.index, c.start]
@@ -174,7 +174,7 @@ def _moved(step: Step, places: dict[_Column, _Column]) -> Step:
         columns = ((c.index, c.start + i) for i in range(c.width))
         sources.update({at + i: places.get(column, column) for i, column in enumerate(columns)})
     if len(sources) != sum(c.width for c in step.operands):
-        return step  # columns are summed
+        return step  # a column is the sum of several pieces
     pieces: list[tuple[Columns, int]] = []
     for at, (value, column) in sorted(sources.items()):
         places[step.out, at] = value, column

@@ -1,4 +1,4 @@
-"""Joins runs, cuts them, and places them in each other. The result is a new run of several parts.
+"""Joins runs, cuts runs, and places a run in another one. The result is a new run of several parts.
 
 Positions are in units of the new scene. The source runs are never changed.
 """
@@ -32,15 +32,15 @@ from voronerf.town.network import StoredRouter, config_of
 from voronerf.town.parts import Part, Parts
 from voronerf.town.run import TOWN, is_town, open_parts, write_parts
 
-#: Greatest number of voxels of a joined grid; its voxels become larger if it would have more.
+#: The maximum number of voxels of a joined grid; a grid that would have more gets larger voxels.
 MOST_VOXELS = 1 << 22
-#: The least size of a run as a share of the joined scene: the strata of a ray would step over a smaller one.
+#: The minimum size of a run as a fraction of the joined scene: the strata of a ray would step over a smaller run.
 SMALLEST = 1e-4
 
 
 @dataclass(frozen=True)
 class Source:
-    """The contents of a run that are joined, cut or placed: settings, scene, parts and grid."""
+    """The contents of a run to join, cut or place: settings, scene, parts and grid."""
 
     name: str
     config: TrainConfig
@@ -50,7 +50,7 @@ class Source:
 
     @classmethod
     def of(cls, run: Path | str) -> Source:
-        """Reads the source from a run directory; of the networks, only the field."""
+        """Reads the source from a run directory, with the field as its only network."""
         run = Path(run)
         name, record = run.name, run / "scene.json"
         checkpoint = last_checkpoint(run, keep=is_shown)
@@ -80,7 +80,7 @@ class Source:
 
 
 def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Similarity] | None = None) -> Source:
-    """Joins several runs into a new one; where they overlap, the nearest centre decides.
+    """Joins several runs into a new run; where runs overlap, the nearest centre decides.
 
     Args:
         runs: At least two run directories, which are not changed; the first gives data, background and settings.
@@ -108,13 +108,13 @@ def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Simila
 
 
 def cut(run: Path | str, kept: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Source:
-    """Writes a new run with only a solid or some cells of a run; networks that it does not need are left out.
+    """Writes a new run with only a solid or some cells of a run; networks of all other cells are left out.
 
     Args:
         run: The run directory, which is not changed.
         kept: A solid of the scene, such as ``Solid.box(low, high)``, or numbers of cells.
         out: A new directory.
-        outside: Whether to keep everything outside of the solid or cells instead.
+        outside: Whether to keep everything except the solid or the cells instead.
 
     Returns:
         The contents of the new run.
@@ -152,8 +152,8 @@ def place(
 
     Args:
         run: The run directory of the scene, which is not changed.
-        thing: The run directory of the object, cut out or trained on white.
-        at: The position of the object: the centre of the bottom of its box goes there.
+        thing: The run directory of the object, which was cut out or was trained on a white background.
+        at: The position of the bottom centre of the object's box.
         out: A new directory.
         degrees: The rotations about the axes x, y, z, in this order.
         scale: The factor on the object's size.
@@ -173,7 +173,9 @@ def place(
     source = Source.of(thing)
     box = source.scene.box
     if box is None:
-        raise ConfigError(f"{source.name}: an object must have bounds, which voronerf cut --box or --sphere gives it")
+        raise ConfigError(
+            f"{source.name}: an object must have bounds; cut it first with voronerf cut --box or --sphere"
+        )
     foot = torch.cat(((box[0] + box[1])[:2] / 2, box[0, 2:]))
     standing = Similarity.of(at, degrees, scale) @ Similarity(translation=-foot.double())
     scene = source if Path(run) == Path(thing) else Source.of(run)  # a run placed in itself stores its networks once
@@ -184,19 +186,18 @@ def place(
 
 
 def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_top: bool = False) -> Source:
-    """Joins sources into one; where they overlap, the nearest centre decides.
+    """Joins sources into one source; where sources overlap, the nearest centre decides.
 
     Args:
         sources: At least one source. The first gives the settings, the background, and the data.
         frames: The similarity from each source to the new scene.
-        on_top: Whether to put all sources but the first into layers above it, so that their densities are added.
+        on_top: Whether to put the other sources into layers above the first, so that densities are added.
     """
     first = sources[0]
     for index, source in enumerate(sources):
         if source.scene.box is None and (index or (len(sources) > 1 and not on_top)):
             raise ConfigError(
-                f"{source.name}: must have bounds to be joined, which a run of unbounded space has after "
-                "voronerf cut --box or --sphere"
+                f"{source.name}: must have bounds to be joined; cut it first with voronerf cut --box or --sphere"
             )
         if source.scene.background != first.scene.background and not on_top:
             ours, theirs = (s.scene.background or "none" for s in (first, source))
@@ -211,7 +212,7 @@ def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_
 
 
 def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
-    """Returns the settings of a joined run: the first source's, with strata as short as the shortest of any source."""
+    """Returns the settings of a joined run: the first source's settings, with the shortest strata of all sources."""
     first = sources[0].config
     samples = (first.samples or (64,))[0]
     if scene.box is not None:
@@ -221,7 +222,7 @@ def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Sc
             size = float((source.scene.box[1] - source.scene.box[0]).norm()) * frame.scale
             if not size >= SMALLEST * diagonal:
                 raise ConfigError(
-                    f"{source.name}: must be at least {SMALLEST:g} times as large as all together, got {size:.3g} "
+                    f"{source.name}: must be at least {SMALLEST:g} times as large as the whole scene, got {size:.3g} "
                     f"of {diagonal:.3g}"
                 )
             samples = max(samples, math.ceil((source.config.samples or (64,))[0] * diagonal / size - 1e-6))
@@ -229,7 +230,7 @@ def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Sc
 
 
 def _join_scenes(sources: Sequence[Source], frames: Sequence[Similarity]) -> Scene:
-    """Joins the views of all sources and their boxes; the same scene in the same place counts once."""
+    """Joins the views and the boxes of all sources; the same scene in the same place counts once."""
     first, box, views = sources[0].scene, sources[0].scene.box, []
     seen: set[tuple[str, str]] = set()
     if box is not None:
@@ -260,7 +261,7 @@ def _corners(box: Tensor | None) -> Tensor:
 
 
 def _join_views(views: Sequence[tuple[str, Split, Similarity]]) -> Split:
-    """Joins the cameras of several splits, without images; if names repeat, they get their split's number."""
+    """Joins the cameras of several splits, without images; if names repeat, all names get their split's number."""
     cameras = [moved_cameras(split.cameras, frame) for _, split, frame in views]
     names = [name for _, split, _ in views for name in split.names]
     if len(set(names)) < len(names):
@@ -282,7 +283,7 @@ def moved_cameras(cameras: Cameras, frame: Similarity) -> Cameras:
 
 
 def _join_grids(sources: Sequence[Source], frames: Sequence[Similarity]) -> OccupancyGrid | None:
-    """Joins the occupancy grids; voxels are as small as the smallest source's, as far as `MOST_VOXELS` allows."""
+    """Joins the occupancy grids; voxels have the size of the smallest source voxels if `MOST_VOXELS` allows it."""
     grids = [source.grid for source in sources]
     if any(source.scene.box is None for source in sources) or any(grid is None for grid in grids):
         return None
@@ -322,7 +323,7 @@ def _join_grids(sources: Sequence[Source], frames: Sequence[Similarity]) -> Occu
             density.scatter_reduce_(0, voxels, source.density.view(-1)[occupied] / frame.scale, "amax")
         filled, values = marked.view(grid.density.shape), density.view(grid.density.shape)
         turned = frame.rotation.abs()
-        if bool(((turned > 1e-6) & (turned < 1 - 1e-6)).any()):  # turned voxels reach beyond the sampled voxels
+        if bool(((turned > 1e-6) & (turned < 1 - 1e-6)).any()):  # rotated voxels reach beyond the sampled voxels
             around = torch.nn.functional.max_pool3d(filled.float()[None, None], 3, 1, 1)[0, 0] > 0
             values = torch.where(around & ~filled, threshold, values)
             filled = around
@@ -343,9 +344,9 @@ def _empty_grid(box: Tensor, shape: Sequence[int], threshold: float) -> Occupanc
 
 
 def cut_source(source: Source, kept: Solid | Tensor) -> Source:
-    """Returns a source with only a solid or some cells; networks that it does not need are left out.
+    """Returns a source with only a solid or some cells; networks of all other cells are left out.
 
-    A contraction is the identity inside of its sphere, so that a cut inside of it needs no contraction.
+    A contraction is the identity inside of its sphere, so a cut inside of the sphere needs no contraction.
 
     Args:
         source: The source, of any kind.
@@ -385,7 +386,7 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
     near = ((places > box[0] - size) & (places < box[1] + size)).all(-1)
     grid = _trimmed(grid, parts, occupied[near])
     if grid is None:
-        raise ConfigError(f"{source.name}: nothing is left of it")
+        raise ConfigError(f"{source.name}: the cut leaves nothing of it")
     if not isinstance(kept, Tensor):
         occupied, shown = grid.occupied.view(-1).nonzero()[:, 0], torch.zeros(parts.num_cells, dtype=torch.bool)
         for offset in _LATTICE:
@@ -397,7 +398,7 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
             parts = keep_cells(parts, shown)
     config, scene = source.config, replace(source.scene, box=grid.box)
     old_box = source.scene.box
-    if old_box is not None:  # keeps the length of the strata
+    if old_box is not None:  # so that strata keep their length
         share = float((grid.box[1] - grid.box[0]).norm() / (old_box[1] - old_box[0]).norm())
         config = replace(config, samples=(max(16, math.ceil((config.samples or (64,))[0] * share - 1e-6)),))
     config = _settings([replace(source, config=config, scene=scene)], [Similarity()], scene)
@@ -426,14 +427,14 @@ def _inside_ball(solid: Solid, contraction: Contraction) -> bool:
     return farthest <= contraction.radius * (1 + 1e-4)
 
 
-#: Sample points in a voxel, by which it is found whether a part covers some of it.
+#: Sample points in a voxel; a part covers the voxel if it covers one of them.
 _LATTICE = torch.tensor([*itertools.product((0.5, 1e-3, 1 - 1e-3), repeat=3)])
 
 
 def _trimmed(grid: OccupancyGrid, parts: Parts, voxels: Tensor) -> OccupancyGrid | None:
-    """Returns a grid of the given voxels, int64 [q], that a part covers, trimmed to their bounding box.
+    """Returns a grid with only the ``voxels``, int64 [q], that parts cover, trimmed to the box of these voxels.
 
-    Returns None if no part covers any of the voxels.
+    The result is None if no part covers any of the voxels.
     """
     covered = torch.zeros(len(voxels), dtype=torch.bool)
     for offset in _LATTICE:
@@ -455,7 +456,7 @@ def _trimmed(grid: OccupancyGrid, parts: Parts, voxels: Tensor) -> OccupancyGrid
 
 
 def _evaluated_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
-    """Makes an occupancy grid of a box, for a run without a grid, by evaluating the field in every voxel."""
+    """Makes an occupancy grid of a box for a run without a grid: evaluates the field in every voxel."""
     threshold = -math.log1p(-OPACITY) * (source.config.samples or (64,))[0] / float((box[1] - box[0]).norm())
     return ask_everywhere(OccupancyGrid(box, PICTURE_RESOLUTION, threshold=threshold), parts.eval())
 
@@ -464,7 +465,7 @@ def _evaluated_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
 
 
 def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, int]:
-    """Finds the similarity that maps cameras of a scene to another scene's cameras of the same image names.
+    """Finds the similarity that maps cameras of a scene to cameras of another scene with the same image names.
 
     Source: Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns".
 
@@ -474,7 +475,7 @@ def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, in
         name: The name of the moving run in error messages.
 
     Returns:
-        The similarity, the root mean square distance of the camera centres after it, and the number of cameras.
+        The similarity, the root mean square distance of the aligned camera centres, and the number of cameras.
     """
     fixed_places, moving_places = (
         {n: place for split in (s.train, s.test) for n, place in zip(split.names, split.cameras.origins, strict=True)}
@@ -487,7 +488,9 @@ def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, in
     target_mean, source_mean = targets.mean(0), sources.mean(0)
     u, spread, v = torch.linalg.svd((targets - target_mean).T @ (sources - source_mean) / len(shared))
     if float(spread[1]) < 1e-9 * max(float(spread[0]), 1e-30):
-        raise ConfigError(f"{name}: --align needs cameras that are not on one line, those of {len(shared)} images are")
+        raise ConfigError(
+            f"{name}: --align needs cameras that are not on one line; the {len(shared)} shared cameras are"
+        )
     sign = torch.ones(3, dtype=torch.float64)
     sign[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(v))
     rotation = u @ torch.diag(sign) @ v
@@ -508,7 +511,7 @@ def check_out(out: Path) -> None:
 
 
 def _process_exists(number: int) -> bool:
-    """Returns whether a process with this number exists; True if that cannot be found out."""
+    """Returns whether a process with this number exists; True if this is unknown."""
     try:
         os.kill(number, 0) if os.name == "posix" else None  # on Windows, os.kill would end the process
     except ProcessLookupError:
@@ -523,7 +526,7 @@ def _write(source: Source, out: Path) -> Source:
     check_out(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     for leftover in out.parent.glob(".*.[0-9]*.partial"):
-        if not _process_exists(int(leftover.suffixes[-2][1:])):  # its process was killed
+        if not _process_exists(int(leftover.suffixes[-2][1:])):  # the process that wrote it was killed
             shutil.rmtree(leftover, ignore_errors=True)
     partial = out.parent / f".{out.name[:100]}.{os.getpid()}.partial"
     try:

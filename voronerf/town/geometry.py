@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-#: Tolerance for the orthonormality of a rotation, since files round its numbers.
+#: Tolerance for the orthonormality of a rotation, since files store rounded numbers.
 _ORTHONORMAL = 1e-4
 
 
@@ -91,7 +91,7 @@ class Similarity:
         return Similarity(1 / self.scale, self.rotation.T, -(self.translation @ self.rotation) / self.scale)
 
     def __matmul__(self, first: Similarity) -> Similarity:
-        """Composes two similarities: ``first`` is applied first, then this one."""
+        """Composes two similarities: applies ``first``, then this one."""
         return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation))
 
     def points(self, points: Tensor) -> Tensor:
@@ -116,7 +116,7 @@ class Solid:
     Args:
         planes: Half-spaces (a, b, c, d), for ``a x + b y + c z <= d``.
         ball: Centre and radius (x, y, z, r), instead of planes.
-        outside: Whether to take the space outside of the planes or the ball instead.
+        outside: Whether the solid is the space outside of the planes or the ball.
 
     Raises:
         ValueError: There are neither planes nor a ball, or both, or their numbers are invalid.
@@ -167,10 +167,10 @@ class Solid:
         return ~inside if self.outside else inside
 
     def bounds(self) -> Tensor:
-        """Returns float32 [2, 3], the box around the planes' or the ball's inside, also for ``outside``.
+        """Returns float32 [2, 3], the box around the ball or the half-spaces' intersection; ignores ``outside``.
 
         Raises:
-            ValueError: The planes have no corner.
+            ValueError: The intersection of the half-spaces has no corner.
         """
         if self.ball is not None:
             centre, radius = torch.tensor(self.ball[:3]), self.ball[3]

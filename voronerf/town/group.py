@@ -28,12 +28,12 @@ from voronerf.app.scenes import Scene
 PATIENCE = 50
 #: Settings that may differ between ranks.
 MAY_DIFFER = ("data", "device", "lpips")
-#: The (first, second) territory of a part of a message: the sender and the receiver, except for answers.
+#: The (first, second) territory of a part of a message: sender and receiver, or for answers receiver and sender.
 Key = tuple[int, int]
 
 
 class RankLost(ConnectionError):
-    """An error because another rank has ended, or does not answer."""
+    """An error because another rank has ended or does not answer."""
 
 
 def world_size() -> int:
@@ -47,7 +47,7 @@ def local_rank() -> int:
 
 
 def restarts() -> int:
-    """Returns how often torchrun has restarted the ranks after a failure."""
+    """Returns the number of times that torchrun has restarted the ranks after failures."""
     return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
 
@@ -121,13 +121,13 @@ class Group:
 
         Args:
             parts: float32 [counts[key], width], the parts that territories of this rank send.
-            counts: int64 [T, T], the numbers of rows of all parts, the same on all ranks; a part has at least one row.
+            counts: int64 [T, T], the number of rows of each part, the same on all ranks; 0 for no part.
             owner: The rank of each territory.
             width: Number of columns of a part.
             back: Whether the parts are answers, from the second territory of a key to the first.
 
         Returns:
-            The parts that territories of this rank receive, by key in ascending order.
+            The parts that territories of this rank receive, by key; keys ascend.
         """
         ends = {(n, m): (owner[m], owner[n]) if back else (owner[n], owner[m]) for n, m in counts.nonzero().tolist()}
         sent, received = (
@@ -152,7 +152,7 @@ class Group:
         return dict(sorted(zip(keys, incoming.split([int(counts[key]) for key in keys]), strict=True)))
 
     def check_equal(self, texts: dict[str, str]) -> None:
-        """Raises ValueError unless the texts of all ranks, by name, are equal."""
+        """Raises ValueError unless all ranks have the same ``texts`` by the same names."""
         first, *others = self.gather(texts)
         for name, value in first.items():
             for rank, other in enumerate(others, 1):
@@ -162,7 +162,7 @@ class Group:
                     )
 
     def check_same(self, config: Any, territories: int) -> None:
-        """Raises ValueError unless the settings, a dataclass, and the code are the same on all ranks."""
+        """Raises ValueError unless all ranks have the same settings (`config`, a dataclass) and the same code."""
         root, code = Path(__file__).resolve().parents[1], 0
         for path in sorted(root.rglob("*.py")):
             code = zlib.crc32(path.read_bytes(), code)
@@ -198,7 +198,7 @@ class Group:
 
 @contextlib.contextmanager
 def waiting() -> Iterator[None]:
-    """A context that converts errors of torch.distributed into `RankLost`."""
+    """Converts errors of torch.distributed into `RankLost` within the context."""
     try:
         yield
     except RuntimeError as error:  # DistError, and errors of gloo

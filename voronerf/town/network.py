@@ -1,4 +1,4 @@
-"""The stored networks of cells, from which a router is made on first use."""
+"""The stored networks of cells; the first use makes a router from them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from voronerf.router import VoronoiRouter
 
 
 class StoredRouter:
-    """A router as a checkpoint with its settings and tensors."""
+    """A stored router: the settings and the tensors of its checkpoint."""
 
     def __init__(self, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> None:
         self.checkpoint, self.device, self.backend = checkpoint, device, backend
@@ -41,7 +41,7 @@ class StoredRouter:
         return StoredRouter.of(self.router.part(cells), config_of(self.checkpoint))
 
     def stored(self) -> Checkpoint:
-        """Returns the checkpoint on the CPU, without tensors that only a training needs."""
+        """Returns the checkpoint on the CPU, without the tensors that are needed only in training."""
         kept = {k: v for k, v in self.checkpoint.tensors.items() if k.startswith("router") or k.endswith(".average")}
         tensors = {name: tensor.cpu() for name, tensor in kept.items()}
         return Checkpoint(tensors, {"config": self.checkpoint.values["config"]})

@@ -1,7 +1,7 @@
 """Parts: routers that are placed in one scene, each in a frame of its own, and evaluated as one field.
 
 n samples, r rays, k cells of all parts, l leaves of the diagram of one part. Positions, lengths and densities are in
-scene units unless a part's frame is named; a similarity maps a part's frame to the scene.
+scene units unless the text names a part's frame; a similarity maps a part's frame to the scene.
 
 A part covers a point if the point lies in its region and its leaf has a network. If several parts of a layer cover a
 point, the part with the nearest centre is evaluated, in the cell of its own diagram. Layers are superposed: their
@@ -29,11 +29,11 @@ from voronerf.town.network import StoredRouter
 class Part(nn.Module):
     """A diagram with networks in its leaves, placed in a scene by a frame of its own.
 
-    Usually one router has the networks of all leaves. A training in territories makes several routers, with tables of
-    their own. Leaves whose cells were cut away have no network; space is empty there.
+    Usually one router has the networks of all leaves. A training in territories makes several routers, each with its
+    own tables. Leaves whose cells were cut away have no network; space is empty there.
 
     Args:
-        networks: Router i has the leaves with ``owner == i``, in ascending order.
+        networks: The stored routers; router i has the networks of the leaves with ``owner == i``, in ascending order.
         diagram: A diagram with l leaves; None for the diagram of the only router.
         owner: int [l], the network of each leaf, -1 for none; None for the only network.
         frame: The similarity from the part's frame to the scene.
@@ -89,7 +89,7 @@ class Part(nn.Module):
         return Part(**{**{name: getattr(self, name) for name in names}, **changes})
 
     def keep(self, cells: Tensor) -> Part | None:
-        """Returns the part with the networks of only these cells, int64 [c]; None if it has none of them."""
+        """Returns the part with only the networks of ``cells``, int64 [c]; None if no cell is kept."""
         if len(cells) == self.num_cells:
             return self
         kept = torch.zeros(self.num_cells, dtype=torch.bool, device=self.owner.device)
@@ -117,7 +117,7 @@ class Part(nn.Module):
         return leaf, covered
 
     def evaluate(self, local: Tensor, leaf: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns colours [m, 3] and densities [m] per scene unit of points that the part covers.
+        """Returns the colours [m, 3] and the densities [m], per scene unit, of points that the part covers.
 
         Args:
             local: [m, 3], the points in the part's frame.
@@ -140,7 +140,7 @@ class Part(nn.Module):
 
 
 class Claim(NamedTuple):
-    """The positions that a part covers and that belong to it."""
+    """The positions that a part covers and evaluates."""
 
     part: int
     rows: Tensor  # int64 [m], numbers of the positions
@@ -151,7 +151,7 @@ class Claim(NamedTuple):
 class Parts(nn.Module):
     """Several parts of one scene, as one :class:`voronerf.nerf.Field`.
 
-    Cells are numbered part after part, within a part in the order of its leaves.
+    Cells are numbered part after part, and within a part in the order of its leaves.
 
     Attributes:
         parts: The parts.
@@ -195,9 +195,9 @@ class Parts(nn.Module):
             claims[index].append(claim)
             uncovered[claim.rows] = False
         rows = uncovered.nonzero()[:, 0]
-        if len(members) > 1 and len(rows):  # not covered by their nearest part
+        if len(members) > 1 and len(rows):  # these positions are not covered by their nearest part
             least = positions.new_full((len(positions),), math.inf)
-            others = []  # claims of all parts on these positions; the nearest of the parts gets a position
+            others = []  # claims of all parts on these positions; each position goes to the nearest of these parts
             for index in members:
                 claim = self._claim(index, positions, rows)
                 places, centres = positions[claim.rows], self[index].centres.to(positions)
@@ -207,13 +207,13 @@ class Parts(nn.Module):
                 others.append((claim, distance))
             for claim, distance in others:
                 first = distance == least[claim.rows]
-                least[claim.rows[first]] = -1.0  # a tie goes to the first
+                least[claim.rows[first]] = -1.0  # a tie goes to the first part
                 claims[claim.part].append(Claim(claim.part, *(column[first] for column in claim[1:])))
         joined = [Claim(i, *map(torch.cat, zip(*(claim[1:] for claim in each)))) for i, each in claims.items()]
         return [claim for claim in joined if len(claim.rows)]
 
     def _claim(self, index: int, positions: Tensor, rows: Tensor) -> Claim:
-        """Returns the claim of a part on the rows that it covers."""
+        """Returns the claim of a part on the positions of ``rows`` that it covers."""
         local = self[index].frame.inverse.points(positions[rows])
         leaf, covered = self[index].find(local, self.backend)
         return Claim(index, rows[covered], local[covered], leaf[covered])

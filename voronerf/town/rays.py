@@ -1,10 +1,10 @@
 """The loss of rays that pass through several territories with networks of their own: only partial sums are sent.
 
-Every territory draws rays from its own views, and evaluates its own part of them first. A ray that is not opaque by
-then is sent to the other territories that it meets. Each of them returns a partial sum of 24 bytes. The home territory,
-which drew the ray, merges the sums and sends an answer of 24 bytes to each, from which the gradients of the sum follow
-(Li et al. 2024, NeRF-XL). The results of a territory do not depend on its rank. r rays, m samples, q runs, T
-territories.
+Every territory draws rays from its own views, and first evaluates the part of each ray in its own space. If the ray is
+not opaque yet, it is sent to the other territories that it meets. Each of these territories returns a partial sum of 24
+bytes. The home territory, which drew the ray, merges the sums and sends an answer of 24 bytes to each territory, which
+then computes its gradients (Li et al. 2024, NeRF-XL). The results of a territory do not depend on its rank. r rays, m
+samples, q runs of samples, T territories.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from voronerf.ops.ray_runs import OwnSamples, compose_runs, own_samples, run_gra
 from voronerf.town.group import Group, Key
 from voronerf.town.territories import Place
 
-#: Least transmittance for which a ray is sent on: one level of an 8-bit image.
+#: The minimum transmittance of a ray that is sent to other territories: one level of an 8-bit image.
 FAINT = 1 / 255
-#: Number of columns of rays that are sent, and of sums and answers.
+#: Number of columns of a sent ray, and of a sum or an answer.
 RAY, SUM = 8, 6
 
 
@@ -70,15 +70,15 @@ class Pass:
     """One territory's part of a step: partial sums of its rays [r], then gradients from the merged result.
 
     Attributes:
-        sums: [q, 6], the sums of its runs.
-        learnt: The segment that has set the gradients of the parameters, in a list; empty without samples.
+        sums: [q, 6], the partial sum of each run of samples.
+        learnt: The segment that has set the gradients of the parameters, as a list; empty without samples.
 
     Args:
-        name: The name of its segments of the step.
+        name: The prefix of the segment names.
         territory: The territory whose networks are evaluated.
         rays: r rays.
         near: [r], the distance at which each ray begins.
-        far: [r], the distance at which it ends.
+        far: [r], the distance at which each ray ends.
     """
 
     def __init__(self, name: str, territory: Territory, rays: Rays, near: Tensor, far: Tensor) -> None:
@@ -88,7 +88,7 @@ class Pass:
         step, place, renderer = territory.step, territory.place, territory.renderer
         if renderer.contraction is None:
             first, last, _ = intersect_box(rays.origins, rays.directions, place.box.to(near.device), 0.0, math.inf)
-            near, far = torch.maximum(near, first), torch.minimum(far, last)  # no interval for rays that miss the box
+            near, far = torch.maximum(near, first), torch.minimum(far, last)  # rays that miss the box have no interval
         self.sums = near.new_empty(0, SUM)
         if not len(near):
             return
@@ -119,7 +119,7 @@ class Pass:
         renderer = self.territory.renderer
         field = radiance_of(renderer.field)
         if isinstance(field, str) or field.networks.density_scale is None:
-            raise ValueError(f"Pass: field must put out what comes before its activations, got {field}")
+            raise ValueError(f"Pass: field must return its values before the activations, got {field}")
         return field
 
     def end(self) -> Tensor:
@@ -166,7 +166,7 @@ class Pass:
 
 
 class Crossing(StepOutput):
-    """The result of a territory's step whose rays also pass through other territories."""
+    """The result of a territory's step with rays that also pass through other territories."""
 
     def __init__(self, batch: Batch, output: RenderOutput, sums: Tensor) -> None:
         super().__init__(batch, output)
@@ -215,7 +215,7 @@ def step_together(
         at: The number of steps that each of ``territories`` has done since its coarse stage began.
 
     Returns:
-        The result of each of ``territories``, on its own rays and on other territories' rays; the loss is of its own
+        The result of each of ``territories`` on its own rays and on other territories' rays; the loss counts its own
         rays only.
     """
     count, bounds = len(owner), bounds.to(group.device)
@@ -291,7 +291,7 @@ def _table(batch: Batch, rows: Tensor) -> Tensor:
 
 
 def _split_sums(guest: Pass, sizes: Sequence[int]) -> list[Tensor]:
-    """Splits the sums by the senders of the rays; rays are numbered anew within each sender's part."""
+    """Splits the sums by the senders of the rays; rays are renumbered within each sender's part."""
     number = guest.sums[:, -1].long()
     ends = torch.tensor([0, *sizes], device=number.device).cumsum(0)
     counts = torch.searchsorted(number, ends).diff()

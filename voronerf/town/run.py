@@ -58,7 +58,7 @@ def stored_territories(run: Path) -> int | None:
 
 
 def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGrid | None) -> None:
-    """Writes the files of the networks, one per network even if several parts share it, then the run's checkpoint."""
+    """Writes one file per network, also for a network that several parts share, then the run's checkpoint."""
     folder, names = checkpoint_path(run).parent, dict[int, str]()
     for network in (network for part in parts for network in part.networks):
         if id(network) not in names:
@@ -87,7 +87,7 @@ def index_of(
     placed: list[dict[str, Any]],
     grid: OccupancyGrid | None,
 ) -> Checkpoint:
-    """Makes the checkpoint of a run of parts, without the networks, which are files of their own.
+    """Makes the checkpoint of a run of parts, without the networks, which have their own files.
 
     Args:
         config: The settings of the run.
@@ -149,7 +149,7 @@ def open_run(
 
     Args:
         path: The run directory.
-        scene: The scene if it is already loaded, with the first run's images or none.
+        scene: The scene if it is already loaded, with the images of the first run or without images.
         data: The scene folder of the first run; None for the folder of its training.
         downscale: The factor by which images are reduced; None for the factor of the training.
         allow_outside: Also read images that lie outside of the scene folder.
@@ -189,10 +189,10 @@ def open_run(
 
 
 def _in_place(read: Scene, record: Scene) -> Scene:
-    """Gives the views of a scene the poses that the run's record has for them.
+    """Replaces the poses of a scene's views by the poses in the run's record.
 
-    The views must be the first views of the record, by name. Otherwise they keep their poses, moved into the record's
-    space.
+    The views must have the names of the first views in the record. Otherwise, the views keep their poses, which are
+    moved into the record's space.
     """
     splits = {}
     for name in ("train", "test"):

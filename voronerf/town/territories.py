@@ -17,7 +17,7 @@ from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
 from voronerf.ops.nearest_centre import nearest_centre
 
-#: Rays along each side of the lattice by which the place of a view is found.
+#: The number of rays along each side of the lattice that locates a view.
 LATTICE = 7
 #: Number of nearest centres whose bisectors are intersected for the corners of a territory.
 NEIGHBOURS = 16
@@ -41,7 +41,7 @@ class Territories:
         return len(self.centres)
 
     def place(self, number: int) -> Place:
-        """Returns the place of a territory: its box, its centre and the centres near it."""
+        """Returns the place of a territory: its box, its centre and the neighbouring centres."""
         other_territories = torch.arange(len(self)) != number
         low, high = self.boxes[number]
         corners = torch.cartesian_prod(*torch.stack((low, high)).T)
@@ -58,7 +58,7 @@ class Territories:
         return (self.train == number).nonzero()[:, 0]
 
     def scene(self, whole: Scene, number: int) -> Scene:
-        """Returns the scene of a territory, for its settings: its box, and the cameras of its views without images."""
+        """Returns a territory's scene without images, for its settings: the box, and the cameras of its views."""
         rows = self.views(number)
         names = tuple(whole.train.names[row] for row in rows.tolist())
         train = replace(whole.train, cameras=whole.train.cameras[rows], names=names, images=whole.train.images[:0])
@@ -73,7 +73,7 @@ class Place:
         box: [2, 3], the box around the territory.
         centres: [l, 3], its own centre and the centres of territories that may reach into its box, in ascending order
             of territories.
-        own: int32 [l], 0 for its own centre and -1 for the other centres.
+        own: int32 [l], 0 for the territory's own centre and -1 for the other centres.
     """
 
     box: Tensor
@@ -96,7 +96,7 @@ class Place:
         return torch.cat(masks)
 
     def bounds(self, grid: OccupancyGrid) -> Tensor:
-        """Returns [2, 3], a box around the occupied voxels; with a contraction, which bends rays, all of space.
+        """Returns [2, 3], a box around the occupied voxels; all of space with a contraction, since it bends rays.
 
         For an empty grid the first corner is above the second.
         """
@@ -111,11 +111,11 @@ class Place:
 
 
 def cut_space(scene: Scene, count: int, contraction: Contraction | Perspective | None) -> Territories:
-    """Cuts the space of a scene into territories with equal numbers of training views, within one.
+    """Cuts the space of a scene into territories whose numbers of training views differ by at most one.
 
-    The place of a view is the mean of its rays' middles in the scene, at most half a territory's width after the near
-    end. The views are halved recursively by their places, along the longest side of the places' box. The centre of a
-    territory is the mean of its views' places.
+    The place of a view is the mean of the middles of its rays in the scene; a middle is at most half a territory's
+    width beyond the near end of its ray. The views are halved recursively by their places, along the longest side of
+    the places' box. The centre of a territory is the mean of its views' places.
     """
     views = len(scene.train)
     if count > views:
@@ -129,12 +129,15 @@ def cut_space(scene: Scene, count: int, contraction: Contraction | Perspective |
     sizes = torch.bincount(homes, minlength=count)
     centres = torch.zeros(count, 3).index_add(0, homes, places) / sizes[:, None]
     if len(centres.unique(dim=0)) < count:
-        raise ValueError(f"--territories must be at most the places that views of {scene.name} look at, got {count}")
+        raise ValueError(
+            f"--territories must be at most the number of different places that the views of {scene.name} look at, "
+            f"got {count}"
+        )
     return Territories(centres, _boxes(centres, box), homes)
 
 
 def halve(places: Tensor, count: int) -> Tensor:
-    """Divides places [n, 3] into compact parts of equal size, within one, by recursive halving.
+    """Divides places [n, 3] into compact parts by recursive halving; part sizes differ by at most one.
 
     Returns:
         int64 [n], the part of each place; parts with neighbouring numbers are neighbours in space.
@@ -170,7 +173,7 @@ def _places(scene: Scene, width: float, contraction: Contraction | Perspective |
     points = torch.addcmul(rays.origins, depth[:, None], rays.directions)
     points = points if contraction is None else contraction.points(points)
     weight = hit.float()[:, None]
-    blind = ~hit.view(views, -1).any(1)  # no ray hits the scene
+    blind = ~hit.view(views, -1).any(1)  # views without a ray that hits the scene
     weight[blind.repeat_interleave(len(x))] = 1
     return (points * weight).view(views, -1, 3).sum(1) / weight.view(views, -1, 1).sum(1)
 

@@ -47,9 +47,9 @@ from voronerf.town.rays import Territory, step_together
 from voronerf.town.run import TOWN, index_of
 from voronerf.town.territories import Territories, cut_space
 
-#: Number of steps after which ranks exchange the bounds of occupied space; more often in the first steps.
+#: Number of steps between exchanges of the bounds of occupied space; the first exchanges are more frequent.
 EXCHANGE_EVERY = 64
-#: Number of steps after which ranks agree on the elapsed time and on stops.
+#: Number of steps between agreements of the ranks on the elapsed time and on a stop.
 AGREE_EVERY = 8
 #: Greatest number of voxels of the occupancy grid of a finished run.
 VOXELS = 1 << 21
@@ -57,7 +57,7 @@ VOXELS = 1 << 21
 
 @dataclass
 class Town:
-    """A training in territories, as one rank sees it; :func:`build_town` makes it.
+    """The state of a training in territories on one rank; :func:`build_town` makes it.
 
     Attributes:
         config: The settings of a territory.
@@ -67,7 +67,7 @@ class Town:
         territories: All territories.
         owner: The rank of each territory, [T].
         states: The training states of this rank's territories, by number.
-        members: The same territories, for the exchange of rays.
+        members: The territories of this rank by number, for the exchange of rays.
         bounds: [T, 2, 3], a box around the occupied space of each territory.
         stopping: Whether this rank was asked to end the training.
     """
@@ -109,7 +109,7 @@ class Town:
 
 
 def grid_of(state: State) -> OccupancyGrid:
-    """Returns the occupancy grid of a territory; `check_territories` rejects settings without one."""
+    """Returns the occupancy grid of a territory; `check_territories` rejects settings without a grid."""
     assert state.sampler.grid is not None
     return state.sampler.grid
 
@@ -118,16 +118,18 @@ def check_territories(config: TrainConfig, count: int, ranks: int) -> None:
     """Rejects settings that a training in territories does not support."""
     rules: dict[str, tuple[bool, str]] = {
         "out": (config.out is not None, "be given: all ranks write there"),
-        "sampling": (config.sampling == "stratified", "be stratified: no territory sees whole rays"),
+        "sampling": (config.sampling == "stratified", "be stratified: a ray is split between territories"),
         "field": (not config.field_type.cones, "take points: cones cross borders"),
         "contraction": (config.contraction != "ndc", "be none or sphere: parts have no normalised device coordinates"),
         "occupancy": (config.occupancy, "be on"),
         "precision": (config.precision == "fp32", "be fp32"),
-        "sparse_depth": (count == 1 or not config.sparse_depth, "be 0: no territory sees whole rays"),
+        "sparse_depth": (count == 1 or not config.sparse_depth, "be 0: a ray is split between territories"),
     }
-    for name, (fits, rule) in rules.items():
+    for name, (fits, text) in rules.items():
         if not fits:
-            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, in territories, got {getattr(config, name)!r}")
+            (rule, colon, reason), setting = text.partition(":"), getattr(config, name)
+            option = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{option} must {rule} with --territories{colon}{reason}, got {setting!r}")
     if count < ranks:
         raise ConfigError(f"--territories must be at least the {ranks} ranks, got {count}")
 
@@ -215,7 +217,7 @@ def train(
         town: The training from :func:`build_town`.
         callbacks: Called with the state of this rank's first territory.
         checkpoint_every: Seconds of training between checkpoints; another one is written at the end.
-        clock: Returns the time in seconds; the clock of rank 0 is the training's clock.
+        clock: Function that returns the time in seconds; all ranks use the time of rank 0.
 
     Raises:
         TrainingError: Gradients or parameters are no longer finite; the last checkpoint stays.
@@ -252,7 +254,9 @@ def train(
                     state.stop()
                 if state.skipped_in_a_row >= PATIENCE:
                     raise diverged(
-                        town.out, f"gradients of {state.skipped_in_a_row} steps in a row not finite", state.step
+                        town.out,
+                        f"the gradients of {state.skipped_in_a_row} consecutive steps are not finite",
+                        state.step,
                     )
         for callback in callbacks:
             callback.after_step(first)
@@ -270,7 +274,7 @@ def train(
 
 
 def save(town: Town) -> None:
-    """Writes the checkpoints of all territories, then the index that names them; until then the last index is valid."""
+    """Writes the checkpoints of all territories, then the index that names them; the old index is valid until then."""
     group, count, folder = town.group, len(town.owner), checkpoint_path(town.out).parent
     token = f"{town.first.step}-{group.gather(secrets.token_hex(4))[0]}"
     names = [f"networks-{token}-{number}.safetensors" for number in range(count)]
@@ -278,7 +282,7 @@ def save(town: Town) -> None:
     try:
         for number, state in town.states.items():
             if not all_finite(state.optimizer):
-                raise diverged(town.out, "parameters or moments of Adam not finite", state.step)
+                raise diverged(town.out, "parameters or moments of Adam are not finite", state.step)
             save_checkpoint(folder / names[number], snapshot(state))
     except OSError as error:
         failure = error
@@ -302,7 +306,7 @@ def save(town: Town) -> None:
 
 
 def _names(path: Path) -> list[str]:
-    """Returns the names of the files that a checkpoint uses; for an unreadable checkpoint, of all files."""
+    """Returns the names of the files that a checkpoint uses; all names for an unreadable checkpoint."""
     try:
         return list(load_checkpoint(path).values["parts"][0]["networks"])
     except CheckpointError:
@@ -359,7 +363,7 @@ def resume(town: Town) -> None:
                 load(state, parts[number])
             town.bounds = index.tensors["bounds"].clone()
             if errors:
-                town.first.report(f"{errors[0]}; {path.name} takes its place")
+                town.first.report(f"{errors[0]}; using {path.name} instead")
             return
         errors.append(failure or CheckpointError(f"{path}: another rank cannot read it"))
     raise errors[0] if errors else CheckpointError(f"{town.out}: there is no checkpoint")

@@ -13,7 +13,7 @@ namespace {
 
 #if VN_ISA == 2
 
-// Loads the first `count` floats (0 to 16) and fills up with zeros. A negative count is 0.
+// Loads the first `count` floats (0 to 16) and pads with zeros. A negative count counts as 0.
 VN_INLINE F32 load_some(const float* from, int64_t count) {
   const unsigned mask = count >= kLanes ? 0xffffu : count <= 0 ? 0u : (1u << count) - 1u;
   return _mm512_maskz_loadu_ps(static_cast<__mmask16>(mask), from);
@@ -28,15 +28,15 @@ VN_INLINE F32 interleave(F32 even, F32 odd) {
   return (F32)_mm512_maskz_permutexvar_epi16(0xffffffffu, order, (__m512i)joined(even, odd));
 }
 
-// Returns one half of the joined values as floats: the first (0) or the second (1) vector.
+// Returns one of two joined vectors as floats: the first (half 0) or the second (half 1).
 VN_INLINE F32 widened(F32 pairs, int half) {
   const __m256i values =
       half == 0 ? _mm512_castsi512_si256((__m512i)pairs) : _mm512_maskz_extracti64x4_epi64(0xf, (__m512i)pairs, 1);
   return (F32)_mm512_maskz_slli_epi32(0xffff, _mm512_maskz_cvtepu16_epi32(0xffff, values), 16);
 }
 
-// Zips the values of two joined vectors to pairs: `low` has the pairs of their first halves, `high` of their second
-// halves.
+// Zips the values of two joined vectors to pairs: `low` gets the pairs of the first halves, `high` the pairs of the
+// second halves.
 VN_INLINE void zip_halves(F32 even, F32 odd, F32& low, F32& high) {
   const __m512i first = _mm512_set_epi16(47, 15, 46, 14, 45, 13, 44, 12, 43, 11, 42, 10, 41, 9, 40, 8, 39, 7, 38, 6, 37,
                                          5, 36, 4, 35, 3, 34, 2, 33, 1, 32, 0);

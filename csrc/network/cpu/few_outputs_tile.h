@@ -1,6 +1,6 @@
 // Layers of up to four outputs, such as heads. The product of gemm_tile.h would leave most lanes of an output vector
-// empty. Here vectors run along the inputs, and each output of a row is a dot product. A block has one dot product per
-// lane, [rows][1] or [rows][4], and adds up the lanes of all of them at the end.
+// empty. Here vectors run along the inputs, and each output of a row is a dot product. A block has as many dot products
+// as a vector has lanes, [rows][1] or [rows][4], and adds up the lanes of each at the end.
 #pragma once
 
 #include "network/cpu/gemm_tile.h"
@@ -10,9 +10,9 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// Sources have whole vectors of k, weights are [O][all k], and C is [rows][kGranule], padded with 0. All sums use the
-// same order, so a row's result does not depend on its position. If `rows` is not a multiple of a block's rows, the
-// last row is computed repeatedly.
+// The depth of each source is a multiple of kLanes, weights are [O][all k], and C is [rows][kGranule], padded with 0.
+// All sums use the same order, so a row's result does not depend on its position. If `rows` is not a multiple of a
+// block's rows, the last row is computed repeatedly.
 template <int O>
 void few_outputs(const Source* sources, int64_t count, const float* weights, int64_t depth, const float* bias,
                  bool relu, int64_t rows, float* c) {

@@ -1,4 +1,4 @@
-// The vector functions of which network/functions.h builds the functions of programs.
+// The vector functions from which network/functions.h builds the functions of programs.
 #pragma once
 
 #include "common/elementwise_math.h"

@@ -7,14 +7,14 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// Returns the rows of a block that fill the registers.
+// Returns the number of rows with which a block fills the registers.
 template <int V>
 constexpr int block_rows() {
   return kLanes < 16 ? 6 : V == 4 ? 6 : V == 3 ? 8 : 12;
 }
 
-// Computes a block of R rows by V vectors. It is not inlined, or its pointers would be spilled to the stack and
-// reloaded in the inner loop.
+// Computes a block of R rows by V vectors. It is not inlined, since inlining would spill its pointers to the stack and
+// reload them in the inner loop.
 template <int R, int V, bool Transposed>
 __attribute__((noinline)) void block(const Product& p, int64_t row, int64_t column) {
   F32 sum[R][V];
@@ -56,9 +56,9 @@ __attribute__((noinline)) void block(const Product& p, int64_t row, int64_t colu
       } while (--depth > 0);
     }
   } while (++source != end);
-  // Each finish has its own stores: shared stores would spill the sums to the stack. The order of the operands of max
-  // lets NaN pass, as in torch. A slope selects instead of multiplying, since 0 times an infinite gradient would be
-  // NaN.
+  // Each kind of `finish` has its own stores: shared stores would spill the sums to the stack. The order of the
+  // operands of max lets NaN pass, as in torch. A slope selects instead of multiplying, since 0 times an infinite
+  // gradient would be NaN.
   const F32 zero = splat(0.0f);
   const int64_t c_stride = p.c_stride;
   float* const c = p.c == nullptr ? nullptr : p.c + row * c_stride + column;

@@ -10,9 +10,9 @@
 //   input gradient   rows are samples, k the outputs, A = gradients [rows][k],    B = weights [k][inputs]
 //   weight gradient  rows are inputs,  k the samples, A = activations [k][rows],  B = gradients [k][outputs]
 //
-// A concatenated A is a list of sources, which are added to the same accumulators one after the other. The remaining
-// rows run in a block of exactly their number: nothing outside `rows` is read or written. Columns are a multiple of 16,
-// to which B, C and `start` must be padded.
+// A concatenated A is a list of sources, which are added to the same accumulators one after the other. The last rows
+// run in a block with exactly as many rows, so nothing outside `rows` is read or written. The number of columns is a
+// multiple of 16, and B, C and `start` must be padded to this number.
 #pragma once
 
 #include "common/memory_tile.h"
@@ -31,8 +31,8 @@ inline namespace pairs {
 inline namespace tiles_of_pairs {
 #endif
 
-// Columns of a packed panel of B, which blocks read contiguously. If they read 16 of 64 columns, B would use a quarter
-// of the sets of the first-level cache, shared with the columns of C.
+// The columns of a packed panel of B. Blocks read whole panels: if they read 16 of 64 columns, B would use only a
+// quarter of the sets of the first-level cache, the same sets as the columns of C.
 constexpr int64_t kPanel = VN_ISA == 2 || VN_HALF == 2 ? 64 : 16;
 
 // One source of a concatenated A, with `depth` values of k in rows of `stride` floats.
@@ -55,8 +55,8 @@ struct Product {
   int64_t c_stride;
   Finish finish;
   const float* slope;  // relu_slope: C is 0 where slope <= 0, [rows][c_stride]
-  // With bfloat16 operands: C as pairs too, [rows][pairs_stride], and c may be null. Without tile registers the columns
-  // must then be a multiple of 32, and there must be no slope.
+  // With bfloat16 operands, C is also stored as pairs, [rows][pairs_stride], and `c` may be null. Without tile
+  // registers the columns must then be a multiple of 32, and `slope` must be null.
   float* pairs;
   int64_t pairs_stride;
   bool slope_in_pairs;  // in tile registers: slope is [rows][pairs_stride]

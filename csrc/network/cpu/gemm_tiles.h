@@ -1,10 +1,10 @@
 // The products of gemm_tile.h in tile registers (tile_registers.h), 16 rows by 16 columns by 16 pairs at a time. All
 // operands are pairs, and depths are padded with 0 to a multiple of 16 pairs.
 //
-// A block of 32 rows by 32 columns has four registers of sums, two of A and two of B: as many loads as products, and a
-// product takes twice as long as a load. The sums of a block are stored to memory in the first-level cache and finished
-// (ReLU, rounding) while the products of the next block run. Otherwise instructions that wait for the sums would fill
-// the processor's queue, and the next products could not enter it.
+// A block of 32 rows by 32 columns has four registers of sums, two of A and two of B. It needs as many loads as
+// products, and a product takes twice as long as a load. The sums of a block are stored to memory in the first-level
+// cache and finished (ReLU, rounding) while the products of the next block run. Otherwise instructions that wait for
+// the sums would fill the processor's queue, and the next products could not enter it.
 #pragma once
 
 #include "network/cpu/gemm_tile.h"
@@ -51,8 +51,8 @@ VN_INLINE F32 by_slope(F32 slope, F32 sum) { return slope <= splat(0.0f) ? splat
 
 VN_INLINE F32 joined_by_slope(F32 slopes, F32 low, F32 high) {
 #if VN_ISA == 2
-  // As signed integers, the bits of slopes above 0 are above 0. As unsigned integers, the bits of negative NaN are the
-  // largest.
+  // As signed integers, the bits of a slope above 0 are above 0. As unsigned integers, the bits of negative NaN are
+  // larger than the bits of any other number.
   const __m512i slope = (__m512i)slopes;
   const __mmask32 above = _mm512_cmpgt_epi16_mask(slope, _mm512_setzero_si512());
   const __mmask32 none = _mm512_cmpgt_epu16_mask(slope, _mm512_set1_epi16(static_cast<int16_t>(0xff80)));
@@ -113,9 +113,9 @@ VN_INLINE void finish(const Product& p, const Block& block, int64_t begin, int64
   }
 }
 
-// Computes blocks of R by C registers. The sums of the previous block are stored while the products of a block's first
-// step run: to C if there is nothing to finish, else to a buffer, which is finished while the products of the last step
-// run.
+// Computes blocks of R by C registers. While the products of a block's first step run, the sums of the previous block
+// are stored: to C if there is nothing to finish, else to a buffer, which is finished during the products of the last
+// step.
 template <int R, int C, Slope S, bool kFloats, Pairs P>
 __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& blocks) {
   constexpr bool kFinish = S != Slope::none || P != Pairs::none;

@@ -34,8 +34,8 @@ bool in_tiles(const ProgramTable& table) {
   return table.layout == ProgramLayout::tiles || table.layout == ProgramLayout::parts;
 }
 
-// Returns whether a value is outside [0, end): then the value or its distance to end - 1 is negative. The loop collects
-// sign bits, which compilers vectorise on any processor, unlike unsigned comparisons.
+// Returns whether a value is outside [0, end): for such a value, the value itself or end - 1 minus the value is
+// negative. The loop collects sign bits, which compilers vectorise on any processor, unlike unsigned comparisons.
 bool out_of_range(const int32_t* values, int64_t n, int64_t end) {
   const auto last = static_cast<uint32_t>(end - 1);
   uint32_t signs = 0;
@@ -118,7 +118,7 @@ void clear_strays(const ProgramInputs& in, const ProgramResults& results, const 
   }
 }
 
-// Sets the entries of kept look-ups to 0 that no look-up writes: rows in no cell, and columns after the features.
+// Zeros the entries of kept look-ups that no look-up writes: rows in no cell, and columns after the features.
 void clear_kept(const ProgramInputs& in, int64_t features, int64_t stride, float* kept, int threads) {
   std::fill(kept, kept + in.offsets[0] * stride, 0.0f);
   std::fill(kept + in.offsets[in.k] * stride, kept + in.n * stride, 0.0f);
@@ -331,7 +331,7 @@ void ProgramRows::reduce(const ProgramCall& call, int64_t cell, float* partials,
 }
 
 void ProgramRows::forward(const ProgramInputs& in, const ProgramResults& results, Own& own) const {
-  constexpr size_t kFew = 16;  // inputs, or memories, of a network; more would need an allocation per call
+  constexpr size_t kFew = 16;  // limit for inputs and for memories; more would need an allocation per call
   VN_CHECK(table_.inputs.size() <= kFew && table_.memories.size() <= kFew, "a program of rows has at most 16 inputs");
   bool in_place[kFew];
   float* memories[kFew] = {};
@@ -456,7 +456,7 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& original, 
     return grid;
   };
 
-  // Look-ups in a table that all cells share, level by level, so that the entries of a level stay in cache.
+  // Look up points in tables that all cells share, level by level, so that the entries of a level stay in cache.
   for (const ProgramLookup& lookup : table.lookups) {
     const auto m = static_cast<size_t>(lookup.memory);
     if (in.ready || memories[m] == nullptr || !filled[m]) continue;
@@ -488,7 +488,8 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& original, 
     });
   }
 
-  // The gradients of tables, one item per table and level. Each adds the rows in order, for any number of threads.
+  // The gradients of tables, one item per table and level. Each item adds the rows in order, whatever the number of
+  // threads.
   for (const ProgramScatter& scatter : table.scatters) {
     const auto m = static_cast<size_t>(scatter.memory);
     const HashEncoding grid = grid_of(scatter.grid, scatter.parameter, scatter.input);

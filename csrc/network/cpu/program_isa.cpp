@@ -1,7 +1,7 @@
 // The CPU kernels of programs, compiled once per instruction set.
 //
 // A tile of rows runs through all steps while its values stay in the first two cache levels, so no [n, layer width]
-// tensor is written. Each thread packs the parameters of its cells once, matrices in the layout of the products
+// tensor is written. Each thread packs the parameters of its cells once, with matrices in the layout of the products
 // (gemm_tile.h). All tiles of a task add to the same partial sums, which stay in cache too.
 #define VN_HALF 0
 #include "network/cpu/program_tile.h"

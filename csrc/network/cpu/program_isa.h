@@ -31,7 +31,8 @@ struct ProgramCall {
   bool parts;    // in tile registers: rounding remainders follow the pairs of a value
 };
 
-// Packs a cell's parameters. `first`: it is the thread's first cell. `free`: the thread's slots, as scratch memory.
+// Packs a cell's parameters. `first`: the cell is the thread's first one. `free`: the thread's slots, as scratch
+// memory.
 VN_DECLARE_FOR_ISA(void program_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free))
 
 // Runs rows [begin, end) of the packed cell. `tiles` holds the slots, and the sums of the rows are written to

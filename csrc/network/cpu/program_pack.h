@@ -45,7 +45,7 @@ VN_INLINE int64_t padded(int64_t width) { return (width + kGranule - 1) / kGranu
 // registers.
 VN_INLINE int64_t steps_of(int64_t depth) { return VN_HALF == 2 ? pairs_of(depth) : VN_HALF ? (depth + 1) / 2 : depth; }
 
-// A matrix in memory. The outputs of the product are contiguous if `turned`, else its depth is.
+// A matrix in memory. With `turned`, the outputs of the product are contiguous, otherwise the depth is contiguous.
 struct Matrix {
   const float* from;
   int64_t stride;  // from one row in memory to the next

@@ -1,5 +1,5 @@
-// A program for calls with few rows each, on the caller's threads. Data that depends only on the program and its
-// parameters is prepared once.
+// A program for calls that have few rows each and run on the caller's threads. Data that depends only on the program
+// and its parameters is prepared once.
 #pragma once
 
 #include <memory>
@@ -18,7 +18,7 @@ class ProgramRows {
     int64_t packed = -1;  // the cell whose parameters are packed; -1: none
   };
 
-  // Reads from `in` only which inputs are turned.
+  // Reads only the member `turned` of `in`.
   ProgramRows(const Program& program, const ProgramInputs& in, Isa isa);
 
   int64_t workspace() const;  // floats per thread, a multiple of 16

@@ -89,7 +89,7 @@ VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to
   }
 }
 
-// Joins neighbouring rows to pairs [(rows + 1) / 2][columns], with a last odd row padded with 0. `columns` must be a
+// Joins neighbouring rows to pairs [(rows + 1) / 2][columns]. An odd last row is paired with zeros. `columns` must be a
 // multiple of 16.
 VN_INLINE void interleave_columns(const Rows& x, int64_t columns, int64_t rows, float* to) {
   for (int64_t row = 0; row < rows; row += 2, to += columns) {

@@ -98,7 +98,7 @@ struct ProgramTile {
     }
   }
 
-  // Returns the result of a step, or its input if it is read in place.
+  // Returns the result of a step, or the step's input if the input is read in place.
   Rows result_of(const ProgramStep& step, const float* to) const {
     if (step.op != ProgramOp::input || !step.in_place || !call.in_place[step.number]) return {to, step.stride, false};
     return {static_cast<const float*>(call.inputs[step.number]) + begin * step.width, step.width, false};

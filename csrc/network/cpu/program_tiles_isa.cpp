@@ -1,6 +1,6 @@
 // The kernels of programs with bfloat16 products in tile registers, by AMX or, for tests, by its emulation on the
-// portable path. Values, slopes, sums and gradients are float32 in the tile, except the ones that only products read.
-// Operands of products are rounded to bfloat16.
+// portable path. Values, slopes, sums and gradients are float32 in the tile, except values that only products read:
+// operands of products are rounded to bfloat16.
 #include "network/cpu/program_isa.h"
 
 #if VN_ISA == 0 || (VN_ISA == 2 && VN_HAS_TILES)

@@ -46,8 +46,8 @@ void check_offsets(const std::string& op, const int32_t* offsets, int64_t k, int
   int64_t previous = 0;
   for (int64_t c = 0; c <= k; ++c) {
     if (offsets[c] < previous || offsets[c] > n) {
-      throw std::invalid_argument(op + ": offsets must rise from 0 or more to at most the number of rows, " +
-                                  std::to_string(n) + ", got " + std::to_string(offsets[c]) + " for cell " +
+      throw std::invalid_argument(op + ": offsets must ascend within 0 to " + std::to_string(n) +
+                                  " (the number of rows), got " + std::to_string(offsets[c]) + " for cell " +
                                   std::to_string(c));
     }
     previous = offsets[c];

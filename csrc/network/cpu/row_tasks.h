@@ -33,19 +33,19 @@ struct RowLimits {
 // The most floats of partial weight gradients in a call: wide networks get longer tasks instead of more memory.
 constexpr int64_t kPartialFloats = int64_t{1} << 24;
 
-// Throws std::invalid_argument unless offsets [k+1] rise from 0 or more to at most n.
+// Throws std::invalid_argument unless offsets [k+1] never decrease and lie in 0..n.
 void check_offsets(const std::string& op, const int32_t* offsets, int64_t k, int64_t n);
 
 // Splits n rows into tasks. If a cell has several tasks, their sizes are multiples of `unit`, except the last.
 // `partial`, the floats of one partial (0: none), limits the number of tasks.
 RowTasks split_rows(const int32_t* offsets, int64_t k, int64_t n, RowLimits limits, int64_t unit, int64_t partial);
 
-// Returns the rows of a tile, a multiple of all blocks of rows (6, 8, 12). Of 48, 96, 144 and 192 rows, 96 is the
-// fastest on AMD's Zen 4 and 5, where 48 takes 1.015 times as long. Elsewhere the choice follows from cache sizes, not
+// Returns the rows of a tile, a multiple of all blocks of rows (6, 8, 12). On AMD's Zen 4 and 5, 96 rows are the
+// fastest of 48, 96, 144 and 192; 48 rows take 1.015 times as long. Elsewhere the choice follows from cache sizes, not
 // measurements. On Intel, a layer of width 64 reads and writes 40 KiB with 48 rows, which fits the first-level cache of
 // 48 KiB. With 96 rows every line of C is stored to the second level, and a load 4 KiB apart waits for the store. On
-// AMD without AVX-512 that cache has 32 KiB: 96 rows of the two operands of a weight gradient have 12 lines in each of
-// 16 sets, which hold 8, and miss 3.1 times as often as 48 rows.
+// AMD without AVX-512 the first-level cache has 32 KiB. With 96 rows, the two operands of a weight gradient have 12
+// lines in each of 16 sets of 8 lines, and miss 3.1 times as often as with 48 rows.
 int64_t tile_rows();
 
 // The memory of one call, aligned to a cache line. The calling thread keeps it for later calls until it ends, since the
@@ -60,8 +60,8 @@ class Workspace {
   float* data() const;
 };
 
-// Runs all tasks on the threads. For each task a thread calls pack(cell, own, first) if the cell is not the cell of its
-// previous task (first: it had none), ahead(cell) for its most likely next cell, and run(task, own). `own` is the
+// Runs all tasks on the threads. For each task a thread calls pack(cell, own, first) if its previous task had another
+// cell (first: there was no previous task), ahead(cell) for its most likely next cell, and run(task, own). `own` is the
 // thread's part of `memory`, `stride` floats.
 template <typename Pack, typename Ahead, typename Run>
 void for_each_task(const RowTasks& tasks, float* memory, int64_t stride, int threads, const Pack& pack,

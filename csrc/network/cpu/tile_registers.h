@@ -1,7 +1,7 @@
 // The AMX instructions for bfloat16 products, on eight registers of up to 16 rows of 64 bytes. The portable path
 // emulates them, so that every machine can test the kernels that use them.
 //
-//   shape_tiles    sets the rows, and the bytes per row, of each register, and all registers to 0
+//   shape_tiles    sets each register's number of rows and bytes per row, and zeros all registers
 //   tile_load      loads rows `stride` bytes apart
 //   tile_store     stores rows `stride` bytes apart
 //   tile_zero      sets a register to 0

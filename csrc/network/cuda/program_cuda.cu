@@ -161,7 +161,7 @@ __device__ __noinline__ void keep(Tile tile, const ProgramStep& step) {
 
 // Kernels --------------------------------------------------------------------------------------------------------
 
-// Returns the cell of a task, the last cell whose first task is not above it. All lanes of a warp search together.
+// Returns the cell of a task: the last cell whose first task is at most `task`. All lanes of a warp search together.
 __device__ __forceinline__ int cell_of_task(const CudaRows& rows, int task) {
   const int lane = static_cast<int>(threadIdx.x % 32);
   MapSpan cells{0, rows.k};
@@ -173,7 +173,8 @@ __device__ __forceinline__ int cell_of_task(const CudaRows& rows, int task) {
   return static_cast<int>(cells.first);
 }
 
-// Runs the steps from `i` on that a team computes independently. Returns the index of the next sum over rows.
+// Runs the steps from `i` up to the next sum over rows; a team computes these steps independently. Returns the index of
+// the sum.
 template <typename Steps, typename Tile>
 __device__ __forceinline__ int own_steps(const CudaProgram& call, const Tile& tile, int i) {
   for (; i < call.code.step_count; ++i) {
@@ -454,7 +455,7 @@ const Device& current_device() {
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&properties.shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
   properties.multiprocessor_bytes = properties.shared_bytes + kReservedBytes;
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&properties.multiprocessors, cudaDevAttrMultiProcessorCount, device));
-  // Code compiled for a lower architecture than the device's uses only the instructions of that architecture.
+  // Code compiled for a lower architecture than the device's uses only the instructions of the lower architecture.
   cudaFuncAttributes compiled{};
   VN_CUDA_CHECK(cudaFuncGetAttributes(&compiled, program_prepare_kernel));
   properties.capability = std::min(10 * major + minor, compiled.ptxVersion);
@@ -577,8 +578,8 @@ CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, cons
   return result;
 }
 
-// Merges a sum over the columns of a gradient into a neighbouring outer product, if its right operand is the same
-// words.
+// Merges the column sums of a gradient into a neighbouring outer product whose right operand is the same gradient, read
+// from the same words.
 void join_columns(std::vector<CudaStep>& steps) {
   for (size_t i = 0; i < steps.size(); ++i) {
     CudaStep& sum = steps[i];
@@ -621,13 +622,15 @@ LaunchPlan plan_launch(const Program& program, int64_t n, int64_t k) {
   }
   LaunchPlan result{};
   const int64_t columns = std::max(1, Slots(table).columns());  // a program whose sums stay 0 has no columns
-  // Returns the teams of `rows` rows that fit into a multiprocessor, besides the fixed memory of its resident blocks.
+  // Returns how many teams of `rows` rows fit into a multiprocessor, in addition to the fixed memory of its resident
+  // blocks.
   const auto fitting = [&](int rows) {
     return (device.multiprocessor_bytes - program_blocks(rows) * (kReservedBytes + kProgramStates)) /
            (4 * rows * columns);
   };
-  // A warp with 32 rows reads each weight once for all of them. This is used if cells have enough rows and the values
-  // of all resident warps fit. Else a warp has 16 rows, if the values of half the resident warps fit.
+  // Warps have 32 rows, and read each weight once for all of them, if cells have enough rows and the values of all
+  // resident warps fit. Otherwise warps have 16 rows, which the warps of a team share unless the values of half the
+  // resident warps fit.
   const int64_t resident_tall = program_blocks(32) * program_warps(32);
   const bool tall = table.layout == ProgramLayout::tiles && fitting(32) >= resident_tall && n >= 32 * k;
   result.own_rows = tall ? 32 : 16;
@@ -647,7 +650,8 @@ LaunchPlan plan_launch(const Program& program, int64_t n, int64_t k) {
   // A task has several tiles if each multiprocessor has many tiles.
   result.task_rows = height * std::clamp<int64_t>(n / (32 * height * device.multiprocessors), 1, 8);
   if (table.partial > 0) {
-    // One task per resident block, counting a smaller last task of each cell, and partials of at most kPartialBytes.
+    // At most one task per resident block, counting a smaller last task of each cell, and at most kPartialBytes of
+    // partials.
     const int64_t most_blocks = resident * program_warps(result.own_rows) / result.warps;
     const int64_t blocks = device.multiprocessor_bytes / (result.shared + kReservedBytes);
     const int64_t wave = std::clamp<int64_t>(blocks, 1, most_blocks) * device.multiprocessors;

@@ -27,7 +27,7 @@ struct PackedMatrix {
   }
 };
 
-// Returns word `word` of the fragments: lane 4 g + m of a tile has the depth indices of member m, of column g.
+// Returns word `word` of the fragments: lane 4 g + m of a tile has the depth indices of member m in column g.
 template <typename Numbers>
 __device__ __forceinline__ uint32_t packed_word(const PackedMatrix& matrix, int word) {
   const int tiles = padded(matrix.outputs, kProgramOutputs) / 8;
@@ -110,7 +110,7 @@ struct HalfNumbers {
   }
 
   // Loads a transposed left operand for sums over rows: columns from i on become its rows, and the 16 rows from `row`
-  // on its depth. kWhole: the value is in words.
+  // on become its depth. kWhole: the value is in words.
   static constexpr int kRows = 16;
   template <bool kShared, bool kWhole>
   static __device__ __forceinline__ void turned_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
@@ -267,8 +267,8 @@ struct TensorSteps {
     }
   }
 
-  // Runs a step of a chain of layers, from words to words. Each way to read the operand has separate code: where the
-  // ways shared code, the compiler would move sums between registers.
+  // Runs a step of a chain of layers, from words to words. The code is separate for each way to read the operand, since
+  // in shared code the compiler would move sums between registers.
   static __device__ __forceinline__ void chained(const Tile& tile, const CudaStep& step, Held& held) {
     if constexpr (Numbers::kHalves) {
       const int width = step.width, half = kProgramWide / 2;
@@ -356,7 +356,7 @@ struct TensorSteps {
     }
   }
 
-  // Computes partial[j] += sum over rows of b[row][j]; for words by a product with ones.
+  // Computes partial[j] += sum over rows of b[row][j]; for words, by a product with ones.
   static __device__ __forceinline__ void columns(const Tile& tile, const CudaStep& step) {
     if constexpr (Numbers::kHalves) {
       if (step.x_words) return sum_words(tile, step);
@@ -413,7 +413,8 @@ struct TensorSteps {
       store<kTiles, false>(sums, tile, step, first);
     }
     // Words are made even if no step reads them: otherwise the previously held value would occupy registers besides the
-    // sums. Overwriting it is safe, since a value in registers has at most 64 columns, so no other part needs it.
+    // sums. Overwriting it is safe, since a value in registers has at most 64 columns, so no other part needs the
+    // previous value.
     if constexpr (kTiles > 1 && Numbers::kHalves) put_words<kTiles>(held, sums, tile, step, first);
   }
 
@@ -564,7 +565,7 @@ struct TensorSteps {
       add_columns(sums, tile.partial() + step.number, j0, step.width, fill, lane);
     }
   }
-  // Adds a sum over rows of columns by a product with ones.
+  // Adds sums of columns over the rows, by a product with ones.
   static __device__ __forceinline__ void add_ones(float (&sums)[4], const uint32_t (&right)[2]) {
     const uint32_t one = Numbers::pair(1.0f, 1.0f), ones[4] = {one, one, one, one};
     Numbers::multiply_turned(sums, ones, right);

@@ -98,7 +98,7 @@ __device__ __forceinline__ int64_t source_row(const CudaRows& rows, int64_t row)
   return rows.order == nullptr ? row : index_within(rows.order[row], rows.n);
 }
 
-// cell_begin returns the first row of a cell, cell_rows the number of its rows.
+// `cell_begin` returns the first row of a cell, `cell_rows` the number of its rows.
 __device__ __forceinline__ int64_t cell_begin(const CudaRows& rows, int64_t cell) {
   const int64_t first = rows.offsets[cell];
   return first < 0 ? 0 : first > rows.n ? rows.n : first;
@@ -198,7 +198,7 @@ struct TileState {
 };
 constexpr int kProgramStates = 512;  // bytes of all states, before the slots
 
-// Each team has a value as [kRows][stride] at its slot. Rows without a sample are undefined as floats, and 0 as 16-bit
+// A value of a team is [kRows][stride] at its slot. Rows without a sample are undefined as floats, and 0 as 16-bit
 // numbers. kShared: the slots are in the block's shared memory.
 template <int kOwnRows, int kWarps, bool kShared, ProgramNumbers kNumbers>
 struct ProgramTile {
@@ -220,7 +220,7 @@ struct ProgramTile {
   // Returns the floats from the slots of a team to the slots of the next team.
   __device__ __forceinline__ int pitch() const { return call.code.columns * kRows; }
 
-  // worker returns the index of a thread in its team, warp the index of a warp.
+  // `worker` returns the index of a thread in its team, `warp` the index of its warp.
   static __device__ __forceinline__ int worker() { return static_cast<int>(thread_again() % kWorkers); }
   static __device__ __forceinline__ int warp() { return worker() / 32; }
   // Makes the writes of a team visible to all its threads.
@@ -232,7 +232,7 @@ struct ProgramTile {
     }
   }
 
-  // slot returns a slot of the thread's team, first_slot of the block's first team.
+  // `slot` returns a slot of the thread's team, `first_slot` a slot of the block's first team.
   __device__ __forceinline__ float* slot(int32_t columns) const {
     return first_slot(columns) + static_cast<int>(thread_again() / kWorkers) * pitch();
   }

@@ -1,5 +1,5 @@
-// The scalar functions of which network/functions.h builds the functions of programs, and encoding/encodings.h the
-// formulas of encodings. F32 is one float per thread.
+// Scalar functions, from which network/functions.h builds the functions of programs, and encoding/encodings.h builds
+// the formulas of encodings. F32 is one float per thread.
 #pragma once
 
 #include <cmath>

@@ -310,7 +310,7 @@ def test_arguments_that_a_terminal_would_obey(fails):
 
 def test_a_failed_run_leaves_its_folder_usable(tmp_path, fails):
     train = "train --data builtin --out", tmp_path
-    fails("more cells than samples", *train, TINY.replace("--cells 3", "--cells 10000"))
+    fails("10000 cells need at least 10000 samples", *train, TINY.replace("--cells 3", "--cells 10000"))
     assert not list(tmp_path.rglob("*.safetensors"))
     succeeds(*train, TINY)
     assert (tmp_path / "metrics.jsonl").read_text().count("\n") == 2

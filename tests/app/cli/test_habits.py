@@ -70,7 +70,7 @@ def test_a_joined_run_shows_what_is_known(tmp_path, capsys):
     count = json.loads((one / "summary.json").read_text())["parameters"]
     assert figures["cells"] == ["3", "6"] and figures["parameters"] == [f"{count:,}"] * 2  # one network, placed twice
     assert figures["PSNR [dB]"][1] == figures["scores of"][1] == figures["training [s]"][1] == "-"
-    assert f"{joined} has no scores: voronerf eval '{joined}' makes them" in shown and f"{one} has" not in shown
+    assert f"{joined} has no scores: voronerf eval '{joined}' computes them" in shown and f"{one} has" not in shown
     assert main(words("eval --views 3 --panels 0", joined)) == 0
     psnr = json.loads((joined / "eval.json").read_text())["psnr"]
     capsys.readouterr()

@@ -121,7 +121,7 @@ def test_where_weights_are_looked_for(tmp_path, weights, monkeypatch):
     monkeypatch.setenv("VORONERF_LPIPS", "off")
     assert find_lpips(None, str(scenes / "lego"))[0] is None
     monkeypatch.setenv("VORONERF_LPIPS", str(tmp_path / "gone"))
-    absent = "there is no such file or folder, asked for by"
+    absent = "there is no such file or folder, as set by"
     refuses(f"gone: {absent} VORONERF_LPIPS", find_lpips, None, error=LpipsError)
     refuses(f"away: {absent} --lpips", find_lpips, tmp_path / "away", error=LpipsError)
     file = scenes / "lpips" / "lpips_alex.safetensors"
@@ -183,7 +183,7 @@ def test_bad_files(tmp_path, weights):
     assert "not a readable file of weights" in error("tensor.pth")
     partial = {name: tensor for name, tensor in weights.items() if name != "features.6.bias"}
     save_file(partial, tmp_path / "partial.safetensors")
-    assert error("partial.safetensors").endswith("without features.6.bias")
+    assert error("partial.safetensors").endswith("AlexNet: features.6.bias missing")
     save_file({"other": torch.zeros(1)}, tmp_path / "other.safetensors")
     assert error("other.safetensors").endswith("features.0.weight, features.3.weight, features.6.weight and 12 more")
     save_file({**weights, "lin2.model.1.weight": torch.zeros(1, 3, 1, 1)}, tmp_path / "shape.safetensors")

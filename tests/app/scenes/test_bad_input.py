@@ -159,7 +159,7 @@ def test_images(tmp_path):
         (tmp_path / f"{index}.png").unlink()
     fails(tmp_path, "transforms.json: none of its 3 images exists, the first is", "0.png")
     write_noise(tmp_path, count=1)
-    fails(tmp_path, "one image is too few")
+    fails(tmp_path, "needs at least two images")
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_images(tmp_path):
         ({"ftheta_p0": 0.0, "ftheta_p1": 0.1}, "ftheta_p1 is not supported, only lenses that are PINHOLE"),
         ({"camera_model": "ORTHOPHOTO"}, "camera model ORTHOPHOTO is not supported, only PINHOLE"),
         ({"fisheye_crop_radius": "9"}, "fisheye_crop_radius must be a finite number up to 1e+09, got '9'"),
-        ({"fisheye_crop_radius": 0.2}, "png: its mask and its lens must leave a pixel"),
+        ({"fisheye_crop_radius": 0.2}, "png: its mask and its lens exclude all pixels"),
         ({"applied_scale": 0}, "applied_scale must be positive, got 0"),
         ({"applied_scale": [1, 1, 1]}, "applied_scale must be a finite number up to 1e+09, got [1, 1, 1]"),
         ({"k1": math.inf}, "k1 must be a finite number up to 1e+09, got inf"),
@@ -203,7 +203,7 @@ def test_images(tmp_path):
         ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, "lens distortion k4 is not supported"),
         ({"distortion_params": ["0"] * 6}, "k4 must be a finite number up to 1e+09, got '0'"),
         ({"test_filenames": "0.png"}, "test_filenames must be a list of file names, got '0.png'"),
-        ({"test_filenames": ["9.png"]}, "test_filenames has 9.png, which is no file_path of a frame"),
+        ({"test_filenames": ["9.png"]}, "test_filenames lists 9.png, but no frame has this file_path"),
         ({"train_filenames": ["0.png"], "test_filenames": ["./0.png"]}, "must differ, both have 0.png"),
         ({"train_filenames": ["0.png", "1.png", "2.png"]}, "leave no image for testing"),
         ({"test_filenames": ["0.png", "1.png", "2.png"]}, "leave no image for training"),

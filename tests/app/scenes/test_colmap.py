@@ -110,7 +110,7 @@ def test_images_are_found_by_their_names_or_else_by_their_order(tmp_path, name, 
     write_named(tmp_path, name.format, file.format)
     (tmp_path / "images/._0.png").write_bytes(b"of macOS")
     scene = load_scene(tmp_path, normalise=False)
-    line = "the names in images are not those of the model: its images are taken in their order"
+    line = "no file in images has a name of the model: files are matched by order"
     assert (line in scene.notes) == order
     for split in (scene.train, scene.test):
         for image, pose in zip(split.images, split.cameras.poses):
@@ -227,7 +227,7 @@ def test_an_image_that_is_listed_twice_is_not_also_held_out(tmp_path, again):
     write_named(tmp_path, lambda index: again if index == 8 else f"{index:02d}.jpg", "{:02d}.jpg".format)
     (tmp_path / "images/link.jpg").symlink_to(tmp_path / "images/03.jpg")
     scene = load_scene(tmp_path)
-    assert f"of images that are listed twice the first counts: {again.rpartition('/')[2]}" in scene.notes
+    assert f"images are listed twice; only the first entry counts: {again.rpartition('/')[2]}" in scene.notes
     assert sorted((*scene.train.names, *scene.test.names)) == [f"{index:02d}" for index in range(8)]
 
 
@@ -308,7 +308,7 @@ def test_masks_of_reduced_images(tmp_path):
         ),
         (lambda model: broken(model / "cameras.bin", 32, "<d", -1.0), "camera 1 must have a size, finite parameters"),
         (lambda model: broken(model / "images.bin", 44, "<d", 1e300), "its pose must be a unit quaternion and a"),
-        (lambda model: broken(model / "images.bin", 8 + 60, "<I", 99), "has camera 99, which cameras.bin has not"),
+        (lambda model: broken(model / "images.bin", 8 + 60, "<I", 99), "camera 99, which is missing in cameras.bin"),
         (lambda model: broken(model / "images.bin", 8 + 64, "<6s", b"../../"), "must lie in the folder"),
         (lambda model: (model / "images.bin").write_bytes((model / "images.bin").read_bytes()[:90]), "is cut short"),
         (lambda model: (model / "images.bin").write_bytes(bytes(8)), "images.bin: has no images"),
@@ -347,11 +347,11 @@ def test_numbers_of_points_that_are_none_are_passed_over(tmp_path):
 @pytest.mark.parametrize(
     ("file", "text", "reason"),
     [
-        ("cameras", "1 PINHOLE 12 ten 20 20 6 5", "cameras.txt: line 1 is not that of a camera"),
+        ("cameras", "1 PINHOLE 12 ten 20 20 6 5", "cameras.txt: line 1 does not describe a camera"),
         ("cameras", f"1 PINHOLE {10**400} 10 20 20 6 5", "camera 1 must have a size, finite parameters"),
         ("cameras", "1 PINHOLE 12 10 20 20 6", "camera 1: PINHOLE must have 4 parameters, got 3"),
-        ("images", "1 1 0 0 0 0 0", "images.txt: line 1 is not that of an image"),
-        ("points3D", "7 one 2 3", "points3D.txt: line 1 is not that of a point"),
+        ("images", "1 1 0 0 0 0 0", "images.txt: line 1 does not describe an image"),
+        ("points3D", "7 one 2 3", "points3D.txt: line 1 does not describe a point"),
     ],
 )
 def test_broken_text_is_one_line(tmp_path, file, text, reason):

@@ -54,7 +54,7 @@ def test_a_scale_that_was_applied():
 def test_the_default_export_of_blendernerf():
     scene = load_scene(case("blendernerf_default"))
     assert (len(scene.train), len(scene.test)) == (7, 2)
-    assert any("every 8th is held out" in note for note in scene.notes)
+    assert any("every 8th image is held out" in note for note in scene.notes)
 
 
 def test_flags_of_lenses():
@@ -124,11 +124,11 @@ def test_models_of_colmap_4():
 @pytest.mark.parametrize(
     ("name", "count", "line"),
     [
-        ("subs", 5, "repeat others to the byte: camB_0.jpg"),
+        ("subs", 5, "byte-identical copies of images are left out: camB_0.jpg"),
         ("webp", 5, ""),
         ("tif", 5, ""),
         ("mac", 5, ""),
-        ("mixed", 5, "images in its folders are left out"),
+        ("mixed", 5, "images in subfolders are left out"),
     ],
 )
 def test_sources_of_process(tmp_path, name, count, line):
@@ -141,7 +141,7 @@ def test_short_videos(tmp_path, name):
     pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed")
     images, said = gathered(case("short_video") / name, tmp_path)
     assert len(images) == len({path.read_bytes() for path in images}) == 40
-    assert "all of its frames are taken, 40 in place of --frames 150" in said
+    assert "all 40 frames are taken, fewer than --frames 150" in said
 
 
 @pytest.mark.parametrize("name", ["legacy", "v1", "nested"])

@@ -35,7 +35,7 @@ def test_masks_leave_pixels_out_of_training_and_scores(tmp_path):
         ({"mask_path": "none.png"}, "does not exist"),
         ({"mask_path": 3}, "mask_path must be a file name, got 3"),
         ({"mask_path": "small.png"}, "small.png: is 3 x 2 pixels"),
-        ({"mask_path": "black.png"}, "black.png: must leave a pixel"),
+        ({"mask_path": "black.png"}, "black.png: excludes all pixels"),
     ):
         Image.new("L", (12, 10)).save(tmp_path / "black.png")
         Image.new("L", (3, 2), 255).save(tmp_path / "small.png")
@@ -108,9 +108,9 @@ def test_alpha_and_masks_count_together_upright_and_reduced(tmp_path):
     assert [int((~half.train.mask(index)).sum()) for index in range(7)] == [6, *[5] * 6]
     pixels[..., 3] = 0
     Image.fromarray(pixels).save(tmp_path / "02.png")
-    refuses("mask.png: must leave a pixel that counts", load_scene, tmp_path, error=SceneError)
+    refuses("mask.png: excludes all pixels", load_scene, tmp_path, error=SceneError)
     rewrite(tmp_path, lambda contents: [frame.pop("mask_path") for frame in contents["frames"]])
-    refuses("02.png: its alpha must leave a pixel that counts", load_scene, tmp_path, error=SceneError)
+    refuses("02.png: its alpha excludes all pixels", load_scene, tmp_path, error=SceneError)
 
 
 @pytest.mark.parametrize("tag", [1, 3, 6, 8])
@@ -165,7 +165,7 @@ def test_corners_without_a_ray_are_masked(tmp_path, focal, lens, limit):
     write_capture(tmp_path, rig, fl_x=focal, **lens)
     scene = load_scene(tmp_path, normalise=False)
     cameras, mask = scene.train.cameras, scene.train.mask(0)
-    assert any("are none that their lens shows, and are masked" in note for note in scene.notes)
+    assert any("have no ray of their lens, and are masked" in note for note in scene.notes)
     assert 0.4 < float(mask.float().mean()) < 1
     if limit:
         assert torch.equal(mask, disc(20, limit))

@@ -355,7 +355,7 @@ def test_a_picture_that_is_listed_twice_counts_once(tmp_path):
     rewrite(tmp_path, change)
     scene = load_scene(tmp_path)
     assert sorted(scene.train.names + scene.test.names) == [f"{index:02d}" for index in range(9)]
-    assert "of images that are listed twice the first counts: 07.png, 99.png, 99.png" in scene.notes
+    assert "images are listed twice; only the first entry counts: 07.png, 99.png, 99.png" in scene.notes
 
 
 @pytest.mark.parametrize("tag", [3, 6, 8])
@@ -508,7 +508,7 @@ def test_a_folder_trains_is_scored_and_opened_again(tmp_path):
         (np.zeros((9, 16)), "must have 17 numbers for each image, got shape [9, 16]"),
         (np.full((9, 17), np.nan), "has values that are not finite"),
         (np.ones((9, 17)), "row 0 is not a pose"),
-        (np.zeros((9, 17), dtype=object), "is no array of NumPy that can be read"),
+        (np.zeros((9, 17), dtype=object), "is not a readable NumPy array"),
     ],
 )
 def test_broken_llff_is_one_line(tmp_path, rows, reason):
@@ -523,12 +523,12 @@ def test_an_array_with_a_broken_header_is_one_line(tmp_path, header):
     path = tmp_path / "poses_bounds.npy"
     assert header[0] in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(*header, 1))
-    refuses("is no array of NumPy that can be read", load_scene, tmp_path, format="llff", error=SceneError)
+    refuses("is not a readable NumPy array", load_scene, tmp_path, format="llff", error=SceneError)
 
 
 def test_formats_and_kinds_are_named(tmp_path):
     write_both(tmp_path)
-    refuses("format must be colmap or llff, which it has, got blender", load_scene, tmp_path, format="blender")
+    refuses("must be one that the folder has, colmap or llff, got blender", load_scene, tmp_path, format="blender")
     refuses("format must be auto, blender or", load_scene, tmp_path, format="nerf")
     refuses("kind must be auto, object or", load_scene, tmp_path, kind="outdoor")
     refuses("builtin: format must be auto and kind auto or object", load_scene, "builtin", kind="forward")

@@ -80,7 +80,7 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
         process.process(pictures, out, max_features=300, progress=stop)
     assert not (out / "sparse").exists() and set(seen) == {"images", "features", "pairs", "matches"}
     refuses(
-        "was begun with --max-features 300, not 500",
+        "was started with --max-features 300, got 500",
         process.process,
         pictures,
         out,
@@ -319,7 +319,7 @@ def test_a_lost_camera_does_not_give_a_scene_its_scale(tmp_path):
     scene, kept = load_scene(tmp_path), load_scene(tmp_path, keep_far=True)
     line = "1 of 17 cameras lie far from the others and are"
     assert f"{line} left out (--keep-far keeps them): 03.jpg" in scene.notes
-    assert f"{line} kept, as asked: 03.jpg" in kept.notes and len(kept.train) + len(kept.test) == 17
+    assert f"{line} kept (--keep-far): 03.jpg" in kept.notes and len(kept.train) + len(kept.test) == 17
     assert not any("check the cameras" in note for note in scene.notes)
     for ours, without in ((scene.train, sound.train), (scene.test, sound.test)):  # same as without the far camera
         assert ours.names == without.names and torch.equal(ours.cameras.poses, without.cameras.poses)
@@ -380,14 +380,16 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
     before = sorted(tmp_path.rglob("*"))
     for source, reason in (
         ("nowhere", "there is no such video or folder"),
-        ("text.mp4", "text.mp4: is no video in a container that is read"),
-        ("list.mp4", "list.mp4: is no video in a container that is read"),
+        ("text.mp4", "text.mp4: must be a video in a supported container"),
+        ("list.mp4", "list.mp4: must be a video in a supported container"),
         ("images", "must have at least 3 images, got 2"),
         ("", f"{tmp_path}/images: must have at least 3 images, got 2"),
         ("full", f"{tmp_path}/full: must have at least 3 images, got 0"),
     ):
         refuses(reason, process.process, tmp_path / source, tmp_path / "out", error=SceneError)
-    refuses("full: must not exist yet", process.process, tmp_path / "images", tmp_path / "full", error=SceneError)
+    refuses(
+        "full: must be a new or empty folder", process.process, tmp_path / "images", tmp_path / "full", error=SceneError
+    )
     refuses("matching must be one of auto", process.process, tmp_path, tmp_path / "out", matching="all")
     refuses("max_features must be at least 100, got 5", process.process, tmp_path, tmp_path / "out", max_features=5)
     assert sorted(tmp_path.rglob("*")) == before
@@ -522,27 +524,27 @@ def numbered(*patterns, first=0, count=3):
         (
             {**numbered("camA/{}.jpg", "cam B/{}.jpg"), **numbered("Mask/{}.png", "camA/depth/{}.png", first=9)},
             [f"cam{c}_{i}.jpg" for c in ("A", "_B") for i in range(3)],
-            ["the images are those of cam B (3), camA (3)"],
+            ["the images come from cam B (3), camA (3)"],
         ),
         (numbered("a/b/{}.png"), ["a_b_0.png", "a_b_1.png", "a_b_2.png"], []),
         (numbered("images/{}.jpg", "images_2/{}.jpg", "depth/{}.png"), ["0.jpg", "1.jpg", "2.jpg"], []),
         (
             numbered("Images/{}.jpg", "more/{}.jpg"),
             ["0.jpg", "1.jpg", "2.jpg"],
-            ["3 images in other folders than Images are left out"],
+            ["3 images outside of Images are left out"],
         ),
-        (numbered("{}.JPG", "more/{}.jpg"), ["0.JPG", "1.JPG", "2.JPG"], ["3 images in its folders are left out"]),
+        (numbered("{}.JPG", "more/{}.jpg"), ["0.JPG", "1.JPG", "2.JPG"], ["3 images in subfolders are left out"]),
         (
             numbered("{}.jpg", "{}.png", "{}.webp", "b{}.webp", "b{}.tif"),
             ["0.jpg", "1.jpg", "2.jpg", "b0.png", "b1.png", "b2.png"],
-            ["9 images are left out that are there in another format, too: 0.png, 1.png, 2.png, 0.webp"],
+            ["9 images are left out, since they also exist in another format: 0.png, 1.png, 2.png, 0.webp"],
         ),
         (numbered("{}.webp"), ["0.jpg", "1.jpg", "2.jpg"], []),
         (numbered("{}.tif", "b{}.TIFF", "c{}.bmp"), [f"{c}{i}.png" for c in ("", "b", "c") for i in range(3)], []),
         (
             {**numbered("{}.jpg"), "0 (1).jpg": 0, "copy of 1.jpg": 1, "b/2.jpg": 2},
             ["0.jpg", "1.jpg", "2.jpg"],
-            ["1 images in its", "2 images are left out that repeat others to the byte: 0_(1).jpg, copy_of_1.jpg"],
+            ["1 images in subfolders", "2 byte-identical copies of images are left out: 0_(1).jpg, copy_of_1.jpg"],
         ),
         (
             {**numbered("{}.jpg"), "1.dng": b"raw", "2.dng": b"raw", "0.mov": b"live", "LICENSE": b"words"},
@@ -572,7 +574,7 @@ def test_images_of_two_folders_must_not_get_one_name(tmp_path):
     for name in ("a/b_0.jpg", "a_b/0.jpg"):
         (tmp_path / "in" / name).parent.mkdir(parents=True)
         picture(1).save(tmp_path / "in" / name)
-    line = f"a_b/0.jpg: {tmp_path}/in/a/b_0.jpg has this name, too"
+    line = f"a_b/0.jpg: {tmp_path}/in/a/b_0.jpg has the same name"
     refuses(line, process.process, tmp_path / "in", tmp_path / "out", error=SceneError)
 
 
@@ -654,7 +656,7 @@ def test_of_16_bits_a_channel_8_are_kept(tmp_path, monkeypatch, suffix):
         write_deep(folder / f"{number}{suffix}", values[number])
     said = []
     refuses("no model", process.process, folder, tmp_path / "out", say=said.append, error=SceneError)
-    assert said[0] == f"{folder}: of 3 images with 16 bits a channel the upper 8 are kept: " + ", ".join(
+    assert said[0] == f"{folder}: 3 images have 16 bits a channel, of which the upper 8 are kept: " + ", ".join(
         f"{number}{suffix}" for number in range(3)
     )
     copies = [np.asarray(Image.open(tmp_path / f"out/images/{number}.png")) for number in range(3)]
@@ -697,7 +699,7 @@ def clear(mask):
             ["0.jpg"],
             "1 of 3",
         ),
-        ({**numbered("{}.jpg"), "masks/mask_1.png": half()}, [], "masks: has no mask of an image; that of 0.jpg is"),
+        ({**numbered("{}.jpg"), "masks/mask_1.png": half()}, [], "masks: has no mask of any image; the mask of 0.jpg"),
         (numbered("{}.jpg"), [], ""),
     ],
 )
@@ -792,9 +794,7 @@ def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch
         with pycolmap.Database.open(out / "colmap/database.db") as opened:
             sizes.append(min(len(opened.read_keypoints(image.image_id)) for image in opened.read_all_images()))
     assert sizes[1] < 0.95 * sizes[0]
-    refuses(
-        "was begun with --size 100, not 90", process.process, pictures, out, max_features=300, size=90, error=SceneError
-    )
+    refuses("with --size 100, got 90", process.process, pictures, out, max_features=300, size=90, error=SceneError)
     refuses("size must be at least 64, got 9", process.process, pictures, tmp_path / "new", size=9)
 
 
@@ -821,7 +821,7 @@ def test_a_background_that_stands_still_is_said(tmp_path, pictures, monkeypatch)
         monkeypatch.setattr(process, "still_pairs", lambda _, still=still: (still, 28))
         out, said = tmp_path / f"{still}", []
         refuses("no model", process.process, pictures, out, max_features=300, say=said.append, error=SceneError)
-        assert sum(f"{still} of 28 pairs differ by a shift alone" in line for line in said) == lines
+        assert sum(f"{still} of 28 pairs show a static background" in line for line in said) == lines
 
 
 def test_a_training_of_photographs_without_cameras_points_to_process(tmp_path):

@@ -119,7 +119,7 @@ def blender_nerf(folder, test, lens):
 def test_without_pictures_for_testing_every_eighth_is_held_out(tmp_path, test, lens):
     blender_nerf(tmp_path, test, lens)
     scene = load_scene(tmp_path)
-    held = any("every 8th is held out" in note for note in scene.notes)
+    held = any("every 8th image is held out" in note for note in scene.notes)
     assert (scene.background, scene.box is None, held) == ("white", False, test != "val")
     assert scene.test.names == (("r_0", "r_8") if held else ("val_r_0", "val_r_1") if lens else ("r_0", "r_1"))
     assert len(scene.train) == (7 if held else 9)
@@ -145,7 +145,7 @@ def test_a_picture_of_blender_that_is_listed_twice_is_not_also_held_out(tmp_path
 def test_a_single_picture_of_blender_is_too_few(tmp_path):
     write_blender(tmp_path, builtin_scene(8, train_views=1, test_views=1), 0.69)
     (tmp_path / "transforms_test.json").unlink()
-    refuses("transforms_train.json: one image is too few", load_scene, tmp_path, error=SceneError)
+    refuses("transforms_train.json: needs at least two images", load_scene, tmp_path, error=SceneError)
 
 
 def test_capture(tmp_path, caplog):
@@ -231,7 +231,7 @@ def test_names_of_a_capture_are_all_different(tmp_path):
     contents["frames"][1]["file_path"] = "./left/../left/00.png"  # the first frame's image again
     path.write_text(json.dumps(contents))
     assert len(set(names())) == 7
-    assert "of images that are listed twice the first counts: 00.png" in load_scene(tmp_path).notes
+    assert "images are listed twice; only the first entry counts: 00.png" in load_scene(tmp_path).notes
     for frame, name in zip(contents["frames"], ("a", "b", "c", "d", "e", "f", "g", "h")):
         (tmp_path / frame["file_path"]).with_name(f"{name}.png").write_bytes((tmp_path / "left/00.png").read_bytes())
         frame["file_path"] = str(Path(frame["file_path"]).with_name(f"{name}.png"))

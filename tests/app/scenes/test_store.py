@@ -111,8 +111,8 @@ def test_a_build_goes_on_and_other_images_are_built_again(folder, cache, monkeyp
     del again, other
     assert torch.equal(*load_scene(folder, images="disk").train.images[:2])
     lines = [record.getMessage() for record in caplog.records]
-    assert len(lines) == 2 and "holds other images than those of the scene now" in lines[0]
-    assert "image 0 is damaged, it and those behind it are made again" in lines[1]
+    assert len(lines) == 2 and "the images of the scene have changed; the store is rebuilt" in lines[0]
+    assert "image 0 is damaged; it and all later images are decoded again" in lines[1]
 
 
 def test_what_is_damaged_is_made_again(folder, cache, caplog):
@@ -193,7 +193,7 @@ def test_a_wait_for_another_process_is_said(folder, cache, caplog):
     threading.Timer(0.5, os.close, (number,)).start()
     load_scene(folder, images="disk")
     assert [record.getMessage() for record in caplog.records] == [
-        f"{place}: another process makes these images, this one waits for it"
+        f"{place}: waiting for another process that decodes these images"
     ]
 
 

@@ -54,7 +54,7 @@ def test_frames_of_a_video_are_evenly_spread_and_each_is_taken_once(tmp_path, co
     said = []
     gather._take_frames(write_clip(tmp_path / "a.mp4", count), tmp_path / "frames", frames, said.append)
     assert steps_of(tmp_path / "frames") == list(taken)
-    line = f"{tmp_path}/a.mp4: all of its frames are taken, {count} in place of --frames {frames}"
+    line = f"{tmp_path}/a.mp4: all {count} frames are taken, fewer than --frames {frames}"
     assert said == [line] * (count < frames)
 
 
@@ -99,7 +99,7 @@ def test_sound_with_a_cover_is_no_video(tmp_path):
     Image.new("RGB", (64, 64)).save(tmp_path / "cover.jpg")
     options = ("-f", "lavfi", "-i", "anullsrc=d=1", "-c:v", "copy", "-disposition:v:0", "attached_pic")
     convert(tmp_path / "cover.jpg", path := tmp_path / "a.mp4", *options)
-    refuses("is no video in a container that is read", gather._take_frames, path, tmp_path, 5, print, error=SceneError)
+    refuses("must be a video in a supported container", gather._take_frames, path, tmp_path, 5, print, error=SceneError)
 
 
 def test_times_that_go_back_do_not_matter(tmp_path):

@@ -115,7 +115,7 @@ def test_an_older_checkpoint_takes_the_place_of_a_damaged_one(tmp_path):
     for damaged, taken in (("last", 1), ("last-1", 0)):
         path = tmp_path / "checkpoints" / f"{damaged}.safetensors"
         path.write_bytes(path.read_bytes()[:-1] + b"\x7f")
-        place = rf"last.safetensors: a damaged checkpoint, x has another checksum; last-{2 - taken}.* takes its place"
+        place = rf"last.safetensors: a damaged checkpoint, x has another checksum; using last-{2 - taken}.* instead"
         with pytest.warns(UserWarning, match=place):
             assert int(last_checkpoint(tmp_path).tensors["x"]) == taken
     (tmp_path / "checkpoints" / "last-2.safetensors").write_bytes(b"")

@@ -163,7 +163,7 @@ def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
     (partial := config.out / "checkpoints" / ".1-1.partial").write_bytes(b"of a process that died")
     path = checkpoint_path(config.out)
     path.write_bytes(path.read_bytes()[:-1] + b"\x7f")
-    with held(config.out), pytest.warns(UserWarning, match="takes its place"):
+    with held(config.out), pytest.warns(UserWarning, match="; using last-.* instead"):
         assert trained(config, scene, resume=True)["complete"] and state.step == 14
     assert not partial.exists()
     trained(small(tmp_path / "whole"), scene)
@@ -242,7 +242,7 @@ def test_turns_leave_checkpoints(tmp_path, scene):
 
 def test_a_change_of_threads_is_said_where_torch_computes(scene, tmp_path):
     before = torch.get_num_threads()
-    changed = f"by torch on {before} thread{'s' * (before > 1)}, what follows by torch on {before + 1} threads"
+    changed = f"by torch on {before} thread{'s' * (before > 1)}, later steps by torch on {before + 1} threads"
     for backend, expected in (("auto", []), ("reference", [changed])):
         said = []
         config = small(tmp_path / backend, backend=backend, steps=2, cells=())
@@ -264,4 +264,4 @@ def test_a_resume_without_the_compiled_module_is_said(scene, tmp_path, monkeypat
         load(build(config, scene, on_event=said.append), load_checkpoint(checkpoint_path(tmp_path)))
     finally:
         backends._choose_once.cache_clear()
-    assert "was computed by native operations, what follows by torch on" in "".join(said)
+    assert "was computed by native operations, later steps by torch on" in "".join(said)

@@ -160,7 +160,7 @@ def test_a_diverged_run_ends_with_its_last_checkpoint(tmp_path, scene, harm):
                 (parameter if harm == "weights" else state.optimizer.state[parameter]["exp_avg_sq"]).fill_(torch.inf)
 
     state, checkpoints = build(small(tmp_path, steps=60), scene), Checkpoints(tmp_path, every=1e-9)
-    said = r"not finite at step \d+, try a smaller --lr; the last checkpoint is unchanged"
+    said = r"not finite, at step \d+; try a smaller --lr; the last checkpoint is unchanged"
     with pytest.raises(TrainingError, match=said):
         run(state, [Divergence(tmp_path), checkpoints, Each(spoil)])
     checkpoints.writer.wait()
@@ -171,7 +171,7 @@ def test_a_run_that_diverges_before_its_first_checkpoint_ends(tmp_path, scene):
     state = started(scene, 4, cells=())
     with torch.no_grad():
         next(iter(state.router.parameters())).fill_(torch.nan)
-    with pytest.raises(TrainingError, match=r"gradients of 10 steps in a row not finite at step 14, .* no checkpoint"):
+    with pytest.raises(TrainingError, match=r"10 consecutive steps are not finite, at step 14; .* no checkpoint"):
         run(state, [Divergence(tmp_path)])
     assert list(tmp_path.iterdir()) == []
 

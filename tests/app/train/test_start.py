@@ -38,7 +38,7 @@ def test_a_start_that_failed_begins_again_and_learns(scene, monkeypatch):
     steps_of(state, 20)
     state.sampler.grid.occupied.fill_(False)
     steps_of(state, 30)
-    assert said == ["nothing is learnt by step 50: all space is empty; begins again from another draw, 1 of 3"]
+    assert said == ["nothing is learnt by step 50: the field is empty everywhere; restart 1 of 3 with another seed"]
     assert state.began == 50 and state.sampler.grid.share == 1 and state.rays == 64 and not state.optimizer.state
     assert len(state.strategy.reservoir) == 0 and state.learning_rate() < 0.1 * state.config.lr
     steps_of(state, 100)
@@ -71,4 +71,4 @@ def test_a_start_of_one_colour_has_failed():
         batch = Batch(Rays(places, places), nothing, nothing, wanted, background)
         samples = Samples(places, torch.arange(50), torch.arange(51), nothing, nothing)
         output = RenderOutput(torch.zeros(()), nothing, light[:, 0], nothing, samples, colour)
-        assert why_nothing_is_learnt(batch, output) == ("all has one colour" if failed else None)
+        assert why_nothing_is_learnt(batch, output) == ("all rays have the same colour" if failed else None)

@@ -130,7 +130,7 @@ class Tab:
             value = done()
             if value:
                 return value
-            assert time.monotonic() < end, f"waited {seconds} s in vain"
+            assert time.monotonic() < end, f"timed out after {seconds} s"
 
     def rest(self):
         """Waits for the sharp picture after a change and returns it, uint8 [h, w, 3]."""

@@ -153,11 +153,11 @@ def test_what_cannot_be_drawn_is_refused_in_a_line(runs, tmp_path):
         return torch.zeros_like(positions), torch.zeros_like(positions[:, 0])
 
     cones = renderer_of({"field": VoronoiRouter(MipNeRF(width=8, depth=2), centres)}, samples=8, cones=True)
-    refused("its field is asked about cones", replace(run, renderer=cones))
-    refused("no grid of empty space: --occupancy makes one", changed(run, sampler=Stratified(8)))
-    refused("no single network for each cell (the field is a function, no router)", changed(run, formula))
+    refused("its field takes cones", replace(run, renderer=cones))
+    refused("no occupancy grid; train it with --occupancy", changed(run, sampler=Stratified(8)))
+    refused("does not have one network per cell (the field is a function, not a VoronoiRouter)", changed(run, formula))
     wide = VoronoiRouter(NeRF(width=256, depth=8), centres)
-    refused("numbers of a sample, a page at most 2,000", changed(run, wide))
+    refused("numbers per sample, a page allows 2,000", changed(run, wide))
 
     class Odd(torch.nn.Module):
         def __init__(self):

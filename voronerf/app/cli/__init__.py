@@ -38,7 +38,7 @@ def _prepare() -> None:
     # By default, waiting OpenMP threads spin for milliseconds on cores that other processes may need: beside ten busy
     # processes a training step takes twenty times as long. OpenMP reads the variable when torch loads its runtime.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    # Threads still spin for some ten microseconds before they sleep, since to sleep and wake takes as long.
+    # Threads still spin for some ten microseconds before they sleep, since going to sleep and waking takes as long.
     if os.environ["OMP_WAIT_POLICY"] == "passive":
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     keep_freed_memory()

@@ -22,7 +22,7 @@ FIGURES = (
     *(("cells", "cells", 0), ("parameters", "parameters", 0), ("steps", "steps", 0), ("seconds", "training [s]", 0)),
     *(("rays_per_second", "rays/s", 0), ("psnr", "PSNR [dB]", 2), ("ssim", "SSIM", 4), ("lpips", "LPIPS", 4)),
 )
-#: Scores of test views, and the mark of scores of view centres only.
+#: Scores of test views, and the mark for scores of view centres alone.
 SCORES, PARTLY = ("psnr", "ssim", "lpips"), "*"
 #: Settings about the location and outputs of a run, which are not compared.
 PLACES = ("out", "resume", "allow_outside", "panels", "tensorboard")
@@ -57,7 +57,7 @@ def compare(runs: tuple[Path, ...], /) -> int:
     console.print(table)
     for run, (figures, _) in zip(runs, read, strict=True):
         if "psnr" not in figures:
-            say(f"{run} has no scores: {shlex.join(['voronerf', 'eval', str(run)])} makes them")
+            say(f"{run} has no scores: {shlex.join(['voronerf', 'eval', str(run)])} computes them")
     return 0
 
 

@@ -77,10 +77,10 @@ def show(run: Path, scene: Scene, scores: dict[str, Any], budget: float) -> None
         f"{score} on {scores['views']} views it has not seen, {counted(scores['cells'], 'cell')}, "
         f"{scores['steps']:,} steps: {run}"
     )
-    say(f"wrote {run / 'turn.png'} and {run / 'turn.mp4'}: the scene, and in colour which cell each point belongs to")
+    say(f"wrote {run / 'turn.png'} and {run / 'turn.mp4'}: the scene beside its cells in colour")
     say(f"wrote {run / 'placed.png'}: {program} place {quoted} {quoted} --at {xyz} --scale {SCALE:g}, without training")
     _, size = export_web(opened, run / "scene.html")
-    say(f"wrote {run / 'scene.html'}, {size / 1e6:.1f} MB: the scene in any browser with WebGPU, a phone's too")
+    say(f"wrote {run / 'scene.html'}, {size / 1e6:.1f} MB: the scene for any browser with WebGPU, also on a phone")
     has_viewer = importlib.util.find_spec("viser") is not None
     say(f"next: {program} {f'view {quoted}' if has_viewer else 'train --data DIR, with your pictures'}")
     say(f"open {run / 'scene.html'}")

@@ -172,7 +172,7 @@ class TrainingDisplay(Callback):
             self.progress.remove_task(task)
 
     def on_event(self, line: str) -> None:
-        """Prints a line that stays, above the live one."""
+        """Prints a permanent line above the live line."""
         self.told = time.monotonic()
         if not self.quiet:
             say(line)

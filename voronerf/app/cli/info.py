@@ -31,7 +31,7 @@ EXTRAS = {
     "nerfstudio": Extra("ns-train voronerf, in nerfstudio", ("nerfstudio",)),
     "warp": Extra("kernels in NVIDIA Warp (--backend warp)", ("warp",)),
     "tensorboard": Extra("train --tensorboard", ("tensorboard",)),
-    "dev": Extra("checks of the sources", ("ruff", "mypy")),
+    "dev": Extra("checks of the source code", ("ruff", "mypy")),
 }
 
 
@@ -82,4 +82,4 @@ def _show_ops() -> None:
 
 def _state(name: str, modules: Sequence[str]) -> str:
     missing = [module for module in modules if importlib.util.find_spec(module) is None]
-    return f"no {', '.join(missing)}; pip install 'voronerf[{name}]'" if missing else "there"
+    return f"no {', '.join(missing)}; pip install 'voronerf[{name}]'" if missing else "installed"

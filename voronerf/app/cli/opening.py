@@ -27,7 +27,7 @@ class Opening:
     """The settings with which a run is opened; None keeps the setting of the training."""
 
     data: str | None = None
-    """Scene folder. By default the folder of the training, but only if you named it there, or it lies in the run
+    """Scene folder; default: the folder of the training, if you have named it yourself, or if it lies in the run
     directory, the working directory or VORONERF_DATA, since a run may be another person's."""
     downscale: int | None = None
     """Factor by which images and the frames of a camera path are reduced; default as in training, 1 for a path."""
@@ -79,5 +79,5 @@ def crop_box(run: Run, crop: Crop) -> Tensor | None:
         return None if crop is None else tensor(crop, dtype=float64).view(2, 3)
     box = read_crop(run.path)
     if box is None:
-        raise ConfigError(f"--crop saved needs a crop, which the viewer saves with the run: {run.path} has none")
+        raise ConfigError(f"--crop saved needs a crop that the viewer has saved in the run: {run.path} has none")
     return box

@@ -1,4 +1,4 @@
-"""Parses the words of a command line into a command with its arguments, by tyro, with one-line errors."""
+"""Parses a command line into a command and its arguments, by tyro; error messages are one line."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def in_a_line(box: str) -> str:
     """Returns the message in an error box of tyro as one line."""
     _, *rows = (line[2:].rstrip(" │") for line in COLOURS.sub("", box).splitlines())
     parts = [[*part] for is_rule, part in itertools.groupby(rows, lambda row: row[:1] in ("─", "-")) if not is_rule]
-    if missing := re.fullmatch("Missing from voronerf (.*):", parts[0][0]):  # each argument, its help indented
+    if missing := re.fullmatch("Missing from voronerf (.*):", parts[0][0]):  # lists each argument with its help
         names = [row.strip() for row in parts[0][1:] if re.match(r" {4}\S", row)]
         return f"{missing[1]} needs {' and '.join([', '.join(names[:-1]), names[-1]] if names[1:] else names)}"
     message = re.sub("^Error parsing ([^:]+):", r"\1", " ".join(" ".join(parts[0]).split())).rstrip(".")
@@ -85,7 +85,7 @@ def too_few_values(match: re.Match[str]) -> str:
 
 
 def _argument(hint: Any, default: Any) -> Any:
-    """Returns an argument's type for tyro: settings get a group each, and empty defaults are not shown."""
+    """Returns an argument's type for tyro: a class of settings gets a group, and empty defaults are not shown."""
     if hint is TrainConfig:
         return Annotated[hint, tyro.conf.arg(name="")]
     return Annotated[hint, tyro.conf.arg(help_behavior_hint="")] if default in NOTHING else hint

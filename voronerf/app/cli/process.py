@@ -38,7 +38,7 @@ def process(
             images. Its folder masks may have a mask for each image; pixels that are black in it are ignored.
         out: The folder to make; it gets images, masks if there are any, sparse/0, transforms.json and colmap, which
             keeps every stage.
-        frames: Number of frames taken from a video, evenly spread; at most all of them.
+        frames: Number of evenly spaced frames to take from a video; all frames if it has fewer.
         matching: The pairs of images that are compared: all pairs (exhaustive), neighbours by name (sequential), or
             images that share their largest features (auto).
         camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
@@ -80,9 +80,10 @@ BAR = 10
 
 
 class TimeLeft(ProgressColumn):
-    """A column with a stage's remaining time, extrapolated from its start, or if unknown, with its elapsed time.
+    """A column with the remaining time of a stage, or with its elapsed time if the remaining time is unknown.
 
-    rich's own column extrapolates from the last 30 seconds alone, in which few images may be done.
+    The time is extrapolated from the whole stage. The column of rich uses the last 30 seconds alone, in which few
+    images may be done.
     """
 
     def render(self, task: Task) -> Text:

@@ -194,12 +194,12 @@ def _show_commands() -> int:
         "usage: voronerf COMMAND ...\n\nMany small networks, one per Voronoi cell of space, trained and run as one.\n"
     )
     console.print(table, soft_wrap=False)
-    print("\nvoronerf COMMAND --help shows the options of one, voronerf --version the version.")
+    print("\nvoronerf COMMAND --help shows the options of a command, voronerf --version shows the version.")
     return 0
 
 
 def _show_thread_error(args: threading.ExceptHookArgs) -> None:
-    """Prints the traceback of a thread, except for lack of memory: the thread that waits for it reports that."""
+    """Prints a thread's traceback, except for lack of memory, which the waiting thread reports."""
     if not isinstance(args.exc_value, (MemoryError, SystemError)):
         threading.__excepthook__(args)
 

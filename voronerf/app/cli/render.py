@@ -34,7 +34,7 @@ def render(
         out: The video file, .mp4, or with --images a new folder; default video, or the name of the path, in the run
             directory.
         path: Camera path in nerfstudio's format, as the viewer saves it, in the coordinates of this run's scene. It
-            gives the frames and their size.
+            determines the frames and their size.
         frames: Number of frames of a video without a path.
         fps: Frames per second; default 24, or the rate of the path.
         size: Width and height of the frames, such as 1280x720; default the size of the training images, or of the path.

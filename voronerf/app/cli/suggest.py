@@ -14,7 +14,7 @@ from voronerf.app.wording import either, nearest
 
 
 def suggest(name: str, command: Callable[..., int], words: list[str], error: str) -> str:
-    """Returns "; did you mean ...?" for a command line that the parser rejected with `error`, or "" without an idea."""
+    """Returns "; did you mean ...?" for a command line that the parser rejected with `error`, or ""."""
     arguments, options, paths = argument_names(command)
     line = list(words)
     for word in filter(re.compile("--?[a-zA-Z]").match, words):

@@ -85,7 +85,7 @@ def join(
 
 
 def given_frames(runs: int, move: Sequence[tuple[str, str]]) -> dict[int, Similarity]:
-    """Parses --move into transforms by the number of the run, from 0."""
+    """Parses --move into a transform for each moved run; runs are counted from 0."""
     frames: dict[int, Similarity] = {}
     for number, text in move:
         if not number.isdecimal() or not 1 <= int(number) <= runs:
@@ -177,7 +177,7 @@ def train_territories(
     checkpoint_every: float = CHECKPOINT_EVERY,
     panels: int = 4,
 ) -> int:
-    """Train a large scene in territories, each with its own cells, table, views and rays; rays cross their borders.
+    """Train a large scene in territories, each with its own cells, table, views and rays, which may cross the borders.
 
     `torchrun --nproc-per-node 4 -m voronerf train-territories --out RUN` distributes the territories over processes.
     The run is the same bit for bit on any number of processes. The finished run is scored; `eval`, `view`, `join` and
@@ -185,8 +185,8 @@ def train_territories(
 
     Args:
         config: The settings of each territory.
-        territories: Number of territories; default as in a resumed run, else the least power of two that gives every
-            process one.
+        territories: Number of territories; default as in a resumed run, else the smallest power of two that gives every
+            process a territory.
         resume: Continue the run in --out from its last checkpoint.
         file: JSON of settings by name, such as the config.json of a run; options on the command line override it.
         checkpoint_every: Seconds of training between checkpoints.

@@ -55,7 +55,7 @@ from voronerf.app.train.run_directory import (
 from voronerf.app.train.state import HALVES, State
 from voronerf.ops._core import backends
 
-#: Bytes of a picture's name without its suffix that most file systems allow.
+#: The maximum length of a picture's name without its suffix, in bytes, on most file systems.
 LONGEST_NAME = 255 - len(".png")
 #: Default number of panels.
 PANELS = 4
@@ -253,7 +253,7 @@ def run_training(
 
 @contextlib.contextmanager
 def stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """A context in which the first of the signals of ``STOPPING`` calls ``stop``, and a second ends the process."""
+    """A context in which the first signal of ``STOPPING`` calls ``stop``, and a second signal ends the process."""
     # An ignored signal stays ignored, as under nohup or in a shell's background job.
     handlers = {number: signal.getsignal(number) for number in STOPPING}
     handlers = {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
@@ -275,12 +275,12 @@ def stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 
 def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callable[..., int]:
-    """Returns a training command whose defaults are the settings of --config, or with --resume of the run in --out."""
+    """Returns a training command whose defaults are the settings of --config or, to resume, of the run in --out."""
     file, out = _option_path(args, "--config"), _option_path(args, "--out")
     if file is None and "--resume" not in args:
         return command
     if file is not None and "--resume" in args:
-        raise ConfigError("--config must be left out with --resume, which goes on with the settings of the run")
+        raise ConfigError("--config must be left out with --resume, which continues with the settings of the run")
     if file is not None and not file.is_file():
         raise ConfigError(f"--config {file}: there is no such file")
     stored = read_config(file) if file is not None else None if out is None else stored_config(out)

@@ -15,8 +15,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
-#: Convolutions of AlexNet under torchvision's names: number, (out, in, kernel), stride, padding, and whether a maximum
-#: over 3 x 3 pixels at stride 2 comes before.
+#: Convolutions of AlexNet under torchvision's names: number, (out, in, kernel), stride, padding, and whether a 3 x 3
+#: max pooling with stride 2 precedes it.
 CONVOLUTIONS = (
     (0, (64, 3, 11), 4, 2, False),
     (3, (192, 64, 5), 1, 2, True),
@@ -134,7 +134,7 @@ def find_lpips(
         return None, "LPIPS is off"
     path = Path(named).expanduser()
     if named and not path.exists():
-        raise LpipsError(f"{path}: there is no such file or folder, asked for by {'--lpips' if setting else VARIABLE}")
+        raise LpipsError(f"{path}: there is no such file or folder, as set by {'--lpips' if setting else VARIABLE}")
     if min(size) < SMALLEST:
         why = f"images of {size[0]} x {size[1]} are below AlexNet's smallest, {SMALLEST} x {SMALLEST}"
         if setting:
@@ -172,7 +172,7 @@ def read_weights(files: list[Path]) -> dict[str, Tensor]:
             else:
                 tensors = torch.load(file, map_location="cpu", weights_only=True)
             named = [(name, tensor) for name, tensor in tensors.items() if isinstance(tensor, Tensor)]
-        except Exception as error:  # unpickling a damaged file raises anything
+        except Exception as error:  # unpickling a damaged file may raise any error
             raise LpipsError(f"{file}: not a readable file of weights: {_first_line(error)}") from None
         for name, tensor in named:
             name = re.sub(r"^net\.slice\d\.", "features.", name)
@@ -185,12 +185,12 @@ def read_weights(files: list[Path]) -> dict[str, Tensor]:
     if missing:
         where = ", ".join(map(str, files))
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-        raise LpipsError(f"{where}: not the weights of LPIPS v0.1 on AlexNet, without {', '.join(missing[:3])}{more}")
+        raise LpipsError(f"{where}: not the weights of LPIPS v0.1 on AlexNet: {', '.join(missing[:3])}{more} missing")
     return weights
 
 
 def _files(path: Path) -> list[Path]:
-    """Lists the weight files of a path: the file itself, or a folder's files with "alex" in their names, else all."""
+    """Lists the weight files of a path: the file itself; of a folder, the files with "alex" in their names, or all."""
     if path.is_file():
         return [path]
     files = sorted(file for file in path.glob("*") if file.suffix in SUFFIXES)

@@ -27,7 +27,7 @@ def in_silence(items: Sequence[Any], name: str) -> Iterable[Any]:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """PSNR in dB, SSIM and LPIPS (None without its weights) of one view, on the scene's background (white).
+    """PSNR in dB, SSIM and LPIPS (None without its weights) of one view, composited on the scene's background.
 
     Examples:
         >>> from voronerf.app.evaluate import ViewScore

@@ -23,8 +23,8 @@ UNSIGNED_SHORT = 5123
 def follow_conventions(buffers: dict[Any, bytes], tree: dict[str, Any]) -> None:
     """Turns +Z into +Y, makes colours linear, and gives meshes with vertex colours a material.
 
-    A ``buffer_postprocessor`` of ``trimesh.exchange.gltf.export_glb``. Vertex colours become 16 bits: with 8 linear
-    bits, a quarter of the sRGB bytes, the dark ones, would become equal to others.
+    This is a ``buffer_postprocessor`` of ``trimesh.exchange.gltf.export_glb``. Linear vertex colours get 16 bits, since
+    8 bits would merge a quarter of the sRGB values (the dark ones) with other values.
 
     Args:
         buffers: The bytes of each buffer view; changed in place.

@@ -39,27 +39,28 @@ SUFFIXES = (".ply", ".glb", ".obj")
 RESOLUTION, FACES = 256, 100_000
 #: Greatest number of pixels along the longer side of the rendered views.
 LONGEST = 512
-#: The truncation distance in cubes, before and behind a surface. Fewer cubes leave holes where views disagree; more
-#: let the two sides of a thin object meet.
+#: The truncation distance in cubes, in front of and behind a surface. Fewer cubes leave holes where views disagree;
+#: more let the two sides of a thin object meet.
 REACH = 8
 #: Standard deviation in cubes of the Gaussian that smooths the distances, since a learnt surface is rough; and the
-#: share of `REACH` to which distances are clamped first. Unclamped, the distances before a surface that views see from
-#: the side are too long, which would move it inwards.
+#: fraction of `REACH` to which distances are clamped first. Without the clamp, views that see a surface from the side
+#: would give too long distances in front of it, and move it inwards.
 SMOOTH, CUT = 1.0, 0.3
-#: The distance by which the surface of an object on a plain background is moved towards the cameras, as a share of the
-#: longest side of the scene's box: views look a little into its field, and smoothing makes it smaller. The value was
-#: chosen on the built-in scene and Lego (docs/export.md). Scenes without a box get worse by it.
+#: The distance by which the surface of an object on a plain background is moved towards the cameras, as a fraction of
+#: the longest side of the scene's box: rendered depths lie a little inside the object, and smoothing makes it smaller.
+#: The value was chosen on the built-in scene and Lego (docs/export.md). For scenes without a box, the shift makes
+#: meshes worse.
 BEFORE = 0.003
 #: Nodes along the side of a block, and number of blocks that are filled at once.
 BLOCK, BLOCKS = 8, 256
 #: Greatest number of bytes that a node takes in marching cubes.
 NODE = 16
-#: Constants of :func:`looked_at`: the least share of the pictures that show a point of the box; the share of outliers
-#: at either end of an axis; the factor by which the box is enlarged; and the greatest number of points.
+#: Constants of :func:`looked_at`: the minimum fraction of the pictures that show a point of the box; the fraction of
+#: outliers at each end of an axis; the factor by which the box is enlarged; and the greatest number of points.
 SHARED, OUTLIERS, LONGER, POINTS = 0.5, 0.02, 1.2, 100_000
-#: The least side of that box as a share of its longest side, since the box of a wall would be flat.
+#: The minimum side of that box as a fraction of its longest side, since the box of a wall would be flat.
 FLAT = 0.1
-#: Triangles of the smallest connected component that is kept, as a share of the largest component.
+#: Triangles of the smallest connected component that is kept, as a fraction of the largest component.
 SMALLEST = 0.02
 #: Exponent of the cosine between a view's direction and the normal, in the weights of colours.
 FRONTAL = 4
@@ -91,7 +92,7 @@ def export_mesh(
         box: [2, 3], the exported region; default the scene's box, or the box of :func:`looked_at`.
         to_files: Write coordinates of the scene's files instead of scene coordinates.
         track: Shows progress: takes a sequence and the task's name, and yields the items.
-        say: Called with a line about the share of surfaces outside of the box.
+        say: Called with a line about the fraction of surfaces outside of the box.
 
     Raises:
         ConfigError: The resolution does not fit into memory, `faces` is below 4, or the views show no surface in the
@@ -139,13 +140,13 @@ def looked_at(views: list[SurfaceView]) -> Tensor | None:
 
 
 def _left_out(views: list[SurfaceView], box: Tensor) -> str:
-    """Returns a line about the share of surfaces outside of a box."""
+    """Returns a line about the fraction of surfaces outside of a box."""
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])
     points = points[points.isfinite().all(-1)]
     inside = ((points >= box[0]) & (points <= box[1])).all(-1)
     corners = " ".join(f"{x:.3g}" for x in box.flatten().tolist())
     share = 1 - float(inside.float().mean()) if len(points) else 0.0
-    return f"{share:.0%} of the surfaces in the views lie outside of the box {corners} (--crop takes another)"
+    return f"{share:.0%} of the surfaces in the views lie outside of the box {corners} (--crop chooses another box)"
 
 
 def _surface(
@@ -193,7 +194,7 @@ def _surface(
         raise no_surface
     mesh: Any = trimesh.Trimesh(low.numpy() + side * vertices, triangles, process=False)
     mesh = _without_loose(mesh)
-    if len(mesh.faces) > faces:  # simplification splits thin surfaces
+    if len(mesh.faces) > faces:  # simplification may split thin surfaces
         mesh = _without_loose(mesh.simplify_quadric_decimation(face_count=faces))
     points = torch.from_numpy(np.array(mesh.vertices, dtype=np.float32))
     normals = torch.from_numpy(np.array(mesh.vertex_normals, dtype=np.float32))
@@ -219,19 +220,19 @@ def _resolution(extent: Tensor, resolution: int | None) -> int:
     if resolution is None:
         return max(min(RESOLUTION, greatest), 8)
     if not 8 <= resolution <= greatest:
-        raise ConfigError(f"--resolution must be 8 to {greatest}, for which there is memory, got {resolution}")
+        raise ConfigError(f"--resolution must be 8 to {greatest}, the most that fits into memory, got {resolution}")
     return resolution
 
 
 def _fused(
     low: Tensor, side: float, blocks: Tensor, views: list[SurfaceView], closed: bool, track: Track
 ) -> tuple[Tensor, Tensor]:
-    """Returns the truncated distances of the nodes, positive before a surface, and a mask of the seen nodes."""
+    """Returns the truncated distances of the nodes, positive in front of a surface, and a mask of the seen nodes."""
     counts: list[int] = blocks.tolist()
     value, seen = torch.ones(counts), torch.zeros([BLOCK * count for count in counts], dtype=torch.bool)
     near = torch.zeros(counts, dtype=torch.bool)
     reach = REACH * side
-    if closed:  # blocks far from a surface are solid or empty; blocks where these meet are filled
+    if closed:  # blocks far from a surface are solid or empty; blocks between them are filled
         centres = low + side * (BLOCK * near.logical_not().nonzero() + (BLOCK - 1) / 2)
         value = _distance(centres, views, reach)[0].view(counts)
         greatest, least = (sign * max_pool3d(sign * value[None], 3, 1, 1)[0] for sign in (1, -1))
@@ -254,8 +255,8 @@ def _fused(
 def _distance(points: Tensor, views: list[SurfaceView], reach: float) -> tuple[Tensor, Tensor]:
     """Returns the mean distances [n] from points [n, 3] to the surfaces behind them, and a mask [n] of seen points.
 
-    Distances are in units of `reach`, at most 1. A point is seen if it lies before a surface of a view or shortly
-    behind it. The distance of an unseen point is -1 behind a surface, and 1 outside of all pictures.
+    Distances are in units of `reach`, at most 1. A point is seen if it lies in front of a surface of a view or shortly
+    behind the surface. The distance of an unseen point is -1 behind a surface, and 1 outside of all pictures.
     """
     total, count, inside = (torch.zeros(len(points)) for _ in range(3))
     for view in views:
@@ -276,7 +277,7 @@ def _in_picture(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
 
 
 def _gap(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
-    """Returns the pixels [n, 2] of points, and the distances [n] by which the surface is behind them; NaN outside."""
+    """Returns the pixels [n, 2] of points, and the distances [n] to the surface behind them; NaN outside a picture."""
     width = view.colour.shape[1]
     pixels, inside = _in_picture(points, view)
     x, y = torch.where(inside[:, None], pixels, 0).long().unbind(-1)

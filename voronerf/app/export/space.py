@@ -76,7 +76,7 @@ def box_of(run: Run, box: Tensor | None = None) -> Tensor:
         return run.scene.box.float().cpu()
     contraction = run.renderer.contraction
     if not isinstance(contraction, Contraction):
-        raise ConfigError("--crop must be given, six numbers or saved: the scene has no bounds")
+        raise ConfigError("--crop must be given as six numbers or saved: the scene has no bounds")
     return torch.stack((contraction.centre - contraction.radius, contraction.centre + contraction.radius)).cpu()
 
 
@@ -114,7 +114,7 @@ def spread_around(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Finds the principal axes of each point's nearest neighbours.
 
     Returns:
-        [n, 3, 3], the axes in columns, least spread first; and [n, count], the distances of the neighbours.
+        [n, 3, 3], the axes in columns, the axis of least spread first; and [n, count], the distances of the neighbours.
     """
     from scipy.spatial import cKDTree
 

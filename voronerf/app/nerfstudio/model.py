@@ -1,4 +1,4 @@
-"""The model: voronerf's networks, renderer, occupancy grid and splits between nerfstudio's rays and its losses."""
+"""The model: connects voronerf's networks, renderer, occupancy grid and splits with nerfstudio's rays and losses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from voronerf.nerf.adam import parameter_groups
 
 @dataclasses.dataclass
 class VoronerfModelConfig(ModelConfig):
-    """Settings of the model, by the names of ``voronerf train``."""
+    """Settings of the model, named as in ``voronerf train``."""
 
     _target: type = dataclasses.field(default_factory=lambda: VoronerfModel)
     enable_collider: bool = False
@@ -44,12 +44,14 @@ class VoronerfModelConfig(ModelConfig):
     """When to split, as fractions of max_num_iterations, one per level; default: 0.2, or evenly spaced from 0.15 to
     0.5."""
     sampling: str = "stratified"
-    """Samples along a ray: stratified in one pass, or hierarchical, with a second pass at the weights of the first."""
+    """Samples along a ray: stratified in one pass, or hierarchical, with a second pass where the first pass has large
+    weights."""
     samples: tuple[int, ...] | None = None
-    """Samples per ray of each pass; default: by the cameras if empty space is skipped, else 64, or 32 and 32."""
+    """Samples per ray of each pass; default: depends on the cameras if empty space is skipped, else 64 for one pass, or
+    32 and 32 for two passes."""
     contraction: Literal["auto", "none", "sphere"] = "auto"
     """The rendered space: only the scene box (none), or all of space, contracted outside of a sphere into a shell
-    (sphere); auto is the box if all cameras stand outside of it."""
+    (sphere); auto is none if all cameras stand outside of the box, else sphere."""
     occupancy: bool = True
     """Skip empty space, with stratified samples."""
 

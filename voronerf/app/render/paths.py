@@ -37,8 +37,8 @@ FARTHEST = 1e9
 ORTHONORMAL = 2e-3
 #: Length of the mean direction above which cameras look one way.
 ONE_WAY = 0.95
-#: Angles around the cameras' focus, in radians: the least gap between cameras that no path crosses, and the standard
-#: deviation of the Gaussian weights by which a path averages the distances and heights of near cameras.
+#: Angles around the cameras' focus, in radians: the smallest gap between cameras that a path does not cross, and the
+#: standard deviation of the Gaussian weights by which a path averages the distances and heights of near cameras.
 GAP, WINDOW = math.radians(60), math.radians(25)
 #: Frames of a path between two of its cameras.
 BETWEEN = 4
@@ -72,10 +72,10 @@ class CameraPath:
 def read_camera_path(file: Path | str) -> CameraPath:
     """Reads a path that nerfstudio's viewers, its add-ons or :func:`write_camera_path` have saved.
 
-    Positions are in the coordinates of the rendered scene. The scale of a pose, as in exports of scaled objects, has no
-    effect, nor have crops, times and transitions of the file. The default angle of view is the file's `default_fov`.
-    Without `fps`, the rate follows from the file's `seconds`, else it is 24 frames a second. Invalid keyframes are left
-    out.
+    Positions are in the coordinates of the rendered scene. The scale of a pose, as in exports of scaled objects, is
+    ignored, and so are crops, times and transitions of the file. The default angle of view is the file's `default_fov`.
+    If `fps` is missing, the rate follows from the file's `seconds`, and is 24 frames a second if these are missing too.
+    Invalid keyframes are left out.
 
     Raises:
         ValueError: the file is no camera path, is too large, or its cameras are not perspective, fisheye or
@@ -149,7 +149,7 @@ def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Came
     Args:
         keyframes: at least one camera.
         count: number of frames, distributed equally over the pairs of keyframes.
-        closed: whether the path returns to the first keyframe; the last frame is then the one before it.
+        closed: whether the path returns to the first keyframe; the last frame is then just before it.
 
     Raises:
         ValueError: there is no keyframe, or `count` is below 1.
@@ -190,16 +190,16 @@ def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Ca
     """Returns a path that stays near the cameras of a capture, so that it shows regions that they have seen.
 
     For cameras that look one way, the path is the spiral of LLFF (Mildenhall et al. 2019) around their focus, as large
-    as their extent. For cameras around a focus, it is a turn around it, at the mean distance and height of the nearest
-    cameras; if the cameras leave a gap, the path goes from one end of it to the other and back, without crossing it.
-    For cameras that look outwards, it is a smooth path through some of them, in their order. The frames have the
-    commonest size of the cameras.
+    as their extent. For cameras around a focus, it is a turn around the focus, at the mean distance and height of the
+    nearest cameras; if the cameras leave a gap, the path goes from one end of the gap to the other and back, without
+    crossing the gap. For cameras that look outwards, it is a smooth path through some of them, in their order. The
+    frames have the commonest size of the cameras.
 
     Args:
         cameras: the cameras of the capture, such as the training views; the path has their mean focal length.
         count: number of frames.
-        near: the distance at which the scene begins along a ray.
-        far: the distance at which it ends; near and far give the focus of parallel cameras.
+        near: distance along a ray at which the scene begins.
+        far: distance along a ray at which the scene ends; near and far give the focus of parallel cameras.
 
     Raises:
         ValueError: `count` is below 1.
@@ -238,7 +238,7 @@ def like_most(cameras: Cameras) -> Cameras:
 
 
 def resized(cameras: Cameras, size: tuple[int, int]) -> Cameras:
-    """Resizes cameras to another (width, height); the new pictures show no more than the old ones at any side."""
+    """Resizes cameras to another (width, height); the new pictures reach no farther than the old ones on any side."""
     scale = max(size[0] / cameras.width, size[1] / cameras.height)
     intrinsics = scale * cameras.intrinsics
     intrinsics[:, 2] += (size[0] - scale * cameras.width) / 2
@@ -252,7 +252,7 @@ def see_all_around(cameras: Cameras) -> bool:
 
 
 def panoramas(cameras: Cameras, size: tuple[int, int]) -> Cameras:
-    """Returns equirectangular 360-degree cameras at the same positions, z up, of a (width, height) of 2 to 1.
+    """Returns equirectangular 360-degree cameras with ``size``, 2 to 1, at the same positions and with z up.
 
     Raises:
         ValueError: the size is not 2 to 1.
@@ -269,7 +269,7 @@ def panoramas(cameras: Cameras, size: tuple[int, int]) -> Cameras:
 
 
 def _spiral(cameras: Cameras, count: int, focus: Tensor | None, near: float, far: float) -> Tensor:
-    """Returns the poses of a closed spiral of two turns before a scene."""
+    """Returns the poses of a closed spiral of two turns in front of a scene."""
     poses = cameras.poses.double()
     angles = torch.arange(count, dtype=torch.float64, device=poses.device) * (4 * math.pi / count)
     centre, forward = poses[:, :3, 3].mean(0), -poses[:, :3, 2].mean(0)
@@ -284,7 +284,7 @@ def _spiral(cameras: Cameras, count: int, focus: Tensor | None, near: float, far
 
 
 def _around(cameras: Cameras, count: int, focus: Tensor) -> Tensor:
-    """Returns the poses of a turn around a focus, or of a way to and fro if the cameras leave a gap."""
+    """Returns the poses of a turn around a focus, or of a path back and forth if the cameras leave a gap."""
     up = cameras.poses[:, :3, 1].double().mean(0)
     up = torch.nn.functional.normalize(up, dim=0) if up.norm() > 0.1 else up.new_tensor((0.0, 0.0, 1.0))
     axes = look_at(up[None], torch.zeros_like(up), torch.ones_like(up))[0, :3, :3]  # its third column is up

@@ -23,8 +23,8 @@ from voronerf.app.wording import similar_path
 __all__ = ["Scene", "SceneError", "Split", "builtin_scene", "city_scene", "load_scene"]
 
 BUILTIN_SIZE = 100
-BUILTIN, CITY = "builtin", "builtin-city"  # also with a size, builtin:400, or a number of blocks, builtin-city:4x4
-CACHED = 100  # side in pixels from which on the built-in scene is cached
+BUILTIN, CITY = "builtin", "builtin-city"  # optional suffix: builtin:SIZE, builtin-city:BLOCKS
+CACHED = 100  # least side, in pixels, of a built-in scene that is cached
 MOST_PIXELS = 1600  # largest side of the built-in scene
 
 
@@ -33,7 +33,7 @@ VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".mpg")
 
 
 class Format(NamedTuple):
-    """A scene format: the file that identifies it, its loader, and a search function where one file does not tell."""
+    """A scene format: the file that identifies it, its loader, and a search function if one file cannot identify it."""
 
     sign: str
     load: Callable[[Path, Reading], Scene]
@@ -54,7 +54,7 @@ FORMATS = {
 
 
 def _computed(size: int) -> Scene:
-    """Returns the built-in scene, cached from the side `CACHED` on, which takes seconds to compute."""
+    """Returns the built-in scene; caches it for sides of at least `CACHED`, which take seconds to compute."""
     if size < CACHED:
         return builtin_scene(size)
     try:
@@ -91,17 +91,20 @@ def load_scene(
             "builtin-city" with one block, or "builtin-city:4x4" with 16. The folder has `transforms_train.json`
             (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, or LLFF's
             `poses_bounds.npy`. The path of such a file, or of a COLMAP model's folder, also names the scene.
-        downscale: factor by which images are reduced, >= 1. None is 1, and for photographs the smallest factor that
-            leaves at most 512 pixels a side. For a built-in scene it divides the 100 pixels or the named size.
+        downscale: factor by which images are reduced, >= 1. None is 1 or, for photographs, the smallest factor that
+            leaves at most 512 pixels a side. The image side of a built-in scene, 100 pixels by default, is divided by
+            it.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
             or a link.
-        format: the format of a folder, one of `FORMATS` such as "colmap"; "auto" is the first that the folder has.
+        format: the format of a folder, one of `FORMATS` such as "colmap"; "auto" is the first format that the folder
+            has.
         kind: the kind of photographs: "object" (on white), "forward" (the cameras look the same way), "inside-out" or
             "unbounded"; "auto" decides by transparent pixels and by the cameras.
         normalise: move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera
-            at distance 1; otherwise the coordinates of the files are kept.
+            is at distance 1; otherwise the coordinates of the files are kept.
         images: the storage of a folder's images: "memory"; "disk", a file of the cache (VORONERF_CACHE, or `voronerf`
-            in the user's caches) that is mapped into memory; or "auto", which is disk if they do not fit into memory.
+            in the user's caches) that is mapped into memory; or "auto", which is "disk" if the images do not fit into
+            memory.
         keep_far: keep photographs whose cameras lie far from the others. By default they are left out, since one such
             camera would determine the scale of the scene.
 
@@ -144,21 +147,21 @@ def load_scene(
         siblings = (path for path in folder.parent.glob("*") if path.is_dir())
         raise SceneError(f"{folder}: there is no such folder{similar_path(folder, (Path(BUILTIN), *siblings))}")
     if not folder.is_dir():
-        hint = f"; of a video, voronerf process {folder} DIR makes one" if folder.suffix.lower() in VIDEOS else ""
+        hint = f"; voronerf process {folder} DIR makes one from a video" if folder.suffix.lower() in VIDEOS else ""
         raise SceneError(f"{folder}: is not a folder{hint}")
     formats = [name for name, item in FORMATS.items() if item.is_used_by(folder)]
     models = find_models(folder)
     if "transforms" in formats and models and models.paths[0].relative_to(models.folder).parts[1:2] == ("sparse",):
-        formats.remove("colmap")  # nerfstudio makes transforms.json from colmap/sparse/0, and adds to it
+        formats.remove("colmap")  # nerfstudio makes transforms.json, with further entries, from colmap/sparse/0
         formats.append("colmap")
     if not formats:
-        message = f"{folder}: is not a scene, it has none of {', '.join(item.sign for item in FORMATS.values())}"
+        message = f"{folder}: is not a scene: it has none of {', '.join(item.sign for item in FORMATS.values())}"
         photographs = next((item for item in (folder, folder / "images") if item.is_dir() and has_images(item)), None)
         raise SceneError(
             message + (f"; voronerf process {photographs} DIR finds the cameras of its images" if photographs else "")
         )
     if format != "auto" and format not in formats:
-        raise SceneError(f"{folder}: format must be {' or '.join(formats)}, which it has, got {format}")
+        raise SceneError(f"{folder}: format must be one that the folder has, {' or '.join(formats)}, got {format}")
     chosen = formats[0] if format == "auto" else format
     scene = FORMATS[chosen].load(folder, Reading(downscale, allow_outside, kind, normalise, images, keep_far))
     others = tuple(f"--format {name} would read {FORMATS[name].sign}" for name in formats if name != chosen)

@@ -28,9 +28,9 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     """Loads a Blender synthetic scene.
 
     `transforms_test.json` lists the test views, or `transforms_val.json` if the former is missing or has no image.
-    Without either file, as BlenderNeRF exports scenes, every 8th training view is held out. Entries such as `fl_x`,
-    `cx` or `k1`, which Blender's files do not have, mark a capture with a predefined split. It is loaded as by
-    `load_transforms`, with this split.
+    If both files are missing, as in exports of BlenderNeRF, every 8th training view is held out. A file with entries
+    such as `fl_x`, `cx` or `k1`, which Blender's files do not have, is a capture with a predefined split. It is loaded
+    as in `load_transforms`, with this split.
 
     Returns:
         The scene, with near 2 and far 6 or the file's `near` and `far`, and a box carved from the alpha masks of the
@@ -42,12 +42,12 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     test_frames = _test_frames(folder, train_frames, reading)
     note: tuple[str, ...] = ()
     if not test_frames:
-        note = ("no other images for testing, as BlenderNeRF exports scenes: every 8th is held out",)
+        note = ("no test images, as in BlenderNeRF's exports: every 8th image is held out",)
         train_frames.sort(key=lambda frame: frame.path.as_posix())
         test_frames = train_frames[::HOLD_OUT]
         train_frames = [frame for number, frame in enumerate(train_frames) if number % HOLD_OUT]
         if not train_frames:
-            raise SceneError(f"{train_file}: one image is too few, one is held out for testing")
+            raise SceneError(f"{train_file}: needs at least two images, since one is held out for testing")
 
     if has_lens((*train_frames, *test_frames)):
         if "near" in entries or "far" in entries:
@@ -74,7 +74,7 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
 
 
 def _test_frames(folder: Path, train_frames: Sequence[ListedImage], reading: Reading) -> list[ListedImage]:
-    """Returns the test images of the first file that has any, without training images, for which it warns."""
+    """Returns the test images of the first file that has any; leaves out training images, with a warning."""
     training = {frame.path.resolve() for frame in train_frames}
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():

@@ -24,21 +24,21 @@ MASK_PIXELS, MOST_MASK_PIXELS = 100, 1000  # target length of a mask's shorter s
 VIEWS = 100
 GROWTHS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # mask dilations in pixels
 MARGIN = GROWTHS[-1] + 1
-SEEN_BY = 0.25  # least share of the views that see a voxel of the object
+SEEN_BY = 0.25  # least fraction of the views that must see a voxel of the object
 MISSED_BY = 1  # number of views whose masks may be wrong about a voxel
-OUTSIDE = 1e-3  # largest share of the masks' pixels whose rays miss the box
+OUTSIDE = 1e-3  # largest fraction of the masks' pixels whose rays may miss the box
 
 
 def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tensor | None:
     """Returns the bounding box of the voxels that at most one mask excludes.
 
-    A voxel is removed if two views see it entirely outside their mask. Each mask is dilated by the voxel's size in
+    A voxel is removed if two views see it entirely outside their masks. Each mask is dilated by the voxel's size in
     pixels, so that the box does not cut the object. The box is larger than the object by one or two voxels, each about
     a fortieth of the object's size, and includes concavities that no silhouette shows.
 
     Args:
-        cameras: c perspective cameras that look at the object from around it.
-        alpha: uint8 [c, h, w]; a pixel with alpha > 0 shows the object. Zero beside smaller images.
+        cameras: c perspective cameras around the object, which look at it.
+        alpha: uint8 [c, h, w]; a pixel with alpha > 0 shows the object. Smaller images are padded with zeros.
         near: smallest distance of the object from a camera.
         far: largest distance of the object; the search covers a cube of half side (far - near) / 2.
 
@@ -91,7 +91,7 @@ class _Silhouette:
         self.masks = np.stack(levels)
 
     def _straightened(self, mask: NDArray[np.bool_], coefficients: Tensor) -> NDArray[np.bool_]:
-        """Returns the undistorted mask; pixels outside the picture count as the object unless it shows all of it."""
+        """Returns the undistorted mask; pixels outside the picture are set unless it shows the whole object."""
         row, column = torch.from_numpy(np.indices(mask.shape) + 0.5)
         u, v = distort((column - self.cx) / self.fx, (row - self.cy) / self.fy, coefficients)
         x, y = (u * self.fx + self.cx).floor().numpy(), (v * self.fy + self.cy).floor().numpy()
@@ -101,7 +101,7 @@ class _Silhouette:
         return straight
 
     def judge(self, points: Array, radius: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Returns bool masks (seen [n], missed [n]): balls that this view sees, and seen balls outside its mask."""
+        """Returns (seen, missed), bool [n]: which balls this view sees, and which of these lie outside its mask."""
         x, y, z = (points - self.pose[:3, 3]).T
         local = [self.pose[0, i] * x + self.pose[1, i] * y + self.pose[2, i] * z for i in range(3)]
         depth = -local[2]
@@ -162,7 +162,7 @@ def _widen(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _share_outside(cameras: Cameras, visible: NDArray[np.bool_], box: Array) -> float:
-    """Returns the share of the masks' pixels whose rays miss the box."""
+    """Returns the fraction of the masks' pixels whose rays miss the box."""
     image, row, column = visible.nonzero()
     step = max(1, len(image) // 20_000)
     chosen = [torch.from_numpy(index[::step].copy()) for index in (image, column, row)]

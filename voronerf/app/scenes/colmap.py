@@ -4,7 +4,8 @@ c images, n points, s observations of points in images. COLMAP's poses are world
 forward; voronerf's are camera to world with OpenGL's axes. Every count in a file is compared with the remaining bytes,
 so that a corrupt count allocates no memory.
 
-Source: COLMAP, "Output Format". Models of rigs, too, have the pose of each image in `images`, which is read.
+Source: COLMAP, "Output Format". Models of rigs also store the pose of each image in `images`; only these poses are
+read.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ from voronerf.app.scenes.transforms import LARGEST, LONGEST
 Array = NDArray[Any]
 
 FILES = ("cameras", "images", "points3D")
-#: Folders of models in a scene's folder, and the folders of their images, in the order of the search. A folder has one
-#: model, or models 0, 1, ... They are by COLMAP, nerfstudio, gaussian-splatting (before undistortion) and
+#: Model folders in a scene's folder, and their image folders, in the order of the search. A model folder holds one
+#: model, or models 0, 1, ... These are the layouts of COLMAP, nerfstudio, gaussian-splatting (before undistortion) and
 #: image_undistorter.
 PLACES = {
     "sparse": "images",
@@ -51,11 +52,12 @@ PLACES = {
 }
 #: The largest size of a file in bytes.
 MOST_BYTES = 2**31
-#: The fewest images that must see a point: positions of other points are too uncertain.
+#: The minimum number of images that see a point; with fewer images, its position is too uncertain.
 LEAST_SEEN = 3
 #: The first invalid point number: COLMAP writes 2^64 - 1 for an observation without a point.
 NO_POINT = 2**63
-#: The share of a view's points cut off at either end of their depths, and the fewest points for depth bounds.
+#: The fraction of a view's points that is dropped at each end of the depths, and the minimum number of points for depth
+#: bounds.
 OUTLIERS, LEAST_POINTS = 0.01, 20
 
 
@@ -97,7 +99,7 @@ class Models(NamedTuple):
 
 
 def find_models(folder: Path) -> Models | None:
-    """Returns the COLMAP models of a scene, or None; ``folder`` is the scene's, a model's, or the parent of models."""
+    """Returns the COLMAP models of a scene, or None; ``folder`` holds the scene, one model or several models."""
     for place, images in PLACES.items():
         folder = Path(os.path.abspath(folder)) if place == "." else folder
         inside = folder / place
@@ -110,7 +112,7 @@ def find_models(folder: Path) -> Models | None:
 
 
 def _scene_around(folder: Path) -> tuple[Path, str]:
-    """Returns a scene's folder and its images' path there, given this folder or a folder of models inside it."""
+    """Returns (scene folder, path of the images in it), given the scene folder or a model folder inside it."""
     models = folder.parent if folder.name.isdecimal() else folder
     if not image_folders(folder):
         for place, images in PLACES.items():
@@ -121,7 +123,7 @@ def _scene_around(folder: Path) -> tuple[Path, str]:
 
 
 def _suffix(folder: Path) -> str | None:
-    """Returns the suffix of a model's files, preferably binary; None for a folder without a model."""
+    """Returns the suffix of a model's files, .bin if both kinds exist; None for a folder without a model."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{name}{suffix}").is_file() for name in FILES[:2]):
             return suffix
@@ -129,7 +131,7 @@ def _suffix(folder: Path) -> str | None:
 
 
 def _count_images(folder: Path) -> int:
-    """Returns the number of images of a model, from the first bytes of a binary one; 0 for a broken model."""
+    """Returns the number of images of a model; 0 for a broken model. Binary files are not read in full."""
     path = folder / f"images{_suffix(folder)}"
     try:
         if path.suffix == ".txt":
@@ -142,7 +144,7 @@ def _count_images(folder: Path) -> int:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Reads a model, from binary files if there are both kinds. Without `points3D` it has no points."""
+    """Reads a model, from the binary files if both kinds exist. Without `points3D`, the model has no points."""
     suffix = _suffix(folder) or ".bin"
     cameras_path, images_path, points_path = (folder / f"{name}{suffix}" for name in FILES)
     binary = suffix == ".bin"
@@ -153,7 +155,9 @@ def read_model(folder: Path) -> ColmapModel:
             if "\0" in name:
                 raise SceneError(f"{images_path}: the name of an image must have no zero byte, got {name!r:.60}")
             if camera not in cameras:
-                raise SceneError(f"{images_path}: image {name} has camera {camera}, which {cameras_path.name} has not")
+                raise SceneError(
+                    f"{images_path}: image {name} has camera {camera}, which is missing in {cameras_path.name}"
+                )
             images.append(ColmapImage(name, cameras[camera], _pose(values, f"{images_path}: image {name}"), points))
         numbers, points = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
         if points_path.is_file():
@@ -223,7 +227,7 @@ def _cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
         yield number, _camera(path, number, name, width, height, reader.values(f"<{len(parameters.split())}d"))
 
 
-#: The bytes of the smallest image record: no observations and an empty name.
+#: The size in bytes of the smallest image record, with no observations and an empty name.
 LEAST_IMAGE = 64 + 1 + 8
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 RawImage = tuple[str, int, tuple[float, ...], Array]
@@ -262,7 +266,7 @@ def _line_of(what: str, path: Path, line: int) -> Iterator[None]:
     try:
         yield
     except (ValueError, IndexError, OverflowError):
-        raise SceneError(f"{path}: line {line} is not that of {what}") from None
+        raise SceneError(f"{path}: line {line} does not describe {what}") from None
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
@@ -281,7 +285,7 @@ def _text_images(path: Path) -> Iterator[RawImage]:
             continue
         with _line_of("an image", path, line):
             values, camera, name = tuple(map(float, words[1:8])), int(words[8]), " ".join(words[9:])
-        line, seen = next(lines, (line + 1, []))  # the line of its observations; empty without any
+        line, seen = next(lines, (line + 1, []))  # the line of the image's observations, which may be empty
         with _line_of("the points of an image", path, line):
             numbers = [int(number) for number in seen[2::3]]
         yield name, camera, values, np.array([number for number in numbers if 0 <= number < NO_POINT], dtype=np.int64)
@@ -335,8 +339,9 @@ def _pose(values: tuple[float, ...], where: str) -> Array:
 def load_colmap(folder: Path, reading: Reading) -> Scene:
     """Loads a capture with a COLMAP model; every 8th image in the order of names is held out for testing.
 
-    If there are several models, the one with the most images is read. Black pixels of a mask in `masks` beside the
-    images are neither trained nor scored. The bounds of a view are the depths between which 98 % of its points lie.
+    If there are several models, the one with the most images is read. Masks lie in `masks` beside the images; their
+    black pixels are neither trained nor scored. The bounds of a view are the depths between which 98 % of its points
+    lie.
     """
     models = find_models(folder)
     if models is None:

@@ -29,7 +29,7 @@ class ImageFolder(NamedTuple):
 
     Attributes:
         path: the folder.
-        full: the folder of the same images in full size, or None if ``path`` is this folder.
+        full: the folder of the same images in full size; None if ``path`` has full size, or if this folder is missing.
         masks: the folder of their masks, or None.
         factor: the remaining downscale factor; None to choose it by the size of the images.
         notes: lines for the user.
@@ -47,7 +47,7 @@ class ImageFolder(NamedTuple):
 
 
 def image_folders(folder: Path, images: str = "images") -> dict[int, Path]:
-    """Returns the folders `images` (N = 1) and `images_N` by N, in any case; `images` is a path in ``folder``."""
+    """Returns {N: folder} for `images` (N = 1) and `images_N`, ignoring case; `images` is a path in ``folder``."""
     parent, name = (folder / images).parent, Path(images).name
     matches = [
         (re.fullmatch(rf"{name}(?:_([1-9]\d{{0,3}}))?", path.name, re.IGNORECASE), path)
@@ -59,9 +59,9 @@ def image_folders(folder: Path, images: str = "images") -> dict[int, Path]:
 def choose_images(folder: Path, downscale: int | None, images: str = "images") -> ImageFolder:
     """Returns the image folder that needs the least further reduction.
 
-    With `downscale` N, this is `images_N`; if it is missing, `images`, whose files are reduced by N. Without `images`,
-    it is the `images_N` with the largest images, which `downscale` 1 leaves in their size. `downscale` None reduces the
-    images by `least_factor`. `images` is a path in the scene's folder.
+    For `downscale` N, this is `images_N` or, if missing, `images`, whose files are then reduced by N. If `images` is
+    missing too, it is the `images_N` with the smallest N; `downscale` 1 keeps the size of these images. For `downscale`
+    None, images are reduced by `least_factor`. The argument `images` is a path in the scene's folder.
     """
     sizes = image_folders(folder, images)
     if not sizes:
@@ -74,7 +74,7 @@ def choose_images(folder: Path, downscale: int | None, images: str = "images") -
         factor = max(downscale // chosen, 1)
     else:
         raise SceneError(f"{sizes[chosen]}: --downscale must be 1 or a multiple of {chosen}, got {downscale}")
-    notes = () if chosen == 1 else (f"{sizes[chosen].name} is read, and not {images}",)
+    notes = () if chosen == 1 else (f"{sizes[chosen].name} is read instead of {images}",)
     masks = image_folders(folder, posixpath.join(posixpath.dirname(images), "masks"))
     full = sizes.get(1) if chosen > 1 else None
     return ImageFolder(sizes[chosen], full, masks.get(chosen, masks.get(1)), factor, notes)
@@ -83,16 +83,16 @@ def choose_images(folder: Path, downscale: int | None, images: str = "images") -
 def stay_inside(path: Path, folder: Path, allow_outside: bool, name: str = "") -> None:
     """Raises SceneError for a path that leads out of the scene's folder by `..` or a link, unless this is allowed.
 
-    The error message begins with ``name``, or else with the path.
+    The error message begins with ``name`` or, if it is empty, with the path.
     """
     if not allow_outside and leads_outside(path, folder):
-        raise SceneError(f"{name or path}: must lie in the folder of the scene; --allow-outside reads others")
+        raise SceneError(f"{name or path}: must lie in the folder of the scene; --allow-outside also reads other files")
 
 
 def named_images(
     source: Path, images: ImageFolder, names: Sequence[str], allow_outside: bool
 ) -> tuple[list[Path | None], tuple[str, ...]]:
-    """Finds the image files of names by `named_files`, or, if none fits, by order where there are as many files.
+    """Finds the image file of each name by `named_files` or, if no name fits, by the order of files and names.
 
     Warns of missing files.
 
@@ -103,7 +103,7 @@ def named_images(
     notes: tuple[str, ...] = ()
     if not any(files):
         files = _files_in_order(source, images, names, allow_outside)
-        notes = (f"the names in {images.path.name} are not those of the model: its images are taken in their order",)
+        notes = (f"no file in {images.path.name} has a name of the model: files are matched by order",)
     missing = files.count(None)
     if missing == len(files):
         raise SceneError(f"{source}: none of its {len(files)} images exists, the first is {images.path / names[0]}")
@@ -113,11 +113,11 @@ def named_images(
 
 
 def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
-    """Finds the files of names in a folder and its subfolders; None for missing files.
+    """Finds the file of each name in a folder and its subfolders; None for a missing file.
 
-    A name is compared with a file's path: exactly, then without the file's suffix, then without both suffixes, and at
-    last in the same ways without regard to case. If no name fits, and the names' last parts are unique, these last
-    parts are compared in the same ways.
+    A name is compared with a file's path: exactly, then without the file's suffix, then without both suffixes, and
+    finally in the same ways, ignoring case. If no name fits, and the last parts of the names are unique, they are
+    compared with the last parts of the paths.
     """
     names = [posixpath.normpath(name.replace("\\", "/")) for name in names]
     found = {
@@ -131,7 +131,7 @@ def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside:
         if not found and len(set(map(posixpath.basename, names))) == len(set(names)):
             _compare(source, folder, set(names), files, found, posixpath.basename)
     for name in names:
-        if name in found or not posixpath.isabs(name):  # an absolute path may be of another machine
+        if name in found or not posixpath.isabs(name):  # an absolute path may come from another machine
             stay_inside(found.get(name, folder / name), folder.parent, allow_outside)
     return [found.get(name) for name in names]
 
@@ -139,7 +139,7 @@ def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside:
 def _compare(
     source: Path, folder: Path, names: set[str], files: list[Path], found: dict[str, Path], part: Callable[[str], str]
 ) -> None:
-    """Adds the files of names to ``found``, by comparing a part of the paths; ambiguous matches are left out."""
+    """Compares ``part`` of names and paths, and adds the matches to ``found``; skips or refuses ambiguous matches."""
     for fold in (str, str.casefold):
         for cut, cut_file in ((str, str), (str, _without_suffix), (_without_suffix, _without_suffix)):
             by_key = defaultdict(list)
@@ -151,7 +151,7 @@ def _compare(
                 paths = by_key.get(keys[name], [])
                 if len(paths) > 1 and part is str:
                     candidates = " or ".join(path.relative_to(folder).as_posix() for path in paths[:2])
-                    raise SceneError(f"{source}: {name} may be {candidates} in {folder}: leave one of them there")
+                    raise SceneError(f"{source}: {name} may be {candidates} in {folder}: keep only one of these files")
                 if len(paths) == counts[keys[name]] == 1 and paths[0] not in taken:
                     found[name] = paths[0]
 
@@ -161,10 +161,10 @@ def _without_suffix(name: str) -> str:
 
 
 def _files_in_order(source: Path, images: ImageFolder, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
-    """Matches files with names by their order; for reduced images, the order of the images in full size counts.
+    """Matches files with names by order; for reduced images, by the order of the images in full size.
 
-    It finds none if sorting by characters and by numbers differ, as for 10.jpg and 9.jpg: the other program may have
-    used either order.
+    No file is matched if the numbers of files and names differ, or if sorting by characters and by numbers gives
+    different orders, as for 10.jpg and 9.jpg: the other program may have used either order.
     """
     files = image_files(images.path)
     ordered: list[Any] = sorted(set(names)) if images.full is None else image_files(images.full)
@@ -177,7 +177,7 @@ def _files_in_order(source: Path, images: ImageFolder, names: Sequence[str], all
 
 
 def _in_numeric_order(paths: Sequence[Path | str]) -> bool:
-    """Returns whether the numbers in sorted paths are in ascending order, too."""
+    """Returns whether sorted paths are in numeric order, too, such as 9 before 10."""
     parts = [re.split(r"(\d+)", str(path)) for path in paths]
     keys = [[int(part) if part.isdecimal() else part for part in pieces] for pieces in parts]
     return keys == sorted(keys)

@@ -3,8 +3,9 @@
 Behind an object on a turntable, the background has most features, and its features show a static camera. A model is
 folded if it places the images of two sides of an object on one side.
 
-False matches between two sides lie on the object alone, which fills little of the images. Matches of neighbouring
-images reach over much of them. So these wide pairs are trusted, and a model that contradicts them is folded.
+False matches between two sides lie on the object alone, which fills a small part of the images. Matches of neighbouring
+images spread over a large part; such pairs of images are called wide. Wide pairs are trusted, and a model that
+contradicts them is folded.
 
 f features of an image, m matches of two images. Positions are in pixels, as in :func:`voronerf.nerf.lenses.unproject`.
 """
@@ -25,35 +26,38 @@ from voronerf.nerf.lenses import unproject
 Array = NDArray[Any]
 Pair = tuple[str, str]
 
-#: The fewest matches of a wide pair, and the least area of their bounding box, in both images, as a share of the box of
-#: all features. For a can with the same print on two sides, 326 right pairs and a wrong one are wide, of 835 pairs.
+#: The minimum number of matches of a wide pair, and the minimum area of their bounding box in both images, as a
+#: fraction of the box of all features. For a can with the same print on two sides, 327 of 835 pairs are wide, and one
+#: of these is wrong.
 WIDE_MATCHES, WIDE = 30, 0.12
-#: The matches of a strong pair, at least, as a share of the most matches of a pair with one of its images. Weaker pairs
-#: may be wrong where patterns repeat: good cameras of bonsai contradict 22 of 593 wide pairs, none above .2.
+#: The minimum number of matches of a strong pair, as a fraction of the largest number of any pair with one of its
+#: images. Weaker pairs may be wrong where patterns repeat: good cameras of bonsai contradict 22 of 593 wide pairs, none
+#: of them with a fraction above 0.2.
 STRONG = 0.25
 #: The number of other pairs that are trusted for an image without strong pairs.
 HOLDING = 2
 #: The median epipolar distance of a pair's matches, in image widths, above which the cameras contradict the pair.
 CONTRADICTED = 0.02
-#: A folded model contradicts at least this number of strong pairs, and more than this share of them.
+#: A folded model contradicts at least this number of strong pairs, and more than this fraction of them.
 FOLDED_PAIRS, FOLDED = 3, 0.01
-#: A pair of images is still if more than the share `SHIFTED` of its matches lie within `SHIFT` of their median shift,
-#: in units of the longest side of the features' box. In bust, beer, fern, fox and mouse, at most 2 % of the pairs are
-#: still, for a head on a turntable 57 %. The background is static if the share of still pairs exceeds `STILL`.
+#: A pair of images is still if more than the fraction `SHIFTED` of its matches have nearly the median shift: they
+#: differ from it by less than `SHIFT`, in units of the longer side of the features' box. At most 2 % of the pairs are
+#: still in bust, beer, fern, fox and mouse, and 57 % for a head on a turntable. The background is static if the
+#: fraction of still pairs exceeds `STILL`.
 SHIFTED, SHIFT, STILL = 0.5, 0.0025, 0.25
 #: The smallest divisor, in place of a length of zero.
 TINY = 1e-12
 
 
 class Matches(NamedTuple):
-    """COLMAP's verified matches, which fit two cameras, by the names of the images."""
+    """COLMAP's verified matches, which fit two cameras, by image name."""
 
     features: dict[str, Array]  # float [f, 2], the positions of each image's features
     pairs: dict[Pair, Array]  # int64 [m, 2], the indices of each pair's matching features
 
 
 def spreads(matches: Matches) -> dict[Pair, float]:
-    """Returns for each pair the area of its matches' box over the box of all features, the smaller of both images."""
+    """Returns for each pair the smaller ratio, of two images, of the area of the matches' box to the features' box."""
     boxes = {name: max(_box(places), TINY) for name, places in matches.features.items()}
     return {
         pair: min(_box(matches.features[name][indices]) / boxes[name] for name, indices in zip(pair, rows.T))
@@ -62,13 +66,13 @@ def spreads(matches: Matches) -> dict[Pair, float]:
 
 
 def _box(places: Array) -> float:
-    """Returns the area of the box of positions [n, 2], without the outer 5 % at each border."""
+    """Returns the area of the box between the 5 % and 95 % quantiles of positions [n, 2]."""
     low, high = np.quantile(places, (0.05, 0.95), axis=0) if len(places) else np.zeros((2, 2))
     return float((high - low).prod())
 
 
 def still_pairs(matches: Matches) -> tuple[int, int]:
-    """Returns the number of still pairs, whose matches differ by a shift alone, and of pairs with enough matches."""
+    """Returns (number of still pairs, whose matches have nearly equal shifts; number of pairs with enough matches)."""
     lengths = {name: float(np.ptp(places, axis=0).max()) for name, places in matches.features.items() if len(places)}
     large = {pair: rows for pair, rows in matches.pairs.items() if len(rows) >= WIDE_MATCHES}
     count = 0
@@ -80,12 +84,12 @@ def still_pairs(matches: Matches) -> tuple[int, int]:
 
 
 def wide_pairs(matches: Matches, spread: dict[Pair, float]) -> list[Pair]:
-    """Returns the pairs whose matches reach over much of both images."""
+    """Returns the pairs whose matches spread over a large part of both images."""
     return [pair for pair, rows in matches.pairs.items() if len(rows) >= WIDE_MATCHES and spread[pair] >= WIDE]
 
 
 def strong_pairs(matches: Matches, wide: Iterable[Pair]) -> list[Pair]:
-    """Returns the wide pairs with at least the share `STRONG` of the matches of their images' best pairs."""
+    """Returns the wide pairs with at least `STRONG` times as many matches as the best pair of either image."""
     most = dict.fromkeys(matches.features, 0)
     for pair, rows in matches.pairs.items():
         most.update({name: max(most[name], len(rows)) for name in pair})
@@ -93,7 +97,7 @@ def strong_pairs(matches: Matches, wide: Iterable[Pair]) -> list[Pair]:
 
 
 def trusted_pairs(matches: Matches, spread: dict[Pair, float]) -> set[Pair]:
-    """Returns the wide pairs and, for an image without strong pairs, its best other pairs by matches times spread."""
+    """Returns the wide pairs and, for an image without strong pairs, its best other pairs, by matches x spread."""
     wide = set(wide_pairs(matches, spread))
     covered = {name for pair in strong_pairs(matches, wide) for name in pair}
     others = [pair for pair, rows in matches.pairs.items() if pair not in wide and len(rows) >= WIDE_MATCHES]
@@ -103,7 +107,7 @@ def trusted_pairs(matches: Matches, spread: dict[Pair, float]) -> set[Pair]:
 
 
 def contradicted_pairs(matches: Matches, strong: Iterable[Pair], images: Sequence[ColmapImage]) -> tuple[int, int]:
-    """Returns the number of strong pairs that a model's cameras contradict, and of strong pairs among its images."""
+    """Returns (number of strong pairs that a model's cameras contradict, number of strong pairs of its images)."""
     by_name = {image.name: image for image in images}
     placed = [pair for pair in strong if by_name.keys() >= set(pair)]
     rays = {name: _rays(by_name[name], matches.features[name]) for name in {name for pair in placed for name in pair}}
@@ -117,7 +121,7 @@ def contradicted_pairs(matches: Matches, strong: Iterable[Pair], images: Sequenc
 
 
 def _rays(image: ColmapImage, places: Array) -> Tensor:
-    """Returns the ray directions of positions [f, 2] in the scene, float64 [f, 3]; NaN where the lens has no ray."""
+    """Returns the world ray directions float64 [f, 3] of image positions [f, 2]; NaN where the lens has no ray."""
     x, y = torch.from_numpy(places.astype(np.float64)).unbind(-1)
     intrinsics, coefficients, model = image.camera.lens
     directions, valid = unproject(x, y, torch.tensor(intrinsics), torch.tensor(coefficients), model)
@@ -142,5 +146,5 @@ def epipolar_angles(a: Tensor, b: Tensor, base: Tensor) -> Tensor:
 
 
 def is_folded(contradicted: int, strong: int) -> bool:
-    """Returns whether a model is folded, by the number of contradicted and of all strong pairs."""
+    """Returns whether a model is folded, given its numbers of contradicted and of all strong pairs."""
     return contradicted >= FOLDED_PAIRS and contradicted > FOLDED * strong

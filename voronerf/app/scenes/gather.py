@@ -21,13 +21,14 @@ from voronerf.app.scenes.soundness import some_of
 
 #: Container formats of videos. Playlists are excluded, since they name other files.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
-#: Image formats, recognised by the content of a file, and the formats that are copied. MPO is JPEG with two pictures.
+#: Image formats, recognised by the content of a file, and the formats that are copied unchanged. MPO is JPEG with two
+#: pictures.
 FORMATS = ("PNG", "JPEG", "WebP", "TIFF", "BMP")
 COPIED = ("PNG", "JPEG", "MPO")
 #: The EXIF tags from which COLMAP gets a focal length.
 CAMERA = (ExifTags.Base.Make, ExifTags.Base.Model)
 LENS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
-#: Image suffixes in order of preference. Of files that differ in suffix alone, such as a photograph and its cut-out,
+#: Image suffixes in order of preference. If files differ in suffix alone, such as a photograph and its cut-out, only
 #: the first is taken.
 KINDS = (*reversed(SUFFIXES), *CONVERTED)
 #: Files and folders of operating systems, which are ignored like hidden ones.
@@ -47,8 +48,8 @@ def gather(
     Args:
         source: a video, or a folder, as in :func:`voronerf.app.scenes.process.process`.
         images: the empty folder for the images.
-        masks: the folder for the masks, made if there are any.
-        frames: the number of frames of a video.
+        masks: the folder for the masks, which is made only if there are masks.
+        frames: the number of frames to extract from a video.
         say: called with a line for the user, such as about files that are left out.
         progress: called with the name "images", the number of copied images, and the number of all.
     """
@@ -58,7 +59,7 @@ def gather(
     if not source.is_dir():
         _take_frames(source, images, frames, say)
     if repeats := _remove_repeats(images):
-        say(f"{folder}: {len(repeats)} images are left out that repeat others to the byte: {some_of(repeats)}")
+        say(f"{folder}: {len(repeats)} byte-identical copies of images are left out: {some_of(repeats)}")
     count = len(listed_images(images))
     if count < LEAST_IMAGES:
         raise SceneError(f"{folder}: must have at least {LEAST_IMAGES} images, got {count}")
@@ -98,14 +99,14 @@ def _list_images(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[P
     deeper = [path for path in images if path.parent != folder]
     if len(deeper) < len(images):
         if deeper:
-            say(f"{folder}: {len(deeper)} images in its folders are left out, since it has images itself")
+            say(f"{folder}: {len(deeper)} images in subfolders are left out, since the folder itself has images")
         files, images = ([path for path in paths if path.parent == folder] for paths in (files, images))
     elif inner := next((path for path in folder.iterdir() if path.is_dir() and path.name.lower() == "images"), None):
         if skipped := sum(inner not in path.parents for path in images):
-            say(f"{folder}: {skipped} images in other folders than {inner.name} are left out")
+            say(f"{folder}: {skipped} images outside of {inner.name} are left out")
         return _list_images(inner, say)
     elif len(places := Counter(str(path.parent.relative_to(folder)) for path in deeper)) > 1:
-        say(f"{folder}: the images are those of {some_of([f'{name} ({count})' for name, count in places.items()])}")
+        say(f"{folder}: the images come from {some_of([f'{name} ({count})' for name, count in places.items()])}")
     if others := Counter(path.suffix.lower() or path.name for path in files if path.suffix.lower() not in KINDS):
         listed = [f"{count} {kind}" for kind, count in others.most_common()]
         say(f"{folder}: other files than {', '.join(FORMATS)} and HEIC are left out: {some_of(listed)}")
@@ -116,7 +117,9 @@ def _list_images(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[P
     images.sort(key=lambda path: KINDS.index(path.suffix.lower()))
     first = {path.with_suffix(""): path for path in reversed(images)}
     if repeats := [str(path.relative_to(folder)) for path in images if first[path.with_suffix("")] != path]:
-        say(f"{folder}: {len(repeats)} images are left out that are there in another format, too: {some_of(repeats)}")
+        say(
+            f"{folder}: {len(repeats)} images are left out, since they also exist in another format: {some_of(repeats)}"
+        )
     return folder, sorted(first.values())
 
 
@@ -132,12 +135,12 @@ def _copy_images(
     for path in files:
         copy, reduced = _copy_image(path, part / "_".join("_".join(path.relative_to(folder).parts).split()))
         if copy in copied:
-            raise SceneError(f"{path}: {copied[copy]} has this name, too, with _ in the place of spaces and /")
+            raise SceneError(f"{path}: {copied[copy]} has the same name, once _ replaces spaces and /")
         copied[copy] = path
         deep += [path.name] * reduced
         progress("images", len(copied), len(files))
     if deep:
-        say(f"{folder}: of {len(deep)} images with 16 bits a channel the upper 8 are kept: {some_of(deep)}")
+        say(f"{folder}: {len(deep)} images have 16 bits a channel, of which the upper 8 are kept: {some_of(deep)}")
     return copied
 
 
@@ -147,7 +150,7 @@ def _opened(path: Path) -> Image.Image:
         return Image.open(path, formats=FORMATS)
     import pillow_heif
 
-    image: Image.Image = pillow_heif.open_heif(path).to_pillow()  # upright, with its tag
+    image: Image.Image = pillow_heif.open_heif(path).to_pillow()  # upright, with a matching tag
     return image
 
 
@@ -202,7 +205,7 @@ def _remove_repeats(folder: Path) -> list[str]:
 
 
 def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callable[[str], None]) -> None:
-    """Writes the masks of images, found in `masks` in or beside their folder, by COLMAP's names for the copies."""
+    """Writes the masks from the folder `masks`, in or beside the images' folder, under COLMAP's names for copies."""
     places = [place for place in (folder / "masks", folder / ".." / "masks") if place.is_dir()]
     count = 0
     for copy, path in copied.items():
@@ -227,14 +230,14 @@ def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callab
     if count:
         say(f"{count} of {len(copied)} images have a mask: nothing is learnt where it is black")
     elif places and copied:
-        say(f"{places[0]}: has no mask of an image; that of 0.jpg is 0.jpg.png or 0.png")
+        say(f"{places[0]}: has no mask of any image; the mask of 0.jpg must be 0.jpg.png or 0.png")
 
 
 def _take_frames(video: Path, folder: Path, count: int, say: Callable[[str], None]) -> None:
     """Writes evenly spaced frames of a video as JPEG without repeats; ffmpeg turns frames of phones upright.
 
     Packets are counted first, which is fast, since durations may be missing or wrong. A video that was cut without
-    encoding has more packets than frames, and is read a second time.
+    re-encoding has more packets than frames, and is read a second time.
     """
     import imageio_ffmpeg
 
@@ -248,7 +251,7 @@ def _take_frames(video: Path, folder: Path, count: int, say: Callable[[str], Non
         return subprocess.run([*command, *options], capture_output=True, text=True, errors="replace")
 
     def take(total: int) -> int:
-        """Writes frames of a video, supposing `total` frames, and returns the actual number of its frames."""
+        """Writes frames, assuming that the video has `total` frames, and returns the actual number."""
         rate = f"{min(count, total)}/{total}"
         chosen = f"select='gt(floor((n+1)*{rate}+0.5),floor(n*{rate}+0.5))'"
         # Frame numbers replace time stamps, since ffmpeg stops at repeated or decreasing ones.
@@ -266,9 +269,9 @@ def _take_frames(video: Path, folder: Path, count: int, say: Callable[[str], Non
     packets = sum(not line.startswith("#") for line in copied.stdout.splitlines())
     if not packets:
         reason = (copied.stderr.strip().splitlines() or ["no reason"])[-1]
-        raise SceneError(f"{video}: is no video in a container that is read ({CONTAINERS}): {reason:.200}")
+        raise SceneError(f"{video}: must be a video in a supported container ({CONTAINERS}): {reason:.200}")
     frames = take(packets)
     if len(listed_images(folder)) != min(count, frames):
         take(frames)
     if frames < count:
-        say(f"{video}: all of its frames are taken, {frames} in place of --frames {count}")
+        say(f"{video}: all {frames} frames are taken, fewer than --frames {count}")

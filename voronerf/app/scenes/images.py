@@ -31,13 +31,13 @@ UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.err
 TURNS = {3: 2, 6: 3, 8: 1}
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_DEPTH = 24  # byte offset of the number of bits per channel
-#: Alpha from which a pixel counts where alpha is a mask; pixels below mix with the background.
+#: The least alpha of a pixel that counts, if alpha is a mask; other pixels are mixed with the background.
 OPAQUE = 250
-#: The largest share of the free memory for a scene; the rest is for the networks.
+#: The largest fraction of the free memory for a scene; the rest is for the networks.
 SHARE = 0.75
 #: Bytes per pixel for rendering and scoring a view, most of them for SSIM.
 VIEW = 550
-#: The most decoding threads, and the most bytes of the images that they decode at a time.
+#: The maximum number of decoding threads, and of bytes of the images that they decode at a time.
 THREADS, IN_HAND = 4, 2**26
 #: The number of pixels that are converted and averaged at a time.
 BAND = 2**20
@@ -144,15 +144,15 @@ def read_images(
     most_channels: int = 4,
     upright: bool = False,
 ) -> Decoded:
-    """Decodes images; memory holds the result and one image, or several small ones.
+    """Decodes images; beside the result, memory holds only one image, or several small images.
 
     Args:
         paths: at least one file.
-        headers: the headers of the files that were read before, with None for other files.
+        headers: the headers, with None for each header that has not been read yet.
         factor: downscale factor, >= 1.
         keep: "memory"; "disk", see `voronerf.app.scenes.store`; or "auto": on disk if they do not fit into memory.
         name: the name of the scene.
-        most_channels: the most channels; 3 drops alpha.
+        most_channels: the maximum number of channels; 3 drops alpha.
         upright: turn images upright by their orientation tags.
     """
     found_headers = [header or read_header(path) for path, header in itertools.zip_longest(paths, headers)]
@@ -219,8 +219,8 @@ def read_masks(
     Args:
         masks: the mask file of each image, or None if the whole image counts.
         paths: the image files.
-        images: the decoded images, which have the size of their masks or a smaller one. Masks get the same turns, and
-            are on disk if the images are.
+        images: the decoded images, which have the size of their masks or a smaller one. Each mask is rotated like its
+            image. If the images are stored on disk, the masks are stored there too.
         factor: downscale factor.
         name: the name of the scene.
         alpha: exclude transparent pixels, too.
@@ -252,10 +252,8 @@ def read_masks(
         if alpha:
             kept = kept & (images.images[index, : kept.shape[0], : kept.shape[1], 3].numpy() >= OPAQUE)
         if not kept.any():
-            rule = f"{mask}: must" if mask else f"{path}: its alpha must"
-            raise SceneError(
-                f"{rule} leave a pixel that counts, or with --downscale a block of pixels; else take the image away"
-            )
+            cause = f"{mask}:" if mask else f"{path}: its alpha"
+            raise SceneError(f"{cause} excludes all pixels (with --downscale, all blocks); remove the image")
         place = np.zeros(shape[1:], dtype=np.uint8)
         place[: kept.shape[0], : kept.shape[1]] = kept
         return place
@@ -268,10 +266,10 @@ def read_masks(
 
 
 def drawn(mask: Image.Image, size: Sequence[int], turns: int) -> NDArray[np.bool_]:
-    """Returns bool [h, w], in the orientation of the stored image: pixels of a mask neither black nor transparent.
+    """Returns which pixels of a mask are neither black nor transparent, bool [h, w], oriented like the stored image.
 
-    A mask may have been drawn on the upright image. JPEG blurs borders, so that its pixels darker than grey count as
-    black.
+    A mask may have been drawn on the upright image. Since JPEG blurs borders, pixels of a JPEG mask that are darker
+    than grey count as black.
 
     Args:
         mask: the opened mask file.

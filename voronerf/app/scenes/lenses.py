@@ -1,4 +1,4 @@
-"""Lenses by the names of COLMAP's camera models, and a check which pixels of a lens have rays.
+"""Lenses by the names of COLMAP's camera models, and a check of which pixels of a lens have rays.
 
 Source: COLMAP, "Camera Models", and `src/colmap/sensor/models.h`.
 """

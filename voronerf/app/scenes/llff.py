@@ -1,8 +1,8 @@
 """Captures with LLFF's `poses_bounds.npy` (Mildenhall et al. 2019), and `images` or `images_N` beside it.
 
-The file has a row for each image, in the order of their names. It begins with a 3 x 5 matrix, whose columns are the
-axes down, right and backwards, the position, and height, width and focal length in pixels of `images`. Then follow the
-least and the largest depth of its points.
+The file has a row for each image, in the order of the images' names. A row begins with a 3 x 5 matrix, whose columns
+are the axes down, right and backwards, the position, and height, width and focal length in pixels of `images`. The
+smallest and the largest depth of the image's points follow.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from voronerf.app.scenes.transforms import LARGEST, ORTHONORMAL
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17
-#: The most rows, one for each image, of a file.
+#: The maximum number of rows in a file, one for each image.
 MOST = 1_000_000
 
 
@@ -60,8 +60,8 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
 def _read(path: Path) -> np.ndarray:
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # the header is Python syntax, which may fail in any way
-        raise SceneError(f"{path}: is no array of NumPy that can be read: {error!s:.80}") from None
+    except Exception as error:  # the header is Python syntax; parsing may raise any error
+        raise SceneError(f"{path}: is not a readable NumPy array: {error!s:.80}") from None
     if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and 0 < len(rows) <= MOST):
         raise SceneError(
             f"{path}: must have {COLUMNS} numbers for each image, got shape {list(getattr(rows, 'shape', []))}"

@@ -30,25 +30,26 @@ from voronerf.nerf.contraction import Contraction, Perspective
 HOLD_OUT = 8
 # The longest side of images by default: about the resolution that can be learnt in minutes.
 LONGEST_SIDE = 512
-# The near bound of scenes without sparse points, as a share of the distance from the focus to the nearest camera.
-# Closer objects are rarely in focus.
+# The near bound of scenes without sparse points, as a fraction of the distance between the point that the cameras
+# face and the nearest camera. Photographs rarely show closer objects sharply.
 NEAR = 0.35
-# The smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
+# The smallest near bound, as a fraction of the distance of the farthest camera; disparity needs a near bound above 0.
 NEAREST = 0.05
 FAR = 4.0
-# Points nearer than `LEAST_NEAR` count as noise if at most the share `NOISY` of the views has such points. A smaller
-# near bound costs samples: half of them lie before twice the near bound.
+# Points nearer than `LEAST_NEAR` count as noise if at most the fraction `NOISY` of the views has such points. A smaller
+# near bound costs samples: half of the samples lie nearer than twice the near bound.
 LEAST_NEAR, NOISY = 0.02, 0.1
-# Factors of the views' bounds: surfaces may be a little nearer than the nearest point, and farther than the farthest.
+# Factors of the views' bounds: surfaces may be a little nearer than the nearest point, or farther than the farthest
+# point.
 NEARER, FARTHER = 0.75, 1.5
 # The length of the mean of the viewing directions above which a scene is forward facing.
 PARALLEL = 0.95
-# The least transparent shares of all pixels and of border pixels in a picture of a cut-out object. Masks of people,
-# edges after undistortion and single pixels stay below one of them.
+# In a picture of a cut-out object, at least these fractions of all pixels and of the border pixels are transparent.
+# Masks of people, edges after undistortion and single pixels stay below one of these fractions.
 CLEAR, CLEAR_BORDER = 0.25, 0.5
-# The number of positions along each side of an image that give its field of view if its corners have no rays.
+# The number of positions along each side of an image that are tried for its field of view if its corners have no rays.
 ACROSS = 65
-# The least share of an image's pixels that have a ray.
+# The minimum fraction of an image's pixels that have a ray.
 LEAST_RAYS = 0.25
 # The tolerance in pixels for the aspect ratio of a reduced image: sizes are integers, and exporters that scale images
 # may write fractions.
@@ -100,7 +101,7 @@ def distinct_names(paths: list[Path], folder: Path) -> list[str]:
     """Returns a unique name for each image, used for files of rendered pictures.
 
     The names are the stems of the files if these are unique; otherwise the paths inside the scene's folder, such as
-    a_00 for a/00.png; and if some paths are equal, the image's number and its path.
+    a_00 for a/00.png. If some paths are equal, each name is the image's number and its path.
     """
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
@@ -192,7 +193,7 @@ def photograph_scene(
 def _listed_once(
     views: Sequence[View], held_out: Tensor | None
 ) -> tuple[Sequence[View], Tensor | None, tuple[str, ...]]:
-    """Returns the views without repeated files, ``held_out``, and notes: no file may be both trained and tested."""
+    """Returns (views without repeated files, their ``held_out``, notes): no file may be both trained and tested."""
     first: dict[Path, int] = {}
     for index, view in enumerate(views):
         first.setdefault(view.path.resolve(), index)
@@ -200,7 +201,7 @@ def _listed_once(
         return views, held_out, ()
     kept = list(first.values())
     names = [views[index].path.name for index in sorted(set(range(len(views))) - set(kept))]
-    note = f"of images that are listed twice the first counts: {some_of(names)}"
+    note = f"images are listed twice; only the first entry counts: {some_of(names)}"
     return [views[index] for index in kept], None if held_out is None else held_out[kept], (note,)
 
 
@@ -211,7 +212,7 @@ def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path
     order = held_out.int().argsort(stable=True).tolist()
     count = int((~held_out).sum())
     if not 0 < count < len(views):
-        raise SceneError(f"{source}: one image is too few, one is held out for testing")
+        raise SceneError(f"{source}: needs at least two images, since one is held out for testing")
     return [views[index] for index in order], count
 
 
@@ -265,10 +266,10 @@ def _is_cut_out(alpha: Tensor) -> bool:
 
 
 def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
-    """Returns a note on the views with ``far`` True, bool [c]: one such camera would determine the scene's scale."""
+    """Returns a note on the views with ``far`` [c] True: one such camera would determine the scale of the scene."""
     names = [view.path.name for view, is_far in zip(views, far.tolist()) if is_far]
     start = f"{len(names)} of {len(views)} cameras lie far from the others"
-    treatment = "and are kept, as asked" if kept else "and are left out (--keep-far keeps them)"
+    treatment = "and are kept (--keep-far)" if kept else "and are left out (--keep-far keeps them)"
     return [f"{start} {treatment}: {some_of(names)}"] if names else []
 
 
@@ -410,12 +411,13 @@ def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
 
 
 def _kind(poses: Tensor, transparent: bool, cut_out: bool, panoramic: bool, reading: Reading, source: Path) -> str:
-    """Returns the requested kind of scene, or else the kind by images and cameras.
+    """Returns the requested kind of scene or, for "auto", the kind that fits the images and cameras.
 
-    The flags tell whether images have transparent pixels, most images show a cut-out, and any camera is a panorama.
+    The flags tell whether images have transparent pixels, whether most images show a cut-out, and whether any camera is
+    a panorama.
     """
     if reading.kind == "object" and not transparent:
-        raise SceneError(f"{source}: --kind object needs images with transparent pixels, these are opaque")
+        raise SceneError(f"{source}: --kind object needs images with transparent pixels, got opaque images")
     if reading.kind != "auto":
         return reading.kind
     if cut_out:
@@ -503,9 +505,9 @@ def _masked_by_lenses(
         height, width = valid.shape
         masks[index, :height, :width] &= valid
         if not masks[index].any():
-            raise SceneError(f"{views[index].path}: its mask and its lens must leave a pixel")
+            raise SceneError(f"{views[index].path}: its mask and its lens exclude all pixels")
     share = 1 - sum(map(torch.sum, seen.values())) / sum(map(torch.numel, seen.values()))
-    return masks, (f"{share:.0%} of the pixels of {len(seen)} images are none that their lens shows, and are masked",)
+    return masks, (f"{share:.0%} of the pixels of {len(seen)} images have no ray of their lens, and are masked",)
 
 
 def _circle(view: View, factor: int) -> Tensor:

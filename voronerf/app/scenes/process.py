@@ -1,10 +1,10 @@
-"""Makes a scene of a video or a folder of images: COLMAP, by pycolmap, finds the cameras.
+"""Makes a scene from a video or a folder of images; COLMAP (through pycolmap) finds the cameras.
 
-The stages keep their results in `OUT/colmap`. A stopped process continues from them, and COLMAP's own program can open
-them:
+The stages keep their results in `OUT/colmap`. A stopped process continues from these results, and COLMAP's own program
+can open them:
 
     features   `database.db`: the features of each image; `masks`: pixels that are neither transparent nor masked
-    pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: the pairs to match
+    pairs      `few.db`: the largest features, matched between all images; `pairs.json`: the pairs to match
     matches    `database.db`: the matches of these pairs
     cameras    `global` and, if this model has faults or loses cameras, `incremental`. A mapper runs again, on
                `trusted.db`, if its model contradicts pairs of images (:mod:`voronerf.app.scenes.folds`). The best model
@@ -59,37 +59,40 @@ from voronerf.app.wording import did_you_mean
 
 MATCHINGS = ("auto", "exhaustive", "sequential")
 MAPPERS = ("auto", "global", "incremental")
-#: The least alpha of pixels with features.
+#: The minimum alpha of pixels with features.
 OPAQUE = 128
-#: The most images for which "auto" matches all pairs.
+#: The largest number of images for which "auto" matches all pairs.
 FEW_IMAGES = 40
-#: Selection of pairs: the number of an image's largest features, the most partners of an image, the fewest matches of
-#: these features in a pair, and the number of next images by name that are always partners.
+#: Selection of pairs: the number of largest features per image, the maximum number of partners of an image, the minimum
+#: number of matches of these features in a pair, and the number of next images by name that are always partners.
 LARGEST_FEATURES, NEIGHBOURS, LEAST_MATCHES, FOLLOWING = 800, 20, 10, 2
 #: The number of pairs in a part, and of images in a block. Pairs are sorted by blocks, so that a part reads the
 #: features of few images.
 PART, BLOCK = 256, 16
-#: The number of images on which features are tried without upsampling. If they give less than a quarter of the
-#: requested features, all images are enlarged to twice their sides, as in the original SIFT, which takes four times as
-#: long.
+#: The number of images on which features are tried without upsampling. If these images have fewer than a quarter of the
+#: requested features, all images are enlarged to twice their width and height, as in the original SIFT. This takes four
+#: times as long.
 TRIED = 4
-#: "sequential" matches an image with this number of next images, and with as many at distances of powers of two.
+#: "sequential" matches an image with this number of next images, and with the same number of images at distances of
+#: powers of two.
 SEQUENTIAL = 10
-#: Shares of the images with a camera: below the first, a model is refused; below the second, other mappers are tried.
+#: Fractions of the images that have a camera: below the first, a model is refused; below the second, other mappers are
+#: tried.
 LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
-#: The fewest points, seen by at least three images, of a camera that is not lost. COLMAP requires as many matches of
-#: two images.
+#: A camera is lost if it sees fewer points than this; only points in at least three images count. COLMAP requires the
+#: same number of matches between two images.
 LEAST_HELD = 15
-#: The largest mean reprojection error of a sound model: in pixels, and as a share of the longer side, whichever is
-#: larger. A phone's images of 4,032 pixels have an error of 2.04, and fields are as good as with 1.39.
+#: The largest mean reprojection error of a sound model: in pixels, and as a fraction of the longer side, whichever is
+#: larger. With a phone's images of 4,032 pixels, fields are as good at an error of 2.04 as at 1.39.
 LARGEST_ERROR, ERROR_SHARE = 2.0, 1 / 800
-#: The tracks of an image that the global mapper uses for placing cameras, longest first; triangulation adds the rest.
+#: The number of tracks per image that the global mapper uses to place cameras, longest first; triangulation adds the
+#: other tracks.
 TRACKS = 200
 #: The name of the mapper's thread, which cannot be interrupted.
 MAPPER = "mapper"
 #: The temporary name of the stages' folder, until its settings are written.
 BEGUN = ".colmap"
-#: The least longer side of reduced images that are written, in pixels.
+#: Reduced images are written only if their longer side has at least this number of pixels.
 LEAST_SIDE = 256
 
 #: The prefix of COLMAP's log files, and the pattern of a log line at the start of a stage of the global mapper.
@@ -158,21 +161,21 @@ def process(
     settings continues. `out/sparse/0` is written last.
 
     Args:
-        source: a video, or a folder of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC images. Without images of
-            its own, its subfolder `images` is read, or all its subfolders. Features are found neither in transparent
-            parts nor in parts that a mask shows black. The mask of `0.jpg` is `0.jpg.png` or `0.png` in a folder
+        source: a video, or a folder of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC images. If the folder
+            itself has no images, its subfolder `images` or else all its subfolders are read. Pixels that are
+            transparent, or black in a mask, have no features. The mask of `0.jpg` is `0.jpg.png` or `0.png` in a folder
             `masks`, in or beside the images' folder, and is copied to `out/masks`. The static surroundings of an object
             on a turntable must be transparent or masked.
-        out: the folder to make. It must not exist, or must be empty or the folder of a stopped process.
-        frames: the number of evenly spaced frames of a video, or all if it has fewer.
+        out: the folder to make; an existing folder must be empty or belong to a stopped process.
+        frames: the number of evenly spaced frames to take from a video; all frames if it has fewer.
         matching: selection of image pairs: "exhaustive", all pairs; "sequential", neighbours by name; "auto", images
-            whose largest features match, and the next two by name.
+            whose largest features match, and the next two images by name.
         camera_model: COLMAP's name of the lens model.
         mapper: "global", "incremental", or "auto": global, and also incremental if the global model has faults or loses
             cameras. If a model contradicts pairs of images, its mapper runs again on trusted pairs alone.
-        max_features: the most features of an image.
+        max_features: the maximum number of features per image.
         size: the longer side in pixels to which images are reduced for finding features. COLMAP's default, 3,200,
-            doubles the time for phones' images, and fields are no better.
+            doubles the time for phones' images without better fields.
         verbose: show COLMAP's log.
         say: called with a line about each step.
         progress: called with the name of a stage, the number of finished items, and the number of all items, 0 if
@@ -215,7 +218,7 @@ def process(
     sizes = {path.name: read_header(path).size for path in files}
     counts = [f"{count} of {width} x {height}" for (width, height), count in Counter(sizes.values()).most_common()]
     shared = "one camera" if len(counts) == 1 else f"{len(counts)} cameras, one for each size: {some_of(counts)}"
-    say(f"{len(files)} images with {shared}; {work} keeps what COLMAP finds")
+    say(f"{len(files)} images with {shared}; {work} keeps COLMAP's results")
     stages = Stages(pycolmap, work, images, progress)
     if masks.is_dir() or any(read_header(path).alpha for path in files):
         _write_masks(files, masks, work / "masks")
@@ -224,7 +227,7 @@ def process(
     still, pairs = still_pairs(matches)
     if still > STILL * pairs:
         say(
-            f"check the images: {still} of {pairs} pairs differ by a shift alone, so that a background stands still; "
+            f"check the images: {still} of {pairs} pairs show a static background; "
             "the surroundings of an object on a turntable must be transparent (PNG)"
         )
     models = _find_models(stages, matches, mapper, len(files), say)
@@ -236,7 +239,7 @@ def process(
     if faults:
         raise SceneError(
             f"{out}: no sound model of {len(files)} images: {'; '.join(faults)}. Try --matching exhaustive, "
-            f"--max-features 8192, another --camera-model, or more images; {work} has what was found"
+            f"--max-features 8192, another --camera-model, or more images; {work} has COLMAP's results"
         )
     for factor in (2, 4):
         _write_reduced(files, out / f"images_{factor}", factor)
@@ -268,15 +271,15 @@ def _begin(out: Path, settings: Settings) -> Path:
         if changed := [name for name, value in wanted.items() if stored.get(name) != value]:
             name = changed[0]
             raise SceneError(
-                f"{work}: was begun with --{name.replace('_', '-')} {stored.get(name)}, not {wanted[name]}; give the "
-                "same, or another folder"
+                f"{work}: was started with --{name.replace('_', '-')} {stored.get(name)}, got {wanted[name]}; give "
+                "the same value, or another folder"
             )
         if (out / "sparse" / "0").exists():
             raise SceneError(f"{out}: is a scene already")
         return work
     partial = out / BEGUN
     if out.exists() and (not out.is_dir() or any(path != partial for path in out.iterdir())):
-        raise SceneError(f"{out}: must not exist yet, be an empty folder, or be that of a process that was stopped")
+        raise SceneError(f"{out}: must be a new or empty folder, or the folder of a stopped process")
     write_text(emptied(partial) / record.name, json.dumps(settings._asdict(), indent=1))
     os.replace(partial, work)
     return work
@@ -291,7 +294,7 @@ def _begin_images(source: Path, out: Path, frames: int, say: Callable[[str], Non
         for folder in (part, masks):
             shutil.rmtree(folder, ignore_errors=True)
         with contextlib.suppress(OSError):
-            os.replace(out / "colmap", out / BEGUN)  # renamed first: a kill cannot leave half of it
+            os.replace(out / "colmap", out / BEGUN)  # renamed first, so that a kill cannot leave a partial folder
             shutil.rmtree(out / BEGUN)
             out.rmdir()
         raise
@@ -325,7 +328,7 @@ def _named_errors(stage: str) -> Iterator[None]:
 
 
 def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
-    """Finds and matches features of images, for which ``sizes`` has the names and sizes."""
+    """Finds and matches the features of images; ``sizes`` maps the images' names to their sizes."""
     colmap, database, names = stages.colmap, stages.work / "database.db", list(sizes)
     extraction = colmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = settings.max_features
@@ -413,7 +416,7 @@ def _keep_largest(colmap: Any, database: Path, target: Path, most: int) -> None:
 
 
 def _choose_pairs(colmap: Any, few: Path) -> list[Pair]:
-    """Returns the pairs to match with all features: for each image its best partners, and the next by name."""
+    """Returns the pairs to match with all features: for each image its best partners, and the next images by name."""
     with colmap.Database.open(few) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         numbers, matches = opened.read_two_view_geometry_num_inliers()
@@ -431,7 +434,7 @@ def _choose_pairs(colmap: Any, few: Path) -> list[Pair]:
 
 
 def _find_models(stages: Stages, matches: Matches, mapper: str, count: int, say: Callable[[str], None]) -> list[Model]:
-    """Reconstructs with ``mapper``; "auto" tries the mappers in order until a model of ``count`` images is good."""
+    """Reconstructs ``count`` images with ``mapper``; "auto" tries the mappers in order until a model is good."""
     spread = spreads(matches)
     strong, models = strong_pairs(matches, wide_pairs(matches, spread)), list[Model]()
     for name, repeat in itertools.product(MAPPERS[1:], (False, True)):
@@ -490,9 +493,9 @@ def _sound(model: Model, least: float) -> bool:
 
 
 def _best(models: Sequence[Model], count: int) -> Model:
-    """Returns the best model of ``count`` images: sound, not folded, most cameras, fewest lost, and least error.
+    """Returns the best model: sound, not folded, with most cameras, fewest lost cameras and least error, in this order.
 
-    The criteria count in this order. A contradicted pair counts as a missing camera: it shows that cameras are wrong.
+    The models are of ``count`` images. A contradicted pair counts as a missing camera: it shows that cameras are wrong.
     """
 
     def worth(model: Model) -> tuple[float, ...]:
@@ -503,7 +506,7 @@ def _best(models: Sequence[Model], count: int) -> Model:
 
 
 def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Sequence[Pair]) -> Model | None:
-    """Returns the largest model of the mapper with which ``name`` begins, or None if it finds no model."""
+    """Runs the mapper with which ``name`` begins; returns its largest model, or None if it finds no model."""
     colmap, folder = stages.colmap, stages.work / name
     mapper, _, again = name.partition("_")
     if not folder.is_dir():
@@ -525,7 +528,7 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Se
             except Exception as error:
                 errors.append(error)
 
-        # A thread keeps Ctrl-C working, which does not reach COLMAP.
+        # COLMAP runs in a thread, since Ctrl-C could not interrupt it in the main thread.
         thread = threading.Thread(target=find, name=MAPPER, daemon=True)
         thread.start()
         while thread.is_alive():

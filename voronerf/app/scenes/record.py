@@ -46,7 +46,7 @@ def placed(scene: Scene, other: Scene) -> Scene:
     """
     if scene.background != other.background:
         ours, theirs = (each.background or "none" for each in (other, scene))
-        raise SceneError(f"{scene.name}: background must be that of {other.name}, {ours}, got {theirs}")
+        raise SceneError(f"{scene.name}: background must be {ours}, as in {other.name}, got {theirs}")
     train, test = scene.train, scene.test
     if other.transform is not None and scene.transform is not None:
         motion = other.transform @ torch.linalg.inv(scene.transform)
@@ -58,7 +58,7 @@ def placed(scene: Scene, other: Scene) -> Scene:
                 train = replace(train, sparse_depth=seen._replace(distances=scale * seen.distances))
     elif other.transform is not None or scene.transform is not None:
         frame = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
-        raise SceneError(f"{scene.name}: must be in the frame of {other.name}, got one that is {frame} (--normalise)")
+        raise SceneError(f"{scene.name}: must be in the frame of {other.name}, got a frame {frame} (--normalise)")
     return replace(other, name=scene.name, notes=scene.notes, train=train, test=test)
 
 

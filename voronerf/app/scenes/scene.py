@@ -17,8 +17,8 @@ from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.volume import Space
 
-#: An object on white; cameras that look the same way; cameras that look outwards; cameras that look at one place with
-#: surroundings.
+#: The kinds of scenes: an object on white; cameras that look the same way; cameras that look outwards; cameras that
+#: look at one place with surroundings.
 KINDS = ("object", "forward", "inside-out", "unbounded")
 
 
@@ -44,7 +44,7 @@ class Split:
             h x w, see `Cameras.size`, lie in the upper left corner, padded with zeros.
         names: names of the images, for tables and file names.
         masks: bool [c, h, w], False for pixels that are neither trained nor scored, or None.
-        on_disk: whether images and masks are mapped from files, since they may not fit into memory, and read-only.
+        on_disk: whether images and masks are read-only and mapped from files, for scenes larger than the memory.
         sparse_depth: the distances of a sparse model's points, or None.
 
     Examples:
@@ -161,15 +161,15 @@ class Scene:
         else:
             radius = float(self.train.cameras.origins.norm(dim=-1).max())
             if radius == 0:
-                raise SceneError(f"{self.name}: contraction sphere needs cameras in several places, all are in one")
+                raise SceneError(f"{self.name}: contraction sphere needs cameras in several places, got one place")
             sphere = Contraction(torch.zeros(3, device=device), radius)
         return Space(sphere, self.spacing, cones, sphere.radius if self.kind == "unbounded" else None)
 
     def cube(self, space: Space) -> tuple[tuple[float, ...], ...]:
         """Returns the corners of the networks' input space: a cube around the box, or the cube of the contraction.
 
-        In a box with unequal sides, the cells of a hash grid would be finer along the short sides, in a city five
-        times. This would cost entries, although the images have no finer details there.
+        In a box with unequal sides, the cells of a hash grid would be finer along the short sides; in a city, five
+        times finer. This would cost table entries, although the images have no finer details there.
 
         Raises:
             SceneError: For a scene without a box that is not contracted.

@@ -14,19 +14,20 @@ from voronerf.app.scenes.lenses import Lens
 from voronerf.nerf.lenses import EQUIRECTANGULAR
 
 #: A camera is lost if the distance to its nearest neighbour exceeds `LOST` times the median of these distances, and
-#: exceeds the share `EXTENT` of all distances between two cameras. The first condition alone would reject all cameras
-#: beside a burst. The second one holds for bursts of up to 57 % of the cameras, and for up to 42 % of lost cameras.
+#: exceeds the fraction `EXTENT` of all distances between two cameras. The first condition alone would reject all
+#: cameras outside a burst of images. The second condition works for bursts of up to 57 % of the cameras, and for up to
+#: 42 % of lost cameras.
 LOST, EXTENT = 8.0, 1 / 3
-#: Cameras that are lost together are each other's neighbours. So a camera is lost, too, if its distance to the median
+#: Cameras that are lost together are each other's neighbours. So a camera is also lost if its distance to the median
 #: position exceeds `APART` times the quantile `MOST` of these distances.
 APART, MOST = 10.0, 0.8
-#: Lost cameras are ignored in the check for a collapse up to this share, or if there is one. More lost cameras may be
-#: all that a collapse left apart.
+#: The check for a collapse ignores lost cameras up to this fraction of all cameras, and a single one always. If more
+#: are lost, these may be the only cameras outside a collapse.
 FEW = 0.1
-#: The most cameras for measuring the distances between all cameras.
+#: The maximum number of cameras whose pairwise distances are measured.
 MOST_CAMERAS = 1000
-#: Cameras have collapsed if their median distance to the nearest neighbour, times their number, is below this share of
-#: their mean distance to the centre. For cameras spread evenly on a circle this ratio is 6.
+#: Cameras have collapsed if (median distance to the nearest neighbour) * (number of cameras) / (mean distance to the
+#: centre) is below this ratio. For evenly spaced cameras on a circle, the ratio is 6.
 COLLAPSED = 0.05
 #: The largest plausible ratio of the largest to the least depth of points.
 DEEPEST = 1e4
@@ -37,7 +38,7 @@ FOCAL_LENGTHS = (0.25, 15.0)
 ASPECT, BENT, TILTED = 0.05, 1.0, 0.05
 
 
-#: The most names in a line.
+#: The maximum number of names in a line.
 MOST_NAMED = 8
 
 

@@ -2,8 +2,8 @@
 
 A store is a folder of the cache with two files. `pixels` holds the bytes of all images, one after another. The record
 `store.json` holds a digest of the source files, and a checksum of each stored image. An interrupted build continues
-after the recorded images. When a store is opened, all images are compared with their checksums, and are decoded again
-from the first damaged one on.
+after the recorded images. When a store is opened, all images are compared with their checksums; the first damaged image
+and all later images are decoded again.
 
 c images of h x w pixels.
 """
@@ -67,7 +67,7 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
     try:
         private_folder(folder.parent)
         private_folder(folder)
-        waits = "%s: another process makes these images, this one waits for it"
+        waits = "%s: waiting for another process that decodes these images"
         with locked(folder, lambda: log.warning(waits, folder)):
             sums = _recorded(folder, wanted, shape[0])
             # Other processes may have mapped the old file; they keep it after unlink.
@@ -104,7 +104,7 @@ def check_mapped() -> None:
 
 
 def _recorded(folder: Path, wanted: dict[str, Any], count: int) -> list[int]:
-    """Returns the checksums of the stored images; [] if the store holds other images, which it reports."""
+    """Returns the checksums of the stored images; if the store holds other images, reports this and returns []."""
     try:
         record = read_json(folder / "store.json")
     except FileNotFoundError:
@@ -113,7 +113,7 @@ def _recorded(folder: Path, wanted: dict[str, Any], count: int) -> list[int]:
         record = None
     sums = record.pop("checksums", None) if isinstance(record, dict) else None
     if record != wanted or not isinstance(sums, list) or len(sums) > count:
-        log.warning("%s: holds other images than those of the scene now, it is built again", folder)
+        log.warning("%s: the images of the scene have changed; the store is rebuilt", folder)
         return []
     return sums
 
@@ -126,7 +126,7 @@ def _allocate(file: int, size: int) -> None:
 
 
 def _undamaged(folder: Path, mapped: mmap.mmap, sums: list[int], image_bytes: int, threads: int) -> list[int]:
-    """Returns the checksums of the images before the first damaged one, which it reports."""
+    """Returns the checksums of the images before the first damaged image, and reports the damage."""
     view = memoryview(mapped)
 
     def is_damaged(number: int) -> bool:
@@ -135,7 +135,7 @@ def _undamaged(folder: Path, mapped: mmap.mmap, sums: list[int], image_bytes: in
     with ThreadPoolExecutor(threads) as pool:
         for number, damaged in enumerate(pool.map(is_damaged, range(len(sums)))):
             if damaged:
-                log.warning("%s: image %d is damaged, it and those behind it are made again", folder, number)
+                log.warning("%s: image %d is damaged; it and all later images are decoded again", folder, number)
                 return sums[:number]
     return sums
 
@@ -178,8 +178,8 @@ def _digest(value: Any) -> str:
 class Pages:
     """A prefetcher for the pages of a mapped tensor.
 
-    Without it, pages that are not in memory are read one by one, when they are touched. A disk serves many requests at
-    a time.
+    Without it, pages that are not in memory are read one by one, when they are touched, although a disk serves many
+    requests at a time.
 
     Args:
         images: uint8 [c, h, w, channels], contiguous, mapped from a file.

@@ -32,7 +32,8 @@ SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 ORTHONORMAL = 2e-3
 #: The largest number, and the inverse of the smallest positive number: float32 can represent their squares.
 LARGEST = 1e9
-#: The longest focal length in image sides, and the inverse of the shortest: fields of view of 0.06 to 179.9 degrees.
+#: The longest focal length in units of the image's side, and the inverse of the shortest: fields of view of 0.06 to
+#: 179.9 degrees.
 LONGEST = 1000
 SPLITS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
@@ -217,7 +218,7 @@ def load_transforms(folder: Path, reading: Reading) -> Scene:
     entries, frames = read_transforms(path, reading.allow_outside)
     frames = sorted(frames, key=lambda frame: frame.path.as_posix())
     if len(frames) < 2:
-        raise SceneError(f"{path}: one image is too few, one is held out for testing")
+        raise SceneError(f"{path}: needs at least two images, since one is held out for testing")
     declared = _declared_split(path, entries, frames)
     frames, held_out = (frames, None) if declared is None else declared
     return capture_scene(folder, entries, frames, held_out, reading)
@@ -239,7 +240,7 @@ def _declared_split(
     all_names = {_plain(frame["file_path"]) for frame in entries["frames"]}
     for key, names in lists.items():
         if unknown := sorted(names - all_names):
-            raise SceneError(f"{path}: {key} has {unknown[0]}, which is no file_path of a frame")
+            raise SceneError(f"{path}: {key} lists {unknown[0]}, but no frame has this file_path")
     train, test, validation = lists.values()
     if not (train or test or validation):
         return None
@@ -382,7 +383,7 @@ def write_transforms(path: Path, shots: Sequence[Shot]) -> None:
         values = {name: value for name, value in zip(COEFFICIENTS[model], coefficients) if value}
         supported = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "p1", "p2", "k3")
         if model in (FOV, EQUIRECTANGULAR) or not values.keys() <= set(supported):
-            raise SceneError(f"{path}: the lens of {shot.file} is none that transforms.json has")
+            raise SceneError(f"{path}: transforms.json cannot describe the lens of {shot.file}")
         lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": shot.width, "h": shot.height}
         lens |= {name: values.get(name, 0.0) for name in supported}
         kind = {"camera_model": "OPENCV_FISHEYE" if model == FISHEYE else "OPENCV"}

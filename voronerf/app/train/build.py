@@ -46,9 +46,9 @@ SMOOTH_DEPTH = 0.1
 #: Factors of the distortion and orientation losses for photographs, which favour one surface per ray. With three times
 #: the distortion loss, even fewer silhouettes are half transparent, but bonsai loses 0.3 dB.
 DISTORTION, ORIENTATION = 0.003, 0.01
-#: The most rays along the longer side of a picture for finding the voxels in front of its camera.
+#: The maximum number of rays along the longer side of a picture that search for voxels in front of its camera.
 LOOKS = 64
-#: A lower bound of the bytes per sample in a step; measured are 100 (kilonerf) to 230 (hashgrid).
+#: A lower bound of the bytes per sample in a step; the measured values are 100 (kilonerf) to 230 (hashgrid).
 SAMPLE_BYTES = 64
 
 
@@ -125,7 +125,7 @@ def build(
     photographs = scene.background is None
     terms: list[Term] = [SparseDepth(config.sparse_depth)] if config.sparse_depth else []
     terms.append(SmoothDepth(SMOOTH_DEPTH))
-    if photographs and isinstance(contraction, Contraction):  # lowers the scores of forward-facing scenes
+    if photographs and isinstance(contraction, Contraction):  # would lower the scores of forward-facing scenes
         terms.append(Surface(distortion=DISTORTION, orientation=ORIENTATION))
     return State(
         config=config,
@@ -358,7 +358,7 @@ def _check_fits(config: TrainConfig, name: str, needed: int) -> None:
 
 
 def present_device(name: str) -> str:
-    """Returns the name of a device that is present; for "auto" a GPU with kernels of this package, else the CPU.
+    """Returns the name of a device that is present; for "auto" a GPU that this package has kernels for, else the CPU.
 
     Raises:
         ConfigError: For a device that is not present, or is no CPU or GPU.

@@ -31,21 +31,22 @@ from voronerf.nerf.split import MIN_SAMPLES, SplitDone
 
 #: Seconds of training between checkpoints, and the number of kept checkpoints.
 CHECKPOINT_EVERY, KEPT = 30.0, 3
-#: Share of the budget for evaluations, half of it for the final evaluation; the most views of an intermediate one.
+#: The fraction of the budget for evaluations, half of it for the final evaluation; the maximum number of views in an
+#: intermediate evaluation.
 SHARE, VIEWS = 0.1, 20
-#: Approximate number of pixels rendered to time a view, and the least side of a view's middle.
+#: Approximate number of pixels rendered to time a view, and the minimum side of a rendered middle part.
 PROBE, PROBE_SIDE = 1024, 31
-#: The most views of which the middle is scored, if there is too little time for a whole view.
+#: The maximum number of views whose middles are scored, if there is too little time for a whole view.
 PARTS = 8
 #: Side of the corner of a view on which LPIPS is timed.
 LPIPS_PROBE = 128
-#: The entries of the last evaluation that are repeated in summary.json.
+#: The entries of the last evaluation that are copied to summary.json.
 FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views", "part")
 #: Number of consecutive skipped steps after which a training has diverged.
 PATIENCE = 10
 #: Drop of the PSNR from its best value, in dB, that counts as a collapse.
 COLLAPSE = 5.0
-#: Step from which, after the middle of a run, its PSNR is compared with the PSNR of a single colour.
+#: From this step on, in the second half of a run, its PSNR is compared with the PSNR of a single colour.
 SETTLED = 100
 
 
@@ -100,7 +101,7 @@ class Checkpoints(Callback):
             OSError: When the previous checkpoint could not be written.
         """
         if not all_finite(state.optimizer):
-            raise diverged(self.out, "parameters or moments of Adam not finite", state.step)
+            raise diverged(self.out, "parameters or moments of Adam are not finite", state.step)
         if not self.described:  # not earlier, so that a run whose first step fails leaves no files
             write_text(self.out / "config.json", state.config.to_json())
             write_scene(self.out / "scene.json", state.scene)
@@ -124,13 +125,15 @@ class Divergence(Callback):
     def after_step(self, state: State) -> None:
         """Raises TrainingError after `PATIENCE` consecutive skipped steps."""
         if state.skipped_in_a_row >= PATIENCE:
-            raise diverged(self.out, f"gradients of {state.skipped_in_a_row} steps in a row not finite", state.step)
+            raise diverged(
+                self.out, f"the gradients of {state.skipped_in_a_row} consecutive steps are not finite", state.step
+            )
 
 
 def diverged(out: Path, reason: str, step: int) -> TrainingError:
     """Returns the error of a training that cannot continue."""
     remark = "the last checkpoint is unchanged" if checkpoint_paths(out) else "there is no checkpoint"
-    return TrainingError(f"{out}: {reason} at step {step}, try a smaller --lr; {remark}")
+    return TrainingError(f"{out}: {reason}, at step {step}; try a smaller --lr; {remark}")
 
 
 def all_finite(optimizer: torch.optim.Optimizer) -> bool:
@@ -145,8 +148,8 @@ class Scores(Callback):
 
     With ``config.budget`` and without ``config.eval_views``, the time of evaluations is limited. Intermediate
     evaluations take at most a twentieth of the elapsed time, and score fewer views, or none, if necessary. All
-    evaluations together take at most a tenth of the budget. If the final one has too little time for a view, the middle
-    of a view is scored.
+    evaluations together take at most a tenth of the budget. If there is too little time for a view at the end, only the
+    middles of some views are scored.
 
     Args:
         out: The run directory; None to write no files.
@@ -243,7 +246,7 @@ class Scores(Callback):
             state.count_evaluation(self.clock() - started, min(self.view_seconds * all_views, SHARE / 2 * budget))
 
     def affordable(self, budget: float | None, most: int) -> int:
-        """Returns how many views, 1 to ``most``, fit into a tenth of a budget in seconds, by the last view's time."""
+        """Returns how many views, 1 to ``most``, fit into a tenth of a budget (seconds), given the last view's time."""
         return most if budget is None else max(1, min(most, int(SHARE * budget / max(self.view_seconds, 1e-9))))
 
     def _seconds_of(self, lpips: Lpips, state: State) -> float:
@@ -254,7 +257,7 @@ class Scores(Callback):
         return (self.clock() - started) * truth.numel() / corner.numel()
 
     def _probe(self, state: State, most: int) -> None:
-        """Estimates the seconds for a view by scoring its middle, which is at most ``most`` times narrower."""
+        """Estimates the seconds for a view by scoring its middle, with at least 1 / ``most`` of the width."""
         width, height = state.scene.test.cameras.size(0)
         factor, started = min(most, max(1, round(math.sqrt(width * height / PROBE)))), self.clock()
         self._score(state, 1, None, factor)
@@ -323,7 +326,7 @@ def why_scores_are_poor(
         settled: Whether the run is long enough for scores above a single colour's.
     """
     if metrics[-1].get("part", 1) < 1:
-        return None  # scores of the views' middle are not comparable
+        return None  # scores of the views' middles are not comparable
     *earlier, now = (math.nan if line["psnr"] is None else line["psnr"] for line in metrics if line.get("part", 1) == 1)
     best = max((psnr for psnr in earlier if math.isfinite(psnr)), default=-math.inf)
     assert config.lr is not None
@@ -375,7 +378,7 @@ class TensorBoard(Callback):
         self.writer: Any = None
 
     def on_start(self, state: State) -> None:
-        """Opens the event file; on a resume, TensorBoard hides earlier entries of later steps."""
+        """Opens the event file; on a resume, TensorBoard hides the old entries of later steps."""
         self.writer, self.written = self._make(str(self.folder), purge_step=state.step + 1), len(self.scores.metrics)
 
     def after_step(self, state: State) -> None:

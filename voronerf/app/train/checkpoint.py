@@ -43,7 +43,7 @@ class Checkpoint:
     source: str = "checkpoint"
 
     def group(self, prefix: str) -> dict[str, Tensor]:
-        """Returns the tensors whose names begin with ``prefix.``, under their names without it."""
+        """Returns the tensors whose names begin with ``prefix.``, under their names without this prefix."""
         return {name[len(prefix) + 1 :]: t for name, t in self.tensors.items() if name.startswith(prefix + ".")}
 
 
@@ -60,7 +60,7 @@ def checkpoint_paths(run: Path) -> list[Path]:
 
 
 def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
-    """Writes the last checkpoint, renames older ones to ``last-1``, ... and keeps ``keep``; on failure, all stay."""
+    """Writes the last checkpoint, renames older ones to ``last-1``, ... and keeps ``keep``, or all on failure."""
     last = checkpoint_path(run)
     written = last.with_name("new.safetensors")
     save_checkpoint(written, checkpoint)
@@ -118,7 +118,7 @@ def _all(name: str) -> bool:
 
 
 def is_shown(name: str) -> bool:
-    """Returns whether rendering needs a tensor, by its name; the other tensors are for training alone."""
+    """Returns whether rendering needs the tensor with this name; other tensors are for training alone."""
     return name.startswith(("router", "part-", "occupancy.")) or name.endswith(".average")
 
 
@@ -143,7 +143,7 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
             errors.append(error)
             continue
         if errors:
-            warnings.warn(f"{errors[0]}; {path.name} takes its place", stacklevel=2)
+            warnings.warn(f"{errors[0]}; using {path.name} instead", stacklevel=2)
         return checkpoint
     raise errors[0]
 

@@ -41,8 +41,8 @@ class SceneSettings:
     """Scene folder in a format of --format, the folder of a COLMAP model in it, or a built-in scene: "builtin",
     "builtin:400" with 400 pixels a side, or "builtin-city:4x4", a city of 16 blocks."""
     format: Literal["auto", "blender", "colmap", "transforms", "llff"] = "auto"
-    """Format of the scene folder; auto is the first that the folder has, in this order, but transforms before a COLMAP
-    model in colmap/sparse (nerfstudio's), distorted/sparse or dense/sparse."""
+    """Format of the scene folder; auto is the first of these formats that the folder has, but transforms before a
+    COLMAP model in colmap/sparse (nerfstudio's), distorted/sparse or dense/sparse."""
     kind: Literal["auto", "object", "forward", "inside-out", "unbounded"] = "auto"
     """Kind of scene: an object on white; cameras that look the same way; cameras that look outwards; or cameras that
     look at one place with surroundings. auto decides by transparent pixels and by the cameras."""
@@ -50,14 +50,14 @@ class SceneSettings:
     """Move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera at distance
     1; otherwise the coordinates of the files are kept."""
     downscale: int | None = None
-    """Factor by which the images are reduced; default 1, and for photographs the smallest factor that leaves at most
+    """Factor by which the images are reduced; default 1 or, for photographs, the smallest factor that leaves at most
     512 pixels a side."""
     images: Literal["auto", "memory", "disk"] = "auto"
     """Keep the images of a scene folder or city in memory, or on disk: decoded once into a file of the cache
-    (VORONERF_CACHE, or voronerf in the user's caches), from which the pixels of each step are read. auto is disk if
-    they do not fit into memory."""
+    (VORONERF_CACHE, or voronerf in the user's caches), from which the pixels of each step are read. auto is disk if the
+    images do not fit into memory."""
     allow_outside: bool = False
-    """Also read images that lie outside of the scene folder, which it may name by .., an absolute path or a link."""
+    """Also read images outside of the scene folder, to which a scene may refer by .., an absolute path or a link."""
     keep_far: bool = False
     """Keep photographs whose cameras lie far from the others. By default they are left out, since one lost camera would
     determine the scale of the scene."""
@@ -134,11 +134,11 @@ class SamplingSettings:
     """Samples along a ray: stratified in one pass, or hierarchical, with a second pass concentrated where the first
     pass has large weights (nerf: a coarse and a fine network)."""
     samples: tuple[int, ...] | None = None
-    """Samples per ray of each pass; default 32 and 32 for two passes, 64 for one pass. With --occupancy,
-    contracted space has 128, or 256 in a training of at least 25 seconds, or 384 in one of 90 seconds. An object has 64
-    at 100 pixels across it and 128 at 400; on a hash grid twice as many, at most 256, in a training of at least 40 or
-    160 seconds. These times are for two cores of an AMD EPYC (Zen 5), and shorter for a CPU that is measured to be
-    faster; with --steps, the machine has no effect."""
+    """Samples per ray of each pass; default 32 and 32 for two passes, 64 for one pass. With --occupancy, contracted
+    space has 128, or 256 in a training of at least 25 seconds, or 384 in one of 90 seconds. An object that is 100
+    pixels wide has 64, and 128 at 400 pixels. On a hash grid, these are doubled, to at most 256, in a training of at
+    least 40 seconds (100 pixels) or 160 seconds (400 pixels). These times are for two cores of an AMD EPYC (Zen 5), and
+    shorter for a CPU that is measured to be faster; with --steps, the machine has no effect."""
     sparse_depth: float | None = None
     """Factor of a loss on light that does not come from the points of a sparse model (Deng et al. 2022,
     "Depth-supervised NeRF"); default 0.0015 for COLMAP's models, and 0, which is off, without points."""

@@ -15,17 +15,17 @@ from voronerf.nerf.samplers import SAMPLERS, usual_samples
 from voronerf.nerf.volume import Space
 from voronerf.ops._core import native
 
-#: Factor of the loss on sparse depths, beside the robust loss, whose gradients are at most as large as the squared
-#: loss's. Beside the squared loss, twice this factor gave 0.3 dB on bonsai and 0.7 to 1.4 dB on beer, at equal steps
-#: and time.
+#: Factor of the loss on sparse depths, if the loss on colours is robust. The gradients of a robust loss do not exceed
+#: the gradients of the squared loss. With the squared loss, twice this factor gained 0.3 dB on bonsai and 0.7 to 1.4
+#: dB on beer, at equal steps and time.
 SPARSE_DEPTH = 0.0015
-#: The fewer image tiles have points of the sparse model, the longer unseen depths are regularised to planes: always if
-#: no tile has points, never if the share `COVERED` of the tiles has points. There are `TILES` tiles along the longer
-#: side. Of the tiles of mouse, 0.13 have points; of beer 0.31, of bust 0.35, and of bonsai, whose scores fall with this
-#: loss, 0.68.
+#: Unseen depths are regularised to planes for a longer time if fewer image tiles have points of the sparse model:
+#: always if no tile has points, never if the fraction `COVERED` of the tiles has points. There are `TILES` tiles along
+#: the longer side. The fraction of tiles with points is 0.13 for mouse, 0.31 for beer, 0.35 for bust, and 0.68 for
+#: bonsai, whose scores this loss lowers.
 COVERED, TILES = 2 / 3, 12
-#: The offset of unseen rays from a camera, as a share of the farthest camera's distance from the point that all look
-#: at.
+#: The offset of unseen rays from a camera, as a fraction of the farthest camera's distance from the point at which all
+#: cameras look.
 BESIDE = 0.2
 #: Samples per ray for one pass, and for each of two passes, without skipping of empty space.
 SAMPLES, EACH_SAMPLES = 64, 32
@@ -44,8 +44,8 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
     """Returns the settings with every default filled in, except ``width`` and ``lr`` if ``parameters`` determines them.
 
     The defaults are for contraction, occupancy, sparse depth, rays, samples per ray, and the options of the field.
-    ``speed`` is relative to the machine of the measured defaults. It has no effect on a training in steps, since the
-    same seed should give the same networks on every machine.
+    ``speed`` is the speed of this machine relative to the one on which the defaults were measured. It has no effect if
+    the length of the training is a number of steps, since the same seed should give the same networks everywhere.
     """
     kind, boxed = config.field_type, scene.box is not None
     contraction, sparse_depth, rays, samples = config.contraction, config.sparse_depth, config.rays, config.samples

@@ -30,8 +30,8 @@ class Callback:
     The time of a callback is not training time, except in :meth:`after_split`.
 
     Attributes:
-        group: The most steps between two calls of :meth:`after_step`. Up to 16 steps are made in one call, which is
-            faster. Results do not depend on ``group``.
+        group: The maximum number of steps between two calls of :meth:`after_step`. Up to 16 steps are made in one call,
+            which is faster. Results do not depend on ``group``.
 
     Examples:
         >>> from voronerf.app.train import Callback
@@ -116,7 +116,7 @@ def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool =
             for callback in callbacks:
                 callback.after_split(state, done)
     optimizer.set_learning_rate(state.learning_rate())
-    group = state.step - (state.step - state.began) % GROUP  # first step of the group, which may be cut
+    group = state.step - (state.step - state.began) % GROUP  # first step of the group, which may be cut short
     if state.batches.unseen and state.fraction_at(group) >= state.unseen_share:
         state.batches.end_unseen()
     if not state.router.training:

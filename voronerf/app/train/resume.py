@@ -104,12 +104,14 @@ def load(state: State, checkpoint: Checkpoint) -> None:
     counts = stored.threads, _threads(state)
     earlier, current = (f"torch on {n} thread{'s' * (n > 1)}" if n else "native operations" for n in counts)
     if earlier != current and state.device.type == "cpu":
-        state.report(f"not bit for bit: {checkpoint.source} was computed by {earlier}, what follows by {current}")
+        state.report(
+            f"the resume is not bit-exact: {checkpoint.source} was computed by {earlier}, later steps by {current}"
+        )
     state.restore(**{name: getattr(stored, name) for name in (*COUNTERS, "stages")})
 
 
 def _threads(state: State) -> int:
-    """Returns the number of torch's threads, on which its sums depend; 0 if native operations compute the networks."""
+    """Returns the number of torch's threads, on which sums of torch depend; 0 if native ops compute the networks."""
     return 0 if state.thread_deterministic else torch.get_num_threads()
 
 

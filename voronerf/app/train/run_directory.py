@@ -60,13 +60,13 @@ def _marker_of(path: str | Path) -> Path:
 
 
 def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None = None) -> None:
-    """Raises ConfigError for a path in a run's settings that `is_outside`, since the run may be another person's."""
+    """Raises ConfigError if `is_outside` is true for a path in a run's settings: the run may be another person's."""
     paths = {"data": None if is_builtin(data) else data, "lpips": None if str(lpips) == OFF else lpips}
     for option, path in paths.items():
         if path is not None and is_outside(run, path):
             raise ConfigError(
-                f"{run}: --{option} must be given once, since a run may be another person's and this one names what is "
-                f"outside of it, of the working directory and of VORONERF_DATA: --{option} {shlex.quote(str(path))}"
+                f"{run}: --{option} must be given once: the run names a path outside of its directory, of the working "
+                f"directory and of VORONERF_DATA, and may be another person's; add --{option} {shlex.quote(str(path))}"
             )
 
 
@@ -127,7 +127,7 @@ def stored_config(run: Path) -> TrainConfig | None:
 def read_config(path: Path) -> TrainConfig:
     """Reads settings from a file, perhaps another person's; resets ``out`` and ``allow_outside``."""
     config = TrainConfig.from_values(read_json(path), str(path))
-    for name, value in vars(config).items():  # as defaults of options, they are printed by the help
+    for name, value in vars(config).items():  # the help prints them as defaults of options
         if not "".join(map(str, value if isinstance(value, tuple) else (value,))).isprintable():
             raise ConfigError(f"{path}: {name} must be printable text, got {value!r:.60}")
     return replace(config, out=None, allow_outside=False)

@@ -1,4 +1,4 @@
-"""Restart of a coarse stage that has learnt nothing, from another random draw; a resumed run decides the same.
+"""Restarts a coarse stage that has learnt nothing, with another seed. A resumed run makes the same decision.
 
 A batch has r rays.
 """
@@ -15,13 +15,13 @@ from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.step import StepOutput
 from voronerf.nerf.volume import Batch, RenderOutput
 
-#: Steps from the settling of the grid to the check of a start, and the most restarts of a training.
+#: Steps from the settling of the grid to the check of a start, and the maximum number of restarts of a training.
 JUDGED, DRAWS = 100, 3
 #: The increment of the networks' seed with each restart.
 STRIDE = 1_000_003
 #: A start has failed if the rays whose target differs from the background by more than `DIFFERS` have a mean opacity
-#: below `EMPTY`. It has also failed if the standard deviation of the rays' colours is below `ONE_COLOUR`, and of their
-#: targets above `COLOURED`.
+#: below `EMPTY`. It has also failed if the standard deviation of the rays' colours is below `ONE_COLOUR`, while the
+#: standard deviation of their targets is above `COLOURED`.
 DIFFERS, EMPTY, ONE_COLOUR, COLOURED = 0.1, 0.02, 1e-3, 0.05
 
 
@@ -52,7 +52,7 @@ def judge_start(state: State, last: StepOutput) -> None:
     state.optimizer.state.clear()
     state.strategy.forget()
     state.begin_again()
-    state.report(f"nothing is learnt by step {state.step}: {fault}; begins again from another draw, {draw} of {DRAWS}")
+    state.report(f"nothing is learnt by step {state.step}: {fault}; restart {draw} of {DRAWS} with another seed")
 
 
 def steps_to_judgement(state: State) -> int:
@@ -67,7 +67,7 @@ def judged_at(state: State) -> int:
 
 
 def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
-    """Returns the fault of a start, by the r rays of a step; None if there is no fault. Waits for the device."""
+    """Returns the fault of a start, judged by the r rays of a step, or None. Waits for the device."""
     background = torch.zeros(3) if batch.background is None else batch.background
     background = background.to(batch.target)
     opacity = output.error.new_zeros(len(batch.rays)).index_add(
@@ -75,10 +75,10 @@ def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
     )
     differs = (batch.target - background).abs().amax(-1) > DIFFERS
     if bool(differs.any()) and not bool(opacity[differs].mean() >= EMPTY):
-        return "all space is empty"
+        return "the field is empty everywhere"
     opaque = opacity > 0.5
     if int(opaque.sum()) > 1:
         colour = (output.colour - (1 - opacity)[:, None] * background)[opaque] / opacity[opaque, None]
         if bool((colour.std(0) < ONE_COLOUR).all()) and bool((batch.target[opaque].std(0) > COLOURED).any()):
-            return "all has one colour"
+            return "all rays have the same colour"
     return None

@@ -76,7 +76,7 @@ class State:
         unseen_share: The fraction of the training in which batches have unseen rays.
         rays_done: The number of rays of all finished steps.
         loss: The loss of the last step that the host has read.
-        skipped_in_a_row: The number of consecutive steps that the guard has skipped last.
+        skipped_in_a_row: The number of steps that the guard has skipped since the last step that it has not skipped.
         stages: The periods of training: the first one, one after each split, and one for each restart of the coarse
             stage.
         stopped: Whether a stop of the training is requested.
@@ -142,7 +142,7 @@ class State:
         return self.fraction_at(self.step)
 
     def fraction_at(self, step: int) -> float:
-        """Returns the finished fraction, 0..1, at a step; a training with a budget takes the current time for it."""
+        """Returns the finished fraction, 0..1, at a step; for a training with a budget, the current fraction."""
         if self.config.steps is not None:
             return min(1.0, step / self.config.steps)
         training = float(self.config.budget or 1.0) - self.evaluation_seconds - self.reserved_seconds
@@ -239,7 +239,7 @@ class State:
         self.seconds += seconds
 
     def restore(self, skipped: int, stages: Sequence[Mapping[str, Any]], **counters: float) -> None:
-        """Restores the counters of a checkpoint, which have the names of these attributes."""
+        """Restores the counters of a checkpoint, which are named like the attributes of a state."""
         self.guard.begin(skipped)
         self.stages[:] = (Stage(**stage) for stage in stages)
         for name, value in counters.items():

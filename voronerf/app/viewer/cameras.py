@@ -75,7 +75,7 @@ def axial_depth(camera: Cameras, depth: Tensor) -> Tensor:
 
 
 def scene_bounds(scene: Scene) -> Tensor:
-    """Returns the scene's box [2, 3], or without one a box around the cameras and points in front of them."""
+    """Returns the scene's box [2, 3]; if there is none, a box around the cameras and points in front of them."""
     if scene.box is not None:
         return scene.box.cpu()
     cameras = scene.train.cameras
@@ -86,7 +86,7 @@ def scene_bounds(scene: Scene) -> Tensor:
 
 
 def look_point(scene: Scene, cameras: Cameras, index: int) -> Tensor:
-    """Returns the point [3] around which a camera turns: on its axis, nearest to the scene's focus."""
+    """Returns the point [3] around which a camera turns: the point of its axis nearest to the scene's focus."""
     focus = shared_focus(scene.train.cameras)
     centre = scene_bounds(scene).mean(0) if focus is None else focus
     origin, forward = cameras.origins[index], cameras.forward[index]

@@ -27,7 +27,7 @@ from voronerf.nerf.cameras import Cameras
 if TYPE_CHECKING:
     from voronerf.app.viewer.viewer import Viewer
 
-#: Pixels along the longer side of the sharp picture: the range for following the window's size, and the maximum.
+#: Pixels along the longer side of the sharp picture: the range if it follows the window's size, and the maximum.
 SHARP, FULL, LARGEST = 512, 1536, 2048
 #: Greatest number of training views that are drawn, and pixels along the longer side of their pictures.
 MOST_VIEWS, THUMBNAIL = 200, 96
@@ -37,7 +37,7 @@ NO_CELL = "Click or tap a cell."
 MOUSE = "Drag: turn. Right drag or two fingers: move. Scroll or pinch: zoom. Click or tap: name the cell."
 #: Seconds without a movement after which the frame rate is measured anew; seconds between updates of its display.
 PAUSE, SAY = 0.5, 0.25
-OWN_GPU = "[Draw it in this browser](/scene.html), by WebGPU: a movement then waits for no picture."
+OWN_GPU = "[Draw it in this browser](/scene.html) with WebGPU: movements then need no pictures from the server."
 #: Padding of the curve in pixels: top, right, bottom, left. Without it the labels are cut off.
 PADDING = (14, 14, 0, 0)
 
@@ -81,7 +81,7 @@ class Client:
         self._look_around()
         self._start()
         handle.camera.on_update(self._moved)
-        self._follow()  # the camera may have moved before the line above
+        self._follow()  # the camera may have moved before `on_update`
         handle.scene.on_click()(self._clicked)
 
     def _start(self) -> None:
@@ -102,7 +102,7 @@ class Client:
         self.change()
 
     def tell(self, title: str, body: str) -> None:
-        """Shows a note for some seconds."""
+        """Shows a notification for a few seconds."""
         self.handle.add_notification(title, body, auto_close_seconds=15.0)
 
     # --- camera ----------------------------------------------------------------------------------------------------
@@ -119,15 +119,15 @@ class Client:
     def _follow(self) -> None:
         """Reads the browser's camera; sets the angle of view of a new browser to show the whole first test view.
 
-        A slow page first reports viser's default angle of view, and takes the server's later. A reconnected page keeps
-        its angle.
+        A slow page first reports viser's default angle of view, and applies the server's angle later. A reconnected
+        page keeps its angle.
         """
         is_valid = self._look_around()
         if is_valid and not self.opened and math.isclose(self.fov, self.viewer.server.initial_camera.fov, rel_tol=1e-3):
             self._open(angle_of_view(self.viewer.subject.scene.test.cameras, 0, self.aspect))
 
     def _look_around(self) -> bool:
-        """Reads the browser's camera; returns False and keeps the old one if the canvas is empty or numbers invalid."""
+        """Reads the browser's camera; returns False and keeps the old one if canvas or numbers are invalid."""
         now = self.handle.camera
         numbers = (*now.wxyz, *now.position, now.fov)
         is_shown = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)
@@ -201,7 +201,7 @@ class Client:
         self.state = gui.add_markdown("rendering")
         pane = gui.add_dropdown("Show", PANES, initial_value="colour", hint="What each pixel shows.")
         self.on(pane.on_update, lambda: self.change(pane=chosen(pane)))
-        hint = "Along the longer side of a picture at rest; at first those of the window."
+        hint = "Pixels along the longer side of the sharp picture; at first the window's size."
         size = gui.add_slider("Pixels", 128, LARGEST, 1, self.longest, hint=hint)
         self.on(size.on_update, lambda: self._resize(chosen(size)))
         self.degrees, hint = shown_angle(self.fov), "Top to bottom, in degrees."

@@ -14,7 +14,7 @@ from voronerf.app.viewer.cameras import scene_bounds
 if TYPE_CHECKING:
     from voronerf.app.viewer.client import Client
 
-#: The least side of the box and the size of a corner's arrows, as shares of the scene's diagonal.
+#: The minimum side of the box and the size of a corner's arrows, as fractions of the scene's diagonal.
 LEAST, ARROWS = 0.01, 0.12
 
 
@@ -33,7 +33,11 @@ class CropBox:
         gui = client.handle.gui
         self.shown = gui.add_checkbox("Crop", False, hint="Render a box only; drag its corners.")
         client.on(self.shown.on_update, self.show)
-        self.button = gui.add_button("Save crop", visible=False, hint="With the run: render and export --crop saved.")
+        self.button = gui.add_button(
+            "Save crop",
+            visible=False,
+            hint="Saves the box in the run directory; use it with render or export --crop saved.",
+        )
         client.on(self.button.on_click, self.save)
 
     def show(self) -> None:
@@ -62,7 +66,7 @@ class CropBox:
         """Moves the lowest corner, number 0, or the highest corner, number 1.
 
         Raises:
-            ValueError: The place is no valid position; a page of the viewer never sends one.
+            ValueError: The place is no valid position, which a page of the viewer never sends.
         """
         place = np.asarray(place, dtype=np.float64)
         if place.shape != (3,) or not (np.abs(place) < 1e9).all():

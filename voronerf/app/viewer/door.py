@@ -24,7 +24,7 @@ from websockets.http11 import Request, Response
 
 log = logging.getLogger(__name__)
 
-#: Greatest number of bytes of a message; viser's page sends some hundred.
+#: Greatest number of bytes of a message; a message of viser's page has a few hundred.
 LARGEST = 2**16
 
 #: The logger for websockets: only critical errors, so that connections without a request are not logged.
@@ -42,7 +42,7 @@ def chosen(part: Any) -> Any:
     """Returns the value of a slider or a list after a check that it is a possible choice.
 
     Raises:
-        ValueError: the value is no possible choice; a page of the viewer never sends one.
+        ValueError: the value is no possible choice; a page of the viewer never sends such a value.
     """
     value = part.value
     if not (value in part.options if hasattr(part, "options") else part.min <= value <= part.max):
@@ -52,7 +52,7 @@ def chosen(part: Any) -> Any:
 
 @contextlib.contextmanager
 def guarded(host: str, pages: Mapping[str, Callable[[], Awaitable[bytes]]]) -> Iterator[None]:
-    """A context in which a viser server is made that refuses requests from pages of other sites.
+    """A context in which to make a viser server, which then refuses requests from pages of other sites.
 
     The server, which listens at `host`, ignores messages that the viewer does not use, and disconnects a browser whose
     message cannot be decoded. It also serves ``pages``, HTML by path.
@@ -107,7 +107,7 @@ def _answer(page: bytes) -> Response:
 
 def _log_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Logs a message that viser could not handle, such as text in place of a number."""
-    log.warning("a message of a browser is passed over: %.200s", context.get("exception", context["message"]))
+    log.warning("a browser's message is ignored: %.200s", context.get("exception", context["message"]))
 
 
 def why_refused(headers: Mapping[str, str], host: str) -> str | None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 FPS = 24
 #: Greatest number of keyframes of one browser.
 MOST = 500
-#: Size of a drawn keyframe as a share of the scene's diagonal; number of points of the line through the keyframes.
+#: Size of a drawn keyframe as a fraction of the scene's diagonal; number of points of the line through the keyframes.
 SIZE, POINTS = 0.04, 200
 
 
@@ -119,7 +119,7 @@ class Keyframes:
 
 
 def same_size(cameras: list[Cameras]) -> Cameras:
-    """Resizes cameras to the last one's size, rounded down to even numbers for a video; keeps vertical angles."""
+    """Resizes cameras to the size of the last one, in even numbers for a video; keeps vertical angles of view."""
     width, height = (max(2, side // 2 * 2) for side in (cameras[-1].width, cameras[-1].height))
     focal = torch.stack([camera.intrinsics[0, 1] * (height / camera.height) for camera in cameras])
     middle = torch.tensor((width / 2, height / 2)).repeat(len(cameras), 1)

@@ -110,7 +110,7 @@ def groups_of(diagram: VoronoiDiagram, level: int) -> Tensor:
 
 
 def space_from(scene: Scene, camera: Cameras) -> Scene:
-    """Returns a scene whose near and far suit a camera anywhere; with a box, the camera sees it from inside too."""
+    """Returns the scene with near and far for a camera at any place, also inside the scene's box."""
     if scene.box is None:
         return scene
     diagonal = float((scene.box[1] - scene.box[0]).norm())

@@ -1,8 +1,8 @@
 """The viewer: a server, its clients, and the order in which pictures are rendered.
 
-One thread renders everything: the one that calls :meth:`Viewer.render_next` or :meth:`Viewer.serve`. In a training it
-is the thread of the steps, so that a picture never shows a half-finished step. The threads of the server only set
-flags.
+One thread renders everything: the thread that calls :meth:`Viewer.render_next` or :meth:`Viewer.serve`. In a training,
+this is the thread that makes the steps, so that a picture never shows a half-finished step. The threads of the server
+only set flags.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ REST = 0.15
 COARSE, BAND = 0.06, 0.1
 #: Least number of pixels along the longer side of a coarse picture.
 SMALLEST = 96
-#: Share of the training time that is spent on new sharp pictures while no camera moves.
+#: Fraction of the training time that is spent on new sharp pictures while no camera moves.
 REFRESH = 0.05
 #: Hosts that mean all addresses of this machine.
 EVERYWHERE = ("0.0.0.0", "::", "")
@@ -231,7 +231,7 @@ class Viewer:
         client.count_picture(camera)
 
     def _draw_sharp(self, client: Client) -> None:
-        """Renders in bands; a movement stops it, and other clients get their coarse pictures between bands."""
+        """Renders the sharp picture in bands; a movement stops it, and between bands others get coarse pictures."""
         version, look, camera = client.version, client.look, client.camera(client.longest)
         started, bands = time.perf_counter(), []
         rows = max(1, int(self.rate * BAND / camera.width))

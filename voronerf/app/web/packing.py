@@ -121,16 +121,16 @@ def _networks(run: Run) -> Radiance:
     """Returns the networks of a run; raises CannotDraw if a page cannot draw them."""
     renderer = run.renderer
     if renderer.cones:
-        raise CannotDraw("its field is asked about cones, a page asks about points")
+        raise CannotDraw("its field takes cones, a page can only evaluate points")
     if not isinstance(renderer.sampler, Occupancy):
-        raise CannotDraw("it has no grid of empty space: --occupancy makes one")
+        raise CannotDraw("it has no occupancy grid; train it with --occupancy")
     directions = torch.nn.functional.normalize(torch.linspace(-1, 1, 3 * TRACED).view(-1, 3), dim=-1)
     samples = torch.linspace(-1, 1, 3 * TRACED).view(-1, 3), directions
     radiance = radiance_of(renderer.field, (samples[0].to(renderer.device), samples[1].to(renderer.device)))
     if isinstance(radiance, str):
-        raise CannotDraw(f"its field is no single network for each cell ({radiance})")
+        raise CannotDraw(f"its field does not have one network per cell ({radiance})")
     if "cells" in radiance.router.places(samples[0].to(renderer.device)):
-        raise CannotDraw("its cells are not those of the nearest centres")
+        raise CannotDraw("its cells are not assigned by the nearest centre")
     return radiance
 
 

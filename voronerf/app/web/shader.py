@@ -1,9 +1,9 @@
 """Generates the WGSL shader of a run: constants, march.wgsl, and the networks step by step.
 
-A field is a program (`voronerf.ops._core.program`). Each value of it becomes an array of vec4f with four columns each;
-padding lanes are finite, and their weights are 0. A matrix becomes blocks of four outputs and four inputs, since a
-product of a mat4x4f and a vec4f needs no sums across lanes. `Layout` has the offsets of a cell's blocks and biases;
-`voronerf.app.web.packing` writes them.
+A field is a program (`voronerf.ops._core.program`). Each value of the program becomes an array of vec4f, with four
+columns in each vec4f; padding lanes are finite, and their weights are 0. A matrix becomes blocks of four outputs and
+four inputs, since a product of a mat4x4f and a vec4f needs no sums across lanes. `Layout` has the offsets of a cell's
+blocks and biases; `voronerf.app.web.packing` writes them.
 
 o outputs and i inputs of a matrix, w columns.
 """
@@ -82,7 +82,7 @@ def fours(width: int) -> int:
 
 
 def networks_text(networks: Networks, layout: Layout) -> str:
-    """Returns the WGSL function ``evaluate``, colour and density at a place; fills the layout of a cell's parameters.
+    """Returns the WGSL function ``evaluate``, which computes colour and density at a position; fills ``layout``.
 
     Raises:
         CannotDraw: A step has no counterpart in WGSL, or a sample needs more than `MOST_NUMBERS`.
@@ -90,7 +90,7 @@ def networks_text(networks: Networks, layout: Layout) -> str:
     program = networks.program
     numbers = sum(4 * fours(step.width) for step in program.steps)
     if numbers > MOST_NUMBERS:
-        raise CannotDraw(f"its networks keep {numbers:,} numbers of a sample, a page at most {MOST_NUMBERS:,}")
+        raise CannotDraw(f"its networks need {numbers:,} numbers per sample, a page allows {MOST_NUMBERS:,}")
     grids = [HashGrid.parse(text) for text in program.grids]
     lines, steps = [], {step.out: step for step in program.steps}
     readers = [columns.index for step in program.steps for columns in step.operands if columns.of == VALUE]
@@ -99,7 +99,7 @@ def networks_text(networks: Networks, layout: Layout) -> str:
     for number, step in enumerate(program.steps):
         if number in fused:
             continue
-        # A ReLU is fused into its layer if it is the only reader.
+        # A ReLU is fused into its layer if nothing else reads the layer's output.
         after, name = program.steps[number + 1] if number + 1 < len(program.steps) else None, step.name
         if step.op == "linear" and after is not None and _is_relu_of(after, step) and readers.count(step.out) == 1:
             fused.add(number + 1)
@@ -165,7 +165,7 @@ def _step(
         lines = [declare]
         for columns, first in zip(step.operands, step.numbers):
             if columns.of != VALUE:
-                raise CannotDraw("its networks put out parameters as they are")
+                raise CannotDraw("its networks return parameters unchanged")
             for number in range(columns.width):
                 column = int(first) + number
                 lines.append(f"{out}[{column // 4}].{'xyzw'[column % 4]} += {_column(columns, steps, number)};")
@@ -258,7 +258,7 @@ def _frequency(out: str, octaves: int) -> list[str]:
 
 
 class _Term(str):
-    """A WGSL expression that Python formulas can compute with."""
+    """A WGSL expression with Python's operators, so that Python formulas can be applied to it."""
 
     def __mul__(self, other: object) -> _Term:
         return _Term(f"{self} * {other}")
@@ -285,7 +285,7 @@ ENCODINGS: dict[str, Callable[[str, int], list[str]]] = {"frequency": _frequency
 def _whole(columns: Columns, steps: dict[int, Step], name: str) -> tuple[list[str], str]:
     """Returns WGSL lines that make an array of exactly these columns, and its name."""
     if columns.of != VALUE:
-        raise CannotDraw("its networks compute with parameters other than weights and biases")
+        raise CannotDraw("its networks use parameters that are neither weights nor biases")
     if not columns.spread and columns.start == 0 and columns.width == steps[columns.index].width:
         return [], f"v{columns.index}"
     lines = [f"var {name}: array<vec4f, {fours(columns.width)}>;"]
@@ -296,7 +296,7 @@ def _whole(columns: Columns, steps: dict[int, Step], name: str) -> tuple[list[st
 
 def _column(columns: Columns, steps: dict[int, Step], number: int) -> str:
     if columns.of != VALUE:
-        raise CannotDraw("its networks put out parameters as they are")
+        raise CannotDraw("its networks return parameters unchanged")
     at = columns.start + (0 if columns.spread else number)
     return f"v{columns.index}[{at // 4}].{'xyzw'[at % 4]}"
 

@@ -13,19 +13,19 @@ from voronerf.ops._core.checks import physical_memory
 from voronerf.ops._core.grids import UNIT_CUBE, HashGrid
 from voronerf.ops._core.layers import MLP, Layer
 
-#: The initial bias of the hidden layers. The features are near zero at first, so with a bias of zero each unit would be
+#: The initial bias of the hidden layers. The features are near zero at first. With a bias of zero, each unit would be
 #: at the kink of its ReLU, and the first steps could switch off a whole layer: one seed in seven lost its colours.
 HIDDEN_BIAS = 0.3
 
-#: The base-2 logarithms of the entries of a level in contracted space, for a short training and for a training of at
-#: least `LONG` seconds. A larger table takes longer to read and to learn; it pays from half a minute on.
+#: The base-2 logarithm of the number of entries of a level in contracted space, for a short training and for a training
+#: of at least `LONG` seconds. A larger table takes longer to read and to learn, which pays from half a minute on.
 CONTRACTED_ENTRIES, LONG_ENTRIES, LONG = 17, 19, 25.0
 
 #: The density scale in contracted space.
 CONTRACTED_DENSITY = 40.0
 
-#: The density scale and the initial density in a box, both times the longest side of the box. A thinner initial field
-#: learns more slowly: a dark object may get a single colour while the field lets most of the light through.
+#: The density scale and the initial density in a box, both multiplied by the longest side of the box. A thinner initial
+#: field learns more slowly: a dark object may get a single colour while the field lets most of the light through.
 BOX_DENSITY, BOX_INITIAL = 200.0, 2.0
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -43,9 +43,9 @@ class HashGridField(RadianceField):
     Args:
         width: Channels of the hidden layers, at least 2.
         depth: Hidden layers before the heads, at least 1.
-        levels: Resolutions of the grid, 1 to 24.
+        levels: The number of resolutions of the grid, 1 to 24.
         level_features: Features of a level: 1, 2, 4 or 8.
-        log2_entries: The base-2 logarithm of the most entries of a level, 10 to 24.
+        log2_entries: The base-2 logarithm of the maximum number of entries of a level, 10 to 24.
         base: The coarsest resolution.
         finest: The finest resolution.
         box: The lowest and the highest corner of the grid; None is the unit cube.
@@ -133,8 +133,9 @@ class HashGridField(RadianceField):
         """Returns options for a scene: the grid covers the box, with finer cells and more entries for larger images.
 
         In a box, the finest cells are half a pixel wide. The number of cells on a surface grows with the square of the
-        resolution, but the entries grow more slowly, since larger tables take longer to read and to learn: 2^15 for an
-        object of 88 pixels, 2^18 for 353 pixels. The density scale is inverse to the size of the box.
+        resolution. The number of entries grows more slowly, from 2^15 for an object of 88 pixels to 2^18 for 353
+        pixels, since larger tables take longer to read and to learn. The density scale is inverse to the size of the
+        box.
 
         In contracted space, most surfaces are farther away than the middle of the scene, where the pixel width is
         measured. So the finest cells are one pixel wide, with 2^17 entries, or 2^19 in a training of at least 25

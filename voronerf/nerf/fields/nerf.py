@@ -24,11 +24,11 @@ class NeRF(RadianceField):
     that also sees the encoded view direction, gives the colour. Without view directions, the colour is a linear head on
     the trunk.
 
-    The density is ``density_scale * softplus(raw)``, where the paper has a ReLU. A ReLU has no gradient if its input
-    becomes negative everywhere: a NeRF on a white background can collapse to a white image within its first hundred
-    steps. Softplus always has a gradient, as in mip-NeRF, section 3.1. The bias of the head sets the untrained density
-    to ``INITIAL_DENSITY``. Surfaces need densities near 100 per scene unit, which network outputs of order one reach
-    sooner with ``density_scale``.
+    The density is ``density_scale * softplus(raw)``; the paper uses a ReLU. A ReLU has no gradient if its input becomes
+    negative everywhere: a NeRF on a white background can collapse to a white image within its first hundred steps.
+    Softplus always has a gradient, as in mip-NeRF, section 3.1. The bias of the head sets the untrained density to
+    ``INITIAL_DENSITY``. Surfaces need densities near 100 per scene unit; with ``density_scale``, network outputs of
+    order one suffice.
 
     The layer table ``layers`` (see :class:`voronerf.ops._core.layers.MLP`) and :meth:`linears` describe the network.
     :class:`voronerf.VoronoiRouter` uses them to evaluate the copies of all cells in one pass.
@@ -61,7 +61,7 @@ class NeRF(RadianceField):
         >>> colour, density = field(positions, per_ray, ray_index)
     """
 
-    #: Half the published layers: cells are small, and what a cell shows is simpler than the scene.
+    #: Half the published layers: a cell is small, and its contents are simpler than the scene.
     training_defaults: ClassVar[dict[str, Any]] = {"depth": 4}
 
     def __init__(
@@ -86,7 +86,9 @@ class NeRF(RadianceField):
         if skips is None:
             skips = (4,) if depth > 5 else ()
         if any(not 0 <= s < depth - 1 for s in skips):
-            raise ValueError(f"NeRF: skips must be trunk layers with another behind, 0..{depth - 2}, got {skips}")
+            raise ValueError(
+                f"NeRF: skips must be indices of trunk layers before the last, 0..{depth - 2}, got {skips}"
+            )
         if not density_scale > 0:
             raise ValueError(f"NeRF: density_scale must be positive, got {density_scale}")
         self.width, self.view_directions, self.density_scale = width, view_directions, density_scale
@@ -161,7 +163,7 @@ class MipNeRF(NeRF):
 
     @staticmethod
     def octaves(finest: int) -> int:
-        """Returns the octaves of the encoding: two more than the images show, at most 16.
+        """Returns the octaves of the encoding: two more octaves than the images show, at most 16.
 
         The cone of a pixel damps the wave of the second additional octave to a thousandth, and the next wave to 1e-11:
         the published 16 octaves would feed zeros to the network.

@@ -15,12 +15,13 @@ from voronerf.ops.grouped_mlp import grouped_mlp
 from voronerf.router import CellProgram, layered_program
 
 #: The density of the untrained field, per scene unit. A scene of diameter 2 then starts with an opacity of about 0.2.
-#: It is translucent enough for a gradient at every sample of a ray, and opaque enough for gradients of the colours.
+#: The field is then translucent enough for a gradient at every sample of a ray, and opaque enough for gradients of the
+#: colours.
 INITIAL_DENSITY = 0.1
 
 
 def activate_radiance(self: Any, raw: Tensor) -> tuple[Tensor, Tensor]:
-    """Applies the activations: turns raw network outputs into colours and densities.
+    """Applies the activations, which turn raw network outputs into colours and densities.
 
     A training with an occupancy grid recognises these activations in the traced program, and fuses them with the loss
     (``voronerf.ops.render_loss``).
@@ -34,7 +35,7 @@ def activate_radiance(self: Any, raw: Tensor) -> tuple[Tensor, Tensor]:
     """
     raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
     # The gradient of `split` is one concatenation; two slices would need two padded arrays and their sum. Torch
-    # vectorises activations only for contiguous values. Both together take a third of the time.
+    # vectorises activations only for contiguous values. Both measures together cut the time to a third.
     colour, density = (part.contiguous() for part in raw.split([3, 1], dim=-1))
     return torch.sigmoid(colour), F.softplus(density.squeeze(-1)) * self.density_scale
 

@@ -1,27 +1,27 @@
-"""The table of fields, which lists the networks that can be trained by name, and their properties.
+"""The table of fields: the names and the properties of the networks that can be trained.
 
 A field is any ``nn.Module`` that maps positions [n, 3] and unit directions [n, 3] to a colour [n, 3] in 0..1 and a
-density [n] >= 0 per scene unit. :func:`register_field` enters its class, or a function that returns a field. The class
-may have these optional attributes:
+density [n] >= 0 per scene unit. :func:`register_field` registers its class, or a function that returns a field. The
+class may have these optional attributes:
 
     inputs                   "points" (the default), or "gaussians": positions are [n, 6], means and variances
     training_defaults        options whose training defaults differ from the defaults of the constructor
     learning_rate(**options) static method: Adam's initial learning rate; default ``LEARNING_RATE``
     router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
-    sparse_parameters        name patterns of tables of which a training step reads few entries. Entries without a
-                             gradient change only by the weight decay of tables; see ``voronerf.ops.adam``
-    ray_growth               the most rays of a training step, as a multiple of ``--rays``, if space is empty; default
-                             1, more for a field whose samples are cheap relative to the rest of a step
+    sparse_parameters        name patterns of sparse tables: a training step reads few of their entries. Entries without
+                             a gradient change only by the weight decay of tables; see ``voronerf.ops.adam``
+    ray_growth               the maximum number of rays of a training step, as a multiple of ``--rays``, if space is
+                             empty; default 1, more for a field whose samples are cheap relative to the rest of a step
     lr_hold                  fraction of a training for which the learning rate stays constant; default 0
     scene_options(pixel, box, contracted, seconds)
-                             static method: defaults of options, from the width of a pixel at the middle of the scene,
-                             the corners of the field's space (both in scene units), whether space is contracted, and
-                             the training time in seconds
+                             static method: defaults of options. Its arguments are the width of a pixel at the middle
+                             of the scene and the corners of the field's space, both in scene units, whether space is
+                             contracted, and the training time in seconds
     octaves(finest)          static method: ``position_octaves`` for images that show ``finest`` octaves; default
                              ``finest``
 
-The options of a field are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is
-called with the directions [r, 3] of the rays, and with the row of each sample's direction.
+The options of a field are the named parameters of its constructor. If ``forward`` has a parameter ``ray_index``, it
+gets the directions [r, 3] of the rays, and as ``ray_index`` the row of each sample's direction.
 
 A class may describe its computation by a method ``program()``, as :class:`voronerf.nerf.fields.NeRF` does by a layer
 table (:func:`voronerf.router.layered_program`). A router then runs the program for all cells in one op and does not
@@ -53,7 +53,7 @@ class FieldType:
     Attributes:
         name: The name of the field, the value of ``--field``.
         network: The class of the module, or a function that returns the module.
-        inputs: "points", positions [n, 3], or "gaussians", means and variances [n, 6].
+        inputs: "points" for positions [n, 3], or "gaussians" for means and variances [n, 6].
         options: The options and their defaults in training; ``inspect.Parameter.empty`` for a required option.
 
     Examples:
@@ -75,7 +75,7 @@ class FieldType:
 
     @property
     def cones(self) -> bool:
-        """True if rays are cones, which are cut into Gaussians."""
+        """True if rays are cones, and the inputs of the field are Gaussians."""
         return self.inputs == "gaussians"
 
     @property
@@ -85,12 +85,12 @@ class FieldType:
 
     @property
     def sparse_parameters(self) -> Sequence[str]:
-        """Name patterns of tables of which a training step reads few entries."""
+        """Name patterns of sparse tables: a training step reads few of their entries."""
         return cast("Sequence[str]", self._declared("sparse_parameters", ()))
 
     @property
     def ray_growth(self) -> float:
-        """The most rays of a training step, as a multiple of the first step's rays, if empty space is skipped."""
+        """The maximum rays of a training step as a multiple of the first step's rays, if empty space is skipped."""
         return float(self._declared("ray_growth", 1.0))
 
     @property
@@ -133,7 +133,7 @@ FIELDS: dict[str, FieldType] = {}
 
 
 def register_field(name: str) -> Callable[[Network], Network]:
-    """Returns a decorator that enters a field into ``FIELDS``; an existing entry of this name is replaced.
+    """Returns a decorator that registers a field in ``FIELDS``; an existing entry of this name is replaced.
 
     Examples:
         >>> import torch
@@ -175,7 +175,7 @@ def register_field(name: str) -> Callable[[Network], Network]:
 
 
 def _options(network: Callable[..., nn.Module]) -> dict[str, Any]:
-    """Returns named parameters and their defaults, including parameters of base classes reached by ``**options``."""
+    """Returns named parameters and their defaults; ``**options`` adds the parameters of base classes."""
     if not isinstance(network, type):
         return _named_parameters(network)[0]
     options: dict[str, Any] = {}

@@ -15,5 +15,5 @@ class _Active(threading.local):
 
 
 active = _Active()
-"""The active :class:`voronerf.ops._core.recording.Recording`, and the function that makes numbers which vary between
-replays, on the CPU and on a GPU."""
+"""The active :class:`voronerf.ops._core.recording.Recording` or None, and the function that makes the numbers that vary
+between replays of a recording (CPU) or a capture (GPU)."""

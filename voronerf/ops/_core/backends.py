@@ -1,5 +1,5 @@
 """The choice of an op's implementation: one table, in which each op declares its row (``voronerf/ops``), and one
-predicate that both selects and explains.
+predicate, which decides the choice and gives the reasons.
 
 An op has up to three implementations, all with the signature of its reference function:
 
@@ -46,9 +46,9 @@ class Implementation:
 
     devices: tuple[str, ...] = ()  # device types; empty for any
     dtypes: tuple[torch.dtype, ...] = ()  # supported dtypes of the op's first tensor; empty for any
-    file: str | None = None  # the op whose module has the function; None if the function has that name
+    file: str | None = None  # the op whose module has the function; None if both have one name
     function: str | None = None  # the function's name; None if it is the op's name
-    plain: bool = False  # whether the backend uses the reference, because it needs no kernel
+    plain: bool = False  # whether the backend uses the reference, because the op needs no kernel
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ class Row:
     Attributes:
         op: name of the op.
         backend: name of the backend.
-        devices: device types on which this pair can run here and now.
+        devices: device types on which the backend can run the op here and now.
         dtypes: names of the supported dtypes; ``("any",)`` for all, ``("plain torch",)`` for the reference in place of
             a kernel, empty without an implementation.
-        reason: one line on why the pair cannot run on all devices; empty if it can.
+        reason: one line on why the backend cannot run the op on all devices; empty if it can.
     """
 
     op: str
@@ -72,7 +72,7 @@ class Row:
 
     @property
     def available(self) -> bool:
-        """Returns whether the pair runs on some device of this machine."""
+        """Returns whether the backend can run the op on some device of this machine."""
         return bool(self.devices)
 
 
@@ -93,7 +93,7 @@ def declare(
     reference: Implementation = Implementation(),
     runs: str | None = None,
 ) -> str:
-    """Adds the row of an op to the table and returns the op's name. None means no such implementation.
+    """Adds the row of an op to the table and returns the op's name. A missing implementation is None.
 
     By default an implementation is a function with the op's name, in a module with the op's name:
     ``voronerf.ops.<op>.reference``, ``voronerf.ops.<op>.native`` or ``voronerf.kernels.<op>``, imported on first use.
@@ -136,16 +136,16 @@ def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) 
 
 
 def resolve_composed(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
-    """Resolves an op whose reference calls other ops and takes the ``backend`` of these ops.
+    """Resolves an op whose reference calls other ops and takes a ``backend`` for them.
 
-    The reference receives "auto" if "auto" falls back to the reference, so that each inner op makes its own choice. It
-    receives the named backend if that backend's implementation is plain.
+    The reference receives "auto" if "auto" falls back to the reference, so that the choice is made for each inner op.
+    It receives the named backend if that backend's implementation is plain.
     """
     return function(op, _choose(op, backend, device.type, device.index, dtype), backend, composed=True)
 
 
 def function(op: str, name: str, backend: str, composed: bool) -> Callable[..., Any]:
-    """Returns the implementation ``name`` that was chosen for ``backend``; ``composed`` as in `resolve_composed`."""
+    """Returns the implementation ``name``, chosen for ``backend``; see `resolve_composed` for ``composed``."""
     run = _FUNCTIONS[op, name]
     passed = composed and (_TABLE[op, name].plain or (name == "reference" and backend == "auto"))
     return functools.partial(run, backend=backend) if passed else run
@@ -192,14 +192,14 @@ def missing(backend: str, device: torch.device) -> str | None:
         module = _import(_PACKAGES[backend])
     except BackendUnavailable as error:
         if backend == "native":
-            _warn_once(f"{error}. Until then plain PyTorch runs in its place, many times slower.")
+            _warn_once(f"{error}. Until then the much slower plain PyTorch is used.")
         return str(error)
     reason: str | None = module.missing(device)
     return reason
 
 
 def automatic(device: torch.device) -> str:
-    """Returns the choice of "auto" on a device, and why preferred backends cannot run: "warp (native: no GPU code)"."""
+    """Returns the choice of "auto" on a device, with the obstacles to other backends: "warp (native: no GPU code)"."""
     reasons: list[str] = []
     for name in ORDER[device.type]:
         reason = missing(name, device)
@@ -212,7 +212,7 @@ def automatic(device: torch.device) -> str:
 def _import(module: str) -> ModuleType:
     """Imports a backend's module.
 
-    A package that runs from its source folder has no ``voronerf.kernels``: the kernels' folder lies beside it.
+    In a source folder ``voronerf.kernels`` is missing, because the kernels' folder lies beside the package.
 
     Raises:
         BackendUnavailable: The backend cannot be used here.
@@ -262,12 +262,12 @@ def cpu_precision() -> str:
     return str(backend.matmul.fp32_precision)
 
 
-# The function behind the public property; it takes a fifteenth of the time.
+# The function behind the public property takes a fifteenth of the time of the property.
 _precision: Callable[[str, str], str] | None = getattr(torch._C, "_get_fp32_precision_getter", None)
 
 
 def threads() -> int:
-    """Returns the number of threads of an op: torch's, or the number saved by `torch_on_one_thread` within it."""
+    """Returns the number of threads of native ops: torch's, or the number that `torch_on_one_thread` has saved."""
     return _override.threads or torch.get_num_threads()
 
 
@@ -332,7 +332,7 @@ def _describe(module: str) -> dict[str, Any]:
     return {"available": True, **described}
 
 
-# torch.compile calls this while tracing and treats the result as constant; it can trace the look-up in _FUNCTIONS.
+# torch.compile calls this while tracing and treats the result as a constant. The look-up in _FUNCTIONS can be traced.
 @constant_result
 def _choose(op: str, backend: str, device: str, index: int | None, dtype: torch.dtype) -> str:
     if not isinstance(backend, str):  # an unhashable backend, such as a list, cannot be a cache key

@@ -5,8 +5,8 @@ torch's operations included. A replay runs no Python, and the function must not 
 :attr:`Capture.obstacle` says where it did.
 
 Numbers that vary from replay to replay lie in device memory (:func:`voronerf.ops._core.rows.varying`). The warm-up run
-allocates this memory: within a capture torch reuses memory, so every replay would overwrite it. The number of rows is
-fixed by the captured run.
+allocates this memory, because torch reuses memory allocated in a capture, and replays would overwrite the numbers. The
+number of rows is fixed by the captured run.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class Capture:
         self._graph.register_generator_state(generator)
         self._device = device
         self._numbers = list[tuple[Tensor, Callable[[], float]]]()
-        self._taken = 0  # numbers that the capture has read, in order
+        self._taken = 0  # the count of numbers that the capture has read
         self._rows: list[tuple[int, Callable[[], int]]] = []
         self.obstacle: str | None = None
 
     def warm_up(self, function: Callable[[], T]) -> T:
-        """Runs the function eagerly, and notes an obstacle if the host synchronises with the device in it."""
+        """Runs the function eagerly, and sets ``obstacle`` if the function synchronises host and device."""
         current, mode = torch.cuda.current_stream(self._device), torch.cuda.get_sync_debug_mode()
         self._stream.wait_stream(current)
         active.vary = self._make_number
@@ -101,7 +101,7 @@ class Capture:
         """Launches the graph ``times`` times and returns ``times``, or 0 if the number of rows has changed.
 
         Args:
-            threads: Unused; the parameter exists for the interface of a recording.
+            threads: Unused; the signature matches `Recording.replay`.
             times: The number of launches.
         """
         if any(count() != rows for rows, count in self._rows):

@@ -1,8 +1,8 @@
 """The case of an op: it makes valid arguments of the op, and lists arguments that the op must refuse.
 
 Each op has a case, ``voronerf/ops/<op>/case.py``. The case parametrises the tests of every op, the random calls of the
-attack and the sanitizers, the runs on the emulated and on a real GPU, and the benchmark. n is the size of a call:
-points, samples or rays.
+attack and the sanitizers, the runs on the emulated and on a real GPU, and the benchmark. n is the number of
+points, samples or rays of a call.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Draw:
 
     Args:
         seed: the seed of the numbers and choices.
-        free: whether to draw any option of each choice and any strides; else the first option and contiguous tensors.
+        free: whether options and strides are random; otherwise first options are chosen and tensors are contiguous.
         pinned: fixed choices, by name.
     """
 
@@ -70,7 +70,7 @@ class Draw:
         return torch.nn.functional.normalize(self.normal(n, 3, dtype=torch.float64), dim=1).to(dtype)
 
     def points(self, n: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        """Draws positions [n, 3]: random ones, ones on a lattice (with equal distances), or far away."""
+        """Draws positions [n, 3]: random, on a lattice (with equal distances), or far from the origin."""
         kind = self.among("points", "random", "lattice", "far")
         positions = self.normal(n, 3, dtype=torch.float64) if kind != "lattice" else self.integers(-2, 3, n, 3).double()
         return self._viewed((positions * (1000.0 if kind == "far" else 1.0)).to(dtype))
@@ -104,7 +104,7 @@ class Case:
 
     Attributes:
         make: (draw, n) -> valid arguments by name, without ``backend``.
-        kinds: name of a kind -> the choices that a test of this kind pins.
+        kinds: name of a kind of call -> the choices that its tests pin.
         refused: error message -> the changed arguments that raise it: a TypeError if the message is about a type, a
             dtype or a kind of number, else a ValueError.
         alternatives: name -> a function that computes the same result from the same arguments, for the benchmark.
@@ -113,10 +113,10 @@ class Case:
         comparable: whether all backends return the same tensors.
         call: the name of the public function, if it is not the op's name.
         traced: whether torch can trace the op on every backend.
-        on_devices: the choices of additional calls on GPUs.
-        device_rows: n of a call under a sanitizer; more than a block if a kernel has one thread for each row.
-        hostile: the arguments that may hold any values without an access out of bounds: "indices"; "numbers" for
-            indices and floating-point numbers; "" for none.
+        on_devices: the pinned choices of additional calls on GPUs.
+        device_rows: n of a call under a sanitizer; more than a thread block if a kernel has one thread for each row.
+        hostile: the arguments for which no values cause an access out of bounds: "indices"; "numbers" for indices and
+            floating-point numbers; "" for none.
     """
 
     make: Callable[[Draw, int], Arguments]

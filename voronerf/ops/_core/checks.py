@@ -88,7 +88,7 @@ def check_shape(
             if not fits:
                 break
     if not fits:
-        # The text is built after a failed check alone, because torch.compile cannot format a symbolic size.
+        # The text is built only after a failed check, because torch.compile cannot format a symbolic size.
         entries = [str(entry) for entry in shape]
         letters = dict.fromkeys(entry.removesuffix("+1") for entry in entries)
         values = ", ".join(f"{letter} = {bound[letter]}" for letter in letters if letter in list(bound)[:bound_before])
@@ -199,7 +199,7 @@ class Row(NamedTuple):
         name: the tensor's name, for errors.
         dtypes: the allowed dtypes.
         shape: the numbers and letters of the shape; "1|k" is 1 or the letter.
-        like: the name of the tensor whose dtype this one must have, if the error should name that tensor.
+        like: the name of a tensor with the same dtype, if the error should name it; else "".
         empty: the error's rule if the tensor has no rows; "" if it may be empty.
     """
 
@@ -211,7 +211,7 @@ class Row(NamedTuple):
 
 
 class Default(NamedTuple):
-    """The number of a letter, unless an earlier tensor has bound it."""
+    """The default number of a letter that no earlier tensor has bound."""
 
     letter: str
     number: int
@@ -235,7 +235,7 @@ def check_rows(
         make: the function that returns the rows.
         tensors: one tensor for each row.
         arguments: the arguments of ``make``; they must be hashable.
-        smooth: whether autograd saves the tensors; inference tensors are then refused.
+        smooth: whether autograd saves the tensors; if so, inference tensors are refused.
 
     Returns:
         The number of each letter; 0 for an unbound letter.
@@ -292,8 +292,8 @@ def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> 
     """Returns whether several lists of tensors match, so that the compiled module can work on them.
 
     The tensors at one index of the lists must have one shape. All tensors, and ``scalars`` of shape [], must be float32
-    and on one device, and tensors of the ``written`` lists must be contiguous. The result is also False where only
-    Python can tell.
+    and on one device, and tensors of the ``written`` lists must be contiguous. The result is also False if only
+    Python can check the tensors.
     """
     native = None if torch.compiler.is_dynamo_compiling() else backends.compiled()
     return native is not None and native.alike(lists, written, scalars)
@@ -313,7 +313,7 @@ def check_writable(op: str, name: str, tensor: Tensor) -> None:
     if not tensor.is_contiguous():
         raise ValueError(f"{op}: {name} must be contiguous, got strides {tensor.stride()}")
     if not torch.compiler.is_compiling() and tensor.is_neg():  # is_neg cannot be traced
-        raise ValueError(f"{op}: {name} must be a tensor of its own (clone), got a negative view")
+        raise ValueError(f"{op}: {name} must not be a negative view: clone it")
 
 
 def check_no_inference(op: str, **tensors: Tensor | None) -> None:
@@ -324,7 +324,7 @@ def check_no_inference(op: str, **tensors: Tensor | None) -> None:
     if any(tensor.requires_grad for _, tensor in present):
         for name, tensor in present:
             if tensor.is_inference():
-                raise TypeError(f"{op}: {name} must be a copy where gradients are recorded, got an inference tensor")
+                raise TypeError(f"{op}: {name} must not be an inference tensor while gradients are recorded: clone it")
 
 
 def check_count(op: str, name: str, count: int) -> None:
@@ -361,7 +361,7 @@ def check_number(op: str, name: str, value: float) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, float, torch.SymFloat, torch.SymInt)):
         raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}")
     if isinstance(value, int) and abs(value) > sys.float_info.max:
-        raise ValueError(f"{op}: {name} must be at most {sys.float_info.max:.2g}, got an integer of more digits")
+        raise ValueError(f"{op}: {name} must be at most {sys.float_info.max:.2g}, got a larger integer")
 
 
 def check_positive(op: str, name: str, value: float) -> None:
@@ -372,7 +372,7 @@ def check_positive(op: str, name: str, value: float) -> None:
 
 
 def check_interval(op: str, name: str, value: float, low: float, high: float, rule: str) -> None:
-    """Runs `check_number`, and raises ValueError outside the interval ``rule``, "[0, 1)" or "0 to 1"."""
+    """Runs `check_number`, and raises ValueError for a value outside the interval ``rule``: "[0, 1)" or "0 to 1"."""
     check_number(op, name, value)
     if not (low <= value < high or (value == high and not rule.endswith(")"))):
         raise ValueError(f"{op}: {name} must lie in {rule}, got {value}")
@@ -418,7 +418,7 @@ def physical_memory() -> int:
 
 
 def available_memory() -> int:
-    """Returns the bytes that this process can still allocate: the free memory, or the rest of its container's limit."""
+    """Returns the bytes that this process can still allocate: free memory, or what its container's limit leaves."""
     free = physical_memory()
     with contextlib.suppress(OSError, ValueError):
         match = re.search(r"^MemAvailable: +(\d+) kB$", Path("/proc/meminfo").read_text(), re.MULTILINE)

@@ -16,7 +16,7 @@ R = TypeVar("R")
 
 
 def constant_result(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a function as ``torch.compiler.assume_constant_result`` does: its result is a constant of the graph."""
+    """Makes the result of a function a constant of the graph, like ``torch.compiler.assume_constant_result``."""
     function._dynamo_marked_constant = True  # type: ignore[attr-defined]  # torch's decorator does the same
     return function
 
@@ -26,7 +26,7 @@ def not_compiled(function: Callable[P, R], reason: str) -> Callable[P, R]:
 
     Args:
         function: The function to exclude. Its first call imports torch's compiler.
-        reason: The reason in the compiler's error if graph breaks are forbidden.
+        reason: The reason that the compiler's error states if graph breaks are forbidden.
     """
 
     @functools.wraps(function)

@@ -1,5 +1,5 @@
-"""The custom op of an implementation: one declaration gives its schema, its fake and its gradients. Calls bypass the
-dispatcher where nothing observes it."""
+"""The custom op of an implementation: one declaration gives its schema, its fake and its gradients. Calls bypass
+torch's dispatcher if nothing observes them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch.autograd import forward_ad
 
 from voronerf.ops._core.active import active
 
-# torch has no public names for these functions; without one of them the custom op is always called.
+# torch has no public names for these functions. If one is missing, the custom op is always called.
 LISTENERS = [
     getattr(torch._C, "_len_torch_function_stack", lambda: True),
     getattr(torch._C, "_len_torch_dispatch_stack", lambda: True),
@@ -35,7 +35,7 @@ def is_watched() -> bool:
 
 
 def custom_op(name: str, memory: Callable[[Any], Any], **options: Any) -> Callable[[Callable[..., Any]], Op]:
-    """Makes a function the custom op ``voronerf::name``, with the options of `Op`. The function fills allocated memory.
+    """Makes the custom op ``voronerf::name`` from a function that fills allocated memory, with the options of `Op`.
 
     ::
 
@@ -65,7 +65,7 @@ class _Fields:
 
     def __init__(self, kind: Any) -> None:
         self.hints: dict[str, Any] = {}
-        self._kinds: list[Any] = []  # each argument's class of named tuple, or None
+        self._kinds: list[Any] = []  # the named-tuple class of each argument, or None
         self._optional: list[bool] = []
         for name, hint in typing.get_type_hints(kind).items():
             tuples = [member for member in (hint, *typing.get_args(hint)) if hasattr(member, "_fields")]
@@ -102,7 +102,7 @@ class _Fields:
 
 
 class Op:
-    """A custom op whose calls bypass PyTorch's dispatcher where nothing observes it.
+    """A custom op whose calls bypass PyTorch's dispatcher if nothing observes them.
 
     The dispatcher and the autograd of ``torch.library`` take some 130 us for a forward and a backward pass, and more
     for lists of tensors. A layer of width 64 takes as long for a thousand samples. Modes, transforms, tracers and
@@ -112,8 +112,8 @@ class Op:
     Args:
         name: the name of the op.
         memory: the function that allocates the results from shapes alone; it is also the op's fake, with which torch
-            traces. Its annotation says that the arguments are a named tuple. Members may be named tuples, which the
-            custom op flattens. The first field of an optional named tuple is never None.
+            traces. The annotation of its parameter is the named tuple of the arguments. Members may be named tuples,
+            which the custom op flattens. The first field of an optional named tuple is never None.
         fill: the function that writes the results into the allocated memory.
         devices: the device types that the op runs on.
         mutates: the arguments that the op writes into.
@@ -123,8 +123,8 @@ class Op:
     Attributes:
         tensors: the indices of the custom op's arguments that are tensors or None.
         plan: the description with which the compiled module makes the call (`Declaration.compiled_op`), or None.
-        without_gradients: a function that returns the results if no gradients are recorded, or None if this class must
-            decide on the call.
+        without_gradients: a function for calls without gradients. It returns the results, or None if this class must
+            handle the call.
         with_gradients: a function that returns the results, with an autograd node, for plain CPU tensors with
             gradients; None if this class makes the node.
     """
@@ -206,7 +206,7 @@ class Op:
         needs_gradients = False
         for tensor in tensors:
             supported = tensor.is_cpu or (tensor.is_cuda and self._on_cuda)
-            if not supported or type(tensor) not in _PLAIN:  # also fake tensors of other tracers
+            if not supported or type(tensor) not in _PLAIN:  # such as fake tensors of other tracers
                 return self._op(*flat)
             needs_gradients = needs_gradients or tensor.requires_grad
         if not (needs_gradients and torch.is_grad_enabled()):
@@ -238,7 +238,7 @@ class Op:
         return self._as_declared(_Differentiable.apply(*entries, lengths, self, None))
 
     def _as_declared(self, results: Any) -> Any:
-        return list(results) if self._listed else results  # autograd.Function returns no lists
+        return list(results) if self._listed else results  # autograd.Function cannot return lists
 
     def refuse_batches(self, of_results: Sequence[Any]) -> None:
         """Raises NotImplementedError for batched gradients."""
@@ -251,7 +251,7 @@ class Op:
         """The error for batched gradients."""
         return NotImplementedError(
             f"{self._name.removesuffix('_native')}: torch.func.vmap, jacrev, hessian, is_grads_batched=True and "
-            "vectorize=True are not supported; ask torch.autograd.grad for one gradient at a time"
+            "vectorize=True are not supported; call torch.autograd.grad once for each gradient"
         )
 
     def _refuse_tangents(self, flat: Sequence[Any]) -> None:
@@ -260,7 +260,7 @@ class Op:
             if isinstance(tensor, Tensor) and forward_ad.unpack_dual(tensor).tangent is not None:
                 raise NotImplementedError(
                     f"{self._name.removesuffix('_native')}: has no forward-mode derivative (jvp, jacfwd, dual "
-                    "numbers); take torch.func.vjp or torch.autograd.grad"
+                    "numbers); use torch.func.vjp or torch.autograd.grad"
                 )
 
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
@@ -289,9 +289,9 @@ class Op:
 class _Differentiable(torch.autograd.Function):
     """An op with gradients for PyTorch's autograd and ``torch.func``.
 
-    It takes the custom op's arguments with flattened lists, the lengths of the lists, the op, and None. Outside
-    ``torch.func``, which would replace the tensors, it takes the op's arguments in place of None. The lengths are then
-    None, and an op with lists passes the result of `Op._tensors_of` in place of the flattened arguments.
+    Under ``torch.func`` it takes the custom op's arguments with flattened lists, the lengths of the lists, the op, and
+    None. Elsewhere the lengths are None, the op's own arguments replace the last None (``torch.func`` would replace
+    their tensors), and an op with lists passes the result of `Op._tensors_of` in place of the flattened arguments.
     """
 
     @staticmethod
@@ -325,7 +325,7 @@ _apply_directly = super(torch.autograd.Function, _Differentiable).apply
 
 
 def _flattened(arguments: Sequence[Any]) -> tuple[list[Any], list[int]]:
-    """Returns the arguments with lists flattened, and for each argument the length of its list, -1 if it is no list."""
+    """Returns the arguments with flattened lists, and the list length of each argument (-1: not a list)."""
     flat: list[Any] = []
     lengths = []
     for argument in arguments:
@@ -345,7 +345,7 @@ def _nested(flat: Sequence[Any], lengths: Sequence[int]) -> tuple[Any, ...]:
 
 
 def in_float32(op: Op) -> Callable[..., Any]:
-    """Wraps a float32 op so that it takes other dtypes, by casts of its floating-point tensors and its results.
+    """Wraps a float32 op for other dtypes: casts its floating-point tensors to float32, and its results back.
 
     All floating-point arguments have the dtype of the first one. The result is a tensor or a tuple of tensors.
     """

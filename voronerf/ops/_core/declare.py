@@ -9,19 +9,20 @@
         *,
         backend: str = "auto",
     ) -> Annotated[Tensor, "int32 [n]"]:
-        \"\"\"What it computes, which needs no body.\"\"\"
+        \"\"\"The docstring; the function has no body.\"\"\"
 
-The decorator makes the function. It checks the arguments, chooses a backend, and calls the backend's implementation
-with positional arguments. The compiled module handles the call if it can (csrc/bindings/signature.cpp); Python handles
-invalid arguments and tensors that are not plain. The signature also gives the schema of custom ops, the allocation of
-their results (which is their fake), their gradients (`Declaration.backward_op`), and the members of compiled structs
-(`Declaration.inputs` and `Declaration.outputs`).
+The decorator makes the public function, which checks the arguments, chooses a backend, and calls the backend's
+implementation with positional arguments. The compiled module handles the call if it can
+(csrc/bindings/signature.cpp); Python handles invalid arguments and tensors that are not plain. The signature also gives
+the schema of custom ops, the allocation of their results (also used as the fake), their gradients
+(`Declaration.backward_op`), and the members of compiled structs (`Declaration.inputs` and `Declaration.outputs`).
 
 A tensor's annotation has dtypes and a shape. The dtypes are ``floating``, a list of names (``float32|float64``),
-``same`` for the dtype of the first floating-point tensor, or ``wide`` for this dtype promoted to at least float32. The
-shape has numbers, letters, a letter plus one, and names of integer arguments. The number of dimensions decides between
-the two shapes of ``[3] or [r, 3]``. The presence of the argument decides in ``[m] if ray_offsets else [r, s]``. The
-shape of a result may also have letters that are functions of the arguments (``sizes``).
+``same`` for the dtype of the first floating-point tensor, or ``wide`` for this dtype promoted to at least float32. An
+entry of a shape is a number, a letter, a letter plus one, or the name of an integer argument. ``[3] or [r, 3]`` allows
+either shape; their numbers of dimensions differ. ``[m] if ray_offsets else [r, s]`` is [m] if the argument
+``ray_offsets`` is not None. The shape of a result may also have letters that are functions of the arguments
+(``sizes``).
 
 An int's annotation is a range (``1..4``, ``0..``), a float's is ``positive`` or an interval (``[0, 1)``, ``0 to 1``), a
 str's is its choices (``linear|disparity``). An argument annotated with a class alone must be an instance of it. The
@@ -88,7 +89,7 @@ class Shaped(NamedTuple):
 
     @property
     def row(self) -> tuple[Any, ...]:
-        """Describes the tensor to the compiled module."""
+        """Returns the description of the tensor for the compiled module."""
         names = [str(dtype).removeprefix("torch.") for dtype in self.dtypes]
         kind = "wide" if self.wide else "" if names else "same"
         return names, kind, self.shape, self.otherwise or None
@@ -125,7 +126,7 @@ class Argument(NamedTuple):
         return self.kind is Tensor and (not self.rule.dtypes or bool({*self.rule.dtypes} & {*FLOATING}))
 
     def check(self, checked: checks.Checked, values: dict[str, Any]) -> None:
-        """Checks the argument's value, an entry of ``values`` by name, and converts an int to a float if declared."""
+        """Checks the argument's entry in ``values``, and converts it to a float if the argument is a float."""
         name, kind, rule, value = self.name, self.kind, self.rule, values[self.name]
         if kind is Tensor:
             self._check_tensor(checked, values)
@@ -156,14 +157,14 @@ class Source(NamedTuple):
 
     Attributes:
         get: returns the parameter, from the arguments of an op and the memory for its results.
-        plan: the description from which the compiled module reads the parameter itself.
+        plan: the description from which the compiled module gets the parameter without ``get``.
     """
 
     get: Callable[[Any, Any], Any]
     plan: tuple[Any, ...]
 
     def __call__(self, arguments: Any) -> Any:
-        """Returns the parameter from the arguments alone, or from the results alone."""
+        """Returns the parameter, which must depend on the arguments alone or on the results alone."""
         return self.get(arguments, arguments)
 
 
@@ -189,9 +190,9 @@ class Declaration:
         warp: the implementation in kernels/.
         reference: the implementation in plain PyTorch.
         smooth: the arguments that have gradients. All other arguments are detached.
-        small: the arguments whose elements an int32 must number.
+        small: the arguments whose number of elements must fit an int32.
         writes: the arguments that the op writes into.
-        sizes: letters that occur in results alone, as functions of the arguments.
+        sizes: functions of the arguments, for letters that occur only in results.
         filled: letters that must be at least 1, and the text of the error.
         compared: two arguments that are compared, so they are promoted to one dtype (`checks.to_common_dtype`).
         prepare: a function from the checked arguments, as a named tuple, to the implementations' arguments. It checks
@@ -241,7 +242,7 @@ class Declaration:
         return [argument for argument in self.arguments if argument.kind is Tensor]
 
     def _letters(self) -> dict[str, Callable[[Any], Any]]:
-        """Returns a function of the arguments for each letter, and ``<name>_per_ray`` for tensors of two shapes."""
+        """Returns functions of the arguments: one for each letter, and ``<name>_per_ray`` for tensors of two shapes."""
         ways, letters = dict[str, list[tuple[int, int, int, int]]](), dict[str, Callable[[Any], Any]]()
         for name, _, _, rule, _ in self._tensors():
             if rule.either:
@@ -255,7 +256,7 @@ class Declaration:
         return {**letters, **{letter: _size_of(sorted(letter_ways)) for letter, letter_ways in ways.items()}}
 
     def _likes(self) -> list[tuple[str, torch.dtype | None]]:
-        """Returns for each result an argument to allocate it like, and its dtype, None for the argument's dtype."""
+        """Returns for each result the argument whose device it takes, and its dtype (None: the argument's dtype)."""
         tensors, likes = [arg for arg in self._tensors() if not arg.optional], list[tuple[str, torch.dtype | None]]()
         for result in self.results.values():
             matching = [arg for arg in tensors if {*arg.rule.dtypes} <= {*(result.dtypes or FLOATING)}]
@@ -263,7 +264,7 @@ class Declaration:
         return likes
 
     def _memory(self) -> Callable[[Any], Any]:
-        """Returns the function that allocates the results, as a named tuple if they have names."""
+        """Returns the function that allocates the results. Results with names form a named tuple."""
         rows, kind = [*zip(self.results.values(), self._likes())], tuple
         if "result0" not in self.results:
             kind = self._Results
@@ -283,7 +284,7 @@ class Declaration:
     def public(self) -> Any:
         """Returns the public function: it checks its arguments, chooses a backend and calls the implementation.
 
-        The compiled module handles the call if it can (csrc/bindings/signature.cpp). `_call` is the fallback: without
+        The compiled module handles the call if it can (csrc/bindings/signature.cpp). `_call` is the fallback without
         the module, for an invalid argument, and for a tensor that is not plain.
         """
         function, self._calls, traces = self.function, self._first_call, torch.compiler.is_dynamo_compiling
@@ -340,7 +341,7 @@ class Declaration:
         return run(*flat) if self._pack is None else self._pack(run(*flat))
 
     def _first_call(self, args: tuple[Any, ...], options: dict[str, Any]) -> Any:
-        """Creates the compiled module's callable of the op at the first call, and calls it."""
+        """Makes the op's callable in the compiled module, at the first call of the op, and calls it."""
         native = backends.compiled()
         if native is None:
             return NotImplemented
@@ -362,7 +363,7 @@ class Declaration:
         return {"default": self._defaults[name]} if name in self._defaults else {}
 
     def _row(self, argument: Argument) -> dict[str, Any]:
-        """Describes an argument to the compiled module."""
+        """Returns the description of an argument for the compiled module."""
         name, kind, optional, rule, text = argument
         row = {"name": name, "optional": optional, "bound": name in self._bound, "rule": rule, "kind": "any"}
         if kind is Tensor:
@@ -401,12 +402,12 @@ class Declaration:
         return re.sub(r"^ {4}Args:\n(?: {8}.+\n)+", rf"\g<0>{backend}", text, count=1, flags=re.MULTILINE)
 
     def custom_op(self, name: str = "", **options: Any) -> Callable[[Callable[..., Any]], Op]:
-        """Makes ``fill(arguments, results)`` a custom op: it writes into the allocated results.
+        """Makes a custom op from ``fill(arguments, results)``, which writes into the allocated results.
 
         Args:
             name: the name of the custom op; by default the op's name.
-            options: the options of `custom_op`. With ``fake`` only the kernels know the number of rows, and
-                ``fill(arguments)`` returns its results.
+            options: the options of `voronerf.ops._core.custom_op`. If only the kernels know the number of rows of the
+                results, also ``fake``; ``fill(arguments)`` then returns the results.
         """
         memory, fake = self.allocate, options.pop("fake", None)
         if fake is not None:
@@ -414,7 +415,7 @@ class Declaration:
         return custom_op(name or self.name, memory, mutates=self.writes, counted=fake is not None, **options)
 
     def backward_op(self, name: str, forward: Op, formula: Callable[..., Any]) -> Callable[[Callable[..., None]], Op]:
-        """Makes ``fill(arguments, arriving, gradients)`` the backward of a custom op.
+        """Makes the backward of a custom op from ``fill(arguments, arriving, gradients)``.
 
         ``arriving`` is a named tuple of the results' gradients, None for zero. ``gradients`` is a named tuple of memory
         for the gradients of the smooth arguments, None for an unwanted gradient or an absent argument.
@@ -461,7 +462,7 @@ class Declaration:
                 or a constant.
 
         Raises:
-            NameError: a member that has no source.
+            NameError: a member has no source.
         """
         return self._struct(kind, others, self.Inputs)
 
@@ -470,7 +471,7 @@ class Declaration:
 
         Args:
             kind: the struct.
-            others: for members with other names than their results: member -> result.
+            others: member -> result, for each member whose name is not the name of its result.
         """
         return self._struct(kind, others, self._Results)
 
@@ -478,12 +479,15 @@ class Declaration:
         values = [others.get(name, name) for name in kind._fields]
         names = [value for value in values if isinstance(value, str)]
         if unknown := [name for name in names if not hasattr(source, name.partition(".")[0])]:
-            raise NameError(f"{self.name}: {kind.__name__} must have members of its declaration, got {unknown}")
+            raise NameError(
+                f"{self.name}: {kind.__name__} must only have members that are arguments, letters or results, "
+                f"got {unknown}"
+            )
         of_results, new, get_named = source is self._Results, tuple.__new__, operator.attrgetter(*names, "__len__")
         rest = [(place, value) for place, value in enumerate(values) if not isinstance(value, str)]
 
         def get(arguments: Any, results: Any) -> Any:
-            *parts, _ = get_named(results if of_results else arguments)  # one call for all members, which are many
+            *parts, _ = get_named(results if of_results else arguments)  # one call for all members; there may be many
             for place, value in rest:
                 parts.insert(place, value(arguments) if callable(value) else value)
             return new(kind, parts)
@@ -491,7 +495,7 @@ class Declaration:
         return Source(get, ("structure", [self._source(value, of_results).plan for value in values]))
 
     def _source(self, value: Any, of_results: bool = False) -> Source:
-        """Returns the source of a parameter or a member, from a name or any other parameter of `compiled_op`."""
+        """Returns the source of a parameter or a member; ``value`` may be any parameter of `compiled_op`."""
         if isinstance(value, Source):
             return value
         if isinstance(value, Memory):
@@ -515,11 +519,11 @@ class Declaration:
         return Source(lambda args, _: get(args), plan)
 
     def _result_rows(self) -> list[tuple[Any, ...]]:
-        """Describes the results to the compiled module."""
+        """Returns the description of the results for the compiled module."""
         known = {*self._places, *self._letters()}
 
         def sizes(shape: Sequence[int | str]) -> list[Any]:
-            """Replaces letters that the compiled module does not know by functions of the arguments."""
+            """Replaces the letters that the compiled module does not know with functions of the arguments."""
             return [
                 entry if isinstance(entry, int) or entry.removesuffix("+1") in known else operator.attrgetter(entry)
                 for entry in shape
@@ -546,10 +550,10 @@ class Declaration:
         Args:
             name: the name of the custom op; by default the op's name.
             function: the name of the compiled function.
-            parameters: the parameters of the function except the machine: names of arguments, results and letters,
-                results of `inputs` and `outputs`, a `Memory`, a function of the arguments, or a constant.
-            on_cuda: a function (arguments, results, machine) that fills the results on a GPU, if the function there has
-                other parameters.
+            parameters: the parameters of the function except the machine. Each is the name of an argument, a result or
+                a letter, a `Source` (`inputs`, `outputs`), a `Memory`, a function of the arguments, or a constant.
+            on_cuda: a function (arguments, results, machine) that fills the results on a GPU, if the compiled function
+                has other parameters on a GPU.
             fault: a function that raises the error; it is called with the arguments if the compiled function returns
                 False.
             options: the options of `custom_op`.
@@ -575,10 +579,11 @@ class Declaration:
 
 
 def _size_of(ways: Sequence[tuple[int, int, int, int]]) -> Callable[[Any], int]:
-    """Returns the function of the arguments that gives a letter.
+    """Returns a function from the arguments to the size of a letter.
 
-    Each way is (dimensions, place, dimension, less): if the argument at ``place`` has that many dimensions, the
-    letter is the size of its ``dimension`` minus ``less``. The first way that applies counts; the default is 0.
+    Each entry of ``ways`` is (dimensions, place, dimension, less): if the argument at ``place`` has ``dimensions``
+    dimensions, the size is that argument's size in ``dimension`` minus ``less``. The first entry that applies counts;
+    the default is 0.
     """
 
     def size(arguments: Any) -> int:
@@ -640,7 +645,7 @@ def _float_check(rule: str) -> Callable[[str, str, float], None]:
 
 
 def _results(hint: Any) -> tuple[Callable[[Any], Any] | None, dict[str, Shaped]]:
-    """Returns the function that packs the results for the caller, or None, and the tensors by name."""
+    """Returns the function that packs the results for the caller (or None), and the result tensors by name."""
     if hint is type(None):
         return None, {}
     if typing.get_origin(hint) is typing.Annotated:
@@ -649,7 +654,7 @@ def _results(hint: Any) -> tuple[Callable[[Any], Any] | None, dict[str, Shaped]]
         fields = typing.get_type_hints(hint, include_extras=True)
         return hint._make, {name: _results(field)[1]["result"] for name, field in fields.items()}
     first, *others = typing.get_args(hint)
-    if hasattr(first, "_fields"):  # the results, and their gradient
+    if hasattr(first, "_fields"):  # a named tuple of results, then a gradient
         count = len(first._fields)
         return lambda results: (first(*results[:count]), *results[count:]), {
             **_results(first)[1],

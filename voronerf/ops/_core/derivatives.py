@@ -23,8 +23,8 @@ def needed_gradients(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
     if _ask is None:
         return [node is not None for node in nodes]
     answers, sure = list[bool](), False
-    # Parameters are the last inputs, and mostly leaves. Once a leaf's gradient is used, the leaves before it count as
-    # used. For an input of torch.autograd.grad the engine raises RuntimeError, which takes 10 us.
+    # Parameters are the last inputs, and mostly leaves. If a leaf's gradient is used, the gradients of all leaves
+    # before it count as used. For an input of torch.autograd.grad the engine raises RuntimeError, which takes 10 us.
     for node in reversed(nodes):
         leaf = type(node).__name__ == "AccumulateGrad"
         if node is None or (sure and leaf):
@@ -43,10 +43,10 @@ _ask = getattr(torch._C, "_will_engine_execute_node", None)
 
 
 def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:
-    """Returns tensors to differentiate by within a double backward, and whether it is differentiated again.
+    """Returns the tensors by which a double backward differentiates, and whether its results are differentiated again.
 
-    If it is, the tensors are aliases within the caller's graph: if one of them was computed from another, the caller's
-    graph differentiates that path. Call this function before ``torch.enable_grad``.
+    If so, the tensors are aliases within the caller's graph. If one tensor was computed from another, that graph
+    differentiates the path between them. Call this function before ``torch.enable_grad``.
     """
     graph = torch.is_grad_enabled()
     leaves = [
@@ -179,7 +179,7 @@ def run_backward(loss: Tensor, defer: bool) -> Tensor:
 
 
 def with_gradients(loss: Tensor, tensors: Sequence[Tensor], gradients: Sequence[Tensor]) -> Tensor:
-    """Returns a loss [] whose gradients are precomputed; one backward pass hands them over."""
+    """Returns a loss [] whose single backward pass gives precomputed gradients to ``tensors``."""
     total: Tensor = _KnownGradients.apply(loss, list(gradients), *tensors)
     return total
 
@@ -193,9 +193,9 @@ class _KnownGradients(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # the precomputed gradients have no graph
-            raise RuntimeError("forward_with_tape: gradients are differentiable no further, got create_graph=True")
-        gradients, ctx.gradients = ctx.gradients, None  # freed here, so that autograd can take them without a copy
-        if not of_loss.is_cpu or float(of_loss) != 1:  # on a GPU the value is not read, which would synchronise
+            raise RuntimeError("forward_with_tape: the gradients cannot be differentiated again, got create_graph=True")
+        gradients, ctx.gradients = ctx.gradients, None  # released, so that autograd can take them without a copy
+        if not of_loss.is_cpu or float(of_loss) != 1:  # reading the value on a GPU would synchronise
             gradients = [gradient * of_loss for gradient in gradients]
         # The cast comes last, so that a scaled loss keeps small gradients.
         return (None, None, *(gradient.to(dtype) for gradient, dtype in zip(gradients, ctx.dtypes, strict=True)))

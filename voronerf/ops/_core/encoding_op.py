@@ -19,13 +19,14 @@ from voronerf.ops._core.memory import on_huge_pages
 def encoding_op(
     op: str, encoding: str, formula: Callable[..., Tensor], inputs: Callable[[Any], tuple[Any, ...]]
 ) -> Callable[..., Any]:
-    """Makes the native implementation of an op that computes an encoding, and its gradients.
+    """Makes the native implementation, with gradients, of an op that computes an encoding.
 
     Args:
         op: the name of the op; its smooth arguments are x and optionally the variances.
         encoding: the encoding's name in ``ENCODINGS``.
         formula: the reference of the op.
-        inputs: a function from the op's arguments to x and the later members of ``Encoding`` (csrc/encoding/encode.h).
+        inputs: a function from the op's arguments to x and the members after it in ``Encoding``
+            (csrc/encoding/encode.h).
     """
     declaration = declared(op)
 

@@ -18,11 +18,11 @@ class Encoding(NamedTuple):
 
     Attributes:
         formula: (x [n, d], size) -> the encoding [n, columns] in the dtype of x, in PyTorch. The compiled module has a
-            row with the values and the gradient (csrc/encoding/encodings.h).
+            table row with the values and the gradient (csrc/encoding/encodings.h).
         columns: (d, size) -> the number of the encoding's columns.
         fits: (d, size) -> whether the encoding exists.
-        octaves: the columns of x for each angle if the compiled module computes sines and cosines of octaves; 0 if the
-            compiled module has a formula for each row.
+        octaves: the number of columns of x for each angle, if the compiled module computes sines and cosines of
+            octaves; 0 if it applies a formula to each row.
         positions: whether a layer table may use the encoding for positions.
         directions: whether a layer table may use the encoding for directions.
     """

@@ -24,7 +24,7 @@ class GridLevel(NamedTuple):
     """One level of a hash grid, as the numbers that an implementation needs.
 
     A point x in 0..1 lies at ``x * scale + shift``, between integer corners. The index of the corner (i, j, k) is
-    ``i + side * j + side**2 * k`` modulo ``entries``. In a hashed level it is the lowest bits of
+    ``i + side * j + side**2 * k`` modulo ``entries``. In a hashed level the index is the lowest bits of
     ``i ^ 2654435761 j ^ 805459861 k`` in unsigned 32-bit arithmetic."""
 
     scale: float  # the box's side in grid cells
@@ -98,23 +98,21 @@ class HashGrid:
         except (TypeError, ValueError, OverflowError):
             valid = False
         if not valid:
-            raise ValueError(
-                f"HashGrid: box must be two corners of which the second is larger on each axis, got {self.box!r:.60}"
-            )
+            raise ValueError(f"HashGrid: box must be two corners, the second larger on each axis, got {self.box!r:.60}")
         object.__setattr__(self, "box", (low, high))
         for name, words in (("interpolation", INTERPOLATIONS), ("convention", CONVENTIONS)):
             value = getattr(self, name)
             if not isinstance(value, str) or value not in words:
                 raise ValueError(f"HashGrid: {name} must be one of {', '.join(words)}, got {value!r:.60}")
         settings = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self) if entry.init}
-        # A cached property would not do: torch.compile cannot trace its lock.
+        # Not a cached property, because torch.compile cannot trace its lock.
         object.__setattr__(self, "text", json.dumps(settings))
 
     @functools.cached_property
     def rows(self) -> tuple[GridLevel, ...]:
         """The levels, coarsest first."""
         max_entries, levels, offset = 2**self.log2_entries, [], 0
-        # Computed in float32, as these libraries do: rounding may change the number of corners.
+        # Computed in float32 like the libraries in CONVENTIONS, because rounding may change the number of corners.
         growth = math.exp((math.log(self.finest) - math.log(self.base)) / max(self.levels - 1, 1))
         index = torch.arange(self.levels, device="cpu")  # on the CPU even if the default device is meta
         if self.convention == "nerfstudio":
@@ -132,7 +130,7 @@ class HashGrid:
 
     @property
     def out_features(self) -> int:
-        """The features of an encoded point."""
+        """The number of features of an encoded point."""
         return self.levels * self.features
 
     @property

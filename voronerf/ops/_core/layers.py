@@ -25,7 +25,7 @@ DIRECTION_ENCODINGS = tuple(name for name, encoding in ENCODINGS.items() if enco
 POSITIONS = "positions"
 DIRECTIONS = "directions"
 NUMBERS = {"softplus": (1.0, 20.0), "sine": (1.0, 0.0)}
-"""The two numbers of a :data:`~voronerf.ops._core.program.FUNCTIONS` entry, for activations that need them."""
+"""The numbers a and b of the activations that need them, see :data:`~voronerf.ops._core.program.FUNCTIONS`."""
 MOST_FEATURES = 2**20
 """The largest width of a layer."""
 
@@ -126,13 +126,13 @@ class MLP:
         hashed = self.position_encoding == "hash"
         if hashed != (self.grid is not None) or (hashed and self.position_octaves is not None):
             raise ValueError(
-                "MLP: grid must come with the hash encoding, and without position_octaves, got "
+                'MLP: grid must be set if and only if position_encoding is "hash", without position_octaves, got '
                 f"{self.position_encoding} with {self.position_octaves} octaves and the grid {self.grid}"
             )
         self._check_degree()
         rows = [[list(layer.inputs), layer.width, layer.activation] for layer in self.layers]
         table = [rows, list(self.outputs), self.position_octaves, self.direction_octaves]
-        # Tables with default encodings have four entries, as in old saved runs: trailing defaults are not written.
+        # Trailing defaults are not written, so a table with default encodings has four entries, as in old saved runs.
         choices: list[object] = [self.position_encoding, self.grid and self.grid.text]
         choices += [self.direction_encoding, self.direction_degree]
         while choices and choices[-1] in (None, "frequency"):
@@ -210,7 +210,7 @@ class MLP:
     ) -> Program:
         """Builds the network's program, which ``grouped_program`` runs.
 
-        Its inputs are the positions and, if any layer reads them, the directions, both before encoding. Its parameters
+        Its inputs, before encoding, are the positions and, if a layer reads directions, the directions. Its parameters
         are the weight (o, i) of each layer, the bias (o,) of each biased layer, and the grid's table (e, f) if there is
         a grid, in this order. The program keeps parameters that no output depends on. It has one output,
         [n, out_features].
@@ -239,7 +239,7 @@ class MLP:
 
 @functools.lru_cache(maxsize=256)
 def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool) -> Program:
-    """Builds :meth:`MLP.program` of a table from its text."""
+    """Builds the result of :meth:`MLP.program` for the table in ``text``."""
     table, builder = MLP.parse(text), Builder()
     if widths is not None:
         layers = zip(table.layers, widths, strict=True)
@@ -284,7 +284,7 @@ def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: 
 
 @constant_result
 def program_text(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool) -> str:
-    """Returns the text of :meth:`MLP.program` of a table; for ``torch.compile`` the result is a constant."""
+    """Returns the text of :meth:`MLP.program` for the table in ``text``; ``torch.compile`` treats it as a constant."""
     return _program(text, p, q, widths, biased, ray).text
 
 

@@ -1,4 +1,4 @@
-"""Programs: the sequence of steps that an op runs on the rows of one cell.
+"""Programs: sequences of steps that an op runs on the rows of each cell.
 
 A program takes inputs with one row for each sample, [n, w], and parameters with one entry for each cell, [k, o, i] or
 [k, w]. Its steps compute values, [n, w], and sums over the rows of a cell. Rows are samples of rays: an input may have
@@ -11,12 +11,12 @@ the table of a hash grid, m the order of a derivative.
 The steps:
 
     input      the columns of an input
-    linear     x W^T, or x W if transposed, where W is a matrix from input column ``start`` on; plus an optional value
-    function   f(x) for f of :data:`FUNCTIONS` or one of its derivatives; times an optional value
+    linear     x W^T, or x W if transposed, plus an optional value; W is a matrix from its input column ``start`` on
+    function   f(x), times an optional value; f is one of :data:`FUNCTIONS` or a derivative of one
     binary     one of :data:`BINARY` of two values
     total      the sums over groups of adjacent columns
     move       columns of values, placed side by side; overlapping columns are added
-    encode     one of :data:`ENCODINGS`, or "hash", of columns; or one of its derivatives
+    encode     an encoding of columns (one of :data:`ENCODINGS`, or "hash"), or a derivative of one
     outer      g^T x, summed over the rows of a cell: the gradient of a matrix
     columns    the sum over the rows of a cell: the gradient of a vector
     scatter    the gradient of a table, summed over the rows of a cell, or over all rows if the cells share the table
@@ -98,7 +98,7 @@ BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 """The functions of two values, by name in the compiled module."""
 
 HASH = "hash"
-"""The name of ``hash_encode``, the one encoding with a parameter, which :data:`ENCODINGS` lacks."""
+"""The name of ``hash_encode``, the only encoding with a parameter; it is not in :data:`ENCODINGS`."""
 
 
 def encoded_columns(name: str, raw: int, size: int, grids: Sequence[str] = ()) -> int:
@@ -125,7 +125,7 @@ class Columns(NamedTuple):
     """
 
     of: str
-    index: int  # type: ignore[assignment]  # a tuple's method
+    index: int  # type: ignore[assignment]  # hides a method of tuple
     start: int
     width: int
     spread: bool = False
@@ -143,9 +143,9 @@ class Step(NamedTuple):
         out: the index of the computed value; for outer, columns and scatter, the index of the sum.
         width: the number of columns of the value; for a scatter, the columns of g.
         operands: the columns that the step reads. linear: x, an optional addend, and the operand of ``relu_slope``.
-            function: x and an optional factor. encode, scatter: the arguments of F_m, G_m and T_m, all of them values;
-            G_1 has F_0(x) as a third operand, for the kernels. No gradient flows to this operand, because it depends on
-            x and the table alone.
+            function: x and an optional factor. encode, scatter: the arguments of F_m, G_m and T_m, all values; G_1 has
+            F_0(x) as a third operand, for the kernels. No gradient flows to this operand, because it depends on x and
+            the table alone.
         numbers: input: (index,). linear: (parameter, start, transposed). function: (order, a, b). total: (group size,).
             move: the first target column of each operand. outer, columns: (start,). encode: (size, parameter, m, back):
             the size as in :func:`encoded_columns`, the parameter with the table of "hash" or 0, the order, and back = 0
@@ -166,7 +166,7 @@ class Program:
     """A program on the rows of a cell.
 
     Raises:
-        ValueError: a step, an output or a sum refers to something that does not exist. The kernels trust a program.
+        ValueError: a step, an output or a sum refers to something that does not exist. The kernels do not check this.
     """
 
     inputs: tuple[int, ...]  # the number of columns of each input
@@ -178,9 +178,9 @@ class Program:
     by_ray: tuple[int, ...] = ()  # the outputs summed over the samples of each ray, [r, w]
     grids: tuple[str, ...] = ()  # the texts of the hash grids
     text: str = field(init=False, compare=False)  # the program as JSON, the argument of ops
-    orders: int = field(init=False, compare=False)  # the highest order of derivative of a function; see _order
+    orders: int = field(init=False, compare=False)  # the highest order of derivative of a step; see _order
     tables: tuple[int, ...] = field(init=False, compare=False)  # the parameters that are tables of grids
-    sum_tables: tuple[int | None, ...] = field(init=False, compare=False)  # the table that each sum is the gradient of
+    sum_tables: tuple[int | None, ...] = field(init=False, compare=False)  # the table whose gradient each sum is
 
     def __post_init__(self) -> None:
         check(self)
@@ -214,14 +214,14 @@ class Program:
 
 
 _WIDEST = 1 << 20  # the largest number of columns
-_ORDERS = 20  # orders of derivatives
+_ORDERS = 20  # orders of derivatives are below this
 
 
 def _order(step: Step) -> int:
     """Returns the order of derivative of a step.
 
-    The compiled module has F_0, G_1 and T_0 of an encoding. Every higher derivative counts as `_ORDERS`, an order that
-    it has for no function.
+    The compiled module has F_0, G_1 and T_0 of an encoding. Every higher derivative counts as order `_ORDERS`,
+    which the compiled module has for no function.
     """
     if step.op == "function":
         return int(step.numbers[0])
@@ -242,10 +242,10 @@ def check(program: Program) -> None:
         valid = isinstance(shapes, tuple)
         valid = valid and all((_are_sizes(shape) and len(shape) in (1, 2)) or shape in large for shape in shapes)
         _require(name, valid, shapes)
-    _require("rays", _are_indices(program.rays, len(inputs)), program.rays, "numbers of inputs, each once")
+    _require("rays", _are_indices(program.rays, len(inputs)), program.rays, "distinct indices of inputs")
 
     def fits(columns: Any, *widths: int, rows: bool = False) -> bool:
-        """Returns whether columns exist and have one of the widths; with ``rows`` they must be unspread values."""
+        """Returns whether columns exist and have one of the widths; ``rows`` allows only values without broadcast."""
         if not isinstance(columns, Columns) or not _are_sizes(columns[1:4]) or not isinstance(columns.spread, bool):
             return False
         of, index, start, width, spread = columns
@@ -258,7 +258,7 @@ def check(program: Program) -> None:
         return inside and (not widths or width in widths) and not (rows and (spread or of != VALUE))
 
     def hashed(x: Columns, grid: int, table: int) -> bool:
-        """Returns whether columns are a whole per-sample input of positions, and a parameter is the grid's table."""
+        """Returns whether ``x`` is a whole per-sample input of positions, and the parameter is the grid's table."""
         maker = values[x.index]
         whole = maker.op == "input" and maker.numbers[0] not in program.rays and x.width == maker.width == 3
         available = whole and grid < len(grids) and table < len(parameters)
@@ -332,7 +332,7 @@ def check(program: Program) -> None:
                 return False
             inside = (depth, start + width) if transposed else (width, start + depth)
             spread = any(isinstance(each, Columns) and each.spread for each in operands[1:])
-            _require("steps", not spread, step, "without spread columns in what a linear one adds")
+            _require("steps", not spread, step, "without spread columns in the addends of a linear step")
             others = all(fits(each, width, rows=each.of == VALUE) for each in operands[1:])
             return inside[0] == o and inside[1] <= i and others and not tables.setdefault(matrix, False)
         if not _is_sum(step) or step.out >= len(sums):
@@ -356,7 +356,7 @@ def check(program: Program) -> None:
             values[step.out] = step
     _require("outputs", isinstance(program.outputs, tuple) and all(map(fits, program.outputs)), program.outputs)
     valid = _are_indices(program.by_ray, len(program.outputs)) and bool(program.rays or not program.by_ray)
-    _require("by_ray", valid, program.by_ray, "numbers of outputs, each once, of a program with rays")
+    _require("by_ray", valid, program.by_ray, "distinct indices of outputs, in a program with per-ray inputs")
 
 
 _FINISHES = ("", "relu", "relu_slope")
@@ -381,7 +381,7 @@ def _is_grid(text: Any) -> bool:
         return False
 
 
-def _require(name: str, ok: bool, value: object, rule: str = "of values, parameters and sums that are there") -> None:
+def _require(name: str, ok: bool, value: object, rule: str = "made of existing values, parameters and sums") -> None:
     if not ok:
         raise ValueError(f"Program: {name} must be {rule}, got {value!r:.100}")
 
@@ -443,7 +443,7 @@ class Builder:
 
         Args:
             program: the program to inline.
-            inputs: the columns that replace each input of the program that is read, by index.
+            inputs: the columns that replace the inputs of the program, by index; unread inputs may be missing.
         """
         first, grids = len(self.parameters), [self.grid(text) for text in program.grids]
         self.parameters += program.parameters
@@ -469,14 +469,14 @@ class Builder:
     def linear(
         self, x: Columns, matrix: int, width: int, start: int = 0, transposed: bool = False, add: Columns | None = None
     ) -> Columns:
-        """Adds ``x W[:, start:]^T``, or ``x W[:, start:]`` if transposed, with ``width`` columns; plus ``add``."""
+        """Adds the step ``x W[:, start:]^T`` (if transposed, ``x W[:, start:]``) + ``add``, of ``width`` columns."""
         operands = (self.rows(x),) if add is None else (self.rows(x), self.rows(add) if add.spread else add)
         return self.emit("linear", width, operands, (matrix, start, int(transposed)))
 
     def function(
         self, name: str, x: Columns, a: float = 0.0, b: float = 0.0, order: int = 0, times: Columns | None = None
     ) -> Columns | None:
-        """Adds a function's derivative of some order, times a value; returns None if the derivative is 0."""
+        """Adds a step with the derivative of a function, times a value; returns None if the derivative is 0."""
         if order > FUNCTIONS[name].orders or (name == "power" and a == int(a) and 0 <= a < order):
             return None
         if order == 1 and times is not None and name in ("copy", "affine"):
@@ -489,27 +489,27 @@ class Builder:
         return self.emit("function", x.width, operands, (order, float(a), float(b)), name)
 
     def apply(self, name: str, x: Columns, a: float = 0.0, b: float = 0.0) -> Columns:
-        """Adds an elementwise function."""
+        """Adds a step with an elementwise function."""
         columns = self.function(name, x, a, b)
         assert columns is not None
         return columns
 
     def binary(self, name: str, x: Columns, y: Columns) -> Columns:
-        """Adds one of :data:`BINARY`."""
+        """Adds a step with one of :data:`BINARY`."""
         return self.emit("binary", x.width, (x, y), (), name)
 
     def total(self, x: Columns, group: int) -> Columns:
-        """Adds the sums over groups of adjacent columns."""
+        """Adds a step that sums groups of adjacent columns."""
         return self.emit("total", x.width // group, (self.rows(x),), (group,))
 
     def move(self, width: int, parts: Sequence[tuple[Columns, int]]) -> Columns:
-        """Adds parts to a value of ``width`` zero columns, each at its place; overlapping parts are summed."""
+        """Adds a step that places parts in ``width`` zero columns, each from its first column; overlaps are summed."""
         if len(parts) == 1 and parts[0][0].width == width and not parts[0][0].spread and parts[0][0].of == VALUE:
             return parts[0][0]
         return self.emit("move", width, [columns for columns, _ in parts], [at for _, at in parts])
 
     def side_by_side(self, parts: Sequence[Columns]) -> Columns:
-        """Returns the parts side by side; without a step if they are already adjacent columns of a value."""
+        """Returns the parts side by side; adds no step if they are already adjacent columns of a value."""
         joined, places, start = parts[0], [], 0
         for part in parts[1:]:
             following = joined.part(joined.width, part.width)
@@ -523,7 +523,7 @@ class Builder:
         return self.move(width, places)
 
     def encode(self, name: str, x: Columns, size: int, parameter: int = 0, along: Sequence[Columns] = ()) -> Columns:
-        """Adds an encoding F_0(x), or its derivative F_m along m values.
+        """Adds a step with an encoding F_0(x), or with its derivative F_m along m directions.
 
         Args:
             name: one of :data:`ENCODINGS`, or "hash".
@@ -539,22 +539,22 @@ class Builder:
     def encode_backward(
         self, name: str, x: Columns, g: Columns, size: int, parameter: int = 0, along: Sequence[Columns] = ()
     ) -> Columns:
-        """Adds the gradient to x of ``<g, F_m(x; along)>``, which is G_m+1; see :meth:`encode` for the arguments."""
+        """Adds a step with the gradient G_m+1 of ``<g, F_m(x; along)>`` to x; :meth:`encode` explains the arguments."""
         operands = [self.rows(each) for each in (x, g, *along)]
         if not along:
             operands.append(self.encode(name, x, size, parameter))
         return self.emit("encode", x.width, operands, (size, parameter, len(along) + 1, 1), name)
 
     def rows(self, columns: Columns) -> Columns:
-        """Returns the columns as a value: a parameter or a spread column is copied."""
+        """Returns the columns as a value; copies the columns of a parameter and a broadcast column."""
         return self.apply("copy", columns) if columns.of == PARAMETER or columns.spread else columns
 
     def add_outer(self, index: int, g: Columns, x: Columns, start: int) -> None:
-        """Adds ``g^T x`` to a sum [o, i], from column ``start`` on."""
+        """Adds an outer step: adds ``g^T x`` to a sum [o, i], from column ``start`` on."""
         self.steps.append(Step("outer", index, x.width, (self.rows(g), self.rows(x)), (start,)))
 
     def add_columns(self, index: int, g: Columns, start: int) -> None:
-        """Adds the sum of g's rows to a sum, from entry ``start`` on."""
+        """Adds a columns step: adds the sum of g's rows to a sum, from entry ``start`` on."""
         if g.spread and g.of == VALUE and g.width == 1:
             g = g._replace(spread=False)
         self.steps.append(Step("columns", index, g.width, (self.rows(g),), (start,)))
@@ -562,7 +562,7 @@ class Builder:
     def add_scatter(
         self, index: int, x: Columns, g: Columns, grid: int, parameter: int, along: Sequence[Columns] = ()
     ) -> None:
-        """Adds the gradient of ``<g, F_m(x; along)>`` with respect to a table to a sum [e, f]."""
+        """Adds a scatter step: adds the table's gradient of ``<g, F_m(x; along)>`` to a sum [e, f]."""
         operands = tuple(self.rows(each) for each in (x, g, *along))
         self.steps.append(Step("scatter", index, g.width, operands, (grid, parameter, len(along))))
 
@@ -770,7 +770,7 @@ def _differentiate_encode(b: Builder, arriving: _Arriving, step: Step, g: Column
     size, parameter, order, back = map(int, step.numbers)
     x, *along = step.operands
     if back:
-        # If c arrives, <c, G_m(x, g; h ..)> is <g, F_m(x; h .., c)>. F_0(x) as an operand has no gradient.
+        # With the arriving gradient c, <c, G_m(x, g; h ..)> is <g, F_m(x; h .., c)>. The operand F_0(x) needs none.
         g, along = along[0], [*along[1:order], g]
     _differentiate_product(b, arriving, step.name, size, parameter, x, g, along)
 
@@ -810,7 +810,7 @@ class Ahead(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def encoded_ahead(program: Program, chosen: tuple[bool, ...]) -> tuple[Program, tuple[Ahead, ...]]:
-    """Replaces the encodings of the chosen inputs, except hash encodings, by additional inputs."""
+    """Replaces the encodings of the chosen inputs, except hash encodings, with additional inputs."""
     ahead, steps, inputs, rays = list[Ahead](), list[Step](), list(program.inputs), list(program.rays)
     read = {step.out: int(step.numbers[0]) for step in program.steps if step.op == "input"}
     for step in program.steps:
@@ -837,7 +837,7 @@ def pruned(program: Program) -> Program:
 
 
 def merged(program: Program) -> Program:
-    """Fuses ReLU and its gradient into the preceding linear step; for running, not for :func:`gradient`."""
+    """Fuses ReLU and its gradient into the preceding linear step; :func:`gradient` cannot take the result."""
     kept, uses = list(program.steps), dict[int, int]()
     for columns in (*program.outputs, *(c for step in kept for c in step.operands)):
         if columns.of == VALUE:

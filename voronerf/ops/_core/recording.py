@@ -11,8 +11,8 @@ A recording holds the storages of all tensors that its calls take. If one of the
 
 All values that vary from run to run lie in memory: numbers of rows (rows.py), other numbers
 (:func:`voronerf.ops._core.rows.varying`), random integers, and results of earlier calls. One call of
-:meth:`Recording.replay` can make several runs; between them only random integers and results of calls change. The
-memory has room for a quarter more rows than the recorded run. :meth:`Recording.replay` makes no run that exceeds it.
+:meth:`Recording.replay` can make several runs, in which only random integers and results of calls differ. The
+memory fits a quarter more rows than the recorded run. :meth:`Recording.replay` makes no run with more rows than fit.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from voronerf.ops._core.active import active
 from voronerf.ops._core.rows import Count, RowCount
 
-#: The spare rows of memory: a recorded run of n rows gets n // SPARE + SOME more.
+#: The spare rows of memory: n // SPARE + SOME for a recorded run of n rows.
 SPARE, SOME = 4, 64
 _NEW = ("aten::new_empty", "aten::empty")
 _HARMLESS = ("aten::promote_types", "aten::result_type")
@@ -56,7 +56,7 @@ class _Held(NamedTuple):
 
 
 class _Computed(NamedTuple):
-    """A torch operation to compute again after the first ``after`` compiled calls; ``result`` is None if in place."""
+    """A torch operation to repeat after the first ``after`` compiled calls; ``result`` is None for an in-place one."""
 
     after: int
     function: Any
@@ -66,7 +66,7 @@ class _Computed(NamedTuple):
 
 
 class Recording(TorchDispatchMode):
-    """The recorded calls of a function; a context around the function, to be entered once.
+    """The recorded calls of a function. The function runs within this context, which is entered once.
 
     Attributes:
         obstacle: The reason why the calls cannot be replayed; None if they can.
@@ -97,7 +97,7 @@ class Recording(TorchDispatchMode):
         self._numbers = list[tuple[ctypes.c_float, Tensor, Callable[[], float]]]()
         self._drawn, self._computed = list[Tensor](), list[_Computed]()
         self._inputs, self._taken = list[Tensor](), list[Tensor]()  # memory for the inputs, and the inputs of this run
-        self._range: tuple[int, int, torch.Generator, torch.dtype, int] | None = None  # arguments of all random draws
+        self._range: tuple[int, int, torch.Generator, torch.dtype, int] | None = None  # arguments of every random draw
         self._memory: dict[int, _Memory] = {}  # by the address of the storage
         for recording in before:
             self._memory |= recording._memory
@@ -131,21 +131,21 @@ class Recording(TorchDispatchMode):
         return len(self._calls)
 
     def hold(self, tensor: Tensor) -> None:
-        """Refuses replays once a tensor that the recording allocated has moved: its users may replace its memory."""
+        """Refuses replays after the caller has replaced the memory of a tensor that the recording allocated."""
         self._calls.hold_tensor(tensor)
 
     def count(self, source: Callable[[], int]) -> int:
-        """Returns the number of rows of this run, which the function returns again before each run."""
+        """Returns the number of rows of this run; replays call ``source`` for the number before each run."""
         with _disable_current_modes():
             count = self._new_count(torch.tensor([source()]), source)
         self._counts.append(count)
         return RowCount.of(count)
 
     def computed(self, memory: Tensor) -> int:
-        """Returns a number of rows that a call has computed, int64 [1]."""
+        """Returns the number of rows in ``memory``, int64 [1], which a call has computed."""
         with _disable_current_modes():
-            if memory.dtype is not torch.int64:  # a number on a GPU, whose calls are not recorded
-                self._refuse("a number of rows is no int64")
+            if memory.dtype is not torch.int64:  # a number on a GPU: calls on a GPU are not recorded
+                self._refuse("a number of rows is not int64")
                 return int(memory)
             return RowCount.of(self._new_count(memory, None))
 
@@ -164,7 +164,7 @@ class Recording(TorchDispatchMode):
         return number
 
     def take(self, tensor: Tensor) -> Tensor:
-        """Copies an input of the runs into the recording's memory, and returns that memory; the rows may vary."""
+        """Copies an input of the runs into the recording's memory and returns the memory, whose rows may vary."""
         place = len(self._taken)
         self._taken.append(tensor)  # replaced by the input of each run
         shape = tensor.shape
@@ -178,7 +178,7 @@ class Recording(TorchDispatchMode):
         return memory
 
     def new_rows(self, like: Tensor, shape: Sequence[int], dtype: torch.dtype | None) -> Tensor:
-        """Allocates memory whose number of rows is a `RowCount`, with room for the largest number."""
+        """Allocates memory whose number of rows is a `RowCount`, large enough for the largest number."""
         rows, *columns = shape
         assert isinstance(rows, RowCount)
         with _disable_current_modes():
@@ -229,13 +229,13 @@ class Recording(TorchDispatchMode):
         drawn.random_(low, high, generator=generator)
         places = [integers.data_ptr() for integers in self._drawn]
         completed = self._run(threads, times, drawn.data_ptr(), places, size * drawn.element_size())
-        if completed < times:  # the next run draws the remaining integers again
+        if completed < times:  # the next replay draws the integers of the remaining runs again
             generator.set_state(state)
             drawn[:completed].random_(low, high, generator=generator)
         return completed
 
     def _run(self, threads: int, times: int, drawn: int, places: Sequence[int], size: int) -> int:
-        """Runs the calls and torch operations in order; ``size`` is the bytes of each array of random integers."""
+        """Runs the calls and torch operations in order; ``size``: the bytes of one array of random integers."""
         calls, every = self._calls, len(self._calls)
         if not self._computed:
             completed: int = calls.replay(threads, times, 0, every, drawn, places, size)
@@ -314,14 +314,14 @@ class Recording(TorchDispatchMode):
         result = func(*args, **kwargs)
         if name in _NEW:
             if name == "aten::new_empty" and self._place(args[0]) is not None and [*args[1][:1]] == [len(args[0])]:
-                self._refuse(f"new memory of {len(args[0])} rows is not counted{_line()}")
+                self._refuse(f"memory of {len(args[0])} rows was allocated without a RowCount{_line()}")
             return self._register(result)
         if func.is_view:
             self._calls.add_tensor(args[0])  # a view would keep the old memory if its base moved
             if isinstance(result, Tensor) and (held := self._memory.get(result.untyped_storage().data_ptr())):
                 moved = result.storage_offset() - held.whole.storage_offset()
                 if held.rows is not None and moved >= held.whole.stride(0):
-                    self._refuse(f"a part of the rows of a step is read{_line()}")
+                    self._refuse(f"a slice of a step's rows is read{_line()}")
         elif name == "aten::randint" and len(args) == 3 and kwargs.get("generator") is not None:
             self._drawn.append(result)
             drawn_from = (args[0], args[1], kwargs["generator"], result.dtype, result.numel())
@@ -343,7 +343,7 @@ class Recording(TorchDispatchMode):
             if held is not None and held.rows is not None and tensor.dim():
                 rows = self._place(tensor)
                 if rows is None or tensor.dim() != result.dim():
-                    self._refuse(f"torch takes the rows of a step for columns{_line()}")
+                    self._refuse(f"torch broadcasts a step's rows as columns{_line()}")
                     return result
         memory = None
         if not func._schema.is_mutable:

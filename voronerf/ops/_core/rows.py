@@ -22,7 +22,7 @@ class Count:
 
     Attributes:
         memory: The number, int64 [1].
-        most: The largest number that there is memory for.
+        most: The largest number for which memory is allocated.
         given: The function that returns the number before each run; None if a compiled call computes it.
     """
 
@@ -81,7 +81,7 @@ def rows_of(tensor: Tensor) -> int:
 
 
 def new_empty(like: Tensor, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-    """Allocates memory on a tensor's device; with a `RowCount` of rows, later runs may have more rows."""
+    """Allocates memory on a tensor's device; if the rows are a `RowCount`, later runs may have more rows."""
     recording = active.recording
     if recording is None or not (shape and isinstance(shape[0], RowCount)):
         # torch takes longer with a tuple of sizes, and with a dtype.

@@ -10,7 +10,8 @@ from torch import Tensor
 FLOOR = {torch.float64: 1e-14, torch.float32: 2e-6, torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
 """The rounding error allowed on top of twice the error of plain PyTorch, relative to the largest magnitude.
 
-For bfloat16 it is half a unit in the last place, 2^-9, of the result, and the same for one intermediate value.
+For bfloat16 it allows two rounding errors of half a unit in the last place (2^-9): in the result and in one
+intermediate value.
 """
 
 AGREE = {torch.float64: 1e-7, torch.float32: 1e-3, torch.float16: 5e-2, torch.bfloat16: 1e-1}

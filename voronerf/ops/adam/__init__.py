@@ -1,4 +1,4 @@
-"""A step of Adam, on whole parameters or only on the entries with a gradient."""
+"""A step of Adam, for whole parameters or only for the entries with a gradient."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def adam(
         square  <- b2 square + (1 - b2) g^2
         p       <- p - rate / (1 - b1^s) mean / (sqrt(square) / sqrt(1 - b2^s) + epsilon)
 
-    If a rule does not have ``every``, an entry without a gradient keeps its value and both moments, like hash grids in
+    With ``every=False`` in its rule, an entry whose gradient is 0 keeps its value and both moments, as in hash grids of
     tiny-cuda-nn. If an entry gets its first gradient late, its first step is (1 - b1) / sqrt(1 - b2) times the rate.
 
     Args:
@@ -60,9 +60,10 @@ def adam(
         gradients: float32, the shapes of the parameters. Not differentiable.
         means: float32, the shapes of the parameters, contiguous: the first moments.
         squares: float32, the shapes of the parameters, contiguous, >= 0: the second moments.
-        guard: The guard, which skips the step if ``found`` is not 0; None to skip no step.
-        loss: float32 [], the loss of the step. With a loss, the guard first checks this step: it is skipped and counted
-            unless the magnitudes of the loss, and of the gradients whose rule has ``every``, are all below the limit.
+        guard: The NaN guard, which skips the step if its ``found`` is not 0; None for no guard.
+        loss: float32 [], the loss of the step. If there is a loss, the guard first checks this step. It skips and
+            counts the step if the loss, or a gradient whose rule has ``every``, is NaN or not below the limit in
+            magnitude.
         backend: "auto", "reference", "native" or "warp".
 
     Raises:
@@ -75,7 +76,7 @@ def adam(
         >>> adam([Rule(steps, 0.25)], [weight], [torch.tensor([0.5, -2.0])], [mean], [square])
         >>> weight, steps
         (tensor([-0.2500,  0.2500]), tensor(1.))
-        >>> table = [torch.zeros(3)]  # of whose entries one has a gradient
+        >>> table = [torch.zeros(3)]  # only one entry gets a gradient
         >>> adam([Rule(steps, 0.25, every=False)], table, [torch.tensor([0.0, 1, 0])], [torch.ones(3)], [torch.ones(3)])
         >>> (table[0] != 0).tolist()
         [False, True, False]
@@ -107,7 +108,7 @@ def average(
     Args:
         averages: float32, any shapes, contiguous.
         parameters: float32, the shapes of the averages, contiguous; None for zero. Not differentiable.
-        share: 0 to 1; or float32 [].
+        share: the fraction of the difference to move by, 0 to 1; or float32 [].
         backend: "auto", "reference", "native" or "warp".
 
     Raises:
@@ -169,19 +170,19 @@ def _check_all(
 
 
 def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Sequence[Any]) -> bool:
-    """Returns whether the lists hold anything; raises unless each is as long as ``first``, the list called ``name``."""
+    """Returns whether the lists have elements; raises unless all are as long as ``first``, the list called ``name``."""
     for key, tensors in {name: first, **lists}.items():
         if not isinstance(tensors, Sequence):
             raise TypeError(f"{op}: {key} must be a list, got {type(tensors).__name__}")
         if len(tensors) != len(first):
-            raise ValueError(f"{op}: {key} must be as many as the {len(first)} {name}, got {len(tensors)}")
+            raise ValueError(f"{op}: {key} must have length {len(first)} like {name}, got {len(tensors)}")
     return bool(first)
 
 
 def _check_lists(
     op: str, lists: dict[str, Sequence[Tensor]], read: str, scalars: Sequence[tuple[str, Any]] = ()
 ) -> None:
-    """Checks the tensors of all parameters, and scalars []; the tensors called ``read`` may have any strides."""
+    """Checks the tensors of all parameters, and scalars []; only the tensors named ``read`` need not be contiguous."""
     if alike([*lists.values()], [name[:-1] != read for name in lists], [value for _, value in scalars]):
         return
     for tensors in zip(*lists.values(), strict=True):

@@ -1,4 +1,4 @@
-"""``adam`` and ``average`` of the compiled module. They are no custom ops, which cannot take lists of rules."""
+"""``adam`` and ``average`` of the compiled module. Not custom ops, because these cannot take lists of rules."""
 
 from __future__ import annotations
 

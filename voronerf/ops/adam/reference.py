@@ -1,4 +1,4 @@
-"""A step of Adam, and averages, in place."""
+"""A step of Adam, and moving averages, in place."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Rule(NamedTuple):
         step: float32 [], the number of steps done, on the device of the parameter; `adam` increments it.
         learning_rate: the rate; or float32 [] on the device of the parameter, which a CUDA graph can read.
         betas: the decay rates of the two moments, in [0, 1).
-        epsilon: > 0, added outside of the root.
-        every: whether entries without a gradient move too, as in ``torch.optim.Adam``.
+        epsilon: > 0, added to the square root.
+        every: whether entries without a gradient are updated too, as in ``torch.optim.Adam``.
 
     Examples:
         >>> import torch
@@ -41,7 +41,7 @@ class Guard(NamedTuple):
     Attributes:
         found: not 0 if the step is to be skipped; `adam` writes it if it gets a loss.
         skipped: the number of skipped steps; `adam` increments it if it gets a loss.
-        in_a_row: the number of skipped steps since the last step that was made; counted like ``skipped``.
+        in_a_row: the number of steps skipped since the last completed step; counted like ``skipped``.
         scale: the loss scale by which the gradients are divided; None for 1.
         limit: the limit on the magnitudes of the loss, and of the gradients whose rule has ``every``.
 
@@ -64,7 +64,7 @@ class Guard(NamedTuple):
         return Guard(found, skipped, in_a_row)
 
     def begin(self, skipped: int) -> None:
-        """Resets the guard, with the number of steps that were skipped until now."""
+        """Resets the guard and sets its number of skipped steps."""
         for tensor, value in zip(self[:3], (0, skipped, 0), strict=True):
             tensor.fill_(value)
 

@@ -31,8 +31,8 @@ def balance_centres(
     """Moves all centres `steps` times, towards cells of equal mass; see ``voronerf.diagram.balance``.
 
     ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i`` (Elsner et al. 2023, section 3.2). N(i)
-    are the `neighbours` closest centres, or all others if there are fewer; at equal distance, the first ones. norm_i is
-    the largest W of i and N(i). Updates are computed in float64 and stored in float32. The result is deterministic. Not
+    are the `neighbours` closest centres, or all others if there are fewer; ties go to the lowest index. norm_i is the
+    largest W of i and N(i). Updates are computed in float64 and stored in float32. The result is deterministic. Not
     differentiable.
 
     Args:
@@ -53,6 +53,6 @@ def balance_centres(
         >>> masses = torch.ones(4, dtype=torch.float64)
         >>> centres = torch.tensor([[0.0, 0, 0], [9.0, 0, 0]])
         >>> moved, weights = balance_centres(samples, masses, centres, steps=100)
-        >>> weights  # 3 and 1 before
+        >>> weights  # they were 3 and 1
         tensor([2., 2.], dtype=torch.float64)
     """

@@ -21,17 +21,17 @@ def balance_centres(
 
 
 def cell_masses(samples: Tensor, masses: Tensor, centres: Tensor) -> Tensor:
-    """Returns float64 [k], the mass in each cell, added up in the order of the samples."""
+    """Returns float64 [k], the mass in each cell, summed in the order of the samples."""
     cells = nearest_centre(samples, centres)
     return torch.zeros(centres.shape[0], dtype=masses.dtype, device=masses.device).index_add(0, cells, masses)
 
 
 def published_step(centres: Tensor, weights: Tensor, *, alpha: float, neighbours: int) -> Tensor:
-    """Returns the centres after one update, from centres [k, 3], k >= 2, and the mass [k] of their cells."""
+    """Returns the centres [k, 3], k >= 2, after one update; ``weights`` [k] are the masses of their cells."""
     wide = centres.double()
     nearby = min(neighbours, centres.shape[0] - 1)
     distances = (wide[:, None] - wide[None]).square().sum(-1).fill_diagonal_(float("inf"))
-    # The sort is stable: at equal distance the first centres are the neighbours.
+    # The sort is stable, so ties go to the lowest index.
     others = distances.sort(dim=1, stable=True).indices[:, :nearby]
     heaviest = torch.maximum(weights[others].amax(1), weights)[:, None]
     # In a neighbourhood of weight 0 all differences are 0, so any positive divisor works.

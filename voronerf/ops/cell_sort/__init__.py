@@ -29,9 +29,8 @@ def cell_sort(
         ``offsets[c]`` to ``offsets[c + 1]``.
 
     Raises:
-        ValueError: on the CPU a cell outside 0 to k - 1. (On a GPU and in a compiled graph the values are not checked.
-            Values below 0 are then sorted before ``offsets[0]``, and values above k - 1 from ``offsets[k]`` on, to rows
-            of no cell.)
+        ValueError: a cell is outside 0 to k - 1 (not checked on a GPU or in a compiled graph, where values below 0 are
+            sorted before ``offsets[0]`` and values above k - 1 after the last cell, from ``offsets[k]`` on).
 
     Examples:
         >>> import torch

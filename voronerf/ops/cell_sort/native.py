@@ -21,7 +21,7 @@ def sort(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = 
         cells: int32 [n], the cell of each sample.
         order: int32 [n], to be written.
         offsets: int32 [k + 1], to be written.
-        caller: the operation that errors name.
+        caller: the name of the operation for error messages.
         way: the sorting algorithm on CUDA, one of ``WAYS``, for measurements.
     """
     compiled, machine = native.compiled, native.machine(cells)

@@ -42,20 +42,20 @@ def composite(
             possibly none. None for the dense form.
         background: a colour added with weight 1 - opacity. A ray without samples shows only the background.
 
-    All floating-point arguments share one dtype, float16 to float64, and all are differentiable. Sums are float32 at
-    least.
+    All floating-point arguments share one dtype, float16 to float64, and all are differentiable. Sums have at least
+    float32 precision.
 
     Returns:
         Composite(colour [r, c], opacity [r], depth [r], weights like sigma). ``depth`` is the sum of weight times depth
         and is not divided by the opacity.
 
     Raises:
-        ValueError: on the CPU offsets that decrease or exceed m.
+        ValueError: the offsets decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch
         >>> from voronerf import composite
-        >>> sigma = torch.tensor([[0.0, float("inf"), 1.0]])  # one ray: air, a wall, what is behind it
+        >>> sigma = torch.tensor([[0.0, float("inf"), 1.0]])  # one ray: air, a wall, a sample behind it
         >>> rgb = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]]])
         >>> depths, deltas = torch.tensor([[1.0, 2.0, 3.0]]), torch.ones(1, 3)
         >>> result = composite(sigma, rgb, depths, deltas)

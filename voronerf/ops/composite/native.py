@@ -1,7 +1,7 @@
 """``composite`` of the compiled module, and its gradients.
 
-r rays, s samples of a ray, m samples of all rays (packed), c channels. The arithmetic is float32; half types are cast
-to and from it. Second derivatives come from the reference formula.
+r rays, s samples of a ray, m samples of all rays (packed), c channels. The arithmetic is float32; half-precision types
+are cast to and from float32. Second derivatives come from the reference formula.
 """
 
 from __future__ import annotations

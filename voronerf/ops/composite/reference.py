@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 _OPAQUE = 1e30
-"""The finite value for infinite density: opaque over any length except 0, and 0 times it is 0, not NaN."""
+"""The finite substitute for infinite density: opaque over any length except 0, where the product is 0, not NaN."""
 
 
 class Composite(NamedTuple):
@@ -17,7 +17,7 @@ class Composite(NamedTuple):
     Attributes:
         colour: [r, c], background included.
         opacity: [r], the sum of the weights.
-        depth: [r], the sum of weight times depth: not divided by the opacity.
+        depth: [r], the sum of weight times depth, not divided by the opacity.
         weights: like sigma, the contribution of each sample.
 
     Examples:
@@ -37,11 +37,11 @@ class Composite(NamedTuple):
 
 
 def check_ray_offsets(op: str, ray_offsets: Tensor, m: int) -> None:
-    """Raises ValueError on the CPU, like the kernels, unless the offsets ascend within 0 to m."""
-    traced = torch.compiler.is_compiling() or type(ray_offsets) is not Tensor  # a tracer has no values
+    """Raises ValueError, as the kernels do, for CPU offsets that do not ascend within 0 to m."""
+    traced = torch.compiler.is_compiling() or type(ray_offsets) is not Tensor  # a traced tensor has no values
     if traced or ray_offsets.device.type != "cpu":
         return
-    values = ray_offsets.numpy()  # numpy takes a tenth of torch's time for some hundred rays
+    values = ray_offsets.numpy()  # ten times as fast as torch for some hundred rays
     if len(values) == 0 or (values[0] >= 0 and values[-1] <= m and (values[1:] >= values[:-1]).all()):
         return
     wrong = (ray_offsets < 0) | (ray_offsets > m)
@@ -49,7 +49,7 @@ def check_ray_offsets(op: str, ray_offsets: Tensor, m: int) -> None:
     if bool(wrong.any()):
         ray = int(wrong.nonzero()[0])
         raise ValueError(
-            f"{op}: ray_offsets must rise from 0 or more to at most the number of samples, {m}, got "
+            f"{op}: ray_offsets must ascend within 0 to {m} (the number of samples), got "
             f"{int(ray_offsets[ray])} for ray {ray}"
         )
 
@@ -69,7 +69,7 @@ def composite(
     optical = optical_depth(sigma, deltas)
     if ray_offsets is None:
         weights = _in_front(optical) * -torch.expm1(-optical)
-        colour = (weights[:, :, None] * rgb).sum(dim=1)  # a matrix product would be narrowed by autocast
+        colour = (weights[:, :, None] * rgb).sum(dim=1)  # autocast would round a matrix product
         opacity = weights.sum(dim=1)
         depth = (weights * depths).sum(dim=1)
     else:
@@ -78,7 +78,7 @@ def composite(
         light, ray = packed_light(optical, ray_offsets)
         weights = light * -torch.expm1(-optical)
         weights = torch.where((ray > 0) & (ray <= rays), weights, 0)
-        # Colour, opacity and depth are computed by one sum, over adjacent columns.
+        # One sum over adjacent columns computes colour, opacity and depth.
         columns = torch.cat([rgb, torch.ones_like(depths)[:, None], depths[:, None]], dim=1) * weights[:, None]
         total = columns.new_zeros(rays + 2, columns.shape[1]).index_add(0, ray, columns)[1:-1]
         colour, opacity, depth = total[:, :-2], total[:, -2], total[:, -1]
@@ -98,9 +98,9 @@ def optical_depth(sigma: Tensor, deltas: Tensor) -> Tensor:
 
 
 def packed_light(optical: Tensor, ray_offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the transmittance in front of each packed sample [m], and its ray plus 1, int64 [m].
+    """Returns the transmittance in front of each packed sample [m], and the index of its ray plus 1, int64 [m].
 
-    Samples outside all rays have 0 or r + 1.
+    The index of samples outside all rays is 0 or r + 1.
     """
     rays, row = ray_offsets.shape[0] - 1, torch.arange(optical.shape[0], device=optical.device)
     ray = torch.searchsorted(ray_offsets.long(), row, right=True)
@@ -113,7 +113,7 @@ def packed_light(optical: Tensor, ray_offsets: Tensor) -> tuple[Tensor, Tensor]:
 def _in_front(optical: Tensor) -> Tensor:
     """Returns the transmittance in front of each sample, [r, s]: exp of minus the optical depth in front.
 
-    The exclusive sum is a shifted one: subtracting each last term would give inf - inf for an opaque sample.
+    The terms are shifted before the sum: subtracting each afterwards would give inf - inf for an opaque sample.
     """
     before = torch.nn.functional.pad(optical[:, :-1], (1, 0))
     return torch.exp(-before.cumsum(dim=1))
@@ -122,8 +122,8 @@ def _in_front(optical: Tensor) -> Tensor:
 def _packed_in_front(optical: Tensor, first: Tensor, last: Tensor) -> Tensor:
     """Returns the transmittance in front of each packed sample [m], whose ray has samples ``first`` to ``last``.
 
-    The optical depth of a sample is clamped to ``limit``, where no light passes: an opaque ray then does not reduce the
-    precision of the running sum for later rays.
+    The optical depth of a sample is clamped to ``limit``, at which no light passes, so that an opaque ray does not
+    reduce the precision of the running sum for later rays.
     """
     limit = 128.0 if optical.dtype == torch.float32 else 768.0
     before = _RaySum.apply(optical.double().clamp(max=limit), first, last, False)
@@ -131,11 +131,11 @@ def _packed_in_front(optical: Tensor, first: Tensor, last: Tensor) -> Tensor:
 
 
 class _RaySum(torch.autograd.Function):
-    """The sum over the samples of the same ray in front of each sample or, with ``behind``, behind it.
+    """For each sample, the sum over the samples in front of it on its ray, or behind it with ``behind``.
 
-    Each sum is the adjoint of the other. One running sum over all rays, minus its value at the ray's start or end, is
-    precise enough in float64 for millions of samples. Values that are not finite are excluded from it and make only the
-    later sums of their own ray NaN, in the forward and the backward pass.
+    The two sums are each other's adjoints. One running sum over all rays, minus its value at the ray's start or end, is
+    precise enough in float64 for millions of samples. Values that are not finite are excluded from the running sum.
+    They make only the later sums of their own ray NaN, in the forward and the backward pass.
     """
 
     @staticmethod

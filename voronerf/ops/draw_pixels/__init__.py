@@ -1,4 +1,4 @@
-"""The pixels of a training step, drawn with replacement. n runs of pixels, p known pixels, b pixels."""
+"""Draws the pixels of a step, with replacement. n runs of pixels, p pixels of known distance, b drawn pixels."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def draw_pixels(
 ]:
     """Draws pixels with replacement, and three uniform numbers for each pixel.
 
-    All are hashes of the seed and of the index in the batch: the same on every backend and on any number of threads.
-    Not differentiable.
+    All results are hashes of the seed and of the index in the batch, the same on every backend and on any number of
+    threads. Not differentiable.
 
     Args:
         seed: the seed of the hashes.
@@ -74,8 +74,8 @@ def draw_pixels(
         known: pixels of known distance, from which the first pixels of the batch are drawn; None for none.
 
     Returns:
-        int64 [b], the pixels; float32 [b, 3], uniform in [0, 1); and float32 [several], the distances of the first
-        pixels ([0] without ``known``).
+        int64 [b], the pixels; float32 [b, 3], uniform in [0, 1); and float32 [known.several], the known distances of
+        the first pixels of the batch (shape [0] without ``known``).
 
     Examples:
         >>> import torch

@@ -11,7 +11,7 @@ _OP = declared("draw_pixels")
 
 
 def _of(part: str, name: str) -> Any:
-    """Returns a function that reads an attribute of ``runs`` or ``known`` (``part``), or None if that is None."""
+    """Returns a function that reads an attribute of the argument ``part``; it returns None if the argument is None."""
     return lambda arguments: getattr(getattr(arguments, part), name, None)
 
 

@@ -1,4 +1,4 @@
-"""The pixels of a training step, drawn with replacement. n runs of pixels, p known pixels, b pixels."""
+"""Draws the pixels of a step, with replacement. n runs of pixels, p pixels of known distance, b drawn pixels."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ class _Runs(NamedTuple):
 
 
 class Runs(_Runs):
-    """The pixels to draw from, as runs in ascending order: a compact form if most pixels of a row count.
+    """The pixels to draw from, as ascending runs. This form is compact if most pixels of a row are included.
 
     A place is an index into the pixels of all runs, one run after another.
 
     Attributes:
         ends: int64 [n], the inclusive cumulative sum of the lengths of the runs.
-        shift: int64 [n], the difference between pixel and place in each run.
-        first: int32, the first run that ends behind place 0, 2^bits, 2 * 2^bits and so on, up to ``total``.
-        bits: the binary logarithm of the step of ``first``; 2^bits is about the length of a run.
+        shift: int64 [n], pixel minus place in each run.
+        first: int32, the first run that ends after place 0, 2^bits, 2 * 2^bits and so on, up to ``total``.
+        bits: the binary logarithm of the step between the places of ``first``; 2^bits is about the length of a run.
         total: the number of pixels in all runs.
 
     Raises:
-        ValueError: attributes that do not fit each other; they are checked on construction.
+        ValueError: the attributes do not match each other (checked on construction).
 
     Examples:
         >>> import torch
@@ -43,17 +43,18 @@ class Runs(_Runs):
     __slots__ = ()
 
     def __new__(cls, ends: Tensor, shift: Tensor, first: Tensor, bits: int, total: int) -> Runs:
-        """Checks that the attributes fit each other; ``draw_pixels`` checks their dtypes and shapes."""
+        """Checks that the attributes match each other; ``draw_pixels`` checks their dtypes and shapes."""
         plain = all(type(part) is Tensor and part.dim() == 1 and not part.is_meta for part in (ends, shift, first))
         if plain and len(ends) and 0 <= bits <= 48 and 1 <= total <= 2**48:
             if int(ends[0]) < 1 or int(ends[-1]) != total or not bool((ends[1:] > ends[:-1]).all()):
                 raise ValueError(
-                    f"Runs: ends must rise from 1 or more to the total, {total}, got {ends.tolist()!r:.60}"
+                    f"Runs: ends must ascend from at least 1 to the total, {total}, got {ends.tolist()!r:.60}"
                 )
             wanted = _first_runs(ends, bits, total)
             if first.shape != wanted.shape or not torch.equal(first.to(wanted), wanted):
                 raise ValueError(
-                    f"Runs: first must hold the run of each {1 << bits}th of {total} pixels, got {first.tolist()!r:.60}"
+                    f"Runs: first must hold the run of every {1 << bits}th of the {total} pixels, got "
+                    f"{first.tolist()!r:.60}"
                 )
         return super().__new__(cls, ends, shift, first, bits, total)
 
@@ -67,7 +68,7 @@ class Runs(_Runs):
 
 
 def _first_runs(ends: Tensor, bits: int, total: int) -> Tensor:
-    """Returns int32, the first run that ends behind place 0, 2^bits, 2 * 2^bits and so on."""
+    """Returns int32, the first run that ends after place 0, 2^bits, 2 * 2^bits and so on."""
     places = torch.arange(0, total, 1 << bits, device=ends.device)
     return torch.searchsorted(ends, places, right=True).int()
 

@@ -22,7 +22,7 @@ def draw_points(
     """Draws points uniformly from a box.
 
     This equals drawing a random cell of a regular grid of the box, then a random point in it. Points are hashes of the
-    seed and of their indices: the same on every backend and on any number of threads. Not differentiable.
+    seed and of their indices, the same on every backend and on any number of threads. Not differentiable.
 
     Args:
         seed: the seed of the hashes.

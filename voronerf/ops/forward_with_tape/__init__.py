@@ -1,4 +1,4 @@
-"""Networks with an autograd tape that starts from the gradient of a loss to their outputs. n samples."""
+"""Networks with an autograd tape: the caller computes the loss gradient of their outputs. n samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NEEDED = ("program", "inputs", "parameters")
 
 
 def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> Tape:
-    """Evaluates networks and returns a tape, whose ``backward`` takes the gradient of a loss to their outputs.
+    """Evaluates networks and returns a tape, whose ``backward`` takes the gradient of a loss to the outputs.
 
     ``tape.backward(loss, gradient)`` equals the backward pass of a loss on ``routed_program(**network)``, for a loss
     whose gradient the caller computes. Only first derivatives exist.
@@ -30,7 +30,7 @@ def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> T
         :class:`Tape`, with the outputs and ``backward``.
 
     Raises:
-        ValueError: a network without a program, inputs or parameters.
+        ValueError: ``network`` has no program, inputs or parameters.
 
     Examples:
         >>> import torch

@@ -1,8 +1,8 @@
 """``forward_with_tape`` of the compiled module, in float32.
 
-``backward`` computes the gradients at once and adds them to ``.grad`` itself if autograd would do no more, because
-autograd's operations would prevent the recording of a step (voronerf/ops/_core/recording.py). Otherwise one autograd
-node passes the gradients on.
+``backward`` computes the gradients immediately. If autograd would only add them to ``.grad``, ``backward`` does so
+itself, because autograd's operations would prevent the recording of a step (voronerf/ops/_core/recording.py). Otherwise
+one autograd node passes the gradients to autograd.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def forward_with_tape(arguments: ProgramArguments, routing: Routing, leaves: Seq
             rows, options = network.rows(offsets, order), network.options
             learning = any(tensor.requires_grad for tensor in leaves)
             out, *kept = run(rows, options._replace(keep=True) if learning else options)
-            count = None if native.on_cuda(out) else routing.rows  # on CUDA the uncounted rows have no cell
+            count = None if native.on_cuda(out) else routing.rows  # on CUDA rows that do not count have no cell
             if count is not None:
                 (out,), cells = mask_rows([out], cells, count)
             return _NativeTape(out, rows._replace(kept=kept), options, leaves, count, cells, routing.frozen)

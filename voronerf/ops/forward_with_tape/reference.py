@@ -1,4 +1,4 @@
-"""The tape of a forward pass of networks, by torch.autograd."""
+"""Tapes of a forward pass of networks: the interface, and the tape of torch.autograd."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class Tape(ABC):
 
         Args:
             loss: [], the loss.
-            gradient: [n, out], the gradient of the loss to ``raw``.
+            gradient: [n, out], the gradient of the loss with respect to ``raw``.
             defer: Whether to add the gradients only when ``backward`` of the returned loss is called.
 
         Returns:
             The loss [], detached unless deferred.
 
         Raises:
-            ValueError: a loss or gradient of another shape.
+            ValueError: ``loss`` or ``gradient`` has another shape.
         """
         check_shape("forward_with_tape", "loss", loss, ())
         check_shape("forward_with_tape", "gradient", gradient, self.raw.shape)

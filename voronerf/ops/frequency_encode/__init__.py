@@ -26,7 +26,7 @@ def frequency_encode(
     """Returns ``[x, sin x, cos x, sin 2x, cos 2x, ..., sin 2^(L-1) x, cos 2^(L-1) x]``, in blocks of d features.
 
     The layout follows nerf-pytorch: no factor of pi, and x itself first. Mildenhall et al. 2020, equation 4. Angles
-    are float32 at least.
+    have at least float32 precision.
 
     Args:
         x: the angles of the first octave, n < 2**31.

@@ -38,7 +38,7 @@ def grouped_linear(
 ) -> Annotated[Tensor, "floating [n, o]"]:
     """Applies the linear layer of each sample's cell c: ``activation(W_c x + b_c)``.
 
-    Gradients of every order to x, weight and bias. Products are accumulated in float32 at least. Under
+    x, weight and bias have gradients of every order. Products are accumulated in float32 at least. Under
     ``torch.autocast`` the arguments are cast to its dtype, except float64, as for ``torch.nn.functional.linear``.
 
     Args:
@@ -53,7 +53,7 @@ def grouped_linear(
         [n, o] in the dtype of x (of autocast, if it is enabled).
 
     Raises:
-        ValueError: on the CPU offsets that decrease or exceed n.
+        ValueError: offsets decrease or exceed n (checked on the CPU only).
 
     Examples:
         >>> import torch

@@ -1,7 +1,7 @@
 """``grouped_linear`` of the compiled module: a program of one layer.
 
-float32 and, on the CPU, bfloat16 are read and written as they are stored; other types are cast to float32 on the way in
-and back on the way out.
+float32 and, on the CPU, bfloat16 tensors are read and written without casts. Tensors of other dtypes are cast to
+float32, and the results are cast back.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from torch import Tensor
 from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer, program_text
 from voronerf.ops.grouped_program.native import PRODUCTS, Rows, RunOptions, run_program
 
-# Layer tables of one layer by activation, as text; the width 1 is replaced by the width of the weight.
+# The text of a one-layer table for each activation. The width of the weight replaces the width 1.
 _TABLES = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
 
 

@@ -45,10 +45,10 @@ def grouped_linear(
 
 
 def check_offsets(op: str, offsets: Tensor, n: int) -> list[int]:
-    """Returns the offsets on the host; raises ValueError unless they ascend within 0 to n."""
+    """Returns the offsets on the host; raises ValueError unless they ascend from at least 0 to at most n."""
     bounds: list[int] = offsets.tolist()
     if bounds[0] < 0 or bounds[-1] > n or bounds != sorted(bounds):
-        raise ValueError(f"{op}: offsets must rise from 0 or more to at most the number of rows, {n}, got {bounds}")
+        raise ValueError(f"{op}: offsets must ascend within 0 to {n} (the number of rows), got {bounds}")
     return bounds
 
 

@@ -27,13 +27,13 @@ def grouped_mlp(
     features: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Evaluates every sample by the network of its cell, encodings included.
+    """Evaluates every sample with the network of its cell, including encodings.
 
     Equivalent to the encodings, followed by one ``grouped_linear`` for each layer on the concatenation of its sources.
     The encodings are ``frequency_encode`` (or ``integrated_encode``) if ``layers`` has octaves, ``hash_encode`` if it
-    has a grid, and ``spherical_harmonics`` of the directions if it has a degree. Gradients of every order to positions,
-    directions, features, weights and biases. With 16-bit weights, and under ``torch.autocast``, the operands of
-    products and the result are rounded to 16 bits; all other values are float32 at least.
+    has a grid, and ``spherical_harmonics`` of the directions if it has a degree. Positions, directions, features,
+    weights and biases have gradients of every order. With 16-bit weights, and under ``torch.autocast``, the operands
+    of products and the result are rounded to 16 bits; all other values are float32 at least.
 
     Args:
         positions: [n, p] floating point, sorted by cell, n < 2**31; raw if ``layers`` encodes them, else already
@@ -55,7 +55,7 @@ def grouped_mlp(
         [n, layers.out_features] in the dtype of the weights (of autocast, if it is enabled).
 
     Raises:
-        ValueError: on the CPU offsets that decrease or exceed n, and a direction_index outside 0 to r - 1.
+        ValueError: offsets decrease or exceed n, or a direction_index is outside 0 to r - 1 (checked on the CPU only).
 
     Examples:
         >>> import torch

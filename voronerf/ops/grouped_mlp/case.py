@@ -9,7 +9,7 @@ from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 
 _PLAIN = MLP((Layer((POSITIONS,), 6, "sine"), Layer((0, DIRECTIONS), 4, "sigmoid")), (1, 0), 2, 1)
-# 16 features fill whole vectors: the encodings kept by a forward pass then have no (uninitialised) padding lanes.
+# 16 features fill whole vectors, so the encodings that a forward pass keeps have no (uninitialised) padding lanes.
 _GRID = HashGrid(levels=8, features=2, log2_entries=10, base=3, finest=40)
 GAUSSIANS = {"layers": MLP(_PLAIN.layers, _PLAIN.outputs, 2, 1, "integrated")}
 HASHED = {"layers": MLP(_PLAIN.layers, _PLAIN.outputs, None, 1, "hash", _GRID)}

@@ -35,12 +35,12 @@ class Layered(NamedTuple):
     features: Tensor | None
 
     def check(self, op: str, behind: Others = ((), ()), last: Others = ((), ())) -> dict[str, int]:
-        """Checks the layer table and its tensors, and returns the sizes that the letters of their shapes stand for.
+        """Checks the layer table and its tensors, and returns the size of each letter in their shapes.
 
         Args:
-            op: the operation that errors name.
-            behind: the rules of further tensors, checked after the positions, and these tensors.
-            last: the rules of further tensors, checked last, and these tensors.
+            op: the name of the operation for error messages.
+            behind: additional rules and their tensors, checked after the positions.
+            last: additional rules and their tensors, checked last.
         """
         positions, weights, biases, layers, directions, direction_index, features = self
         if not isinstance(layers, MLP):
@@ -124,8 +124,8 @@ def _rows(
 ) -> list[Row]:
     """Returns the rules for the tensors of a network: positions, ``behind``, further inputs, parameters and ``last``.
 
-    ``form``: whether directions have an index, the number of dimensions of the features or 0, and whether there are
-    directions.
+    ``form`` is (whether directions have an index, the number of dimensions of the features or 0, whether there are
+    directions).
     """
     indexed, dimensions, directed = form
     rows = [Row("positions", FLOATING, ("n", "p")), *behind]

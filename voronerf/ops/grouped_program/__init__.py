@@ -32,19 +32,19 @@ def grouped_program(
     """Runs a program on the rows of each cell, with the cell's parameters.
 
     A program is a list of steps: layers, activations, encodings, sums, products and moves of columns
-    (:mod:`voronerf.ops._core.program`). All values of a tile of rows stay in cache. Gradients of every order to inputs
-    and parameters; the gradient of a program is a program itself.
+    (:mod:`voronerf.ops._core.program`). All values of a tile of rows stay in cache. Inputs and parameters have
+    gradients of every order; the gradient of a program is a program itself.
 
     Args:
-        inputs: [n, w] floating point for each input of the program, sorted by cell, n < 2**31; at least one. [r, w], r
-            < 2**31, for the inputs in ``program.rays``, which have one row for each ray.
+        inputs: one floating-point tensor for each input of the program, at least one: [n, w], sorted by cell; or
+            [r, w], one row for each ray, for the inputs in ``program.rays``. n and r < 2**31.
         parameters: [k, o, i] or [k, w] for each parameter of the program, or [1, ...] if all cells share it; all of one
             dtype, except the table [k, e, f] or [1, e, f] of a hash grid.
         offsets: int32 [k + 1], ascending; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
             give 0. Cells may be empty.
         program: the program to run.
-        order: int32 [n], the row of inputs and results for each sorted row i: ``order[i]``. Inputs and results then
-            need not be sorted. None for sorted rows.
+        order: int32 [n]; sorted row i is row ``order[i]`` of inputs and results, which need not be sorted. None for
+            sorted rows.
         ray_index: int32 [n], values 0 to r - 1: the ray of each row of inputs and results, before sorting by ``order``.
             None for a program without inputs of rays.
         backend: "auto", "reference", "native" or "warp". Warp has kernels for layers only: later steps, and programs
@@ -52,13 +52,13 @@ def grouped_program(
 
     Returns:
         [n, w] for each output of the program, or [r, w], the sum over the rows of each ray, for the outputs in
-        ``program.by_ray``; then [k, ...] for each sum over the rows of a cell, or [1, e, f] for the sum of a table that
-        all cells share. The results have the dtype of the parameters (of autocast, if it is enabled), or without
+        ``program.by_ray``; then [k, ...] for each sum over the rows of a cell, or [1, e, f] for the gradient of a table
+        that all cells share. The results have the dtype of the parameters (of autocast, if it is enabled), or without
         parameters the dtype of the first input. Rows outside all cells add nothing to sums.
 
     Raises:
-        ValueError: on the CPU offsets that decrease or exceed n, an order outside 0 to n - 1, and a ray_index outside 0
-            to r - 1.
+        ValueError: offsets decrease or exceed n, an order is outside 0 to n - 1, or a ray_index is outside 0 to r - 1
+            (checked on the CPU only).
 
     Examples:
         >>> import torch
@@ -89,24 +89,26 @@ def check_program(
     first: Others = ((), ()),
     last: Others = ((), ()),
 ) -> dict[str, int]:
-    """Checks a program and its tensors, and returns the sizes that the letters of their shapes stand for.
+    """Checks a program and its tensors, and returns the size of each letter in their shapes.
 
     Args:
-        op: the operation that errors name.
+        op: the name of the operation for error messages.
         program: the program.
         inputs: the inputs of the program.
         parameters: the parameters of the program.
         ray_index: int32 [n], or None.
-        first: the rules of further tensors, checked first, and these tensors.
-        last: the rules of further tensors, checked last, and these tensors.
+        first: additional rules and their tensors, checked first.
+        last: additional rules and their tensors, checked last.
     """
     if not isinstance(program, Program):
         raise TypeError(f"{op}: program must be a Program, got {type(program).__name__}")
     for name, values, wanted in (("inputs", inputs, program.inputs), ("parameters", parameters, program.parameters)):
         if not isinstance(values, Sequence):
             raise TypeError(f"{op}: {name} must be a list, got {type(values).__name__}")
-        if len(values) != len(wanted) or not (wanted or name == "parameters"):
-            raise ValueError(f"{op}: {name} must be {len(wanted)} tensors (inputs at least one), got {len(values)}")
+        if name == "inputs" and not wanted:
+            raise ValueError(f"{op}: program must have at least one input, got none")
+        if len(values) != len(wanted):
+            raise ValueError(f"{op}: {name} must have {len(wanted)} tensors, got {len(values)}")
     if (ray_index is not None) != (len(program.rays) > 0):
         rule = "given for a program with" if program.rays else "None for a program without"
         came = "None" if ray_index is None else "an index"
@@ -126,7 +128,7 @@ def check_program(
     return sizes
 
 
-_OFFSETS = Row("offsets", INDEX, ("k+1",), empty="must be of at least one cell")
+_OFFSETS = Row("offsets", INDEX, ("k+1",), empty="must have at least two entries")
 _ORDER = Row("order", INDEX, ("n",))
 
 
@@ -147,5 +149,5 @@ def _rows(program: Program, dtype: torch.dtype | None, first: Sequence[Row], las
 
 
 def _among(i: int, numbers: Sequence[int]) -> bool:
-    """Returns whether a number is in a list; torch.compile may make the list's numbers symbolic, and ``in`` fail."""
+    """Returns whether a number is in a list; ``in`` fails if torch.compile makes the list's numbers symbolic."""
     return any(i == number for number in numbers)

@@ -25,7 +25,7 @@ class ProgramArguments(NamedTuple):
         dtype: the dtype of the results: the layers' dtype, or autocast's if it is enabled; without layers, the first
             input's dtype. With float16 and bfloat16, operands of products may be rounded; all other values are float32
             at least.
-        caller: the op that errors name.
+        caller: the name of the op for error messages.
     """
 
     text: str
@@ -65,13 +65,13 @@ class ProgramArguments(NamedTuple):
 
 
 def index_name(caller: str) -> str:
-    """Returns the name of an op's argument that becomes ``ray_index``."""
+    """Returns the name of the argument of ``caller`` that becomes ``ray_index``."""
     return "direction_index" if caller.endswith("_mlp") else "ray_index"
 
 
 @constant_result
 def _first_layer(text: str) -> int | None:
-    """Returns the number of the first parameter of a layer, or None; tables of hash grids may have another dtype."""
+    """Returns the index of the first parameter that is no hash grid's table, or None; tables may have another dtype."""
     program = Program.parse(text)
     return next((i for i in range(len(program.parameters)) if i not in program.tables), None)
 

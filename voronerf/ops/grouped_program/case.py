@@ -94,8 +94,8 @@ CASE = Case(
         "encoded, shared, in any order": {"program": "encoded", "shared": 1, "ordered": True},
     },
     refused={
-        "inputs must be 2 tensors (inputs at least one), got 0": {"inputs": []},
-        "parameters must be 2 tensors (inputs at least one), got 0": {"parameters": []},
+        "inputs must have 2 tensors, got 0": {"inputs": []},
+        "parameters must have 2 tensors, got 0": {"parameters": []},
         "inputs[0] must have shape [n, 5], got [6, 3]": {"inputs": [torch.ones(6, 3), torch.ones(6, 3)]},
         "parameters[0] must have shape [k, 7, 8] with k = 3, got [4, 7, 8]": {
             "parameters": [torch.ones(4, 7, 8), torch.ones(3, 7)]

@@ -28,17 +28,17 @@ from voronerf.ops._core.program import (
 from voronerf.ops.hash_encode.native import compiled_grid
 
 _ORDERS = 3  # the highest order of derivatives in the compiled module
-_FLOATS = 96 << 10  # the values of a tile, in floats: they share the L2 cache with the weights
-_ROWS = (24, 96)  # the fewest and most rows of a tile: whole blocks of products (gemm_tile.h)
+_FLOATS = 96 << 10  # the most floats of the values of a tile, which share the L2 cache with the weights
+_ROWS = (24, 96)  # the fewest and the most rows of a tile; both are whole blocks of products (gemm_tile.h)
 _WHOLE = 48  # the fewest rows of a tile if encodings write whole vectors of rows
 _TILE = 32  # rows of a block of products in tile registers
-_GRANULE = 16  # floats to which widths are padded
-_FEW = 4  # the most outputs of a layer that uses the kernel for few outputs (few_outputs_tile.h)
+_GRANULE = 16  # widths are padded to multiples of this number of floats
+_FEW = 4  # layers of at most this width use the kernel for few outputs (few_outputs_tile.h)
 _NONE = -1
 
 
 class Lookup(NamedTuple):
-    """A lookup in a hash grid: the numbers of the input with the points, of the table and of the grid."""
+    """A lookup in a hash grid: the indices of the input (the points), the parameter (the table) and the grid."""
 
     input: int
     parameter: int
@@ -52,9 +52,9 @@ class Lowered:
     Attributes:
         program: the compiled module's program.
         lookups: the lookups whose features may be kept, [n, width] each, sorted by cell.
-        widths: the floats in a row of the features of each lookup.
-        sizes: the entries of each parameter for one cell.
-        tables: the numbers of the parameters that are tables of hash grids.
+        widths: the number of floats in a row of the features, for each lookup.
+        sizes: the number of entries of each parameter for one cell.
+        tables: the indices of the parameters that are tables of hash grids.
         call: a callable that allocates the results and runs the program on the CPU.
     """
 
@@ -82,8 +82,8 @@ def lower(text: str, layout: str = "floats", cuda: bool = False) -> Lowered:
         text: the text of the program.
         layout: the layout of the operands of products: "floats"; "pairs" of bfloat16; "tiles", pairs for tile
             registers; or "parts", floats in two parts for tile registers.
-        cuda: whether the program is for CUDA. Its products have one source, and layouts "floats" or "tiles" (of any
-            16-bit type).
+        cuda: whether the program is for CUDA, where products have one source and the layout is "floats" or "tiles" (of
+            any 16-bit type).
     """
     return _Lowering(merged(Program.parse(text)), layout, cuda).lowered()
 
@@ -115,7 +115,7 @@ class _Slots:
 
 @dataclass
 class _Value:
-    """The locations of a value: its slot, with rows of ``stride`` floats, and further memory that holds it."""
+    """The locations of a value: a slot with rows of ``stride`` floats, memory of the call, an input, and pairs."""
 
     width: int
     stride: int
@@ -190,7 +190,7 @@ class _Lowering:
         return [*steps, *written]
 
     def _whole(self, g: Columns) -> bool:
-        """Returns whether columns are all of a step's value, which can then be kept in memory of the call."""
+        """Returns whether ``g`` is the whole value of a step, so that the value can be kept in memory of the call."""
         makers = {step.out: step for step in self.program.steps if not _sums(step)}
         scattered = [step.operands[1].index for step in self.program.steps if step.op == "scatter"]
         step = makers[g.index]
@@ -198,7 +198,7 @@ class _Lowering:
         return alone and g.start == 0 and g.width == step.width and not g.spread
 
     def _scratch(self) -> int:
-        """Returns the columns of each part of the scratch memory of steps."""
+        """Returns the number of columns of each part of the scratch memory of steps."""
         widths = [0]
         for step in [] if self.cuda else self.work:
             if step.op == "encode" and step.name == HASH:
@@ -210,7 +210,7 @@ class _Lowering:
         return _padded(max(widths))
 
     def pairs_of(self, width: int) -> int:
-        """Returns the floats in a row of pairs; in the layout "parts" the rounding remainders double it."""
+        """Returns the floats in a row of pairs; in the layout "parts" the rounding remainders double the number."""
         return _padded(width, 2 * _GRANULE) // 2 * (2 if self.parts else 1)
 
     def padded_outputs(self, width: int) -> int:
@@ -220,7 +220,7 @@ class _Lowering:
     # Records ----------------------------------------------------------------------------------------------------------
 
     def pack(self, kind: str, parameter: int, start: int, width: int, floats: int, shape: tuple[int, int]) -> int:
-        """Returns the number of the pack of a part of a parameter; adds the pack if it is new."""
+        """Returns the index of the pack with a part of a parameter; adds the pack if it is new."""
         key = (kind, parameter, *shape, start, width)
         if key not in self.packs:
             self.packs[key] = len(self.packs), self.packed
@@ -276,7 +276,7 @@ class _Lowering:
         self.operands += operands
 
     def memory(self, width: int) -> int:
-        """Adds a memory of the call, [n][width], and returns its number."""
+        """Adds a memory of the call, [n][width], and returns its index."""
         self.memories.append(width)
         return len(self.memories) - 1
 
@@ -306,7 +306,7 @@ class _Lowering:
             self.slots.give(self.pairs_of(location.width), location.pairs)
 
     def make(self, step: Step, dying: set[int], entrywise: Iterable[Columns] = (), stride: int = 0) -> _Value:
-        """Allocates the value of a step: in the slot of an entrywise operand in its last use, or in a new slot."""
+        """Allocates the value of a step: in a new slot, or in the slot of an elementwise operand at its last use."""
         value = _Value(step.width, stride or _padded(step.width))
         self.values[step.out] = value
         if step.op not in ("input", "encode"):
@@ -336,7 +336,7 @@ class _Lowering:
         return value
 
     def _carries(self, at: int) -> bool:
-        """Returns whether a step on CUDA leaves its sums in registers for the next step, which alone adds to them."""
+        """Returns whether a step on CUDA leaves its sums in registers for the next step, their only reader."""
         if not (self.half and self.cuda) or at + 1 == len(self.work):
             return False
         step = self.work[at]
@@ -346,7 +346,7 @@ class _Lowering:
     def _multipliers(self, step: Step) -> list[Step]:
         """Returns the steps after a linear step on CUDA that can read its packed values from registers."""
         steps = list[Step]()
-        # A value that is scattered does not stay in registers: the warp scatters in between.
+        # A scattered value does not stay in registers, because the warp scatters it in between.
         scattered = any(reader.op == "scatter" for reader, _ in self.readers.get(step.out, []))
         if not (self.half and self.cuda) or step.op != "linear" or scattered or self._carries(self.at):
             return steps
@@ -398,7 +398,7 @@ class _Lowering:
         self.emit("input", value=value, number=number, points=points, in_place=value.input != _NONE)
 
     def _within(self, step: Step, stride: int) -> bool:
-        """Returns whether no vector load of a value passes the end of its rows, where the tensor may end."""
+        """Returns whether vector loads of a value stay within its rows; the tensor may end after the last row."""
         columns = [r.operands[p] for r, p in self.readers.get(step.out, []) if r.op not in ("move", "total", "output")]
         return all(c.spread or c.start + _padded(c.width) <= stride for c in columns)
 
@@ -447,7 +447,7 @@ class _Lowering:
         self.emit("linear", records, value, **members)
 
     def _as_pairs(self, step: Step) -> list[bool]:
-        """Returns for each reader of a value whether it takes pairs."""
+        """Returns, for each reader of a step's value, whether the reader takes pairs."""
 
         def takes(reader: Step, place: int) -> bool:
             if not _all_of(reader.operands[place], step.width):
@@ -510,7 +510,7 @@ class _Lowering:
         self.emit("output", [self.operand(step.operands[0])], width=step.width, number=number, depth=first)
 
     def _by_outputs(self, step: Step) -> bool:
-        """Returns whether the partial sum has contiguous inputs, which needs less padding for few outputs."""
+        """Returns whether the partial sum is stored as [outputs, inputs], which needs less padding for few outputs."""
         o, i = step.operands[0].width, step.operands[1].width
         return o * _padded(i) < i * _padded(o)
 
@@ -535,7 +535,7 @@ class _Lowering:
         self.emit("columns", records, number=at, stride=stride, width=step.width)
 
     def finished(self) -> Lowered:
-        """Returns the lowered program."""
+        """Assembles the records into the lowered program."""
         program, compiled = self.program, self.compiled
         scattered = [out for _, _, out in self.scatters]
         for i, shape in enumerate(program.sums):
@@ -605,7 +605,7 @@ class _Lowering:
 def _sum_records(parts: list[tuple[int, str, int, int, int, int, int, int, int]]) -> list[Any]:
     """Returns the records of the parts of sums, in order.
 
-    If the parts of a sum cover it without overlap, they are written; otherwise they are added.
+    Parts that cover their sum without overlap are written; other parts are added.
     """
     spans: dict[int, list[tuple[int, int]]] = {}
     for out, _, _, _, _, start, width, _, _ in parts:
@@ -629,7 +629,7 @@ def _sums(step: Step) -> bool:
 
 
 def _by_octaves(step: Step) -> int:
-    """Returns the columns of x for each angle if a step encodes octaves of sines and cosines, else 0."""
+    """Returns the number of columns of x for each angle if a step encodes octaves of sines and cosines, else 0."""
     return ENCODINGS[step.name].octaves if step.name in ENCODINGS else 0
 
 
@@ -646,7 +646,7 @@ def _adds(step: Step, to: Step) -> bool:
 
 
 def _delayed(steps: list[Step]) -> list[Step]:
-    """Returns the steps, with each product directly before the step that adds to it, if that is its only reader."""
+    """Returns the steps; moves each product directly before the step that adds to it, if no other step reads it."""
     uses = [c.index for step in steps for c in step.operands if c.of == VALUE]
     result = list(steps)
     for step in reversed(steps):
@@ -657,7 +657,7 @@ def _delayed(steps: list[Step]) -> list[Step]:
 
 
 def _joined(steps: list[Step]) -> list[Step]:
-    """Returns the steps with layers of several sources, adjacent in the weights, joined to one product.
+    """Returns the steps; joins a layer's products with several sources, adjacent in the weights, into one product.
 
     The number of sources becomes the fourth number of the step. The sums stay in registers from source to source.
     """

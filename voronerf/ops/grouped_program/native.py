@@ -1,7 +1,7 @@
-"""Programs of the compiled module, which run every op on networks of cells. n rows, r rays, k cells, w columns.
+"""Programs in the compiled module. They run every op on networks of cells. n rows, r rays, k cells, w columns.
 
-The gradient of a program is a program and runs by the same op, and so do higher derivatives. A program with derivatives
-that the compiled module lacks runs in PyTorch.
+The gradient of a program and its higher derivatives are programs too, which the same op runs. A program with
+derivatives that the compiled module lacks runs in PyTorch.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Rows(NamedTuple):
     Attributes:
         inputs: [n, w] each, or [r, w] with a row for each ray; all float32 or all bfloat16.
         parameters: [k, ...] each, or [1, ...] if all cells share the parameter; float32, except tables of hash grids.
-        offsets: int32 [k + 1], the first row of each cell, and the end of the last.
+        offsets: int32 [k + 1], the first row of each cell, and the end of the last cell.
         order: int32 [n], or None for rows that are sorted by cell.
         ray_index: int32 [n], or None without rays.
         kept: float32 [n, w] for each hash grid: the features that an earlier pass looked up, sorted by cell. Empty for
@@ -50,10 +50,11 @@ class RunOptions(NamedTuple):
 
     Attributes:
         text: the text of the program.
-        caller: the op that errors name.
+        caller: the name of the op for error messages.
         products: the type of the operands of products: "float32", "bfloat16" or, on CUDA, "float16".
-        keep: whether the features looked up in hash grids are further results, see `Rows`.
-        gradients: the first input that is a gradient. Rows whose gradients are all 0 add nothing to any sum. -1: none.
+        keep: whether the features looked up in hash grids are additional results, see `Rows`.
+        gradients: the index of the first input that is a gradient, or -1. Rows whose gradients are all 0 add nothing to
+            any sum, so they may be dropped.
     """
 
     text: str
@@ -66,10 +67,10 @@ class RunOptions(NamedTuple):
 class Network(NamedTuple):
     """A program with its tensors in the dtypes of the op.
 
-    If all inputs and the results are bfloat16, they are read and written as such. Otherwise inputs are cast to float32,
-    and results back. Parameters are always cast to float32; a cell has few of them. If the results are bfloat16,
-    products take bfloat16 operands on processors that multiply them faster (AVX512-BF16, AMX), and float32 operands
-    elsewhere. Sums are always float32.
+    If all inputs and the results are bfloat16, they are read and written without casts. Otherwise inputs are cast to
+    float32, and results back. Parameters are always cast to float32; a cell has few of them. If the results are
+    bfloat16, products take bfloat16 operands on processors that multiply them faster (AVX512-BF16, AMX), and float32
+    operands elsewhere. Sums are always float32.
 
     Attributes:
         inputs: in float32, or all in bfloat16 like the results.
@@ -109,7 +110,7 @@ class Network(NamedTuple):
 
 
 PRODUCTS = {torch.bfloat16: "bfloat16", torch.float16: "float16"}
-"""The type of the operands of products by the dtype of the results; "float32" for other dtypes."""
+"""The operand type of products for each dtype of results; "float32" for other dtypes."""
 
 
 def grouped_program(arguments: ProgramArguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
@@ -134,7 +135,7 @@ def _results(text: str) -> int:
 
 @constant_result
 def _tables(text: str) -> tuple[int, ...]:
-    """Returns the numbers of the parameters that are tables of hash grids."""
+    """Returns the indices of the parameters that are tables of hash grids."""
     return Program.parse(text).tables
 
 
@@ -164,7 +165,7 @@ def _memory(arguments: _Call) -> list[Tensor]:
         dtype = None if like.dtype is torch.float32 else torch.float32
         results += [new_empty(like, count, *shape, dtype=dtype) for count, shape in zip(counts, program.sums)]
     if options.keep and program.grids and compiled_runs(program.text):
-        widths = lower(program.text).widths  # the same in every layout; tensors without memory have no layout
+        widths = lower(program.text).widths  # the same in every layout; fake tensors have no layout
         results += [new_empty(like, n, width, dtype=torch.float32) for width in widths]
     return results
 
@@ -240,7 +241,7 @@ def _run_on_cuda(
     outputs: list[Tensor],
     sums: list[Tensor],
 ) -> None:
-    """Runs a program on CUDA. The kernels write one row for each sample, which are summed by ray here."""
+    """Runs a program on CUDA. The kernels write a row for each sample; this function sums the rows of each ray."""
     offsets, index = rows.offsets, rows.ray_index
     if any(step.op == "scatter" for step in program.steps):
         native.refuse_where_deterministic(options.caller, offsets)
@@ -295,10 +296,10 @@ def program_inputs(
         kept: the kept features of each hash grid, or None.
         ready: whether the kept features have been written.
         gradients: see `RunOptions`.
-        caller: the op that errors name.
+        caller: the name of the op for error messages.
     """
     inputs, parameters, offsets, order, ray_index, _ = rows
-    samples = -1 if ray_index is not None and n == r else n  # the length of inputs of samples; -1 if rays have it, too
+    samples = -1 if ray_index is not None and n == r else n  # rows of per-sample inputs; -1 if n and r are equal
     turned = [0 if x.is_contiguous() else int(_is_column_major(x, samples)) for x in inputs]
     if 1 in turned:
         inputs = [x.t() if turn else x for x, turn in zip(inputs, turned)]
@@ -329,7 +330,7 @@ def program_inputs(
 def _is_column_major(x: Tensor, n: int) -> bool:
     """Returns whether samples [n, w] are column-major, like PyTorch's look-ups in planes.
 
-    Points of hash grids [n, 3], which kernels read in place, are not: they are copied to row-major.
+    Tensors [n, 3] never count as column-major: they are copied, because kernels read points of hash grids in place.
     """
     planes = x.stride(0) == 1 and x.t().is_contiguous()
     return planes and x.shape[0] == n and x.shape[1] != 3 and x.dtype == torch.float32
@@ -345,7 +346,7 @@ _LAYOUTS = {
 
 
 def _layout(products: str, tensor: Tensor) -> str:
-    """Returns the layout of values: for 16-bit products if they are requested and the device has them, else "floats".
+    """Returns the layout of values: "floats", or one for 16-bit products if they are requested and the device has them.
 
     For float32 on the CPU, ``torch.set_float32_matmul_precision`` decides; "high" means products in two parts.
     """
@@ -381,7 +382,7 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
 
 
 def _saved_gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """Returns the gradients to the inputs, then to the parameters; None if not wanted."""
+    """Returns the gradients to the inputs, then to the parameters; None for an unwanted gradient."""
     count, saved = ctx.count + ctx.parameters, ctx.saved_tensors
     wanted = needed_gradients(ctx, saved[:count])
     gradients: list[Tensor | None] = [None] * count
@@ -458,7 +459,7 @@ def _gradient(
 class _Node(torch.autograd.Function):
     """The autograd node of a call that nothing else in torch observes.
 
-    The general node of custom ops takes 30 us more, a sixth of a small network with its gradients.
+    The general node of custom ops takes 30 us more, a sixth of the time of a small network with its gradients.
     """
 
     @staticmethod

@@ -81,7 +81,7 @@ def _grid(text: str) -> HashGrid:
 
 
 def check_rows(arguments: ProgramArguments, offsets: Tensor, order: Tensor | None) -> None:
-    """Raises ValueError on the CPU for offsets, an order or a ray index out of range."""
+    """Raises ValueError if offsets, an order or a ray index on the CPU are out of range."""
     if offsets.device.type != "cpu" or torch.compiler.is_compiling():
         return
     index, n = arguments.ray_index, len(arguments.inputs[0] if arguments.ray_index is None else arguments.ray_index)
@@ -138,7 +138,7 @@ class _Run:
         if columns.of == VALUE:
             values = self.values[columns.index][:, columns.start : columns.start + width]
         else:
-            # As a product, its backward pass sums the gradient in pieces.
+            # A product, because its backward pass sums the gradient in pieces.
             ones = self.inputs[0].new_ones(len(self.inputs[0]), 1)
             values = grouped_linear(ones, self.offsets, self.vectors(columns, width).unsqueeze(2))
         return values.expand(-1, columns.width)
@@ -229,14 +229,14 @@ class _Run:
 
 
 def cells_of(offsets: Tensor, rows: Tensor) -> Tensor:
-    """Returns int32 [n], the cell of each sorted row; the nearest cell for a row of no cell."""
+    """Returns int32 [n], the cell of each sorted row; the nearest cell for a row outside all cells."""
     index = torch.arange(rows.shape[0], dtype=torch.int32, device=rows.device)
     return torch.searchsorted(offsets[1:-1].contiguous(), index, right=True, out_int32=True)
 
 
 @contextlib.contextmanager
 def recording() -> Iterator[None]:
-    """Enables autograd within a custom op, where it otherwise does not record and gradients would be 0.
+    """Enables autograd within a custom op; otherwise it records nothing there, and gradients would be 0.
 
     PyTorch has no public function for this.
     """
@@ -248,7 +248,7 @@ def recording() -> Iterator[None]:
 
 
 def along(encode: Callable[[Tensor], Tensor], directions: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
-    """Returns the derivative of an encoding along directions, which is differentiable."""
+    """Returns the derivative of an encoding along directions, as a differentiable function."""
     for direction in directions:
         encode = functools.partial(_slope, encode, direction)
     return encode
@@ -256,13 +256,13 @@ def along(encode: Callable[[Tensor], Tensor], directions: Sequence[Tensor]) -> C
 
 def _slope(encode: Callable[[Tensor], Tensor], direction: Tensor, x: Tensor) -> Tensor:
     y, back, *_ = torch.func.vjp(encode, x)
-    # Forward derivative by two backward passes: the gradient of <direction, back(v)> to v. PyTorch's own forward mode
-    # compiles TorchScript.
+    # Two backward passes give the forward derivative: the gradient of <direction, back(v)> to v. PyTorch's own forward
+    # mode compiles TorchScript.
     return torch.func.vjp(lambda v: back(v)[0], torch.zeros_like(y))[1](direction)[0]
 
 
 def derivative(name: str, x: Tensor, a: float, b: float, order: int) -> Tensor:
-    """Returns a derivative of a function, which is differentiable."""
+    """Returns the derivative of a function at x; the result is differentiable."""
     formula, orders = FUNCTIONS[name]
     if order == 0:
         return formula(x, a, b)

@@ -21,10 +21,10 @@ def hash_encode(
     """Returns the features of points, interpolated on every level of a hash grid.
 
     Müller et al. 2022, section 3: on each level, the eight corners of the point's voxel select eight entries of the
-    table, by their row-major index or by a hash, and the features are interpolated. Gradients of every order to
-    positions and table; with linear interpolation the gradient to the positions is discontinuous at voxel faces. Sums
-    are float32 at least. Results do not depend on the number of threads; on CUDA the gradient of the table is added up
-    in any order.
+    table, by their row-major index or by a hash, and the features are interpolated. Positions and table have gradients
+    of every order. With linear interpolation, the gradient to the positions is discontinuous at voxel faces. Sums have
+    at least float32 precision. Results do not depend on the number of threads; on CUDA the gradient of the table is
+    summed in no fixed order.
 
     Args:
         positions: [n, 3] floating point, n < 2**31, in the units of ``grid.box``. A coordinate outside of the box is
@@ -38,7 +38,7 @@ def hash_encode(
         [n, grid.out_features], coarsest level first, in float32, or float64 if positions or table are float64.
 
     Raises:
-        ValueError: a table of another size than the grid's, ``cells`` with a table [e, f].
+        ValueError: a table whose size differs from the grid's; ``cells`` with a table [e, f].
 
     Examples:
         >>> import torch

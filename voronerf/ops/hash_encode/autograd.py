@@ -17,7 +17,7 @@ from voronerf.ops.hash_encode.reference import interpolate
 class Hashed(NamedTuple):
     """The arguments of the encoding. With a direction [n, 3], the result is the derivative along it.
 
-    Positions are float32, and the grid is its text.
+    Positions are float32, and the grid is given as its text.
     """
 
     positions: Tensor
@@ -32,7 +32,7 @@ class Hashed(NamedTuple):
 
 
 class HashedGradient(NamedTuple):
-    """The arguments of the backward pass: the gradient to the features, and which gradients are wanted."""
+    """The arguments of the backward pass: the gradient to the features, and flags for the wanted gradients."""
 
     gradient: Tensor
     arguments: Hashed
@@ -53,9 +53,9 @@ class HashDerivatives:
     """Registers the derivatives of the hash encoding, from a backend's two ops.
 
     ``encode`` takes the fields of `Hashed` and returns the features or, with a direction, their derivatives along it.
-    ``backward`` takes the fields of `HashedGradient` and returns the gradients to positions and table. Its own
-    derivative needs only these two ops: with the gradient g to the features and the cotangents p and t of the two
-    gradients, it is the gradient of ``g * encode(t as the table) + g * encode(along p)``.
+    ``backward`` takes the fields of `HashedGradient` and returns the gradients to positions and table. The derivative
+    of ``backward`` needs only these two ops: with the gradient g to the features and the cotangents p and t of the two
+    results, it is the gradient of ``g * encode(t as the table) + g * encode(along p)``.
     """
 
     def __init__(self, encode: Op, backward: Op) -> None:
@@ -111,7 +111,7 @@ class HashDerivatives:
             term = arguments._replace(table=features, direction=along)
             if to_gradient:
                 add(0, self._encode(*term))
-            # The first term does not read the table, so only the second has a gradient to it.
+            # The first term does not read the table, so only the second has a gradient to the table.
             of_table = to_table and along is not None
             if to_positions or of_table:
                 parts = self._backward(gradient, term, to_positions, of_table)
@@ -124,7 +124,7 @@ class HashDerivatives:
     def _by_the_reference(
         self, gradient: Tensor, arguments: Hashed, p: Tensor | None, t: Tensor | None
     ) -> list[Tensor | None]:
-        """Returns the gradients by the reference formula, for a derivative along a direction."""
+        """Returns the gradients of a derivative along a direction, by the reference formula."""
         leaves, graph = aliases([gradient, arguments.positions, arguments.table, arguments.direction])
         with torch.enable_grad():
             arriving, positions, table, direction = leaves

@@ -26,8 +26,8 @@ def integrated_encode(
     """Returns the expectation of the frequency encoding over Gaussians with diagonal covariance.
 
     Block l holds ``sin(2^l mu) exp(-4^l var / 2)`` and then ``cos(2^l mu) exp(-4^l var / 2)``, three features each. For
-    variances of 0 it equals ``frequency_encode`` without its input. Barron et al. 2021 (mip-NeRF), equations 13 and 14;
-    their code puts all sines before all cosines.
+    variances of 0 the result equals ``frequency_encode`` without its input. Barron et al. 2021 (mip-NeRF), equations 13
+    and 14; their code puts all sines before all cosines.
 
     Args:
         means: the means of the Gaussians, n < 2**31.

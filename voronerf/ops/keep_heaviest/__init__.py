@@ -1,4 +1,4 @@
-"""The heaviest samples of each batch. b kept batches of q samples, m samples of the batch, r rays, d coordinates."""
+"""The heaviest samples of each batch. b kept batches of q samples, m samples of a new batch, r rays, d coordinates."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def keep_heaviest(
 ) -> None:
     """Replaces the oldest kept batch by the heaviest samples of a new batch, in place.
 
-    The importance of a sample is its weight, times the error of its ray if ``error`` is given (Elsner et al. 2023,
-    section 3.1). Samples with an importance that is not finite and positive are ignored. The q most important samples
-    become batch ``added % b``, in descending order; equal importances keep the order of the batch. The remaining slots,
-    and the slots of samples whose point is not finite, are empty: importance 0 and point 0. Then ``added`` is
+    The importance of a sample is its weight, multiplied by the error of its ray if ``error`` is given (Elsner et al.
+    2023, section 3.1). Samples with an importance that is not finite and positive are ignored. The q most important
+    samples become batch ``added % b``, in descending order; equal importances keep the order of the batch. The
+    remaining slots, and the slots of samples whose point is not finite, get importance 0 and point 0. Then ``added`` is
     incremented. The result does not depend on the number of threads. Not differentiable.
 
     Args:
@@ -53,12 +53,12 @@ def keep_heaviest(
         added: the number of batches that were added so far.
         points: the points of the batch.
         weights: the weights of the samples.
-        error: the errors of the rays; None to take the weights alone.
-        ray_index: the ray of each sample, 0 to r - 1; None if ``error`` is.
+        error: the errors of the rays; None to use the weights alone.
+        ray_index: the ray of each sample, 0 to r - 1; None if ``error`` is None.
 
     Raises:
         ValueError: ``kept_points`` or ``kept_importance`` that are not contiguous; ``error`` without ``ray_index``, or
-            the reverse; on the CPU a ray out of range.
+            the reverse; a ray out of range (checked on the CPU only).
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""The heaviest samples of each batch. b kept batches of q samples, m samples of the batch, r rays, d coordinates."""
+"""The heaviest samples of each batch. b kept batches of q samples, m samples of a new batch, r rays, d coordinates."""
 
 from __future__ import annotations
 

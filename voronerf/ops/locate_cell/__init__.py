@@ -41,13 +41,13 @@ def locate_cell(
     """Returns the leaf of every point in a tree of diagrams.
 
     On each level, a point goes to the nearest centre of its diagram. Diagram 0 is the root; diagram j owns rows
-    ``child_offsets[j]`` to ``child_offsets[j + 1]`` of ``centres``. Exact, with ties to the lowest index, like
-    ``nearest_centre``; a point that is not finite takes the first centre on every level. Trees may be uneven. Not
+    ``child_offsets[j]`` to ``child_offsets[j + 1]`` of ``centres``. The result is exact, with ties to the lowest index,
+    as in ``nearest_centre``; a point that is not finite takes the first centre on every level. Trees may be uneven. Not
     differentiable.
 
     The CPU refuses tables that are not a tree of this depth: a diagram without centres, a child that is not a diagram,
     a path longer than ``depth``. CUDA does not check the tables, to avoid a host read, but reads nothing outside them.
-    A point whose path leaves the tables, or does not end at a leaf, then gets a negative number.
+    On CUDA, a point whose path leaves the tables or ends at no leaf gets a negative number.
 
     Args:
         points: n < 2**31. float16 and bfloat16 are compared in float32.
@@ -61,7 +61,7 @@ def locate_cell(
         int32 [n], the leaf of each point.
 
     Raises:
-        ValueError: on the CPU tables that are not a tree.
+        ValueError: the tables are not a tree of this depth (checked on the CPU only).
 
     Examples:
         >>> import torch

@@ -6,7 +6,7 @@ import torch
 
 from voronerf.ops._core.cases import Arguments, Case, Draw
 
-# Diagram 0 has three centres. Diagrams 1 and 2 refine the second and the third, and diagram 3 refines one of diagram 2.
+# Diagram 0 has three centres. Diagrams 1 and 2 refine its last two; diagram 3 refines a centre of diagram 2.
 _OFFSETS = torch.tensor([0, 3, 5, 7, 10], dtype=torch.int32)
 _CHILD = torch.tensor([-1, 1, 2, -2, -3, -4, 3, -5, -6, -7], dtype=torch.int32)
 

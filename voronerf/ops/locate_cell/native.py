@@ -27,10 +27,10 @@ def find(
     caller: str,
     rows: Tensor | None = None,
 ) -> None:
-    """Fills ``leaves``, int32 [n]; on CUDA with -1 from row ``rows`` on.
+    """Fills ``leaves``, int32 [n]; on CUDA, the rows from ``rows`` on get -1.
 
-    Points and centres have one dtype. ``tree`` is child_offsets, child and depth; ``caller`` is the op that errors
-    name.
+    Points and centres have one dtype. ``tree`` is child_offsets, child and depth; ``caller`` is the op's name for error
+    messages.
     """
     child_offsets, child, depth = tree
     compiled, machine = native.compiled, native.machine(points)

@@ -41,7 +41,7 @@ def locate_cell(points: Tensor, centres: Tensor, child_offsets: Tensor, child: T
 
     def run(points: Tensor) -> Tensor:
         far = distances(points, centres)
-        # `state` is the diagram of a point, or (negative) its leaf.
+        # `state` is the diagram of a point or, if negative, its leaf.
         state = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
         for _ in range(min(depth, child_offsets.shape[0] - 1)):  # a tree has no more levels than diagrams
             nearest = far.masked_fill(owner[None, :] != state[:, None], torch.inf).argmin(dim=1)

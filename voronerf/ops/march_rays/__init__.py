@@ -55,12 +55,12 @@ def march_rays(
     With a ``contraction``, rays and distances are in world space; the grid, its box and the positions are in contracted
     space (Barron et al. 2022, "Mip-NeRF 360", equation 10; or Mildenhall et al. 2020, "NeRF", appendix C).
 
-    Rays can be marched piece by piece, to stop at opaque surfaces: ``most`` samples at a time, with the ``stop`` of one
-    call as the ``start`` of the next.
+    To stop at opaque surfaces, march in pieces: limit each call to ``most`` samples per ray, and pass its ``stop`` as
+    ``start`` to the next call.
 
-    The number of samples depends on the values. Without ``capacity`` the host reads it. With ``capacity`` the result
-    has that many rows: rows beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays that do not fit are cut, as
-    ``stop`` shows. This form can be captured in a CUDA graph and compiled. Not differentiable.
+    The number of samples depends on values on the device. Without ``capacity`` the host waits for it. With ``capacity``
+    the result has that many rows: rows beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays that do not fit
+    are cut off at their ``stop``. This form can be captured in a CUDA graph and compiled. Not differentiable.
 
     Args:
         origins: the origins of the rays.
@@ -70,9 +70,9 @@ def march_rays(
         occupied: whether each cell of the box is occupied; x, y, z >= 1.
         box: the lowest and the highest corner of the grid.
         samples: the number of strata of a ray, s, 1 to 65,535.
-        uniforms: the relative position of each sample in its stratum, 0 to 1; None for the middles.
-        seed: the seed of ``uniforms`` in place of them: hashes of the stratum and of seed + ray, the same on every
-            backend.
+        uniforms: the relative position of each sample in its stratum, 0 to 1; None for the middle.
+        seed: a seed instead of ``uniforms``. The uniforms are then hashes of the stratum and of seed + ray, the same on
+            every backend.
         spacing: the spacing of the strata, "linear" or "disparity" (equal steps of 1 / distance).
         start: the first stratum to consider, >= 0; None for 0.
         most: the largest number of samples of a ray, at least 1; None for all.

@@ -46,7 +46,7 @@ class March(NamedTuple):
 
 
 def memory(near: Tensor, offsets: Tensor, rows: Any) -> March:
-    """Allocates the tensors of ``rows`` samples, besides the offsets of the rays."""
+    """Allocates a result of ``rows`` samples; the ray offsets are given."""
     index, stop = (new_empty(near, count, dtype=torch.int32) for count in (rows, rows_of(near)))
     return March(offsets, index, new_empty(near, rows), new_empty(near, rows), new_empty(near, rows, 3), stop)
 
@@ -84,7 +84,7 @@ def march_rays(*arguments: Any) -> March:
         scale = box.new_full((), size) / (box[1, axis] - box[0, axis])
         place = (place - box[0, axis]) * scale
         mask = mask & (place >= 0) & (place <= size)
-        # NaN guard: samples at NaN are not taken, but NaN may convert to any integer.
+        # NaN guard: samples at NaN are masked, but their index must be valid, and NaN may convert to any integer.
         cell = cell * size + place.nan_to_num(0).clamp(0, size).long().clamp(max=size - 1)
     mask = mask & (occupied.reshape(-1)[cell] != 0)
     if start is not None:
@@ -119,7 +119,7 @@ def march_rays(*arguments: Any) -> March:
 
 
 def hashed_uniforms(seed: Tensor, r: int, samples: int) -> Tensor:
-    """Returns [r, samples] in [0, 1), hashes of ray, stratum and seed int32 [1]; exact in float32."""
+    """Returns hashes of ray, stratum and seed (int32 [1]): [r, samples] in [0, 1), exact in float32."""
     ray, stratum = (torch.arange(count, device=seed.device) for count in (r, samples))
     key = _mixed(ray + seed.long())
     return (_mixed(key[:, None] ^ stratum * 0x9E3779B9) >> 8) / 2**24

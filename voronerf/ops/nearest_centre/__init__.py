@@ -35,16 +35,16 @@ def nearest_centre(
     Args:
         points: n < 2**31, d = 1 to 4. float16 and bfloat16 are compared in float32.
         centres: finite, k >= 1.
-        index: the index of these centres by `index_centres`. The time then grows with log k, and the cells are the
-            same. Without an index, the CPU makes one for the call from 2,048 centres and 1,024 points on. The reference
-            and Warp backends ignore it.
+        index: the result of `index_centres` for these centres. The time then grows with log k, and the cells are the
+            same. Without an index, the CPU makes one for the call if there are at least 2,048 centres and 1,024 points.
+            The reference and Warp backends ignore the index.
 
     Returns:
         int32 [n], the cell of each point, 0 to k - 1.
 
     Raises:
-        ValueError: d above 4, or an index of centres of another number, size or dtype. (A GPU does not check the index:
-            all cells are then -1.)
+        ValueError: d above 4; an index for another k, d or dtype (not checked on a GPU, where all cells are -1 for a
+            wrong index).
 
     Examples:
         >>> import torch
@@ -57,10 +57,11 @@ def nearest_centre(
 
 
 def index_centres(centres: Tensor) -> Tensor | None:
-    """Returns an index of centres for `nearest_centre`: a tree of boxes, which hold 16 boxes or up to 16 centres each.
+    """Returns an index of centres for `nearest_centre`: a tree of boxes, each with 16 boxes or up to 16 centres.
 
-    It pays from some thousand centres on if several calls use it. It has 18 to 36 bytes per centre for three float32
-    coordinates. Its construction takes about 0.1 us per centre on one core; for a GPU it is made on the CPU and copied.
+    The index pays off from some thousand centres on if several calls use it. It has 18 to 36 bytes per centre for three
+    float32 coordinates. Its construction takes about 0.1 us per centre on one core; for a GPU it is made on the CPU and
+    copied.
 
     Args:
         centres: floating [k, d], d = 1 to 4, finite.
@@ -95,7 +96,7 @@ def index_centres(centres: Tensor) -> Tensor | None:
 
 
 def check_sizes(op: str, centres: Tensor) -> None:
-    """Raises ValueError without a centre, or for centres with too many coordinates."""
+    """Raises ValueError if there is no centre, or if the centres have too many coordinates."""
     k, d = centres.shape
     if not 1 <= d <= 4:
         raise ValueError(f"{op}: centres must have shape [k, d], d = 1 to 4, got {list(centres.shape)}")

@@ -18,13 +18,13 @@ def _check(centres: Tensor, index: Tensor | None) -> None:
 
 
 def check_index(op: str, centres: Tensor, index: Tensor) -> None:
-    """Raises ValueError for an index of centres with another number, number of coordinates or dtype."""
+    """Raises ValueError unless the index fits the number, the number of coordinates and the dtype of the centres."""
     (k, d), size, got = centres.shape, centres.itemsize, f"int32 {list(index.shape)}"
     if len(index) == native.compiled.centre_index_words(k, d, size):
         if index.is_cuda or (head := index[:3].tolist()) == [k, d, size]:
             return
-        got = f"one of float{8 * head[2]} {head[:2]}"
-    raise ValueError(f"{op}: index must be of these centres, float{8 * size} [{k}, {d}], got {got}")
+        got = f"an index of float{8 * head[2]} {head[:2]}"
+    raise ValueError(f"{op}: index must belong to these centres, float{8 * size} [{k}, {d}], got {got}")
 
 
 nearest_centre = declared("nearest_centre").compiled_op(
@@ -39,7 +39,7 @@ nearest_centre = declared("nearest_centre").compiled_op(
 def find(
     cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None, index: Tensor | None = None
 ) -> None:
-    """Fills ``cells``, int32 [n], for points and centres of one dtype; on CUDA with -1 from row ``rows`` on."""
+    """Fills ``cells``, int32 [n], for points and centres of one dtype; on CUDA, the rows from ``rows`` on get -1."""
     compiled, machine = native.compiled, native.machine(points)
     n, (k, d), words = rows_of(points), centres.shape, 0 if index is None else len(index)
     if isinstance(machine, compiled.Cuda):

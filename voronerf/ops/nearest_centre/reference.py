@@ -22,9 +22,9 @@ def nearest_centre(points: Tensor, centres: Tensor, index: Tensor | None = None)
 def distances(points: Tensor, centres: Tensor) -> Tensor:
     """Returns float64 squared distances [n, k] in the direct form, whose error is independent of the origin.
 
-    ``x^2 - 2 x.c + c^2`` cancels: in float32 it misplaces one point in ten for a scene 100 units from the origin. NaN
-    and overflow become the largest finite value, so a non-finite point is equally far from every centre and the lowest
-    index wins.
+    ``x^2 - 2 x.c + c^2`` suffers from cancellation: in float32 it misplaces one point in ten for a scene 100 units from
+    the origin. NaN and overflow become the largest finite value, so a non-finite point is equally far from every centre
+    and the lowest index wins.
     """
     points, centres = points.detach().double(), centres.detach().double()
     total = (points[:, None, 0] - centres[None, :, 0]).square()

@@ -46,7 +46,7 @@ def observe_occupancy(
     """Updates the cells of an occupancy grid that contain rendered samples, in place.
 
     A cell with samples gets the largest of their densities and ``decay`` times its old density (Mueller et al. 2022,
-    appendix C). A sample that receives at most the share ``hidden`` of the light counts as density 0:
+    appendix C). If at most the fraction ``hidden`` of the light reaches a sample, its density counts as 0:
     ``weights <= hidden * (1 - exp(-sigma * deltas))``. Cells without samples keep their density. Not differentiable.
 
     With a ``contraction``, the grid, its box and the positions are in contracted space, ``sigma`` and ``deltas`` in
@@ -60,10 +60,10 @@ def observe_occupancy(
         sigma: the densities of the samples; NaN counts as infinite.
         deltas: the lengths of the samples' strata; a sample of length 0 is ignored. None if all light reaches every
             sample.
-        weights: the rendering weights of the samples; None if ``deltas`` is.
+        weights: the rendering weights of the samples; None if ``deltas`` is None.
         decay: the factor on the old density, 0 to 1.
         threshold: the density from which a cell counts as occupied.
-        hidden: a share of the light, 0 to 1; samples that receive no more count as density 0.
+        hidden: the transmittance, 0 to 1, up to which the density of a sample counts as 0.
         contraction: the contraction of the grid's space, as for ``march_rays``.
         fixed: whether each cell keeps its values; None to update all cells.
 

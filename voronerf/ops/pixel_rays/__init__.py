@@ -53,8 +53,8 @@ def pixel_rays(
         near: the nearest distance of interest, >= 0.
         far: the farthest distance of interest.
         box: the lowest and the highest corner; None for all of space.
-        lens: the index of each camera's table; without distortion an index out of range, such as -1. Requires
-            ``tables``.
+        lens: the index of each camera's table, or an index out of range, such as -1, for a camera without distortion.
+            Requires ``tables``.
         tables: the directions (x, y, z) of each lens's pixels in camera axes, as stereographic projections (x, -y) / (1
             - z), see `voronerf.nerf.lenses.LensTables`; None for no distortion.
         background: the colour behind images with an alpha channel; None to ignore alpha.
@@ -63,14 +63,14 @@ def pixel_rays(
         PixelRays(origins, directions, near, far, colour); far == near for a ray that misses the box.
 
     Raises:
-        ValueError: on the CPU pixels out of range.
+        ValueError: a pixel is out of range (checked on the CPU only).
 
     Examples:
         >>> import torch
         >>> from voronerf.ops import pixel_rays
         >>> poses = torch.eye(4)[None]  # at the origin, looking along -z
         >>> intrinsics = torch.tensor([[1.0, 1.0, 0.5, 0.5]])
-        >>> image = torch.tensor([[[[255, 0, 0, 51]]]], dtype=torch.uint8)  # a fifth of red
+        >>> image = torch.tensor([[[[255, 0, 0, 51]]]], dtype=torch.uint8)  # red, alpha 0.2
         >>> box, white = torch.tensor([[-1.0, -1, -3], [1.0, 1, -2]]), torch.ones(3)
         >>> index = torch.zeros(1, dtype=torch.int64)
         >>> rays = pixel_rays(poses, intrinsics, image, index, near=0.0, far=9.0, box=box, background=white)

@@ -42,8 +42,9 @@ def own_samples(
 ) -> OwnSamples:
     """Selects the samples in this rank's own cells, and finds their runs.
 
-    Other ranks may have samples unknown to this rank. None of these lies between two samples that are nearer than the
-    length of a stratum nor, since cells are convex, between two neighbours in one cell.
+    Other ranks may hold samples that this rank does not know. A run therefore also ends between two samples of
+    different cells that are at least one stratum apart, since an unknown sample may lie there. Within one convex cell
+    none can; with ``bent`` rays the run ends there too.
 
     Args:
         positions: the positions of all samples that this rank knows, ray after ray, near to far.
@@ -58,7 +59,7 @@ def own_samples(
         OwnSamples(positions, ray_index, depths, deltas, cells, run_offsets).
 
     Raises:
-        ValueError: on the CPU cells out of range.
+        ValueError: a cell is out of range (checked on the CPU only).
 
     Examples:
         >>> import torch
@@ -92,15 +93,15 @@ def run_sums(
         density_scale: the factor on the density, > 0.
 
     Returns:
-        Sums [q, 6]: colour as if nothing were in front, optical depth, depth of the first sample, index of the ray; and
-        densities [m].
+        Sums [q, 6]: colour without occlusion by runs in front, optical depth, depth of the first sample, index of the
+        ray; and densities [m].
 
     Examples:
         >>> import torch
         >>> from voronerf.ops import own_samples, run_sums
         >>> zeros = torch.zeros(1, dtype=torch.int32)
         >>> mine = own_samples(torch.zeros(1, 3), zeros + 7, torch.ones(1), torch.ones(1), zeros, zeros)
-        >>> run_sums(torch.tensor([[0.0, 0, 0, 50.0]]), mine, density_scale=1.0)[0]  # half grey, opaque, at 1, of ray 7
+        >>> run_sums(torch.tensor([[0.0, 0, 0, 50.0]]), mine, density_scale=1.0)[0]  # grey, opaque, depth 1, ray 7
         tensor([[ 0.5000,  0.5000,  0.5000, 50.0000,  1.0000,  7.0000]])
     """
 
@@ -123,15 +124,16 @@ def compose_runs(
         target: the target colours of the rays.
         background: the colours behind the rays; None is black.
         first: the index of the first of the r rays.
-        rays: the number of rays of all ranks.
+        rays: the total number of rays over all ranks, by which the loss is divided.
         robust: the scale of the robust error, as in `render_loss`.
 
     Returns:
-        Answers [q, 6]: the gradient of the loss to the ray's colour, the loss due to light from behind the run, the
-        optical depth in front, and the squared error of the ray; and the part [] of the loss due to the r rays.
+        Answers [q, 6]: the gradient of the loss with respect to the ray's colour, the loss due to light from behind the
+        run, the optical depth in front, and the squared error of the ray; and the part [] of the loss due to the r
+        rays.
 
     Raises:
-        ValueError: on the CPU runs of rays outside ``first`` to ``first + r - 1``.
+        ValueError: a run's ray is outside ``first`` to ``first + r - 1`` (checked on the CPU only).
 
     Examples:
         >>> import torch
@@ -160,14 +162,14 @@ def run_gradients(
     hidden: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> tuple[Annotated[Tensor, "same [m, 4]"], Annotated[Tensor, "same [m]"]]:
-    """Returns the gradient of the loss to the networks' outputs, from the answers to the runs.
+    """Returns the gradient of the loss with respect to the networks' outputs, from the answers to the runs.
 
     Args:
         raw: colour and density before their activations, as in `run_sums`.
         samples: the result of `own_samples`.
         answers: the answers of `compose_runs`.
         density_scale: the factor on the density, as in `run_sums`.
-        hidden: a share of the light, in [0, 1); samples that receive no more have no gradient.
+        hidden: the transmittance, in [0, 1), up to which a sample counts as hidden. Hidden samples have no gradient.
 
     Returns:
         Gradient [m, 4], and the rendering weights [m] of the samples.
@@ -179,7 +181,7 @@ def run_gradients(
         >>> mine = own_samples(torch.zeros(1, 3), zeros, torch.ones(1), torch.ones(1), zeros, zeros)
         >>> sums, _ = run_sums(raw, mine, density_scale=1.0)
         >>> answers, _ = compose_runs(sums, torch.ones(1, 3), first=0, rays=1)
-        >>> run_gradients(raw, mine, answers, density_scale=1.0)[0][:, :3].round(decimals=4)  # lighter
+        >>> run_gradients(raw, mine, answers, density_scale=1.0)[0][:, :3].round(decimals=4)  # more light is better
         tensor([[-0.0833, -0.0833, -0.0833]])
     """
 
@@ -196,9 +198,7 @@ def _check_samples(op: str, arguments: Any) -> Any:
     check_rows(op, _of_samples, tensors, raw.dtype, smooth=False)
     if not raw.is_cpu or torch.compiler.is_compiling():
         return arguments
-    m, offsets = len(raw), samples.run_offsets.numpy()  # a torch operation could not be replayed by a recording
+    m, offsets = len(raw), samples.run_offsets.numpy()  # numpy: a recording could not replay a torch operation
     if offsets[0] != 0 or offsets[-1] != m or not (offsets[1:] > offsets[:-1]).all():
-        raise ValueError(
-            f"{op}: run_offsets must rise from 0 to the {m} samples, a run having one at least, got others"
-        )
+        raise ValueError(f"{op}: run_offsets must strictly ascend from 0 to the number of samples, {m}")
     return arguments

@@ -27,7 +27,7 @@ _outputs = _GRADIENTS.inputs(native.compiled.RenderLossInputs, **_NO_RAYS)
 
 @_OWN.custom_op("own_samples_native", devices=("cpu",), fake=OwnSamples.fake)
 def own_samples(arguments: Any) -> OwnSamples:
-    """Selects the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
+    """Selects the samples in this rank's own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
     samples = _OWN.allocate(arguments)  # for all n samples; the unused rows are cut below
     offsets = samples.run_offsets[: native.compiled.own_samples(_known(arguments), _own(samples), native.cpu()) + 1]
     m = int(offsets[-1])

@@ -55,11 +55,11 @@ class Runs(NamedTuple):
     """The partial sums of runs. Only colour and optical depth have gradients.
 
     Attributes:
-        colour: [q, c], the colour of each run as if nothing were in front.
+        colour: [q, c], the colour of each run without occlusion by runs in front.
         optical: [q], the optical depth of each run.
         ray: int64 [q], the ray of each run.
         start: [q], the depth of the first sample of each run.
-        weights: [m], the rendering weights of the samples as if nothing were in front of their run.
+        weights: [m], the rendering weights of the samples without occlusion by runs in front.
     """
 
     colour: Tensor
@@ -78,7 +78,7 @@ def own_samples(
     own: Tensor,
     bent: bool,
 ) -> OwnSamples:
-    """Selects the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
+    """Selects the samples in this rank's own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
     numbers = own[cells.long()]
     kept = (numbers >= 0).nonzero()[:, 0]
     ray, at, length, cell = ray_index[kept], depths[kept], deltas[kept], numbers[kept]

@@ -53,17 +53,17 @@ def render_loss(
         deltas: the length of the ray segment of each sample, at least 0.
         ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none. Samples outside all
             rays have weight 0.
-        target: the colours to learn.
+        target: the target colours of the rays.
         background: a colour added with weight 1 - opacity; None is black.
         density_scale: the factor on the density, > 0; None with ``activated``.
         activated: whether ``raw`` is the colour and the density themselves, as for `composite`. They are not clamped,
-            and gradients are to them.
-        hidden: a share of the light, in [0, 1). Samples that receive no more have no gradient, but they contribute to
-            the gradients of the samples in front of them.
+            and the gradient is with respect to them.
+        hidden: the transmittance, in [0, 1), up to which a sample counts as hidden. Hidden samples have no gradient,
+            but they contribute to the gradients of the samples in front of them.
         robust: the scale s of errors beyond which the loss is linear, in [0, 1); 0 for the squared error.
-        triples: the number of triples of `unseen_rays`, at most r / 3. They are the last ``3 triples`` rays and have no
-            target: their error and the gradients of their samples are 0, but the loss is divided by the number of all
-            rays.
+        triples: the number of triples of `unseen_rays`, at most r / 3. These are the last ``3 triples`` rays. They have
+            no target: their errors and the gradients of their samples are 0, but the loss is divided by the number of
+            all rays.
 
     ``deltas``, ``target``, ``background`` and the results are float32, or float64 if ``raw`` is. The loss has
     derivatives of every order in ``raw``. Nothing else has gradients.
@@ -72,8 +72,8 @@ def render_loss(
         RenderLoss(loss [], colour [r, 3], weights [m], density [m], error [r]).
 
     Raises:
-        ValueError: ``density_scale`` with ``activated``, or neither; more triples than a third of the rays; on the CPU
-            offsets that decrease or exceed m.
+        ValueError: ``density_scale`` with ``activated``, or neither; more triples than a third of the rays; offsets
+            that decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch
@@ -84,9 +84,9 @@ def render_loss(
         >>> result.colour, float(result.loss)
         (tensor([[0.5000, 0.5000, 0.5000]]), 0.25)
         >>> result.loss.backward()
-        >>> raw.grad[:, :3].round(decimals=4)  # lighter
+        >>> raw.grad[:, :3].round(decimals=4)  # more light is better
         tensor([[-0.0833, -0.0833, -0.0833]])
-        >>> values = torch.tensor([[0.5, 0.5, 0.5, 50.0]])  # the same wall, of networks that have activated
+        >>> values = torch.tensor([[0.5, 0.5, 0.5, 50.0]])  # the same wall as activated values
         >>> float(render_loss(values, torch.ones(1), offsets, torch.ones(1, 3), activated=True).loss)
         0.25
     """
@@ -113,7 +113,7 @@ def render_loss_gradient(
     triples: Annotated[int, "0.."] = 0,
     backend: str = "auto",
 ) -> tuple[RenderLoss, Annotated[Tensor, "same [m, 4]"]]:
-    """Returns the result of `render_loss` and the gradient of its loss to ``raw``, for `forward_with_tape`.
+    """Returns the result of `render_loss`, and the gradient of its loss to ``raw`` for `forward_with_tape`.
 
     Not differentiable.
 
@@ -121,11 +121,11 @@ def render_loss_gradient(
         raw: colour and density, as in `render_loss`.
         deltas: the length of the ray segment of each sample.
         ray_offsets: the offsets of the rays, as in `render_loss`.
-        target: the colours to learn.
+        target: the target colours of the rays.
         background: a colour added with weight 1 - opacity; None is black.
         density_scale: the factor on the density, > 0; None with ``activated``.
         activated: whether ``raw`` is the colour and the density themselves, as in `render_loss`.
-        hidden: a share of the light, as in `render_loss`.
+        hidden: the transmittance up to which a sample counts as hidden, as in `render_loss`.
         robust: the scale of the robust error, as in `render_loss`.
         triples: the number of triples of unseen rays, as in `render_loss`.
 
@@ -133,7 +133,7 @@ def render_loss_gradient(
         (RenderLoss, gradient [m, 4]).
 
     Raises:
-        ValueError: the arguments that `render_loss` refuses.
+        ValueError: arguments for which `render_loss` raises it.
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""The derivatives of the native and the Warp kernel of ``render_loss``, which compute the gradient with the loss."""
+"""The derivatives of ``render_loss`` for its native and Warp kernels, which compute the gradient with the loss."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from voronerf.ops.render_loss.reference import render_loss
 
 
 def register(forward: Op) -> None:
-    """Registers the derivatives of an op with the results of ``render_loss_gradient``."""
+    """Registers the derivatives of an op that returns the results of ``render_loss_gradient``."""
     forward.register_autograd(_backward, setup_context=_setup)
 
 
@@ -25,7 +25,7 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> Non
 
 
 def _backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
-    """Returns the scaled gradient, or for higher derivatives the gradient of the reference formula."""
+    """Returns the scaled gradient, or the gradient of the reference formula for higher derivatives."""
     raw, *others, gradient = ctx.saved_tensors
     gradient_to_raw = None
     if of_loss is not None and torch.is_grad_enabled():

@@ -1,6 +1,6 @@
 """``render_loss`` of the compiled module. r rays, m samples of all rays (packed).
 
-The gradient of the loss is computed with it, so the backward pass only scales it.
+The forward pass computes the loss and its gradient, so the backward pass only scales the gradient.
 """
 
 from __future__ import annotations

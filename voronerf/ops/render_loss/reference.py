@@ -58,7 +58,7 @@ def render_loss(
         _, density = activate(raw.detach(), density_scale, activated)
         dark = packed_light(optical_depth(density, deltas), ray_offsets)[0] <= hidden
         raw = torch.where(dark[:, None], raw.detach(), raw)
-    if triples and raw.requires_grad:  # without a host read of the offset
+    if triples and raw.requires_grad:  # avoids a host read of the offset
         unseen = torch.arange(len(raw), device=raw.device) >= ray_offsets[first]
         raw = torch.where(unseen[:, None], raw.detach(), raw)
     colours, density = activate(raw, density_scale, activated)
@@ -71,7 +71,7 @@ def render_loss(
 
 
 def robust_error(error: Tensor, robust: float) -> Tensor:
-    """Returns the robust errors [r] for squared errors [r] of rays, unchanged if ``robust`` is 0."""
+    """Returns the robust errors [r] for squared errors [r] of rays; these stay unchanged if ``robust`` is 0."""
     return 2 * robust * error / ((error + robust**2).sqrt() + robust) if robust else error
 
 

@@ -29,7 +29,7 @@ def _prepare(arguments: Any) -> Any:
         raise ValueError(f"{op}: network must hold program and parameters, got {got:.60}")
     if unknown := [name for name in network if name not in NETWORK]:
         raise TypeError(f"{op}: network must hold {', '.join(NETWORK)} alone, got {', '.join(map(str, unknown))}")
-    # The network is checked with one sample, at the origin, for each ray.
+    # The check of the network gets one sample per ray, at the ray's origin.
     origins, reads = arguments.origins, bool(getattr(network["program"], "rays", ()))
     index = torch.arange(len(origins), dtype=torch.int32, device=origins.device) if reads else None
     inputs = [origins, arguments.directions] if reads else [origins]
@@ -37,7 +37,7 @@ def _prepare(arguments: Any) -> Any:
     if (dtype := routed.arguments(op).dtype) is torch.float64 and origins.dtype is not dtype:
         raise TypeError(f"{op}: parameters must have dtype {str(origins.dtype)[6:]} or one of 16 bits, got float64")
     if (width := routed.program.outputs[0].width) != 4:
-        raise ValueError(f"{op}: program must put out 4 numbers, colour and density, got {width}")
+        raise ValueError(f"{op}: program must have outputs of 4 numbers, colour and density, got {width}")
     return scaled(op, arguments._replace(network=routed))
 
 
@@ -77,16 +77,16 @@ def render_opaque(
         far: the end of the last stratum; a ray with far <= near has no samples.
         occupied: whether each cell of the box is occupied.
         box: the lowest and the highest corner of the grid.
-        samples: the number of strata of a ray, s; samples are their middles.
+        samples: the number of strata of a ray, s; each sample is the middle of its stratum.
         network: the arguments of `routed_program` by name: ``program`` and ``parameters``; optionally centres,
-            child_offsets, child, depth and centre_index. Its inputs are positions [n, 3] and, if read, directions with
-            one row for each ray. It has 4 outputs: colour before its sigmoid and density before its softplus, or with
-            ``activated`` the colour and density themselves.
+            child_offsets, child, depth and centre_index. The program's inputs are positions [n, 3] and, if it reads
+            them, directions with one row for each ray. It has 4 outputs: colour before its sigmoid and density before
+            its softplus or, with ``activated``, the colour and density themselves.
         density_scale: the factor on the density, > 0; None with ``activated``.
         activated: whether the networks' outputs are the colour and the density themselves, as for `composite`. They are
             not clamped.
         wave: the number of samples of a ray that are evaluated at a time, 1 to 1,024.
-        opaque: a ray ends after a wave if at most this share of the light remains, in [0, 1).
+        opaque: a ray ends after a wave if at most this fraction of the light remains, in [0, 1).
         spacing: the spacing of the strata, "linear" or "disparity".
         contraction: the contraction of the grid's space, as in ``march_rays``.
         background: the colour behind everything; None is black.
@@ -103,7 +103,7 @@ def render_opaque(
         >>> from voronerf import MLP, Layer
         >>> from voronerf.ops import render_opaque
         >>> program = MLP((Layer(("positions",), 4),), outputs=(0,)).program(3, 0, None, (True,))
-        >>> parameters = [torch.zeros(1, 4, 3), torch.tensor([[0.0, 0, 0, 20]])]  # grey, and 20 dense
+        >>> parameters = [torch.zeros(1, 4, 3), torch.tensor([[0.0, 0, 0, 20]])]  # grey, density 20
         >>> network = {"program": program, "parameters": parameters}
         >>> ray = torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]), torch.zeros(1), torch.full((1,), 4.0)
         >>> box, occupied = torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), torch.ones(1, 1, 1, dtype=torch.bool)

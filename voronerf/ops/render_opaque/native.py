@@ -1,6 +1,6 @@
-"""``render_opaque`` of the compiled module: a wave of some thousand samples stays in the cache from grid to colours.
+"""``render_opaque`` of the compiled module: waves of some thousand samples stay in the cache from grid to colours.
 
-It is no custom op, which cannot take the dictionary ``network``.
+It is not a custom op, because custom ops cannot take the dictionary ``network``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def render_opaque(*flat: Any) -> RaysSeen:
     """Renders every ray until it is opaque, in float32; see ``voronerf.ops.render_opaque``."""
     arguments = _OP.Inputs._make(flat)
     routed = arguments.network
-    none = arguments.near.new_empty(0, dtype=torch.int32)  # a ray index without samples
+    none = arguments.near.new_empty(0, dtype=torch.int32)  # an empty ray index
     network = Network.of(
         routed._replace(ray_index=None if routed.ray_index is None else none).arguments("render_opaque")
     )

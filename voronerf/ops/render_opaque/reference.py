@@ -18,7 +18,7 @@ from voronerf.ops.routed_program import run
 def render_opaque(*flat: Any, backend: str = "reference") -> RaysSeen:
     """Renders every ray until it is opaque; see ``voronerf.ops.render_opaque``.
 
-    ``backend`` is the backend of the operations that it calls.
+    ``backend`` is the backend of the operations that this function calls.
     """
     arguments = declared("render_opaque").Inputs._make(flat)
     routed, wave = arguments.network, arguments.wave

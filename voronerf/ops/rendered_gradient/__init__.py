@@ -44,18 +44,18 @@ def rendered_gradient(
     activated: bool = False,
     backend: str = "auto",
 ) -> None:
-    """Adds to ``gradient`` the gradient of a loss to ``raw``, from its gradients to the rendered values, in place.
+    """Computes the gradient of a loss to ``raw`` from its gradients to the rendered values; adds it to ``gradient``.
 
     `composite` renders the samples, with weights w and transmittance T, to the colour
     ``sum w_i c_i + (1 - sum w_i) background``, the opacity ``sum w_i`` and the depth ``sum w_i d_i``, which is not
-    divided by the opacity. Let v_i be the gradient of the loss to w_i through all of these and through the weights,
-    ``of_weights_i + of_opacity + of_depth d_i + of_colour (c_i - background)``. Then the gradient to the density is
-    ``of_density_i + delta_i (T_{i+1} v_i - sum over j > i of w_j v_j)``, and to the colour of a sample
+    divided by the opacity. Let v_i be the loss gradient of w_i, through all of these and through the weights,
+    ``of_weights_i + of_opacity + of_depth d_i + of_colour (c_i - background)``. Then the gradient to the density of a
+    sample is ``of_density_i + delta_i (T_{i+1} v_i - sum over j > i of w_j v_j)``, and the gradient to the colour is
     ``of_rgb_i + w_i of_colour`` (Max 1995; Mildenhall et al. 2020, equation 3). The chain rule through the activations
     gives the gradient to ``raw``. Not differentiable.
 
     Args:
-        gradient: the gradient to the networks' outputs, contiguous.
+        gradient: the gradient to the networks' outputs, contiguous, updated in place.
         raw: colour and density, before their activations unless ``activated``, as for `render_loss`.
         density: the densities of the samples, as `render_loss` returns them for ``raw``.
         depths: the distances of the samples along the rays.
@@ -64,19 +64,20 @@ def rendered_gradient(
         ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none. Samples outside all
             rays have no gradient.
         background: a colour with weight 1 - opacity; None is black.
-        of_colour: the gradient of the loss to the colours of the rays. None is zero, here and below.
-        of_opacity: the gradient of the loss to the opacities.
-        of_depth: the gradient of the loss to the depths.
-        of_weights: the gradient of the loss to the weights of the samples.
-        of_rgb: the gradient of the loss to the colours of the samples.
-        of_density: the gradient of the loss to the densities of the samples.
-        hidden: a share of the light; samples that receive no more have no gradient. 0 hides no sample.
+        of_colour: the loss gradient of the colours of the rays. None counts as zero, here and for the arguments below.
+        of_opacity: the loss gradient of the opacities.
+        of_depth: the loss gradient of the depths.
+        of_weights: the loss gradient of the weights of the samples.
+        of_rgb: the loss gradient of the colours of the samples.
+        of_density: the loss gradient of the densities of the samples.
+        hidden: the transmittance up to which a sample counts as hidden. Hidden samples have no gradient; 0 hides no
+            sample.
         density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.
-        activated: whether ``raw`` and ``gradient`` are for the colour and the density themselves.
+        activated: whether ``raw`` and ``gradient`` refer to the colour and the density themselves.
 
     Raises:
-        ValueError: a gradient that is not contiguous; ``density_scale`` with ``activated``, or neither; on the CPU
-            offsets that decrease or exceed m.
+        ValueError: a gradient that is not contiguous; ``density_scale`` with ``activated``, or neither; offsets that
+            decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch
@@ -84,9 +85,9 @@ def rendered_gradient(
         >>> raw = torch.tensor([[1.0, 0, 0, 0.0], [0.0, 1, 0, 50.0]])  # red air before a green wall
         >>> depths, deltas, offsets = torch.tensor([1.0, 2.0]), torch.ones(2), torch.tensor([0, 2]).int()
         >>> along = raw[:, 3], depths, deltas, torch.tensor([0.0, 1.0]), offsets
-        >>> gradient, slope = torch.zeros(2, 4), torch.tensor([[1.0, 0, 0]])  # of a loss that grows with red
+        >>> gradient, slope = torch.zeros(2, 4), torch.tensor([[1.0, 0, 0]])  # the loss grows with red
         >>> rendered_gradient(gradient, raw, *along, of_colour=slope, activated=True)
-        >>> gradient  # denser red air would raise it, and so would a redder wall
+        >>> gradient  # denser red air or a redder wall raises the loss
         tensor([[0., 0., 0., 1.],
                 [1., 0., 0., 0.]])
     """

@@ -38,7 +38,7 @@ CASE = Case(
         "backgrounds": {"per_ray": True},
     },
     refused={
-        "ray_offsets must rise from 0 or more to at most the number of samples, 6, got 1 for ray 2": {
+        "ray_offsets must ascend within 0 to 6 (the number of samples), got 1 for ray 2": {
             "ray_offsets": torch.tensor([0, 2, 1], dtype=torch.int32)
         },
         "of_colour must be a tensor, got str": {"of_colour": "x"},

@@ -28,7 +28,7 @@ def rendered_gradient(gradient: Tensor, *arguments: Any) -> None:
     of_density, of_rgb = torch.autograd.grad(outputs, leaves, arriving, materialize_grads=True)
     with torch.no_grad():
         if not activated:
-            of_density = of_density * -density_scale * torch.expm1(-density / density_scale)  # softplus' derivative
+            of_density = of_density * -density_scale * torch.expm1(-density / density_scale)  # softplus derivative
             of_rgb = of_rgb * rgb * (1 - rgb)
         light, ray = packed_light(optical_depth(density, deltas), ray_offsets)
         learning = (ray > 0) & (ray < len(ray_offsets))

@@ -32,17 +32,17 @@ def resample(
     uniforms: Annotated[Tensor | None, "same [r, count]"] = None,
     backend: str = "auto",
 ) -> Annotated[Tensor, "same [r, count]"]:
-    """Draws depths by inverse-CDF sampling, with mass ``weights[:, i]`` spread evenly over bin i of a ray.
+    """Draws depths by inverse-CDF sampling; the mass ``weights[:, i]`` is uniform within bin i of a ray.
 
-    Mildenhall et al. 2020, section 5.2. Weights that are negative or not finite count as 0. If all weights of a ray are
-    0, every bin counts the same. Not differentiable: depths carry no gradient to the weights, the edges or the
+    See Mildenhall et al. 2020, section 5.2. Weights that are negative or not finite count as 0. If all weights of a ray
+    are 0, its bins have equal masses. Not differentiable: depths carry no gradient to the weights, the edges or the
     uniforms.
 
     Args:
         weights: the masses of the bins, s >= 1; they need not sum to 1.
         edges: the edges of the bins, ascending along a ray.
         count: the number of depths of a ray, at least 1.
-        uniforms: 0 to 1, in any order; None for the midpoints of ``count`` equal strata, which is deterministic.
+        uniforms: random numbers, 0 to 1, in any order; None for the midpoints of ``count`` equal strata.
 
     Returns:
         [r, count], depths in ascending order along a ray, in the dtype of the edges.

@@ -36,14 +36,14 @@ def routed_mlp(
     centre_index: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Evaluates every sample by the network of its cell; results are in the order of the samples.
+    """Evaluates every sample with the network of its cell; results are in the order of the samples.
 
     Equivalent to ``locate_cell``, ``cell_sort``, permuting the inputs, ``grouped_mlp``, and undoing the permutation.
     The native CPU implementation gathers and scatters rows inside the tiles of the network. It makes no permuted copy,
-    and for the backward pass keeps only the order (int32) and the features of hashed positions. Gradients of every
-    order to positions, directions, features, weights and biases; none through the choice of the cell. A sample whose
-    coordinates are not finite goes to the first cell, as in ``locate_cell``. A network of one cell (k = 1) needs no
-    tables, and its samples are neither located nor sorted.
+    and for the backward pass keeps only the order (int32) and the features of hashed positions. Positions,
+    directions, features, weights and biases have gradients of every order; the choice of the cell has none. A sample
+    whose coordinates are not finite goes to the first cell, as in ``locate_cell``. A network of one cell (k = 1) needs
+    no tables, and its samples are neither located nor sorted.
 
     Args:
         positions: [n, p] floating point, n < 2**31: the input of the layers, as in ``grouped_mlp``.
@@ -55,8 +55,8 @@ def routed_mlp(
         child_offsets: int32 [g + 1], or None for a flat diagram.
         child: int32 [m], or None for a flat diagram. The leaves are the cells, 0 to k - 1.
         depth: the number of levels of the tree.
-        cells: int32 [n], the cell of each sample, 0 to k - 1, instead of the tables: a stochastic or a reused
-            assignment.
+        cells: int32 [n], the cell of each sample, 0 to k - 1, in place of the tables; for example a stochastic or a
+            reused assignment.
         coords: [n, 3] floating point, the locations of the samples; None uses the first three features of the
             positions.
         directions: [n, q], or [r, q] with ``direction_index``; None if no layer reads directions.
@@ -64,19 +64,19 @@ def routed_mlp(
         features: the table of the hash encoding, as in ``grouped_mlp``; None without a grid.
         frozen: bool [k], the frozen cells, or None. Samples of frozen cells have no gradients at all. The CPU drops
             them from the backward pass, unless positions or directions have gradients.
-        rows: int32 [1], the number of samples that count; None for all. Later samples have output 0, no gradient, and
-            cell -1. On CUDA the host does not wait for this number, which `march_rays` with a capacity returns.
+        rows: int32 [1], the number of valid leading samples, for example from `march_rays` with a capacity; None for
+            all. Later samples have output 0, no gradient, and cell -1. On CUDA the host does not wait for this number.
         centre_index: the index of the centres of a flat diagram by `index_centres`, or None.
         backend: "auto", "reference", "native" or "warp". Without a fused implementation, "auto" calls the separate
-            operations, each on the backend it chooses.
+            operations, each with its own choice of backend.
 
     Returns:
         The output [n, layers.out_features] in the dtype of the weights (of autocast, if it is enabled), and cells int32
         [n].
 
     Raises:
-        ValueError: on the CPU tables that are not a tree, cells outside 0 to k - 1 and a direction_index outside 0
-            to r - 1.
+        ValueError: the tables are not a tree, a cell is outside 0 to k - 1, or a direction_index is outside 0 to r - 1
+            (checked on the CPU only).
 
     Examples:
         >>> import torch

@@ -39,22 +39,22 @@ def routed_program(
     """Runs a program on every sample with the parameters of the cell it lies in.
 
     Equivalent to ``locate_cell``, ``cell_sort`` and ``grouped_program`` with the order of the samples. Results are in
-    the order of the samples. Gradients of every order to inputs and parameters; none through the choice of the cell.
+    the order of the samples. Inputs and parameters have gradients of every order; the choice of the cell has none.
 
     Args:
         program: a program with outputs [n, w] only, without sums; its first input has a row for each sample.
         inputs: the inputs as in ``grouped_program``; the first three columns of the first input locate the samples,
-            unless ``coords`` do.
+            unless ``coords`` is given.
         parameters: the parameters as in ``grouped_program``; parameters that all cells share may lack the dimension of
             cells.
         ray_index: int32 [n], the ray of each sample as in ``grouped_program``; None without inputs of rays.
-        centres: the centres of the tree as in ``routed_mlp``, like the following arguments.
+        centres: the centres of the tree. This argument and the following ones are as in ``routed_mlp``.
         child_offsets: int32 [g + 1], or None for a flat diagram.
         child: int32 [m], or None for a flat diagram.
-        depth: levels of the tree.
+        depth: the number of levels of the tree.
         cells: int32 [n], the cell of each sample, 0 to k - 1, instead of the tables.
         coords: [n, 3], the locations of the samples.
-        frozen: bool [k], the cells whose samples have no gradient to anything, or None.
+        frozen: bool [k], the frozen cells, whose samples have no gradients; or None.
         rows: int32 [1], the number of samples that count; None for all.
         centre_index: the index of the centres of a flat diagram by `index_centres`, or None.
         backend: "auto", "reference", "native" or "warp".
@@ -63,8 +63,8 @@ def routed_program(
         [n, w] for each output, in the dtype of ``grouped_program``; and cells int32 [n].
 
     Raises:
-        ValueError: a program with sums, or with rays as first input; arguments that ``grouped_program`` or
-            ``routed_mlp`` refuse.
+        ValueError: the program has sums, or a first input with rows of rays; or ``grouped_program`` or ``routed_mlp``
+            would refuse the arguments.
 
     Examples:
         >>> import torch
@@ -110,7 +110,7 @@ class Routed(NamedTuple):
 
 
 def check_network(op: str, network: Mapping[str, Any]) -> Routed:
-    """Checks arguments of `routed_program` by name, except the backend, for a program with one output."""
+    """Checks named arguments of `routed_program` without a backend; the program must have one output."""
     routing = {name: network[name] for name in Routing._fields if name in network}
     rest = {name: value for name, value in network.items() if name not in routing}
     if unknown := rest.keys() - {"program", "inputs", "parameters", "ray_index"}:
@@ -135,7 +135,7 @@ def check_routed_program(
     several = alone and len(program.outputs) != 1
     if several or not program.outputs or program.sums or program.by_ray or 0 in program.rays:
         rule = "one output [n, w]" if alone else "outputs [n, w]"
-        raise ValueError(f"{op}: program must have {rule} and inputs[0] [n, w], got others")
+        raise ValueError(f"{op}: program must have {rule}, and inputs[0] with one row for each sample")
     return Routed(program, inputs, parameters, ray_index, routing.at(op, inputs[0], sizes))
 
 
@@ -147,12 +147,12 @@ def with_cells(program: Program, parameters: Sequence[Tensor]) -> Sequence[Tenso
 
 
 def frozen_rows(frozen: Tensor, cells: Tensor) -> Tensor:
-    """Returns bool [n, 1], whether each sample's cell is frozen; a sample in no cell (-1) counts to cell 0."""
+    """Returns bool [n, 1], whether each sample's cell is frozen; a sample in no cell (-1) counts as in cell 0."""
     return frozen.index_select(0, cells.clamp(min=0))[:, None]
 
 
 def stop_gradients(out: Tensor, rows: Tensor) -> Tensor:
-    """Returns the same values with zero gradients in rows bool [n, 1]; native's backward pass drops these rows."""
+    """Returns ``out`` with zero gradients in ``rows``, bool [n, 1]; the native backward pass drops these rows."""
     return _StopGradients.apply(out, rows) if out.requires_grad else out
 
 

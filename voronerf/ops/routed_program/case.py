@@ -11,7 +11,7 @@ from voronerf.ops.nearest_centre import index_centres
 
 
 def two_outputs(rays: bool) -> Program:
-    """Returns a program with two layers: one of positions and directions, and one of its output."""
+    """Returns a program of two layers and two outputs; the first layer reads positions and directions."""
     b = Builder()
     x, seen = b.input(3), b.input(3, ray=rays)
     hidden = b.linear(x, b.parameter(5, 3), 5, add=b.linear(seen, b.parameter(5, 3), 5))
@@ -50,12 +50,12 @@ CASE = Case(
         "of cells, with shared ones": {"by": "cells", "shared": True},
     },
     refused={
-        "centre_index must come with centres, got none that it is of": {
+        "centre_index requires centres, got no centres": {
             "centres": None,
             "centre_index": torch.zeros(1).int(),
         },
         "centres must have shape [k, 3] with k = 2, got [1, 3]": {"centres": torch.zeros(1, 3)},
-        "parameters must be 3 tensors (inputs at least one), got 0": {"parameters": []},
+        "parameters must have 3 tensors, got 0": {"parameters": []},
     },
     differentiable=True,
 )

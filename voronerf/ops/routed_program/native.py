@@ -1,8 +1,8 @@
-"""``routed_program`` of the compiled module: one op locates and sorts, then the program reads the rows in place.
+"""``routed_program`` of the compiled module: one op locates and sorts samples, then the program reads them in place.
 
 n samples, r rays, k cells, m centres of all diagrams together, g diagrams. The tiles of the program gather their rows
 from the unsorted samples and scatter their results back, so only the order (int32) needs memory for n rows besides
-inputs and outputs. On CUDA these are consecutive launches on the current stream, and the host reads no values.
+inputs and outputs. On CUDA the op and the program are launched on the current stream, and the host reads no values.
 ``voronerf.ops`` has validated shapes and dtypes.
 """
 
@@ -35,13 +35,13 @@ def routed_program(arguments: ProgramArguments, routing: Routing) -> tuple[list[
     network, routing = Network.of(arguments), normalise_routing(routing, count_cells(arguments.parameters))
     route = find(network.inputs[0], routing, count_cells(arguments.parameters), arguments.caller)
     outputs = network.run(route.offsets, route.order)
-    if routing.rows is None or native.on_cuda(route.offsets):  # on CUDA the uncounted rows have no cell
+    if routing.rows is None or native.on_cuda(route.offsets):  # on CUDA rows that do not count have no cell
         return outputs, route.cells
     return mask_rows(outputs, route.cells, routing.rows)
 
 
 def normalise_routing(routing: Routing, k: int) -> Routing:
-    """Returns the routing, without tables for one cell, and on CUDA with cell -1 for samples that do not count."""
+    """Returns the routing, without tables if there is one cell; on CUDA, uncounted samples have cell -1."""
     cells, rows = routing.cells, routing.rows
     if rows is not None and cells is not None and native.on_cuda(cells):
         return routing._replace(cells=torch.where(torch.arange(cells.shape[0], device=cells.device) < rows, cells, -1))
@@ -92,9 +92,9 @@ class Route(NamedTuple):
 
 
 def find(positions: Tensor, routing: Routing, k: int, caller: str) -> Route:
-    """Returns the cells of samples, and their order by cell: None if there is one cell.
+    """Returns the cells of samples, and their order by cell, which is None if there is one cell.
 
-    ``caller`` is the op that errors name.
+    ``caller`` is the name of the op for error messages.
     """
     centres, child_offsets, child, depth, given_cells, coords, rows, _, index = routing
     if coords is not None and centres is not None and child is None and rows is None and not _is_observed(positions):
@@ -122,7 +122,7 @@ def _in_two_calls(coords: Tensor, centres: Tensor, index: Tensor | None, k: int)
 
 
 class _Samples(NamedTuple):
-    """The samples, the fields of `Routing`, the number of cells, and the op that errors name."""
+    """The samples, the fields of `Routing`, the number of cells, and the name of the op for error messages."""
 
     positions: Tensor
     centres: Tensor | None
@@ -147,7 +147,7 @@ def _memory(arguments: _Samples) -> tuple[Tensor, Tensor, Tensor]:
 
 @custom_op("routed_program_native", _memory)
 def locate_and_sort(arguments: _Samples, results: tuple[Tensor, Tensor, Tensor]) -> None:
-    """Fills the cells of samples, their order by cell and the offsets."""
+    """Writes the cells of samples, their order by cell and the offsets."""
     positions, centres, child_offsets, child, depth, cells, coords, rows, index, _, caller = arguments
     new_cells, order, offsets = results
     if cells is None and centres is None:  # one cell
@@ -178,4 +178,4 @@ def _nothing(ctx: Any, *gradients: None) -> tuple[Any, ...]:
     return (None,) * len(_Samples._fields)
 
 
-locate_and_sort.register_autograd(_nothing, setup_context=_setup)  # torch.func needs it for integers, too
+locate_and_sort.register_autograd(_nothing, setup_context=_setup)  # torch.func needs one for integers, too

@@ -57,7 +57,7 @@ def find_cells(op: str, routing: Routing, k: int, backend: str) -> Tensor | None
 
 
 def mask_rows(outputs: Sequence[Tensor], cells: Tensor, rows: Tensor | None) -> tuple[list[Tensor], Tensor]:
-    """Masks outputs with 0 and cells with -1 (no cell) from row ``rows`` on: int32 [1], or None to mask no row."""
+    """Sets outputs to 0 and cells to -1 (no cell) from row ``rows`` (int32 [1]) on; None changes nothing."""
     if rows is None:
         return list(outputs), cells
     beyond = torch.arange(cells.shape[0], device=cells.device) >= rows

@@ -39,15 +39,15 @@ class Routing(NamedTuple):
     centre_index: Tensor | None = None
 
     def to_check(self, op: str) -> Others:
-        """Returns the rules of the tensors and the tensors, after checking their combination."""
+        """Checks the combination of arguments, and returns the rules of the tensors and the tensors."""
         if self.centres is None:
             for name, tensor in (("child_offsets", self.child_offsets), ("child", self.child)):
                 if tensor is not None:
                     raise ValueError(f"{op}: {name} must come with centres, got no centres")
             if self.coords is not None:
-                raise ValueError(f"{op}: coords must come with centres, got none to compare them with")
+                raise ValueError(f"{op}: coords require centres, got no centres")
             if self.centre_index is not None:
-                raise ValueError(f"{op}: centre_index must come with centres, got none that it is of")
+                raise ValueError(f"{op}: centre_index requires centres, got no centres")
         else:
             if self.cells is not None:
                 raise ValueError(f"{op}: centres must be None where cells are given, got both")
@@ -67,9 +67,9 @@ class Routing(NamedTuple):
         """Returns the routing with the coordinates of the samples, in a common dtype with the centres.
 
         Args:
-            op: the operation that errors name.
+            op: the name of the operation for error messages.
             positions: [n, p]; the first three columns are the coordinates, unless ``coords`` are given.
-            sizes: the sizes that the letters of the checked shapes stand for.
+            sizes: the size of each letter in the checked shapes.
         """
         if self.centres is None:
             if self.cells is None and sizes["k"] != 1:
@@ -80,7 +80,7 @@ class Routing(NamedTuple):
             raise ValueError(f"{op}: centres must hold at least one centre of one diagram, got {count}")
         p = positions.shape[1]
         if self.coords is None and p < 3:
-            raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {p}")
+            raise ValueError(f"{op}: coords must be given for positions with fewer than 3 features, got {p}")
         coords, centres = to_common_dtype(positions[:, :3] if self.coords is None else self.coords, self.centres)
         index = self.centre_index if centres is self.centres else None
         return self._replace(coords=coords, centres=centres, centre_index=index)

@@ -1,4 +1,4 @@
-"""A loss on unseen rays whose neighbouring depths do not lie on a plane, with its gradient. r rays, m samples."""
+"""A loss on the curvature of unseen rays' disparities, with its gradient. r rays, m samples."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ def smooth_depth_gradient(
 
     The last rays are the triples of `unseen_rays`: ray ``r - 3 triples + i`` lies between rays ``r - 2 triples + i``
     and ``r - triples + i``. The disparity D of a ray is the sum of its weights divided by their depths; the remaining
-    light comes from ``far``. Along a line of an image, the disparity of a plane is linear. The loss is ``factor`` times
-    the mean over the triples of the robust error of ``log((D' + D'') / 2 D)``, where D belongs to the middle ray. The
-    robust error is as in `render_loss`, with scale 0.05, so that edges of surfaces count less. (Distances along rays
-    differ from depths by the cosine of the angle, by 0.005 for 0.1 radians.) The gradient goes to the last column of
-    ``gradient``. The derivative of D by the density of a sample is ``delta (T / depth - S)``, with the transmittance T
-    and the disparity S of everything behind the sample. The loss favours smooth surfaces over fog that only fits single
-    views (after Niemeyer et al. 2022, "RegNeRF", section 4.1, where neighbours should have equal depths). Not
-    differentiable.
+    transmittance counts as a weight at depth ``far``. Along a line of an image, the disparity of a plane is linear. The
+    loss is ``factor`` times the mean over the triples of the robust error of ``log((D' + D'') / 2 D)``, where D belongs
+    to the middle ray. The robust error is as in `render_loss`, with scale 0.05, so that edges of surfaces count less.
+    (Distances along rays differ from depths by the cosine of the angle between rays: by 0.5 % for 0.1 radians.) The
+    gradient goes to the last column of ``gradient``. The derivative of D by the density of a sample is
+    ``delta (T / depth - S)``, where T is the transmittance behind the sample and S the disparity of everything behind
+    the sample. The loss favours smooth surfaces over fog that only fits single views (after Niemeyer et al. 2022,
+    "RegNeRF", section 4.1, whose loss favours equal depths of neighbours). Not differentiable.
 
     Args:
-        loss: the loss, to be added to.
-        gradient: the gradient to the networks' outputs, contiguous, to be added to.
+        loss: the loss, updated in place.
+        gradient: the gradient to the networks' outputs, contiguous, updated in place.
         density: the densities of the samples.
         depths: the distances of the samples along the rays, > 0.
         deltas: the lengths of the samples' ray segments.
@@ -66,23 +66,24 @@ def smooth_depth_gradient(
         far: the far ends of the rays, > 0.
         triples: the number of triples, at most r / 3.
         factor: the factor on the mean.
-        hidden: a share of the light; samples that receive no more have no gradient, as for `render_loss`.
+        hidden: the transmittance up to which a sample counts as hidden. Hidden samples have no gradient, as for
+            `render_loss`.
         density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.
-        activated: whether the gradient is to the density itself.
+        activated: whether the gradient is with respect to the density itself.
 
     Raises:
         ValueError: tensors that are not contiguous; more triples than a third of the rays; ``density_scale`` with
-            ``activated``, or neither; on the CPU offsets that decrease or exceed m.
+            ``activated``, or neither; offsets that decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch
         >>> from voronerf.ops import smooth_depth_gradient
         >>> walls, deltas, offsets = torch.ones(3), torch.full((3,), 0.1), torch.arange(4, dtype=torch.int32)
-        >>> for depths in ([1.0, 1.25, 1 / 1.2], [1.0, 2.0, 2.0]):  # a tilted wall; one before another
+        >>> for depths in ([1.0, 1.25, 1 / 1.2], [1.0, 2.0, 2.0]):  # a tilted wall; a wall in front of another
         ...     given = torch.full((3,), 1e3), torch.tensor(depths), deltas, walls, offsets, torch.full((3,), 4.0)
         ...     loss, gradient = torch.tensor(0.0), torch.zeros(3, 4)
         ...     smooth_depth_gradient(loss, gradient, *given, triples=1, factor=1.0, activated=True)
-        ...     print(f"{float(loss):.3f}")  # the second about 0.1 log(2)
+        ...     print(f"{float(loss):.3f}")  # the second loss is about 0.1 log(2)
         0.000
         0.064
     """

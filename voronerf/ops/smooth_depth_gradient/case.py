@@ -24,7 +24,7 @@ CASE = Case(
     _make,
     {"": {}, "activated": {"activated": True}, "hidden": {"hidden": 0.5}},
     refused={
-        "ray_offsets must rise from 0 or more to at most the number of samples, 6, got 1 for ray 2": {
+        "ray_offsets must ascend within 0 to 6 (the number of samples), got 1 for ray 2": {
             "ray_offsets": torch.tensor([0, 2, 1, 5, 5, 5, 5, 5], dtype=torch.int32)
         },
         "triples must be at most a third of the 7 rays, got 3": {"triples": 3},

@@ -1,4 +1,4 @@
-"""A loss on unseen rays whose neighbouring depths do not lie on a plane, with its gradient. r rays, m samples."""
+"""A loss, and its gradient, for depths of neighbouring unseen rays that do not lie on a plane. r rays, m samples."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from voronerf.ops.composite.reference import check_ray_offsets, composite, optical_depth, packed_light, saveable
 from voronerf.ops.render_loss.reference import robust_error
 
-#: The scale of the logarithms beyond which the loss is linear, which happens at edges of surfaces.
+#: The scale of the logarithms beyond which the loss is linear, as at edges of surfaces.
 EDGE = 0.05
 
 

@@ -1,4 +1,4 @@
-"""A loss on rays whose light does not come from a known point, with its gradient. s of r rays, m samples (packed)."""
+"""A loss on rays that end at known points (sparse depth), with its gradient. r rays, s with points, m samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from voronerf.ops.render_loss.reference import scaled
 def _prepare(arguments: Any) -> Any:
     if arguments.s > arguments.r:
         raise ValueError(
-            f"sparse_depth_gradient: distances must be of at most the {arguments.r} rays, got {arguments.s}"
+            f"sparse_depth_gradient: distances must have at most {arguments.r} entries (the number of rays), "
+            f"got {arguments.s}"
         )
     return scaled("sparse_depth_gradient", arguments)
 
@@ -44,17 +45,18 @@ def sparse_depth_gradient(
 ) -> None:
     """Adds a loss on rays that end at known points, and its gradient, in place.
 
-    A sample is near the point if it is at most 0.03 times the distance of the point, plus the sample's length, away
-    from it. The loss of a ray is ``-log`` of the sum of the weights of these samples, at least 0.001: the likelihood of
-    Deng et al. 2022, "Depth-supervised NeRF", with a box in place of their Gaussian. Fog in front of the point reduces
-    this sum. The derivative of the sum by the density of a sample is ``delta (T near - S)``, with the transmittance T
-    behind the sample, ``near`` 1 if the sample is near and else 0, and S the part of the sum behind the sample.
-    ``factor`` times the mean of the s losses is added to ``loss``, and its gradient to the last column of ``gradient``.
-    If the weight of a sample near the point is NaN, the loss is NaN, and the ray has no gradient. Not differentiable.
+    A sample is near the point if its distance from the point is at most 0.03 times the distance of the point, plus the
+    sample's length. The loss of a ray is ``-log`` of the sum of the weights of these samples, clamped to at least
+    0.001. It is the likelihood of Deng et al. 2022, "Depth-supervised NeRF", with a box in place of their Gaussian. Fog
+    in front of the point reduces this sum. The derivative of the sum by the density of a sample is
+    ``delta (T near - S)``, where T is the transmittance behind the sample, S the part of the sum that is due to samples
+    behind it, and ``near`` is 1 if the sample is near the point, otherwise 0. The mean of the s losses times ``factor``
+    is added to ``loss``, and its gradient to the last column of ``gradient``. If the weight of a sample near the point
+    is NaN, the loss is NaN, and the ray has no gradient. Not differentiable.
 
     Args:
-        loss: the loss, to be added to.
-        gradient: the gradient to the networks' outputs, contiguous, to be added to.
+        loss: the loss, updated in place.
+        gradient: the gradient to the networks' outputs, contiguous, updated in place.
         density: the densities of the samples.
         depths: the distances of the samples along the rays.
         deltas: the lengths of the samples' ray segments.
@@ -63,11 +65,11 @@ def sparse_depth_gradient(
         distances: the distance of the point on each of the first s rays, s <= r; NaN for no point.
         factor: the factor on the mean of the losses.
         density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.
-        activated: whether the gradient is to the density itself.
+        activated: whether the gradient is with respect to the density itself.
 
     Raises:
         ValueError: a gradient that is not contiguous; more distances than rays; ``density_scale`` with ``activated``,
-            or neither; on the CPU offsets that decrease or exceed m.
+            or neither; offsets that decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch
@@ -77,6 +79,6 @@ def sparse_depth_gradient(
         >>> given = torch.tensor([6.93, 1e3]), depths, deltas, weights, offsets, torch.tensor([2.0])
         >>> loss, gradient = torch.tensor(0.0), torch.zeros(2, 4)
         >>> sparse_depth_gradient(loss, gradient, *given, factor=1.0, activated=True)
-        >>> loss, gradient[:, 3].abs().round(decimals=3)  # less fog is better
+        >>> loss, gradient[:, 3].abs().round(decimals=3)  # less fog reduces the loss
         (tensor(0.6931), tensor([0.1000, 0.0000]))
     """

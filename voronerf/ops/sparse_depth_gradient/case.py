@@ -22,10 +22,12 @@ CASE = Case(
     _make,
     {"": {}, "activated": {"activated": True}},
     refused={
-        "ray_offsets must rise from 0 or more to at most the number of samples, 6, got 1 for ray 2": {
+        "ray_offsets must ascend within 0 to 6 (the number of samples), got 1 for ray 2": {
             "ray_offsets": torch.tensor([0, 2, 1, 5], dtype=torch.int32)
         },
-        "distances must be of at most the 2 rays, got 3": {"ray_offsets": torch.tensor([0, 2, 4], dtype=torch.int32)},
+        "distances must have at most 2 entries (the number of rays), got 3": {
+            "ray_offsets": torch.tensor([0, 2, 4], dtype=torch.int32)
+        },
         "density_scale must be given unless the values are activated, got None": {"density_scale": None},
     },
     in_place=True,

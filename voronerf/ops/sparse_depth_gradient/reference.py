@@ -1,4 +1,4 @@
-"""A loss on rays whose light does not come from a known point, with its gradient. s of r rays, m samples (packed)."""
+"""A loss on rays whose light does not come from a known point, with its gradient. r rays, s with points, m samples."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from voronerf.ops.composite.reference import check_ray_offsets, composite, saveable
 
-#: The largest distance of a sparse model's point from the surface, as a share of its distance from the camera.
+#: The largest distance of a sparse model's point from the surface, relative to the point's distance from the camera.
 NEARBY = 0.03
 
 

@@ -22,16 +22,16 @@ def spherical_harmonics(
     """Returns the real spherical harmonics of bands 0 to degree - 1, an orthonormal basis of functions on the sphere.
 
     Order, signs and constants agree with tiny-cuda-nn's ``SphericalHarmonics`` and torch-ngp's ``SHEncoder`` (Müller et
-    al. 2022 encode view directions by them): band after band, orders -l to l, with the Condon-Shortley phase. As in
+    al. 2022 encode view directions with them): band after band, orders -l to l, with the Condon-Shortley phase. As in
     torch-ngp the input is the direction itself; tiny-cuda-nn takes ``(direction + 1) / 2`` instead. The result is a
-    polynomial in x, y and z, for vectors of any length. Gradients of every order.
+    polynomial in x, y and z, for vectors of any length. It has gradients of every order.
 
     Args:
         directions: unit vectors, n < 2**31.
         degree: the number of bands, 1 to 4.
 
     Returns:
-        [n, degree**2] in the dtype of the directions: 1, 4, 9 or 16 values, computed in float32 at least.
+        [n, degree**2] in the dtype of the directions: 1, 4, 9 or 16 values, computed with at least float32 precision.
 
     Examples:
         >>> import torch

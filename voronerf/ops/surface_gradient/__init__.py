@@ -1,4 +1,4 @@
-"""Losses on rays whose light does not come from one surface, with their gradient. r rays, m samples (packed)."""
+"""Two regularisers, a distortion loss and an orientation loss, with their gradient. r rays, m samples (packed)."""
 
 from __future__ import annotations
 
@@ -41,25 +41,26 @@ def surface_gradient(
     activated: bool = False,
     backend: str = "auto",
 ) -> None:
-    """Adds two losses of rays whose light does not come from one surface, and their gradient, in place.
+    """Adds two regularisers, a distortion loss and an orientation loss, and their gradient, in place.
 
-    ``distortion`` and ``orientation`` times the means of these losses over the r rays are added to ``loss``, and their
-    gradient to the last column of ``gradient``. For samples with weights w and opacities a:
+    The means of these losses over the r rays, times ``distortion`` and ``orientation``, are added to ``loss``, and
+    their gradient to the last column of ``gradient``. For samples with weights w and opacities a:
 
     - The distortion ``sum over i, j of w_i w_j |s_i - s_j| + sum of w_i^2 l_i / 3`` (Barron et al. 2022, "Mip-NeRF
-      360", equation 15) is least if all light comes from one depth. Normalised depths go from 0 at ``near`` to 1 at
+      360", equation 15) is smallest if all light comes from one depth. Normalised depths go from 0 at ``near`` to 1 at
       ``far`` in equal steps of disparity, ``s = (1 / near - 1 / depth) / (1 / near - 1 / far)``, and a sample has the
       length ``l = delta / depth^2 / (1 / near - 1 / far)``. The background does not count.
     - The orientation loss ``sum of w_i max(0, a_i - a_{i+1})^2`` (after Verbin et al. 2022, "Ref-NeRF", equation 11,
       with the decrease of the opacity along the ray in place of the normal) is 0 if the opacity does not decrease from
       a visible sample to the next. The next sample must be adjacent: nearer than the sum of both lengths.
 
-    With the transmittance T behind a sample and the gradient v to the weights, the derivative of a loss through the
-    weights is ``delta (T v_i - sum over j > i of w_j v_j)``. Not differentiable.
+    Let T be the transmittance behind sample i, and v_i the derivative of a loss with respect to the weight w_i. The
+    weights contribute ``delta (T v_i - sum over j > i of w_j v_j)`` to the derivative of the loss with respect to the
+    density of sample i. Not differentiable.
 
     Args:
-        loss: the loss, to be added to.
-        gradient: the gradient to the networks' outputs, contiguous, to be added to.
+        loss: the loss, updated in place.
+        gradient: the gradient to the networks' outputs, contiguous, updated in place.
         density: the densities of the samples.
         depths: the distances of the samples along the rays, > 0 and ascending.
         deltas: the lengths of the samples' ray segments.
@@ -69,20 +70,21 @@ def surface_gradient(
         far: the far ends of the rays, beyond ``near``.
         distortion: the factor on the mean of the distortion.
         orientation: the factor on the mean of the orientation loss.
-        hidden: a share of the light; samples that receive no more do not count, and have no gradient.
+        hidden: the transmittance up to which a sample counts as hidden. Both losses ignore hidden samples, which have
+            no gradient.
         density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.
-        activated: whether the gradient is to the density itself.
+        activated: whether the gradient is with respect to the density itself.
 
     Raises:
-        ValueError: a gradient that is not contiguous; ``density_scale`` with ``activated``, or neither; on the CPU
-            offsets that decrease or exceed m.
+        ValueError: a gradient that is not contiguous; ``density_scale`` with ``activated``, or neither; offsets that
+            decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch
         >>> from voronerf.ops import surface_gradient
         >>> depths, deltas, offsets = torch.tensor([1.25, 2.5]), torch.full((2,), 0.1), torch.tensor([0, 2]).int()
         >>> ends = torch.tensor([1.0]), torch.tensor([5.0])
-        >>> for light in (0.0, 0.5, 1.0):  # of a veil before a wall
+        >>> for light in (0.0, 0.5, 1.0):  # from a veil in front of a wall
         ...     weights = torch.tensor([light, 1 - light])
         ...     given = torch.tensor([6.93, 1e3]), depths, deltas, weights, offsets, *ends
         ...     loss, gradient = torch.tensor(0.0), torch.zeros(2, 4)

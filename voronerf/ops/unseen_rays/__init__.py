@@ -40,10 +40,10 @@ def unseen_rays(
 ) -> None:
     """Replaces the last rays of a batch by triples of neighbouring rays from positions without a camera, in place.
 
-    Ray ``r - 3 triples + i`` keeps its direction d, and its origin moves at random, along each axis by at most
-    ``move``. Rays ``r - 2 triples + i`` and ``r - triples + i`` get the same origin and the directions ``d + t`` and
-    ``d - t``, normalised, with t orthogonal to d. Along each axis t is at most ``tilt`` times ``2 ** -4u``, with a
-    random number u in 0 to 1: the angles to the neighbours are spread evenly over four octaves. Not differentiable.
+    Ray ``r - 3 triples + i`` keeps its direction d, and its origin moves randomly, by at most ``move`` along each axis.
+    Rays ``r - 2 triples + i`` and ``r - triples + i`` get the same origin and the directions ``d + t`` and ``d - t``,
+    normalised, with t orthogonal to d. Along each axis t is at most ``tilt`` times ``2 ** -4u``, with a random number u
+    in 0 to 1, so that the angles to the neighbours are distributed evenly over four octaves. Not differentiable.
 
     Args:
         origins: the origins of the rays, contiguous.

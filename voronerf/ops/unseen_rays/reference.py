@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf.ops.march_rays.reference import hashed_uniforms
 
-#: The hashes per ray that `draw_pixels` makes from the same seed, and the octaves of angles between neighbours.
+#: The number of hashes per ray that `draw_pixels` makes from the same seed; the octaves of the neighbours' angles.
 BEFORE, OCTAVES = 5, 4.0
 
 

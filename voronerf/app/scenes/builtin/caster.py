@@ -1,8 +1,8 @@
-"""The first solid on each of many rays, of which few solids are candidates.
+"""Ray casting: finds the first solid on each ray, among a few candidates per ray.
 
-r rays, m solids, e candidates: a solid and a range of rays that might meet it. Rays of a picture are in the order of
-its pixels, and the candidates are the rows of the rectangle around a solid's picture. Rays to the lamp are parallel:
-they are sorted into the squares of a grid across it. Candidates only leave out what could not be hit.
+Sizes: r rays, m solids, e candidates. A candidate is a solid and a range of consecutive rays that might hit it. Camera
+rays lie in pixel order; their candidates are the rows of the bounding rectangle of each projected solid. Shadow rays
+are parallel; they are sorted into the squares of a grid perpendicular to the light. The candidates include every hit.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from voronerf.app.scenes.builtin.solids import Array, Solid, turned
 
-PAIRS = 1 << 15  # of a ray and a solid tested at a time, so that their arrays stay in the cache
-SHARE = 8  # rays in a square of the grid
-CLIP = 1e-4  # distance of the plane in front of a camera behind which nothing is projected
-SLACK = 5e-4  # what float32 may miss a solid by, as a share of how far it is
+PAIRS = 1 << 15  # ray-solid pairs per chunk; its arrays fit in the cache
+SHARE = 8  # average number of rays in a square of the grid
+CLIP = 1e-4  # distance of the near clipping plane from the camera
+SLACK = 5e-4  # tolerance for float32 rounding, relative to the distance
 
 Rows = NDArray[np.int64]
 Numbers = NDArray[np.float64]
@@ -28,10 +28,10 @@ _EDGES = np.array([(i, i + step) for step in (1, 2, 4) for i in range(8) if not 
 
 
 class Caster:
-    """Finds the first of some solids on rays.
+    """A ray caster: finds the first solid on each ray.
 
     Args:
-        solids: each known by its number in this sequence.
+        solids: the solids; the number of a solid is its index in this sequence.
         light: unit vector [3] towards the lamp.
     """
 
@@ -53,21 +53,22 @@ class Caster:
     def first(
         self, origins: Array, directions: Array, solid: Rows, near: Array, start: Rows, end: Rows
     ) -> tuple[Array, Rows]:
-        """The first solid on each ray; of several at one distance, the one with the lowest number.
+        """Returns the first solid on each ray; at equal distances, the solid with the lowest number.
 
         Args:
-            origins: [3, r], or [3, 1] for all rays.
-            directions: [3, r] unit, or [3, 1] for all rays.
-            solid: candidates [e], the number of the solid.
-            near: [e], at most its distance. A candidate counts only for rays that have found nothing nearer.
-            start: [e], its first ray.
-            end: [e], the ray after its last one.
+            origins: ray origins [3, r], or [3, 1] for all rays.
+            directions: unit ray directions [3, r], or [3, 1] for all rays.
+            solid: solid number of each candidate [e].
+            near: lower bound on the distance to each candidate [e]. Rays with a nearer hit skip the candidate.
+            start: first ray of each candidate [e].
+            end: end of each candidate's range of rays [e], exclusive.
 
         Returns:
             (distance [r], infinite for a miss; number of the solid [r], 0 for a miss).
         """
         count = np.broadcast_shapes(origins.shape, directions.shape)[1]
-        # distance and number as one key: the bits of positive floats are in the order of their values
+        # In a key, the bits of the distance are above the solid's number; positive floats sort in the order of their
+        # bits.
         keys = np.full(count, MISS)
         depth = keys.view(np.float32)[1::2]
         order = np.argsort(near, kind="stable")
@@ -85,13 +86,13 @@ class Caster:
         return depth, (keys & np.uint64(2**32 - 1)).astype(np.int64)
 
     def _test(self, origins: Array, directions: Array, rays: Rows, numbers: Rows, keys: NDArray[np.uint64]) -> None:
-        """Tests pairs of a ray and a solid, and notes what is nearer than what was found before."""
+        """Intersects pairs of a ray and a solid, and lowers `keys` [r] in place for nearer hits."""
         kinds = self._kind[numbers]
         for kind, (solid, is_turned) in enumerate(self._kinds):
-            mine = (kinds == kind).nonzero()[0]
-            if not len(mine):
+            selected = (kinds == kind).nonzero()[0]
+            if not len(selected):
                 continue
-            ray, number = rays[mine], numbers[mine]
+            ray, number = rays[selected], numbers[selected]
             (ox, oy, oz), (dx, dy, dz) = (v.take(ray, 1) if v.shape[1] > 1 else v for v in (origins, directions))
             cx, cy, cz = self._centres.take(number, 1)
             away, along = (ox - cx, oy - cy, oz - cz), (dx, dy, dz)
@@ -106,19 +107,22 @@ class Caster:
     def seen(
         self, poses: Numbers, scale: Numbers, size: tuple[int, int], origins: Array, directions: Array
     ) -> tuple[Array, Rows]:
-        """The first solid on the rays of pictures, one after another, row by row.
+        """Returns the first solid on each camera ray of v pictures, in row-major order.
 
         Args:
-            poses: [v, 4, 4], camera to world.
-            scale: [v, 3], of each picture the focal length and the column and the row of its middle, in rays.
-            size: width and height of each picture.
-            origins: [3, v * h * w].
-            directions: [3, v * h * w].
+            poses: camera-to-world matrices [v, 4, 4].
+            scale: focal length, principal column and principal row of each picture [v, 3], in rays.
+            size: width w and height h of each picture, in rays.
+            origins: ray origins [3, v * h * w].
+            directions: unit ray directions [3, v * h * w].
+
+        Returns:
+            (distance [v * h * w], infinite for a miss; number of the solid [v * h * w], 0 for a miss).
         """
         width, height = size
         local = (self._corners - poses[:, None, None, :3, 3]) @ poses[:, None, :3, :3]  # [v, m, 8, 3]
         tails, heads = local[:, :, _EDGES[:, 0]], local[:, :, _EDGES[:, 1]]
-        # an edge that goes behind the camera ends at the plane in front of it
+        # clips the edges of the bounding boxes at the near plane
         share = (-CLIP - tails[..., 2:]) / np.where(
             heads[..., 2:] == tails[..., 2:], 1, heads[..., 2:] - tails[..., 2:]
         )
@@ -136,12 +140,14 @@ class Caster:
         view, solid = ((bounds[1] > bounds[0]) & (bounds[3] > bounds[2])).nonzero()
         x0, x1, y0, y1 = (bound[view, solid].astype(np.int64) for bound in bounds)
         near = ((1 - SLACK) * np.where(shown, depth, np.inf).min(2))[view, solid].astype(np.float32)
-        which, row = _rows(y1 - y0)
-        start = ((view * height + y0)[which] + row) * width
-        return self.first(origins, directions, solid[which], near[which], start + x0[which], start + x1[which])
+        rectangle, row = _rows(y1 - y0)
+        start = ((view * height + y0)[rectangle] + row) * width
+        return self.first(
+            origins, directions, solid[rectangle], near[rectangle], start + x0[rectangle], start + x1[rectangle]
+        )
 
     def is_lit(self, origins: Array) -> NDArray[np.bool_]:
-        """Whether rays from [3, r] to the lamp meet no solid, [r]."""
+        """Returns whether no solid blocks the ray from each origin [3, r] to the lamp, [r]."""
         place = self._across.T @ origins
         if not place.size:
             return np.ones(0, dtype=np.bool_)
@@ -153,11 +159,11 @@ class Caster:
         ends = np.append(0, np.bincount(square, minlength=side * side).cumsum())
         x0, y0 = ((self._shadows[0] - low[:, None]) // width).clip(0, side - 1).astype(np.int64)
         x1, y1 = ((self._shadows[1] - low[:, None]) // width).clip(-1, side - 1).astype(np.int64)
-        which, step = _rows(np.maximum(y1 - y0 + 1, 0))
-        first = (y0[which] + step) * side
-        start, end = ends[first + x0[which]], ends[np.maximum(first + x1[which] + 1, first + x0[which])]
-        solid = which[end > start]
-        near = np.full(len(solid), np.finfo(np.float32).max)  # a ray that has met any solid is done
+        rectangle, step = _rows(np.maximum(y1 - y0 + 1, 0))
+        first = (y0[rectangle] + step) * side
+        start, end = ends[first + x0[rectangle]], ends[np.maximum(first + x1[rectangle] + 1, first + x0[rectangle])]
+        solid = rectangle[end > start]
+        near = np.full(len(solid), np.finfo(np.float32).max)  # rays with a hit skip all further candidates
         depth, _ = self.first(origins[:, order], self.light[:, None], solid, near, start[end > start], end[end > start])
         lit = np.empty(len(order), dtype=np.bool_)
         lit[order] = np.isinf(depth)
@@ -165,6 +171,6 @@ class Caster:
 
 
 def _rows(heights: Rows) -> tuple[Rows, Rows]:
-    """For each row of rectangles of such heights the number of the rectangle, and of the row in it."""
-    which = np.repeat(np.arange(len(heights)), heights)
-    return which, np.arange(len(which)) - np.repeat(np.cumsum(heights) - heights, heights)
+    """Enumerates the rows of rectangles: returns (number of the rectangle, row within it), one entry per row."""
+    rectangle = np.repeat(np.arange(len(heights)), heights)
+    return rectangle, np.arange(len(rectangle)) - np.repeat(np.cumsum(heights) - heights, heights)

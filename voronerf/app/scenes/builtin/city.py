@@ -1,7 +1,7 @@
-"""The built-in city: blocks x blocks of streets, for scenes that grow while their detail stays as fine.
+"""The built-in city: a test scene of any number of blocks at constant detail.
 
-Facades with windows, ledges and bricks, shops, trees, lamps and parked cars; some 90 solids on each block, which is one
-scene unit wide. Each block adds the same number of views from its streets and from above, on white.
+A block is one scene unit wide and holds about 90 solids: buildings with detailed facades, trees, lamps and parked cars.
+Each block adds the same number of views, half of them from its streets and half from above. The background is white.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.scene import Scene, Split
 from voronerf.nerf.cameras import Cameras, look_at
 
-TRAIN_VIEWS, TEST_VIEWS = 40, 8  # of a block; half of them from the street
-MOST = 32  # blocks a side
-FORMULA = 1  # of what is in the city: raised by a change, so that no store has the old one
+TRAIN_VIEWS, TEST_VIEWS = 40, 8  # views per block; half of them are from the street
+MOST = 32  # maximum number of blocks on a side
+FORMULA = 1  # version of the city's content; increase it with each change to invalidate stored images
 NEAR = 0.02
 STREET_ANGLE, ABOVE_ANGLE = 1.2, 0.75  # fields of view, radians
 
@@ -36,19 +36,19 @@ def city_scene(
     test_views: int = TEST_VIEWS,
     images: str = "memory",
 ) -> Scene:
-    """Computes the city.
+    """Computes the built-in city.
 
     Args:
-        size: of the square images, pixels.
-        blocks: on each side, or along x and along y, 1 to 32.
-        train_views: of each block, every other one from its streets and the rest from above.
-        test_views: of each block, at other places than the training views.
-        images: "memory"; "cached", which also keeps them in a store of the cache, where a next call finds them; or
-            "disk", which maps them from there.
+        size: width and height of the images, in pixels.
+        blocks: number of blocks on each side, or along x and along y, 1 to 32.
+        train_views: number of training views per block, alternately from its streets and from above.
+        test_views: number of test views per block, at other positions than the training views.
+        images: "memory" holds the images in memory; "cached" also stores them in the cache directory for later calls;
+            "disk" stores them there and memory-maps them.
 
     Raises:
-        ValueError: a size or number of views below 1, too many blocks, or another place for the images.
-        SceneError: the store cannot be written.
+        ValueError: `size` or a number of views is below 1, or `blocks` or `images` is invalid.
+        SceneError: the images cannot be stored.
 
     Examples:
         >>> from voronerf.app.scenes import city_scene
@@ -65,13 +65,13 @@ def city_scene(
     if images not in ("memory", "cached", "disk"):
         raise ValueError(f"city_scene: images must be memory, cached or disk, got {images!r:.60}")
     solids, name = city(sides), f"builtin-city-{sides[0]}x{sides[1]}"
-    made_of = sides[0] if sides[0] == sides[1] else list(sides)
+    sides_key = sides[0] if sides[0] == sides[1] else list(sides)
     caster = Caster(solids, LIGHT)
 
     def views(part: str, seed: int, count: int) -> Split:
         cameras = city_cameras(size, sides, count, seed)
-        kept = keep_in_store(f"{name}-{part}", [made_of, size, count, seed], FORMULA, images)
-        return replace(render_views(cameras, part, caster, kept), on_disk=images == "disk")
+        keep = keep_in_store(f"{name}-{part}", [sides_key, size, count, seed], FORMULA, images)
+        return replace(render_views(cameras, part, caster, keep), on_disk=images == "disk")
 
     train, test = views("train", 0, train_views), views("test", 1, test_views)
     box, far = torch.from_numpy(bounds(solids)), math.hypot(*sides) + 3
@@ -79,7 +79,7 @@ def city_scene(
 
 
 def city_of(size: int, text: str, images: str) -> Scene:
-    """The city of blocks such as "4x4" or "4x8"; in the cache if it is larger than one block."""
+    """Computes a city of `text` blocks, such as "4x8"; caches its images if there are several blocks."""
     match = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)
     if match is None or max(int(match[1]), int(match[2])) > MOST:
         raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {text!r:.60}")
@@ -88,7 +88,7 @@ def city_of(size: int, text: str, images: str) -> Scene:
 
 
 def city_cameras(size: int, blocks: tuple[int, int], views: int, seed: int) -> Cameras:
-    """The cameras of each block in turn: from the middle of a street beside it, and from above its roofs."""
+    """Returns the cameras block by block, alternately from the middle of a street and from above the roofs."""
     random = np.random.default_rng((seed, 2))
     eyes, aims, angles = [], [], []
     for row in range(blocks[1]):
@@ -107,7 +107,7 @@ def city_cameras(size: int, blocks: tuple[int, int], views: int, seed: int) -> C
 
 
 def _in_the_street(random: np.random.Generator) -> tuple[Array, Array]:
-    """Eye and aim on a side of a block: near the middle of the street, along it or at the houses."""
+    """Draws a camera position near the middle of a street and a target along the street or at the houses."""
     along, off, height = random.uniform(-0.5, 0.5), random.uniform(0.47, 0.5), random.uniform(0.05, 0.16)
     turn, climb = random.uniform(-0.1, 1.2), random.uniform(-0.12, 0.25)
     eye = np.array((along, -off, height))
@@ -117,7 +117,7 @@ def _in_the_street(random: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _above(random: np.random.Generator) -> tuple[Array, Array]:
-    """Eye and aim of a view from above all roofs."""
+    """Draws a camera position above all roofs and a target below it."""
     aim = np.array((*random.uniform(-0.4, 0.4, size=2), 0.12))
     azimuth, climb, distance = random.uniform(0, 2 * np.pi), random.uniform(0.5, 1.25), random.uniform(1.5, 2.3)
     away = np.array((np.cos(climb) * np.cos(azimuth), np.cos(climb) * np.sin(azimuth), np.sin(climb)))

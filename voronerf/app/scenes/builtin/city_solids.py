@@ -1,7 +1,7 @@
 """The solids of the built-in city: blocks of buildings, trees, lamps and cars along streets, and their textures.
 
-A block is a square of one scene unit, half a street on each side of it. What stands on it depends on its place in the
-city alone, not on the size of the city, so that a larger city holds the smaller ones.
+A block is a square of one scene unit, with half a street along each side. Its solids depend only on its column and row,
+so a larger city contains the smaller cities.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from voronerf.app.scenes.builtin.solids import Array, Box, Cylinder, Solid, Sphere, Texture, rotation
 from voronerf.app.scenes.builtin.textures import Colour, plain
 
-STREET = 0.12  # half of its width
+STREET = 0.12  # half the width of a street
 KERB = 0.008  # height of the pavement
-DEPTH = 0.03  # of the ground below the street
-FLOOR, BAY = 0.034, 0.04  # height of a storey and width of a window's part of the wall
+DEPTH = 0.03  # thickness of the ground
+FLOOR, BAY = 0.034, 0.04  # height of a storey and width of a bay, which holds one window
 TALLEST = 0.7
 WALLS: tuple[Colour, ...] = (
     (0.68, 0.36, 0.27),
@@ -40,19 +40,19 @@ CARS: tuple[Colour, ...] = (
 
 
 def _noise(x: Array, y: Array, salt: float) -> Array:
-    """A number in 0..1 for each pair of whole numbers, as shaders make them: [n], [n] -> [n]."""
+    """Hashes pairs of integers to pseudo-random numbers in 0..1 by a shader's sine hash: [n], [n] -> [n]."""
     wave = np.sin(x.astype(np.float64) * 12.9898 + y * 78.233 + salt * 37.719) * 43758.5453
     return (wave - np.floor(wave)).astype(np.float32)
 
 
 def _choose(colours: tuple[Colour, ...], share: Array) -> Array:
-    """Colours by a number in 0..1, [n] -> [n, 3]."""
+    """Picks a colour for each number in 0..1: [n] -> [n, 3]."""
     table = np.array(colours, dtype=np.float32)
     return table[np.minimum((share * len(colours)).astype(np.int64), len(colours) - 1)]
 
 
 def facade(half: tuple[float, float, float], wall: Colour, shop: Colour, salt: float) -> Texture:
-    """Walls of brick with a ledge and a row of windows in each storey, shops in the lowest, a tiled roof."""
+    """Returns a texture of brick walls with a ledge and windows in each storey, shops below and a tiled roof."""
     storeys, base = max(1, round(2 * half[2] / FLOOR)), np.array(wall, dtype=np.float32)
 
     def texture(points: Array, normals: Array) -> Array:
@@ -67,7 +67,7 @@ def facade(half: tuple[float, float, float], wall: Colour, shop: Colour, salt: f
         u, v = bay - column, storey - row
         key = _noise(column + 17 * face, row, salt)
 
-        # four courses of bricks a storey, with mortar between them
+        # four courses of bricks per storey, with mortar between them
         course = np.floor(4 * storey)
         brick = 3 * bay + 0.5 * (course % 2)
         tint = 0.86 + 0.28 * _noise(np.floor(brick) + 31 * face, course, salt)
@@ -100,14 +100,14 @@ def facade(half: tuple[float, float, float], wall: Colour, shop: Colour, salt: f
 
 
 def leaves(points: Array, normals: Array) -> Array:
-    """Patches of three greens."""
+    """Colours leaves: patches in three greens."""
     x, y, z = points.T
     patch = _noise(np.floor(x / 0.009) + 50 * np.floor(z / 0.009), np.floor(y / 0.009), 0.7)
     return _choose(((0.16, 0.36, 0.14), (0.28, 0.50, 0.18), (0.42, 0.60, 0.24)), patch)
 
 
 def ground(points: Array, normals: Array) -> Array:
-    """Asphalt with a dashed line in the middle of each street, which are at whole numbers, and crossings."""
+    """Colours the streets: asphalt, dashed centre lines at integer x and y, and crossings."""
     x, y, _ = points.T
     across, beside = np.abs(x - np.round(x)), np.abs(y - np.round(y))
     grain = _noise(np.floor(x / 0.012), np.floor(y / 0.012), 0.1)
@@ -121,7 +121,7 @@ def ground(points: Array, normals: Array) -> Array:
 
 
 def _paving(points: Array, normals: Array) -> Array:
-    """Slabs of the pavement, and grass in the middle of the block."""
+    """Colours the top of a block: paving slabs around a lawn."""
     x, y, _ = points.T
     slab = 0.58 + 0.14 * _noise(np.floor(x / 0.025), np.floor(y / 0.025), 0.3)
     colour = np.stack((slab, 0.97 * slab, 0.92 * slab), axis=-1)
@@ -133,7 +133,7 @@ def _paving(points: Array, normals: Array) -> Array:
 
 
 def _body(colour: Colour) -> Texture:
-    """A car's body: dark bumpers, lamps at the ends, a line along the side."""
+    """Returns the texture of a car's body, with dark lower parts and lamps at both ends."""
     paint = np.array(colour, dtype=np.float32)
 
     def texture(points: Array, normals: Array) -> Array:
@@ -148,10 +148,10 @@ def _body(colour: Colour) -> Texture:
 
 
 def _car(place: tuple[float, float], degrees: float, colour: Colour) -> list[Solid]:
-    """Body, cabin of glass and two axles of wheels."""
+    """Returns the solids of a car: a body, a cabin of glass, a roof and two axles with wheels."""
     x, y = place
     turn = rotation("z", degrees)
-    ahead = turn[:, 0] * 0.023  # from the middle to an axle
+    ahead = turn[:, 0] * 0.023  # from the car's middle to its front axle
     wheels = turn @ rotation("x", 90)
     parts: list[Solid] = [
         Box((x, y, 0.014), _body(colour), 0.5, 40, turn, half=(0.038, 0.017, 0.008)),
@@ -174,7 +174,7 @@ def _tree(x: float, y: float, size: float) -> list[Solid]:
 
 
 def _building(x: float, y: float, half: tuple[float, float], height: float, random: np.random.Generator) -> list[Solid]:
-    """A house, or a tower that steps back, with what stands on its roof."""
+    """Returns the solids of a building: one box, or two with a setback if it is tall, and its roof equipment."""
     wall = WALLS[int(random.integers(len(WALLS)))]
     shop, salt = SHOPS[int(random.integers(len(SHOPS)))], float(random.uniform(0, 10))
     parts: list[Solid] = []
@@ -196,11 +196,11 @@ def _building(x: float, y: float, half: tuple[float, float], height: float, rand
 
 
 def block(column: int, row: int) -> list[Solid]:
-    """What stands on one block, around the origin; streets run through x and y of -0.5 and 0.5."""
+    """Returns the solids of one block, centred at the origin; the streets' centre lines are at x, y = -0.5, 0.5."""
     random = np.random.default_rng((column, row))
     inner = 0.5 - STREET
     parts: list[Solid] = [Box((0, 0, KERB / 2), _paving, 0.05, 10, half=(inner, inner, KERB / 2))]
-    park = int(random.integers(12))  # of the four lots one or none is a park
+    park = int(random.integers(12))  # a value above 3 means no park
     for lot in range(4):
         x, y = 0.17 * (1 if lot % 2 else -1), 0.17 * (1 if lot // 2 else -1)
         if lot == park:
@@ -231,7 +231,7 @@ def block(column: int, row: int) -> list[Solid]:
 
 
 def city(blocks: tuple[int, int]) -> list[Solid]:
-    """The solids of so many blocks along x and y, the ground first and then block by block."""
+    """Returns the solids of `blocks` (along x, along y): first the ground, then block by block."""
     across, along = blocks[0] / 2, blocks[1] / 2
     corner = np.array((across, along, 0), dtype=np.float32)
     half = (across, along, DEPTH / 2)

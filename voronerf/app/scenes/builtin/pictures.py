@@ -1,4 +1,4 @@
-"""Pictures of solids and their light. All views are square, with an alpha channel."""
+"""Renders and shades pictures of solids. All pictures are square and have an alpha channel."""
 
 from __future__ import annotations
 
@@ -18,26 +18,29 @@ from voronerf.app.scenes.scene import Split
 from voronerf.app.scenes.store import Make, stored
 from voronerf.nerf.cameras import Cameras
 
-SUPERSAMPLES = 3  # on each side of a pixel
-LARGE = 200  # pixels a side, above which two are enough
+SUPERSAMPLES = 3  # samples along each side of a pixel, in images up to `LARGE`
+LARGE = 200  # width in pixels; wider images use two samples along each side of a pixel
 LIGHT = normalised(np.array(((0.45, -0.55, 0.70),), dtype=np.float32))[0]
 AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.46, 0.64, 0.50
-LIFT = 2e-3  # a shadow's ray starts this far above the surface
-BAND = 1 << 16  # rays at a time, so that their arrays stay in the cache
-BOXES = 1 << 13  # of solids that are projected at a time
+LIFT = 2e-3  # distance of a shadow ray's origin from the surface
+BAND = 1 << 16  # rays per chunk; its arrays fit in the cache
+BOXES = 1 << 13  # maximum number of bounding boxes projected per chunk
 
-# from a shape [c, h, w, 4] and a function that makes image i to the images
+# (shape [c, h, w, 4], function that computes image i) -> images
 Keep = Callable[[tuple[int, int, int, int], Make], Tensor]
 
 
 def bounds(solids: Sequence[Solid]) -> Array:
-    """The box that holds all solids, [2, 3]."""
+    """Returns the bounding box of all solids, [2, 3]."""
     boxes = np.stack([solid.bounds() for solid in solids])
     return np.stack((boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)))
 
 
 def keep_in_store(name: str, sources: Sequence[Any], formula: int, images: str) -> Keep | None:
-    """What keeps images in a store of the cache, and for "cached" copies them into memory; None for "memory"."""
+    """Returns a function that stores images in the cache directory, or None if `images` is "memory".
+
+    For "disk" the function returns the memory-mapped images, for "cached" a copy in memory.
+    """
 
     def keep(shape: tuple[int, int, int, int], make: Make) -> Tensor:
         computed = stored(name, sources, formula, shape, make, os.cpu_count() or 1)
@@ -47,29 +50,29 @@ def keep_in_store(name: str, sources: Sequence[Any], formula: int, images: str) 
 
 
 def render_views(cameras: Cameras, name: str, caster: Caster, keep: Keep | None = None) -> Split:
-    """All images, on all cores.
+    """Renders the images of all cameras on all cores.
 
     Args:
-        cameras: with one focal length each and the principal point in the middle.
-        name: of the split, which its images are named after.
-        caster: of the solids.
-        keep: gives the images [c, h, w, 4] of a function that makes one; default: all are made now.
+        cameras: the cameras, with equal focal lengths in x and y and the principal point at the centre.
+        name: name of the split; the images' names begin with it.
+        caster: ray caster with the solids.
+        keep: function that returns stored images [c, h, w, 4] and computes missing ones; by default, none are stored.
     """
     count, size = len(cameras), cameras.width
-    if keep is None:  # small views several at a time, since NumPy's calls take longer than a few rays
-        most = min(BAND // (size * SUPERSAMPLES) ** 2, BOXES // len(caster.solids), -(-count // (os.cpu_count() or 1)))
-        several = max(1, most)
+    if keep is None:  # batches small views to amortise the overhead of NumPy calls
+        limit = min(BAND // (size * SUPERSAMPLES) ** 2, BOXES // len(caster.solids), -(-count // (os.cpu_count() or 1)))
+        group_size = max(1, limit)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            groups = [range(i, min(i + several, count)) for i in range(0, count, several)]
-            made = pool.map(lambda indices: _images(cameras, indices, caster), groups)
-            images = torch.from_numpy(np.concatenate(list(made)))
+            groups = [range(i, min(i + group_size, count)) for i in range(0, count, group_size)]
+            batches = pool.map(lambda indices: _images(cameras, indices, caster), groups)
+            images = torch.from_numpy(np.concatenate(list(batches)))
     else:
         images = keep((count, size, size, 4), lambda index: _images(cameras, [index], caster)[0])
     return Split(cameras, images, tuple(f"{name}_{index:03d}" for index in range(count)))
 
 
 def _images(cameras: Cameras, indices: Sequence[int], caster: Caster) -> NDArray[np.uint8]:
-    """Some images, a band of rows at a time; pixels are averages of premultiplied colour and opacity."""
+    """Renders the images `indices` in bands of rows; averages premultiplied colour and opacity over a pixel."""
     size = cameras.width
     fine = SUPERSAMPLES if size <= LARGE else 2
     images = np.zeros((len(indices), size, size, 4), dtype=np.uint8)
@@ -102,28 +105,28 @@ def _images(cameras: Cameras, indices: Sequence[int], caster: Caster) -> NDArray
 
 
 def shaded(origins: Array, directions: Array, depth: Array, number: NDArray[np.int64], caster: Caster) -> Array:
-    """Colours [r, 3] in 0..1 of what rays meet, zero for a miss.
+    """Returns the colours [r, 3] of the ray hits, in 0..1; zero for a miss.
 
-    Sky light from above, one lamp far away with hard shadows, Phong highlights.
+    The light is ambient sky light, strongest from above, and a distant lamp with hard shadows and Phong highlights.
 
     Args:
-        origins: [r, 3].
-        directions: [r, 3] unit.
-        depth: [r], infinite for a miss.
-        number: of the solid [r].
-        caster: that found them.
+        origins: ray origins [r, 3].
+        directions: unit ray directions [r, 3].
+        depth: distance to the hit [r], infinite for a miss.
+        number: number of the hit solid [r].
+        caster: ray caster with the solids.
     """
     rows = np.isfinite(depth).nonzero()[0]
-    rows = rows[np.argsort(number[rows], kind="stable")]  # those of a solid lie together
+    rows = rows[np.argsort(number[rows], kind="stable")]  # groups the hits by solid
     along = directions[rows]
     points = origins[rows] + depth[rows, None] * along
     normals, albedo = np.zeros_like(points), np.zeros_like(points)
     gloss, sharpness = np.zeros(len(rows), dtype=np.float32), np.ones(len(rows), dtype=np.float32)
     numbers, starts = np.unique(number[rows], return_index=True)
-    for each, start, end in zip(numbers, starts, [*starts[1:], len(rows)]):
-        solid, mine = caster.solids[each], slice(start, end)
-        normals[mine], albedo[mine] = solid.surface(points[mine])
-        gloss[mine], sharpness[mine] = solid.gloss, solid.sharpness
+    for index, start, end in zip(numbers, starts, [*starts[1:], len(rows)]):
+        solid, selected = caster.solids[index], slice(start, end)
+        normals[selected], albedo[selected] = solid.surface(points[selected])
+        gloss[selected], sharpness[selected] = solid.gloss, solid.sharpness
     facing = np.maximum(_dots(normals, LIGHT), 0)
     towards = (facing > 0).nonzero()[0]
     lamp = np.zeros(len(rows), dtype=np.float32)
@@ -138,6 +141,6 @@ def shaded(origins: Array, directions: Array, depth: Array, number: NDArray[np.i
 
 
 def _dots(first: Array, second: Array) -> Array:
-    """Products of vectors [n, 3], [n]: NumPy's sum over three columns takes several times as long."""
+    """Returns the dot products [n] of vectors [n, 3]; several times faster than NumPy's sum over three columns."""
     x, y, z = (first * second).T
     return x + y + z

@@ -1,8 +1,8 @@
-"""The built-in scene: ray-cast from formulas, so that everything runs with no download.
+"""The built-in scene: solids ray-cast from formulas, so it needs no download.
 
-A mosaic plinth carries a sphere, a box, a drum and a column with a ring and a globe, among a circle of marbles: fine
-texture spread over space, sharp edges, hard shadows (which views share) and highlights (which move with the view).
-Images have alpha, by supersampling. Units, axes and camera distance are those of Blender synthetic scenes.
+A mosaic plinth carries a sphere, a box, a drum and a column with a ring and a globe, in a circle of marbles. The scene
+has fine textures, sharp edges, hard shadows and view-dependent highlights. The images have a supersampled alpha
+channel. Units, axes and camera distance match the Blender synthetic scenes.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ TRAIN_VIEWS, TEST_VIEWS = 100, 25
 DISTANCE = 4.0
 ANGLE_X = 0.6911112  # horizontal field of view of the Blender scenes, radians
 NEAR, FAR = 2.0, 6.0
-FORMULA = 1  # of what is in the scene: raised by a change, so that no store has the old one
+FORMULA = 1  # version of the scene's content; increase it with each change to invalidate stored images
 
 
 def builtin_scene(
     size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: int = TEST_VIEWS, images: str = "memory"
 ) -> Scene:
-    """Computes the scene.
+    """Computes the built-in scene.
 
     Args:
-        size: of the square images, pixels.
-        train_views: spread over the upper hemisphere on a spherical Fibonacci lattice.
-        test_views: on an orbit that rises and falls twice, apart from the training views.
-        images: "memory"; or "cached", which also keeps them in a store of the cache, where a next call finds them.
+        size: width and height of the images, in pixels.
+        train_views: number of training views, on a spherical Fibonacci lattice over the upper hemisphere.
+        test_views: number of test views, on an orbit that rises and falls twice.
+        images: "memory" holds the images in memory; "cached" also stores them in the cache directory for later calls.
 
     Raises:
-        ValueError: a size or number of views below 1, or another place for the images.
-        SceneError: the store cannot be written.
+        ValueError: `size` or a number of views is below 1, or `images` is invalid.
+        SceneError: the images cannot be stored.
 
     Examples:
         >>> from voronerf.app.scenes import builtin_scene
@@ -77,7 +77,7 @@ def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
 
 
 def _solids() -> tuple[Solid, ...]:
-    """Everything in the scene."""
+    """Returns all solids of the scene."""
     parts: list[Solid] = [
         Cylinder((0, 0, FLOOR - 0.08), mosaic, 0.08, 10, radius=1.18, half_height=0.08),
         Sphere((0.62, 0.30, FLOOR + 0.36), checker, 0.55, 40, rotation("x", 24), radius=0.36),

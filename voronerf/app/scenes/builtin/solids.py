@@ -1,7 +1,7 @@
-"""Solids that rays are cast against: spheres, boxes, cylinders and tori, each in its own frame.
+"""Solids for ray casting: spheres, boxes, cylinders and tori, each in its own frame.
 
-n points, r rays. Distances are along unit directions, infinite for a miss. Rays start outside of every solid; one that
-starts inside of the box around a torus does not see it.
+Sizes: n points, r rays. Distances are along unit directions, infinite for a miss. Rays must start outside all solids. A
+ray that starts inside the bounding box of a torus misses the torus.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 Axes = tuple[Array, Array, Array]
-"""x, y and z of vectors, of shapes that broadcast."""
+"""The x, y and z coordinates of vectors, with shapes that broadcast."""
 TRACE_STEPS = 40
-SURFACE = 5e-4  # a traced ray closer than this to a torus has hit it
+SURFACE = 5e-4  # distance from a torus below which sphere tracing reports a hit
 
 # points [n, 3] and normals [n, 3] in the solid's frame -> colour [n, 3] in 0..1
 Texture = Callable[[Array, Array], Array]
 
 
 def rotation(axis: str, degrees: float) -> Array:
-    """Rotation about a coordinate axis, [3, 3]."""
+    """Returns the rotation about a coordinate axis, [3, 3]."""
     cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     result = np.eye(3, dtype=np.float32)
@@ -35,13 +35,16 @@ def rotation(axis: str, degrees: float) -> Array:
 
 
 def normalised(vectors: Array) -> Array:
-    """Vectors [n, 3] at unit length."""
+    """Returns vectors [n, 3] scaled to unit length."""
     x, y, z = vectors.T
     return vectors / np.sqrt(x * x + y * y + z * z)[:, None]
 
 
 def turned(vectors: Axes, matrix: Array) -> Axes:
-    """vectors @ matrix [3, 3, ...], whose further axes broadcast with theirs; without threads of a matrix product."""
+    """Returns vectors @ matrix [3, 3, ...].
+
+    The matrix's trailing axes broadcast with the vectors. The product starts no BLAS threads.
+    """
     x, y, z = vectors
     first, second, third = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
     return first, second, third
@@ -49,14 +52,14 @@ def turned(vectors: Axes, matrix: Array) -> Axes:
 
 @dataclass(frozen=True, eq=False)
 class Solid(ABC):
-    """A solid in a pose, with its surface.
+    """A solid with its pose and its surface.
 
     Attributes:
-        centre: position of the solid's frame.
+        centre: origin of the solid's frame, in the world.
         texture: colour of the surface.
         gloss: strength of the highlight, 0..1.
         sharpness: Phong exponent of the highlight.
-        turn: rotation of the solid's frame to the world, [3, 3], or None for none.
+        turn: rotation from the solid's frame to the world, [3, 3]; None for no rotation.
     """
 
     centre: tuple[float, float, float]
@@ -67,23 +70,23 @@ class Solid(ABC):
 
     @abstractmethod
     def extent(self) -> tuple[float, float, float]:
-        """Half sides of the bounding box in the solid's own frame."""
+        """Returns the half sides of the bounding box in the solid's frame."""
 
     @abstractmethod
     def measures(self) -> tuple[float, ...]:
-        """What `distance` takes, at most three numbers."""
+        """Returns the argument `measures` of `distance` for this solid: at most three numbers."""
 
     @staticmethod
     @abstractmethod
     def distance(origins: Axes, directions: Axes, measures: Array) -> Array:
-        """Distance [r] of rays in the frames of solids with measures [3, r]."""
+        """Returns the distances [r] along rays, in the solids' frames, to solids with `measures` [3, r]."""
 
     @abstractmethod
     def normal(self, points: Array) -> Array:
-        """Outward unit normals of points on the surface, in the solid's own frame."""
+        """Returns the outward unit normals at surface points [n, 3], in the solid's frame."""
 
     def bounds(self) -> Array:
-        """A box in the world that holds the solid, [2, 3]; tight where the solid stands upright."""
+        """Returns a bounding box in world axes, [2, 3]; tight for an unrotated solid."""
         half = np.array(self.extent(), dtype=np.float32)
         if self.turn is not None:
             half = np.abs(self.turn) @ half
@@ -91,7 +94,7 @@ class Solid(ABC):
         return np.stack((centre - half, centre + half))
 
     def surface(self, points: Array) -> tuple[Array, Array]:
-        """(normals [n, 3] in the world, colours [n, 3]) of points on the surface."""
+        """Returns (normals [n, 3], colours [n, 3]) at surface points [n, 3], in world coordinates."""
         local = points - np.array(self.centre, dtype=np.float32)
         if self.turn is not None:
             local = np.stack(turned(tuple(local.T), self.turn), axis=-1)
@@ -128,7 +131,7 @@ class Sphere(Solid):
 
 @dataclass(frozen=True, eq=False)
 class Box(Solid):
-    """A box with the given half sides."""
+    """A box with half sides `half`."""
 
     half: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
@@ -165,7 +168,7 @@ class Cylinder(Solid):
 
     @staticmethod
     def distance(origins: Axes, directions: Axes, measures: Array) -> Array:  # noqa: D102
-        # the ray is inside between the later of its two entries (tube, slab) and the earlier of its two exits
+        # The ray is inside from the later of its entries into tube and slab to the earlier of its exits.
         (ox, oy, oz), (dx, dy, dz), (square, half_height, _) = origins, directions, measures
         a = np.maximum(dx * dx + dy * dy, np.float32(1e-12))
         b, c = ox * dx + oy * dy, ox * ox + oy * oy - square
@@ -188,7 +191,7 @@ class Cylinder(Solid):
 
 @dataclass(frozen=True, eq=False)
 class Torus(Solid):
-    """A ring around the z axis of its frame, found by sphere tracing its exact distance (Hart 1996)."""
+    """A ring around the z axis of its frame; hits are found by sphere tracing with its exact distance (Hart 1996)."""
 
     ring: float = 1.0
     tube: float = 0.25
@@ -205,15 +208,15 @@ class Torus(Solid):
         t, leave = slab(origins, directions, np.stack((outer, outer, tube)))
         nearest = np.full_like(t, np.inf)
         rows = ((leave > t) & (t > 0)).nonzero()[0]
-        state = np.stack([each[rows] for each in (t, leave, *origins, *directions, ring, tube)])
+        state = np.stack([values[rows] for values in (t, leave, *origins, *directions, ring, tube)])
         for _ in range(TRACE_STEPS):
             t, leave, ox, oy, oz, dx, dy, dz, ring, tube = state
             gap = np.hypot(np.hypot(ox + t * dx, oy + t * dy) - ring, oz + t * dz) - tube
             arrived = gap < SURFACE
             nearest[rows[arrived]] = t[arrived]
             state[0] = t + gap
-            on = ~arrived & (state[0] < leave)
-            rows, state = rows[on], state[:, on]
+            active = ~arrived & (state[0] < leave)
+            rows, state = rows[active], state[:, active]
         return nearest
 
     def normal(self, points: Array) -> Array:  # noqa: D102
@@ -223,7 +226,10 @@ class Torus(Solid):
 
 
 def slab(origins: Axes, directions: Axes, half: Array) -> tuple[Array, Array]:
-    """Where rays enter and leave a box around the origin with half sides [3, ...]; a miss enters after it leaves."""
+    """Returns (entry, exit) distances of rays at a box around the origin with half sides `half` [3, ...].
+
+    For a miss, the entry is larger than the exit.
+    """
     lows, highs = [], []
     for o, d, side in zip(origins, directions, half):
         d = np.where(np.abs(d) < 1e-9, np.float32(1e-9), d)

@@ -1,4 +1,4 @@
-"""Textures of solids: points [n, 3] and normals [n, 3] in a solid's frame to colours [n, 3]."""
+"""Textures: functions from points [n, 3] and normals [n, 3] in a solid's frame to colours [n, 3]."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ def _paint(colour: Colour) -> Array:
 
 
 def _pick(colours: tuple[Colour, ...], index: Array) -> Array:
-    """Colours by index, rounded down and repeating: [n] -> [n, 3]."""
+    """Picks colours by index, rounded down and taken modulo their number: [n] -> [n, 3]."""
     return np.array(colours, dtype=np.float32)[np.floor(index).astype(np.int64) % len(colours)]
 
 
 def _azimuth(points: Array) -> Array:
-    """Angle around the z axis as a share of the full turn, 0..1, [n]."""
+    """Returns the azimuths [n] of points [n, 3] as fractions of a full turn, 0..1."""
     x, y, _ = points.T
     turn: Array = np.arctan2(y, x) / np.float32(2 * math.pi)
     return turn + np.float32(0.5)
 
 
 def plain(colour: Colour) -> Texture:
-    """One colour."""
+    """Returns the texture of a single colour."""
     return lambda points, normals: np.broadcast_to(_paint(colour), points.shape)
 
 
 def mosaic(points: Array, normals: Array) -> Array:
-    """Rings of tiles in five colours; a striped band on the rim."""
+    """Draws rings of tiles in five colours on top and a striped band on the rim."""
     x, y, _ = points.T
     ring = np.floor(np.hypot(x, y) / 0.1686)
     sector = np.floor(_azimuth(points) * (6 * ring + 5))
@@ -51,13 +51,13 @@ def mosaic(points: Array, normals: Array) -> Array:
 
 
 def checker(points: Array, normals: Array) -> Array:
-    """A fine checker of longitudes and latitudes."""
+    """Draws a fine checkerboard along longitude and latitude."""
     climb = np.arccos(np.clip(normals[:, 2], -1, 1)) / math.pi
     return _pick(((0.86, 0.22, 0.20), (0.97, 0.62, 0.48)), np.floor(_azimuth(points) * 14) + np.floor(climb * 7))
 
 
 def diagonals(points: Array, normals: Array) -> Array:
-    """Diagonal stripes, in other colours on each pair of faces."""
+    """Draws diagonal stripes with two colours for each pair of opposite faces."""
     stripe = np.floor((points.sum(axis=-1) + 9) / 0.15) % 2
     pair = np.argmax(np.abs(normals), axis=-1)
     dark_and_light = (
@@ -72,7 +72,7 @@ def diagonals(points: Array, normals: Array) -> Array:
 
 
 def bricks(points: Array, normals: Array) -> Array:
-    """Courses of bricks of three reds in pale mortar; rings on top."""
+    """Draws courses of bricks in three reds with pale mortar, and rings on both ends."""
     x, y, z = points.T
     height = (z + 1) / 0.105
     course = np.floor(height)
@@ -85,12 +85,12 @@ def bricks(points: Array, normals: Array) -> Array:
 
 
 def barber_pole(points: Array, normals: Array) -> Array:
-    """Two-coloured helix."""
+    """Draws a helix in two colours."""
     return _pick(((0.95, 0.94, 0.92), (0.46, 0.50, 0.60)), 2 * _azimuth(points) + points[:, 2] / 0.16)
 
 
 def globe(points: Array, normals: Array) -> Array:
-    """Continents in a sea."""
+    """Draws continents in a sea."""
     x, y, z = normals.T
     land = np.sin(4 * x + 1.3) * np.sin(5 * y + 0.4) + 0.7 * np.sin(6 * z + 2 * x) > 0.15
     shade = (0.5 + 0.5 * np.sin(9 * x) * np.sin(9 * y + 4 * z))[:, None]
@@ -100,7 +100,7 @@ def globe(points: Array, normals: Array) -> Array:
 
 
 def spiral(points: Array, normals: Array) -> Array:
-    """Bands wound around the tube that meet themselves after a full turn in either direction."""
+    """Draws bands wound around the tube of a torus, without a seam in either direction."""
     outward = (normals[:, :2] * points[:, :2]).sum(axis=-1) / np.hypot(points[:, 0], points[:, 1])
     tube = np.arctan2(normals[:, 2], outward) / (2 * math.pi)
     return _pick(((0.20, 0.66, 0.34), (0.56, 0.84, 0.40), (0.86, 0.92, 0.52)), _azimuth(points) * 12 + 3 * tube)

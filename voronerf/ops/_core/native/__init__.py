@@ -3,9 +3,9 @@
 Importing this package raises ``BackendUnavailable`` if the extension is missing or was built from other sources.
 
 OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch
-has loaded. Linking libgomp would not do, because torch's wheels include a libgomp. The loader shares it if it is named
-``libgomp.so.1`` (CPU wheels). If its name has a hash, such as ``libgomp-a34b3233.so.1``, the loader would add the
-system's libgomp, whose thread pool competes with torch's, or fail if the system has none.
+has loaded. Linking libgomp would not work, because torch's wheels include a libgomp. The dynamic linker shares that one
+if it is named ``libgomp.so.1`` (CPU wheels). If its name has a hash, such as ``libgomp-a34b3233.so.1``, the dynamic
+linker would load the system's libgomp too, whose thread pool competes with torch's, or fail if the system has none.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ def _bind_openmp() -> None:
         mapped = [line.split(maxsplit=5)[5].strip() for line in maps if line.count("/") > 0]
     names = ("libgomp", "libiomp5", "libomp")
     loaded = [path for path in dict.fromkeys(mapped) if os.path.basename(path).startswith(names)]
-    # torch comes first: another package may have loaded a runtime too.
+    # torch's runtime comes first, since another package may have loaded one too.
     loaded.sort(key=lambda path: "torch" not in path.split(os.sep))
     ctypes.CDLL(loaded[0] if loaded else "libgomp.so.1", mode=ctypes.RTLD_GLOBAL)
 
 
 def _interface() -> int | None:
-    """Returns the checksum of all signatures that the sources bind; the built module must have the same."""
+    """Returns the checksum of all signatures that the sources bind; the built module must have the same checksum."""
     file = Path(__file__).resolve().parent.parent / "interface.txt"
     return int(file.read_text()) if file.exists() else None
 
@@ -54,10 +54,13 @@ def _why_missing(error: ImportError | OSError) -> str:
     here = Path(__file__).resolve().parents[4]
     others = [place for place in sys.path if Path(place).resolve() != here]  # where a wheel may be installed
     spec = PathFinder.find_spec("_C", [os.path.join(place, "voronerf", "ops", "_core") for place in others])
-    remedy = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
+    remedy = "install a wheel, or build the module with `pip install -e .` (needs a C++17 compiler)"
     if spec is not None and spec.origin is not None:
         installed = Path(spec.origin).parents[3]
-        remedy = f"run Python in another folder to import that of {installed}, or build it with `pip install -e .`"
+        remedy = (
+            f"run Python in another folder to use the installation in {installed}, or build the module with "
+            "`pip install -e .`"
+        )
     return f"voronerf in {here} cannot load its compiled module ({error}); {remedy}"
 
 
@@ -68,7 +71,7 @@ except (ImportError, OSError) as error:
     raise BackendUnavailable(_why_missing(error)) from None
 if getattr(compiled, "interface", "none") != _interface():
     raise BackendUnavailable(
-        "the compiled module is of another version of voronerf; build it again with `pip install -e .`"
+        "the compiled module was built from another version of voronerf; rebuild it with `pip install -e .`"
     )
 
 DTYPES = {
@@ -93,20 +96,20 @@ def know_torch(module: Any) -> None:
 know_torch(compiled)
 
 signature, Rules, alike, adam_step = compiled.signature, compiled.Rules, compiled.alike, compiled.adam_step
-"""The functions that check arguments and make calls (csrc/bindings/signature.h), also if tests replace `compiled`."""
+"""The functions that check arguments and make calls (csrc/bindings/signature.h), even if tests replace `compiled`."""
 
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
 LEAST_GAIN = 1.25
-"""The least speed-up of bfloat16 over float32 products for networks to use them: rounding and pairing have a cost."""
+"""The least speed-up at which networks use bfloat16 instead of float32 products; rounding and pairing take time."""
 _bfloat16_gain = compiled.bfloat16_gain()
 
 
 def _choose_isa() -> str:
     """Returns the best instruction set of this processor, or the value of VORONERF_ISA.
 
-    avx512_bf16 counts only if its bfloat16 products are faster than float32 products by `LEAST_GAIN`. The measured gain
-    is far from this limit on all known processors, so all processes on a machine make the same choice.
+    avx512_bf16 counts only if its bfloat16 products are `LEAST_GAIN` times as fast as float32 products. The measured
+    gain is far from this limit on all known processors, so all processes on a machine make the same choice.
     """
     best = [isa for isa in SUPPORTED_ISAS if isa != "avx512_bf16" or _bfloat16_gain >= LEAST_GAIN]
     wanted = os.environ.get("VORONERF_ISA") or best[-1]
@@ -172,7 +175,7 @@ def refuse_where_deterministic(op: str, tensor: Tensor) -> None:
         tensor: A tensor of the op; CPU tensors are never refused.
 
     Raises:
-        RuntimeError: Deterministic algorithms are required. With ``warn_only`` a warning takes its place.
+        RuntimeError: Deterministic algorithms are required. With ``warn_only`` this is only a warning.
     """
     if not (on_cuda(tensor) and torch.are_deterministic_algorithms_enabled()):
         return
@@ -239,7 +242,7 @@ def _driver_major() -> int:
 
 
 def _runs_on(architectures: list[str], capability: int) -> bool:
-    """Returns whether code for these architectures, and PTX of the last, runs on a device (86: compute capability 8.6).
+    """Returns whether code for these architectures, or PTX of the last one, runs on a device (86: capability 8.6).
 
     Machine code runs on its version and on later minor versions of the same major version. PTX runs on its version and
     all later ones. Code for an architecture-specific target such as 90a runs on that version alone.
@@ -267,21 +270,21 @@ def describe() -> dict[str, Any]:
 
 
 def _bfloat16_products() -> str:
-    """Describes the arithmetic of bfloat16 products on the CPU, with the reason."""
+    """Describes the arithmetic of bfloat16 products on the CPU, and the reason for it."""
     if _bfloat16_gain == 0:
-        return "in float32: this processor, or this build, has none"
+        return "in float32: the processor or the build has no bfloat16 products"
     if _isa == "amx":
         return "in bfloat16, in tile registers"
     used = "in bfloat16" if _isa == "avx512_bf16" else "in float32"
-    return f"{used}: bfloat16 makes {_bfloat16_gain:.2g} x the operations of float32"
+    return f"{used}: bfloat16 has {_bfloat16_gain:.2g} times the throughput of float32"
 
 
 def measure_peak(kind: str, *, isa: str | None = None, threads: int | None = None) -> float:
     """Measures the machine's peak throughput, the reference of benchmarks; takes 0.1 to 0.2 s.
 
     Args:
-        kind: "float32" (multiply-adds) or "bfloat16" (dot products), with operands in registers, in floating-point
-            operations a second; or "copy" of memory larger than the caches, in bytes read and written a second.
+        kind: "float32" (multiply-adds) or "bfloat16" (dot products), of operands in registers, in floating-point
+            operations a second; or "copy", of memory larger than the caches, in bytes read and written a second.
         isa: the instruction set, one of ``ISAS``; by default the one in use.
         threads: the number of threads; by default torch's number.
 
