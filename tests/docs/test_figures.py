@@ -103,6 +103,9 @@ def test_the_claims_of_the_first_page() -> None:
     few, many = (calls[f"{rows} rows, with backward"] for rows in (4096, 65536))
     ratios = [f"{row['router'] / row['nn.Sequential']:.1f} times" for row in (few, many)]
     assert f"{ratios[0]} as long as PyTorch takes for one of them with 4,096 points, and {ratios[1]}" in text
+    small = [calls[f"{rows} rows, with backward"] for rows in (16, 256)]
+    losses = sorted(row["router"] / row["nn.Sequential"] for row in small)
+    assert f"{losses[0]:.1f} to {losses[1]:.1f} times as much for 16 to 256 points with a backward pass" in text
     routed = [
         row["speedup_over_best"]
         for row in results("throughput.json")["results"]

@@ -200,5 +200,6 @@ def _check_samples(op: str, arguments: Any) -> Any:
         return arguments
     m, offsets = len(raw), samples.run_offsets.numpy()  # numpy: a recording could not replay a torch operation
     if offsets[0] != 0 or offsets[-1] != m or not (offsets[1:] > offsets[:-1]).all():
-        raise ValueError(f"{op}: run_offsets must strictly ascend from 0 to the number of samples, {m}")
+        rule = f"run_offsets must strictly ascend from 0 to the number of samples, {m}"
+        raise ValueError(f"{op}: {rule}, got {offsets.tolist()!s:.60}")
     return arguments
