@@ -2,17 +2,16 @@
 
     OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=1000 python benchmarks/cores.py --data DATA --json FILE
 
-It takes three minutes on two idle cores. DATA holds the scenes lego and bonsai. `voronerf train` sets these variables
-itself (docs/kernels.md). The measured trainings have the same steps and take turns: on one thread and on all cores,
-replayed (voronerf/nerf/step.py) and eager, and beside a second training in another process. The first quarter of the
-turns, which contains the split, and the end of a training are not counted.
+It takes three minutes on two idle cores. DATA holds the scenes lego and bonsai. `voronerf train` sets the two
+environment variables itself (docs/kernels.md). The measured trainings run the same steps, in turns: on one thread and
+on all cores; replayed (voronerf/nerf/step.py) and eager; and beside a second training in another process. The first
+quarter of the turns, which contains the split, and the end of a training are not counted.
 
 The model starts from the processor time of one thread. Calls of the compiled module are traced in separate steps of
 each turn (csrc/common/trace.h). Each chunk of items of a parallel region is assigned to the first free one of 2, 8, 16
-or
-32 threads. All time outside parallel regions is serial: Python, torch's operations, and the compiled module's code
-around its regions. The modelled step time is the serial time, plus the fixed cost of each region, plus the larger of
-the busiest thread's time and the time to move the step's bytes through memory.
+or 32 threads. All time outside parallel regions is serial: Python, torch's operations, and the compiled module's code
+around its regions. The modelled step time is the serial time, plus the fixed cost of each region, plus the time of
+the busiest thread or the time to move the step's bytes through memory, whichever is longer.
 """
 
 from __future__ import annotations
@@ -42,14 +41,14 @@ TEAMS = (2, 8, 16, 32)
 REST = "Python and torch"
 BANDWIDTHS = {"40": 40e9, "80": 80e9}
 TURN = GROUP, 2 * GROUP, 4 * GROUP
-"""Steps of a turn after which the trace (if any), the timing and the next turn begin. The first steps are not counted,
-because `train` takes milliseconds to start."""
+"""The numbers of steps after which, in each turn, the trace (if any) begins, the timing begins, and the turn ends. The
+first steps are not counted, because `train` takes milliseconds to start."""
 LINE, SAMPLE_BYTES, ENTRY_BYTES, TAUGHT_BYTES = 16, 450, 8, 24
 """Parameters in a cache line, and the bytes that a step moves: per sample (positions to gradients), per parameter (its
 gradient, twice), and per parameter of a cache line with a gradient (the value and two moments, read and written)."""
 CALLS, SERIAL_US, TRIALS = 100, 40, 5
-"""Parallel regions in a recording, microseconds of serial work before each region, and measurements; the fastest
-measurement counts."""
+"""Parallel regions in a recording, microseconds of serial work before each region, and the number of measurements,
+of which the fastest counts."""
 
 
 class Case(NamedTuple):
@@ -74,11 +73,11 @@ class Way(NamedTuple):
 
     threads: int
     replayed: bool = True
-    beside: int = 0  # threads of the second training at the same time
+    beside: int = 0  # threads of the simultaneous second training
 
 
 def ways(cores: int) -> dict[str, Way]:
-    """Returns the compared ways, by name."""
+    """Returns the compared ways to run the steps, by name."""
     return {
         "one thread": Way(1),
         "all cores": Way(cores),
@@ -90,7 +89,7 @@ def ways(cores: int) -> dict[str, Way]:
 
 
 class Other(Callback):
-    """A second training in another process, repeated while it has threads to run on."""
+    """A second training in another process; it restarts when it ends, and pauses while it has no threads."""
 
     def __init__(self, case: Case) -> None:
         context = multiprocessing.get_context("spawn")
@@ -127,7 +126,7 @@ class Other(Callback):
 
 
 class Training(Callback):
-    """A training in one of the ways, which runs in turns."""
+    """A training that runs in turns, in one of the ways."""
 
     group = GROUP
 
@@ -138,7 +137,7 @@ class Training(Callback):
         self.ms: list[float] = []
         self.processor_ms: list[float] = []
         self.traced: list[dict[str, list[float]]] = []
-        self._began, self._passed = 0, 0  # first step of the turn; passed marks of TURN
+        self._began, self._passed = 0, 0  # first step of the turn; number of passed marks of TURN
         self._since = 0, 0.0, 0.0  # step, wall and processor seconds at the last mark
 
     def turn(self, other: Other) -> None:
@@ -182,8 +181,9 @@ def load(case: Case, downscale: int | None = None) -> Any:
 
 
 def parts(seconds: float, calls: list[Any]) -> dict[str, list[float]]:
-    """Returns for each compiled function, and for Python and torch: seconds, seconds in parallel regions, number of
-    regions, and modelled seconds on each of TEAMS."""
+    """Returns seconds, seconds in parallel regions, number of regions, and modelled seconds on each of TEAMS.
+
+    The keys are the compiled functions, and "Python and torch"."""
     table: dict[str, list[float]] = defaultdict(lambda: [0.0] * (3 + len(TEAMS)))
     for name, whole, regions, inside, shared in calls:
         added = whole, inside, regions, *(whole - inside + columns for columns in shared)
@@ -196,7 +196,8 @@ def parts(seconds: float, calls: list[Any]) -> dict[str, list[float]]:
 def model(groups: list[dict[str, list[float]]], moved: float, region_us: float) -> dict[str, Any]:
     """Returns the row of the model: speed-ups, and microseconds a step of each part.
 
-    Parts are medians over the groups of steps. Python and torch, and parts that most groups lack, are means."""
+    A part's time is the median over the groups of steps. For Python and torch, and for parts that most groups lack, it
+    is the mean."""
     table = {}
     for name in dict.fromkeys(name for each in groups for name in each):
         rows = [each.get(name, [0.0] * (3 + len(TEAMS))) for each in groups]
@@ -221,8 +222,8 @@ def model(groups: list[dict[str, list[float]]], moved: float, region_us: float) 
 def region(cores: int) -> dict[str, Any]:
     """Measures the cost in microseconds of an empty parallel region that follows serial work.
 
-    The thread team is either woken for each region, or kept waiting by the recording. A recording replayed on one
-    thread has no team, so calls recorded for more threads wake their own."""
+    There are two costs: a thread team is woken for each region, or a recording's team waits between regions. If a
+    recording of calls on several threads is replayed on one thread, it has no team, and each call wakes its own."""
     points, cells, share = torch.rand(2048, 3), torch.empty(2048, dtype=torch.int32), torch.tensor(0.5)
     pair = [torch.zeros(1), torch.zeros(1)], [torch.zeros(1), torch.zeros(1)]
 

@@ -1,14 +1,15 @@
-"""Measures how clean silhouettes are in held-out views of a run, how smooth depth is in plain patches, and holes.
+"""Measures held-out views of a run: how clean silhouettes are, how smooth depth is in plain patches, and holes.
 
     python benchmarks/edges.py RUN
 
-- half: the share of half-covered pixels within 8 pixels of a silhouette. A silhouette is where the disparity changes by
-  a tenth from pixel to pixel; it is the inverse of the median depth of the light, median-filtered over 5 x 5 pixels.
-  The coverage of a pixel is its light from before the geometric mean of the nearest and farthest depth around the
-  pixel. A pixel with a coverage of 0.1 to 0.9 is half covered.
+- half: the fraction of half-covered pixels within 8 pixels of a silhouette. A silhouette is where the disparity changes
+  by a tenth from pixel to pixel. The disparity is the inverse of the median depth of the light, median-filtered over
+  5 x 5 pixels. The coverage of a pixel is its light from nearer than the geometric mean of the nearest and farthest
+  depth around the pixel. A pixel with a coverage of 0.1 to 0.9 is half covered.
 - rough: the root mean square distance of disparities from a fitted plane in patches of 9 x 9 pixels, in percent of the
-  mean disparity. It is averaged over the patches away from silhouettes whose colours differ by less than 0.015.
-- holes: the share of pixels with an opacity below one half, in percent.
+  mean disparity. It is averaged over plain patches: away from silhouettes, and with a standard deviation of grey
+  values below 0.015.
+- holes: the percentage of pixels with an opacity below one half.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Looked(NamedTuple):
     samples: list[tuple[Tensor, Tensor, Tensor, int]]
 
     def before(self, depth: Tensor) -> Tensor:
-        """Returns the light [h, w] from before the depths [h, w]."""
+        """Returns the light [h, w] that comes from nearer than the depths [h, w]."""
         parts, begin, ends = [], 0, depth.reshape(-1)
         for ray, depths, weights, rays in self.samples:
             near = torch.where(depths < ends[begin : begin + rays][ray], weights, 0)
@@ -81,7 +82,7 @@ def patches(values: Tensor) -> Tensor:
 
 
 def measure(seen: Looked, truth: Tensor) -> dict[str, float]:
-    """Returns the three figures of a view with its photograph [h, w, 3]; NaN without a silhouette or a plain patch."""
+    """Returns the three figures of a view, given its photograph [h, w, 3]; NaN without silhouettes or plain patches."""
     around = unfold(pad(seen.half.reciprocal()[None, None], (2, 2, 2, 2), mode="replicate"), 5)[0]
     disparity = around.median(0).values.view(seen.half.shape)
     silhouette = highest(disparity, 3) > -CHANGE * highest(-disparity, 3)

@@ -1,4 +1,4 @@
-"""Runs modules of other codebases in VoronoiRouter: how each runs, and its errors against a loop over masks.
+"""Runs modules of other codebases in VoronoiRouter; reports how each runs and its errors against a loop over masks.
 
 Modules of public repositories (``ops/foreign_public.py``) are imported from checkouts in one folder, each named
 ``owner+name``. Without that folder, small modules in the style of public code (``ops/foreign_kinds.py``) are run.
@@ -55,7 +55,7 @@ def small(pattern: str) -> Iterator[dict[str, Any]]:
 
 
 def counts(results: list[dict[str, Any]]) -> dict[str, int]:
-    """Counts modules by the way they run."""
+    """Counts modules by how they run."""
     ways = Counter(row["how"] for row in results)
     repositories = {row.get("repository") for row in results}
     classes = {(row.get("repository"), row["class"]) for row in results}

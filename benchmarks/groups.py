@@ -1,11 +1,11 @@
-"""Times one network per label on one thread: a router, ``vmap`` over stacked modules, ``baddbmm``, and a loop.
+"""Times one network per label on one thread, computed by a router, by ``vmap``, by ``baddbmm``, and by a loop.
 
     python benchmarks/groups.py --json benchmarks/results/groups.json
 
-The networks are SIRENs with three layers of width 32. Rows are sorted by label and equally many per label, so that the
-alternatives need neither a sort nor padding. The benchmark first checks that all ways compute the same values. A call
-is forward and backward. The last row is a step with Adam on 1,000 images; the router then trains on, to the PSNR in
-the file. Times are median processor times in milliseconds; the ways take turns.
+The networks are SIRENs with three layers of width 32. Rows are sorted by label, with the same number per label, so that
+the alternatives need neither a sort nor padding. The benchmark first checks that all methods compute the same values. A
+call runs forward and backward. The last row is a step with Adam on 1,000 images; then the router trains for ``--steps``
+steps, and its PSNR is stored. Times are median processor times in milliseconds; the methods take turns.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Options:
     """The settings of the benchmark."""
 
     seconds: float = 4.0
-    """Seconds of measurement for each way of a row."""
+    """Seconds of measurement for each method of a row."""
     steps: int = 500
     """Steps of the training on images."""
     json: Path | None = None
@@ -59,7 +59,7 @@ class Siren(nn.Module):
 
 
 def ways(k: int) -> dict[str, tuple[list[nn.Parameter], Run]]:
-    """Returns for each way the parameters of the same k networks, and a function [k, rows, 2] -> [k, rows, 3]."""
+    """Returns for each method its parameters of the same k networks, and a function [k, rows, 2] -> [k, rows, 3]."""
     modules = [Siren() for _ in range(k)]
     router = VoronoiRouter.from_modules(modules, fuse=True, way="fused")
     labels = torch.arange(k)[:, None]
@@ -128,7 +128,7 @@ def call(run: Run, parameters: list[nn.Parameter], x: Tensor) -> Callable[[int],
 
 
 def row(options: Options, k: int, rows: int, images: Tensor | None = None) -> dict[str, Any]:
-    """Measures k networks with ``rows`` rows each: calls, or steps with Adam if ``images`` are there."""
+    """Measures k networks with ``rows`` rows each: calls, or steps with Adam if ``images`` are given."""
     contenders, x = ways(k), torch.rand(k, rows, 2) * 2 - 1
     expected = contenders["loop"][1](x)
     for _, run in contenders.values():

@@ -35,11 +35,11 @@ FEWEST = 3
 """The number of timings below which a row is reported as capped."""
 MOST = 200
 DISTURBED_PEAK = 0.9
-"""A measured peak below this share of the best one counts as disturbed and is replaced by the best one."""
+"""A measured peak below this fraction of the best one counts as disturbed and is replaced by the best one."""
 SLOW = 2
-"""A contender whose single call takes longer than this many limits gets one timing instead of ``FEWEST``."""
+"""If a single call takes longer than this many limits, its contender gets one timing instead of ``FEWEST``."""
 TOO_SLOW = 5
-"""A contender whose warm-up takes longer than this many limits is not called again."""
+"""If the warm-up of a contender takes longer than this many limits, the contender is not called again."""
 BATCH_SECONDS = 5e-3
 """Calls shorter than this are timed in batches. An untimed call precedes each batch, because the previous contender
 left its code and data in the caches, and its threads spinning."""
@@ -150,7 +150,7 @@ def measure(
     stopwatch: Callable[[Run, int, int], float],
     warm: dict[str, float] | None = None,
 ) -> dict[str, Timing]:
-    """Times contenders in turns. The caller has run call 0 of each contender.
+    """Times contenders in turns. The caller must have run call 0 of each contender.
 
     A contender stops when its timings add up to its limit, but not before ``FEWEST`` timings. If a
     single call takes more than ``SLOW`` limits, it is the only timing, and counts as capped.
@@ -159,7 +159,7 @@ def measure(
         contenders: The functions to run, by name, in the order of their turns.
         limits: Seconds for each contender.
         stopwatch: A function of (contender, first call, number of calls) that returns seconds; a :class:`Stopwatch`.
-        warm: Seconds of call 0, if known. Above ``TOO_SLOW`` limits they become the contender's only timing.
+        warm: Seconds of call 0, if known; above ``TOO_SLOW`` limits, they are the contender's only timing.
 
     Returns:
         A timing for each contender.
@@ -198,7 +198,7 @@ def _done(seconds: list[float], batch: int, limit: float) -> bool:
 
 
 class Others:
-    """The load of all other processes since its construction; timings mean little on a busy machine."""
+    """The load of all other processes since the object's construction; timings mean little on a busy machine."""
 
     def __init__(self) -> None:
         self.start = self._now()

@@ -3,8 +3,8 @@
     python benchmarks/many_cells.py --data builtin-city:8x8 --cells 1 16 65536 --seconds 60 --json FILE
 
 All trainings have the same field, rays and learning rate. The coarse stage trains one network for a fifth of the time.
-Its samples then place the centres (`VoronoiDiagram.from_points`), and the networks of all cells begin as copies of it.
-The placement counts as training time.
+Its samples then place the centres (`VoronoiDiagram.from_points`), and the networks of all cells begin as copies of the
+coarse network. The placement counts as training time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from voronerf.nerf import Adam, Occupancy, RayBatches, RayLoss, Renderer, Traini
 from voronerf.nerf.fields import FIELDS
 from voronerf.nerf.schedule import GROUP, learning_rate
 
-COARSE = 0.2  # share of the time
+COARSE = 0.2  # fraction of the time
 
 
 def measure(scene: Scene, cells: int, options: argparse.Namespace) -> dict[str, Any]:

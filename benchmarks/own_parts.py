@@ -2,7 +2,7 @@
 
     OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=1000 python benchmarks/own_parts.py --data DATA --json FILE
 
-Each training of Lego at 100 x 100 has one of the examples. After the split into cells, the trainings run 32 steps each
+Each training of Lego at 100 x 100 uses one of the examples. After the split into cells, the trainings run 32 steps each
 in turns, with 512 or 2,048 rays a step. Ratios to the default step are medians over the turns.
 """
 
@@ -31,7 +31,7 @@ BEFORE, TURN = 20 * GROUP, 2 * GROUP  # steps
 
 
 def examples() -> dict[str, Any]:
-    """Returns all names that the Python code of the page defines."""
+    """Returns all names that the Python code of docs/extend.md defines."""
     names: dict[str, Any] = {}
     for code in re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL):
         exec(code, names)
@@ -103,7 +103,7 @@ class Until(Callback):
 
 
 def measure(scene: Scene, data: str, rays: int, turns: int) -> dict[str, Any]:
-    """Returns milliseconds a step of each way, the ratios, and the steps' `explain()` texts."""
+    """Returns milliseconds a step of each training, the ratios, and the steps' `explain()` texts."""
     own, states = examples(), dict[str, State]()
     for name, change in WAYS.items():
         torch.manual_seed(0)
@@ -111,7 +111,7 @@ def measure(scene: Scene, data: str, rays: int, turns: int) -> dict[str, Any]:
         state.rays = rays
         until = Until(rays)
         until.go_on(state, BEFORE)
-        while state.strategy.left:  # the split is due by the share of the steps
+        while state.strategy.left:  # the split is due at a fraction of the steps
             until.go_on(state, GROUP)
         change(state, own)
         state.training_step.forget()

@@ -1,12 +1,11 @@
 """The rival: Instant NGP in pure PyTorch on the CPU, faster than the public implementations.
 
-Written from the published descriptions: the hash grid of nerfstudio's ``HashEncoding(implementation="torch")``; the
+It follows published descriptions: the hash grid of nerfstudio's ``HashEncoding(implementation="torch")``; the
 networks, the occupancy grid and the adaptive number of rays of nerfacc's ``train_ngp_nerf_occ.py``; the averaged
 weights of torch-ngp. One network covers the whole scene. Only images, rays and scores come from voronerf.
 
 It uses the fastest table lookup in pure PyTorch. Forward and backward of 8 levels take, in ns per sample on one thread
-of
-a Zen 5: 3,950 by indexing, 8,800 by ``F.embedding``, 4,300 by ``F.embedding_bag``, and 370 by ``F.embedding_bag``
+of a Zen 5: 3,950 by indexing, 8,800 by ``F.embedding``, 4,300 by ``F.embedding_bag``, and 370 by ``F.embedding_bag``
 forward with ``scatter_add_`` backward.
 
 Letters: n kept samples, r rays, s strata of a ray, l levels of the grid.
@@ -47,7 +46,7 @@ RISE = 20
 
 @dataclass(frozen=True)
 class RivalConfig:
-    """Settings of the rival. The grid matches `--field hashgrid`; the other defaults are the best of those tried."""
+    """Settings of the rival. The grid matches `--field hashgrid`; the other defaults are the best values tried."""
 
     levels: int = 8
     """The number of levels of the hash grid."""
@@ -64,15 +63,15 @@ class RivalConfig:
     samples: int = 64
     """The number of strata of a ray."""
     batch: int = 1 << 13
-    """The target number of samples of a step, which adapts the number of rays."""
+    """The target number of samples of a step; the number of rays is adapted to it."""
     resolution: int = 64
     """The number of cells of the occupancy grid along each axis."""
     grid_warmup: int = 64
-    """The first steps, in which an update of the occupancy grid evaluates all of its cells."""
+    """The number of first steps in which each update of the occupancy grid evaluates all cells."""
     grid_decay: float = 0.8
     """The decay of a cell's stored opacity when the cell is evaluated again (nerfacc: 0.95)."""
     grid_share: float = 1 / 32
-    """The share of the cells that later updates evaluate, half of them occupied cells."""
+    """The fraction of the cells that each later update evaluates; half of these are occupied cells."""
     lr: float = 2e-2
     """The learning rate of Adam at the start (nerfacc: 0.01)."""
     lr_final: float = 0.1
@@ -183,7 +182,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 class Rival:
-    """A training of the rival on a scene; it takes turns and is evaluated like a ``turns.Training``.
+    """A training of the rival on a scene, which runs in turns and is evaluated like a ``turns.Training``.
 
     A scene without a box is contracted, as with ``--contraction sphere``, and has no occupancy grid.
 
@@ -262,7 +261,7 @@ class Rival:
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
-        # torch-ngp's moving average, with less decay in the first steps
+        # torch-ngp's moving average, with a smaller decay in the first steps
         decay = min(config.average, (1 + self.step) / (10 + self.step))
         torch._foreach_lerp_(self.averages, [p.detach() for p in self.field.parameters()], 1 - decay)
         self.step += 1

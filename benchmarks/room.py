@@ -1,8 +1,8 @@
 """Writes the capture of a random room along a hand-held path, or measures the depth errors of a run trained on it.
 
-Walls, table and floor have no texture, and floor and table are mirrors, so that many depths explain the images. The
-seed determines furniture, colours, textures and the path, so that no setting can be tuned to one picture. The capture
-has PNG files and a COLMAP model. The model's points lie on edges of the images, and its cameras are off by a third of a
+Walls, table and floor have no texture; floor and table are mirrors. Many depths therefore explain the images. The seed
+determines furniture, colours, textures and the path, so that no setting can be tuned to one picture. The capture has
+PNG files and a COLMAP model. The model's points lie on edges of the images, and its cameras are off by a third of a
 pixel. `depths.npy` has the distances in the held-out views.
 
     python benchmarks/room.py FOLDER --seed 1
@@ -39,12 +39,12 @@ from voronerf.nerf.volume import per_ray
 FINE = 2  # rays along each side of a pixel
 #: Reflectance of mirrors at normal and at grazing incidence (Schlick 1994).
 MIRROR = 0.05, 0.6
-#: Standard deviations of the errors: pixel values, camera directions in pixels, and points as a share of their
-#: distance.
+#: Standard deviations of the errors: pixel values, camera directions in pixels, and points as a fraction of
+#: their distance.
 NOISE, TURN, OFF = 0.008, 0.3, 0.003
 #: Points that each view adds to the model.
 POINTS = 20
-#: Light from before this share of a surface's distance counts as in front of the surface.
+#: Light from nearer than this fraction of a surface's distance counts as in front of the surface.
 BEFORE = 0.95
 
 
@@ -115,7 +115,7 @@ def path(draw: random.Random, views: int, width: int, height: int) -> Cameras:
 
 
 def meet(caster: Caster, cameras: Cameras, view: int) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Returns for the rays of a view: origins and directions [r, 3], distances [r], indices of hit solids [r]."""
+    """Returns a view's rays: origins and directions [r, 3], distances [r], and indices of the hit solids [r]."""
     rays, size = cameras.image_rays(view), (cameras.width, cameras.height)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
     scale = np.array([[float(cameras.intrinsics[view, 0]), size[0] / 2 - 0.5, size[1] / 2 - 0.5]])
@@ -200,7 +200,7 @@ def write_capture(
 
 
 def quaternion(turn: Array) -> Array:
-    """Returns the quaternion (w, x, y, z) of a rotation matrix by its largest eigenvector (Bar-Itzhack 2000)."""
+    """Returns the quaternion (w, x, y, z) of a rotation matrix, by Bar-Itzhack's eigenvector method (2000)."""
     (a, b, c), (d, e, f), (g, h, i) = turn.astype(np.float64)
     rows = [
         [a + e + i, h - f, c - g, d - b],
@@ -213,7 +213,7 @@ def quaternion(turn: Array) -> Array:
 
 @torch.no_grad()
 def depth_errors(renderer: Renderer, scene: Scene, folder: Path) -> dict[str, float]:
-    """Returns for held-out views the median relative depth error, and the mean share of light in front of surfaces."""
+    """Returns for held-out views the median relative depth error, and the mean light in front of surfaces."""
     assert scene.transform is not None
     scale = float(torch.linalg.det(scene.transform[:3, :3])) ** (1 / 3)
     errors, early = [], []

@@ -1,4 +1,4 @@
-"""Checks that training starts to learn with every seed: the first steps, for several numbers of rays.
+"""Checks that training starts to learn with every seed, for several numbers of rays; runs only the first steps.
 
     python benchmarks/starts.py --data SHIP LEGO --downscale 4 --steps 300 --json benchmarks/results/starts.json
     python benchmarks/starts.py --data BONSAI --downscale 8 --steps 440 --json benchmarks/results/starts.json

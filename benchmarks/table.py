@@ -2,7 +2,7 @@
 
 python benchmarks/table.py benchmarks/results/throughput.json                    the rows that docs/performance.md shows
 python benchmarks/table.py benchmarks/results/throughput.json --rows '^routed_mlp/'   other rows
-python benchmarks/table.py benchmarks/results/foreign_fields.json --foreign      times faster than the loop over masks
+python benchmarks/table.py benchmarks/results/foreign_fields.json --foreign      speed-ups over the loop over masks
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@
     python benchmarks/throughput.py --json benchmarks/results/throughput.json
     python benchmarks/table.py benchmarks/results/throughput.json     the JSON as Markdown
 
-docs/performance.md says how to read the table. Rows appear as they are measured; progress goes to stderr.
+docs/performance.md explains the table. Rows appear as they are measured; progress goes to stderr.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ OPTIONAL = {"scipy": "scipy", "warp": "warp-lang", "numba": "numba"}
 """Optional packages: module name -> package to install."""
 LIMITS = {"ours": 0.8, "alternative": 0.5}
 QUICK_LIMITS = {"ours": 0.3, "alternative": 0.15}
-"""Time limits in seconds for one contender, with at least three timings: see ``harness.measure``."""
+"""Time limits in seconds of a contender, which gets at least three timings (see ``harness.measure``)."""
 DISTURBED = 0.1
-"""A row counts as disturbed if other processes keep more cores busy than this."""
+"""A row counts as disturbed if other processes keep more than this number of cores busy."""
 SLOW = ("compile", "F.grouped_mm")
 """Parts of the names of slow alternatives, which --quick omits."""
 

@@ -1,4 +1,4 @@
-"""Compares PSNR over training seconds, and seconds to 26, 28, 30 and 32 dB, between settings and with Instant NGP.
+"""Compares settings, and Instant NGP: PSNR over training seconds, and seconds to 26, 28, 30 and 32 dB.
 
     python benchmarks/time_to_quality.py --data builtin --budget 60
     python benchmarks/time_to_quality.py --data LEGO --downscale 4 --seeds 3 --common="--field hashgrid --occupancy"
@@ -61,7 +61,7 @@ class Options:
     clock: Literal["wall", "cpu"] = "wall"
     """The clock of the training time: wall time or, on a shared machine, process CPU time divided by threads."""
     seeds: int = 1
-    """The runs of each side, with seeds 0, 1, ..."""
+    """The number of runs of each side, with seeds 0, 1, ..."""
     turn: float = 5.0
     """The seconds of a turn, after which the next side trains."""
     evaluations: int = 12
@@ -161,7 +161,7 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
 def seconds_to(quality: float, curve: Sequence[dict[str, Any]]) -> float | None:
     """Returns the training seconds at which a curve first reaches a PSNR, interpolated between evaluations.
 
-    The earliest result is the time of the first evaluation. None if the curve never reaches the PSNR.
+    The earliest result is the time of the first evaluation. Returns None if the curve never reaches the PSNR.
     """
     before = None
     for now in curve:

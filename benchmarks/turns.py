@@ -114,11 +114,11 @@ def take_turns(
         trainings: The trainings, at any point of their run; trainings that are ahead wait for the rest.
         budget: Training seconds of each training.
         turn: Seconds of a turn.
-        stops: A function that returns the training seconds at which ``on_stop`` is called for a training, rising.
-        on_stop: A function of a training and the stop that it has reached.
+        stops: A function that returns the training seconds at which ``on_stop`` is called, in rising order.
+        on_stop: A function that is called with a training and the stop that it has reached.
         after_turn: A function that is called with a training after each of its turns.
-        on_failure: A function of a failed training and its error; the other trainings continue. None: the error ends
-            all trainings.
+        on_failure: A function that is called with a failed training and its error; the other trainings continue.
+            None: the error ends all trainings.
 
     Raises:
         ConfigError: When ``turn`` is not positive.
@@ -127,7 +127,7 @@ def take_turns(
     if not turn > 0:
         raise ConfigError(f"--turn must be positive, got {turn}")
     trainings = list(trainings)
-    # Resumed trainings begin with a full turn, because its stops may have been passed without a call of on_stop.
+    # Resumed trainings begin with a full turn, because they may have passed stops without a call of on_stop.
     done = turn * math.floor(min((training.seconds for training in trainings), default=budget) / turn)
     while done < budget:
         before, done = done, min(done + turn, budget)

@@ -3,8 +3,8 @@
     python benchmarks/web.py --runs runs/lego runs/bonsai runs/demo --pixels 100 --json benchmarks/results/web.json
 
 It needs Debian's packages chromium and chromium-driver, and selenium. The speed on a GPU is modelled: the shader's
-operations in a frame, divided by the GPU's operations a second. Operations are counted by `COSTS` from the steps of the
-networks, and from the strata and samples of the rays of five views.
+operations in a frame, divided by the GPU's operations a second. The operations are the sum of the `COSTS` of network
+steps, strata and samples, averaged over five views.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ voronerf.started.then(() => voronerf.picture(camera)).then(
 #: Pixels along each side of a frame, and the distance in pixels between counted rays.
 FRAME, APART = 800, 5
 VIEWS = 5
-#: The page's window while pictures are requested: so small that its own drawing takes no time.
+#: The page's window while pictures are requested, so small that drawing the window takes no time.
 SMALL = {"width": 40, "height": 40, "deviceScaleFactor": 1, "mobile": False}
 #: Operations of the shader besides matrix products: a 4 x 4 block (8 conversions from float16), a corner of a hash grid
 #: (weight, index and sum), a centre, a stratum of a ray, a contraction, a sample (colour and weight), and a sine or
@@ -152,7 +152,7 @@ def compared(run: Run, driver: Any, pixels: int) -> dict[str, Any]:
 
 
 def walked(run: Run, view: int) -> tuple[int, int]:
-    """Returns strata and samples of a frame, from every `APART`th ray along both sides."""
+    """Returns the numbers of strata and samples of a frame, estimated from every `APART`th ray along both sides."""
     sampler, scene, cameras = run.renderer.sampler, run.scene, run.scene.test.cameras
     assert isinstance(sampler, Occupancy)
     side, (width, height) = FRAME // APART, cameras.size(view)
@@ -180,7 +180,7 @@ def walked(run: Run, view: int) -> tuple[int, int]:
 
 
 def counted(run: Run) -> dict[str, Any]:
-    """Returns strata, samples, operations and bytes of a frame, averaged over `VIEWS` views."""
+    """Returns the numbers of strata, samples, operations and bytes of a frame, averaged over `VIEWS` views."""
     radiance = radiance_of(run.renderer.field)
     assert isinstance(radiance, Radiance)
     views = np.linspace(0, len(run.scene.test.cameras) - 1, VIEWS).round().astype(int).tolist()

@@ -2,7 +2,7 @@
 
 The networks of two cells need not agree at their face. If the loss covers only the equation and the border, each cell
 finds its own solution, which is wrong in spite of a small loss. Further conditions, as in XPINNs (Jagtap and
-Karniadakis 2020), make values and normal derivatives equal on both sides of each face. ``--alone`` omits the
+Karniadakis 2020), make values and normal derivatives equal on both sides of each face. ``--alone`` omits these
 conditions.
 """
 

@@ -1,7 +1,8 @@
 """NVIDIA Warp kernels, installed as ``voronerf.kernels``: one file per op, one source for CPU and CUDA.
 
-They are for machines with a GPU but no CUDA compiler. On the CPU Warp has one thread and serves as a check. Importing
-this package raises ``BackendUnavailable`` if Warp is missing or too old; ``import voronerf`` never imports it.
+They are for machines with a GPU but no CUDA compiler. On the CPU, where Warp has one thread, they serve as a check.
+Importing this package raises ``BackendUnavailable`` if Warp is missing or too old; ``import voronerf`` never imports
+it.
 
 A file's kernels are compiled on first use, or by :func:`loads`. Compiled kernels stay in Warp's cache, in the folder
 WARP_CACHE_PATH or Warp's default.
@@ -34,7 +35,7 @@ if tuple(int(part) for part in _VERSION.split(".")[:2]) < MINIMUM:
     raise BackendUnavailable(f"NVIDIA Warp {_VERSION} is too old; {_REMEDY}")
 
 
-#: Printed by Warp's C++ to the process's standard error on every machine without a GPU; no option turns it off.
+#: The line that Warp's C++ code prints to standard error on every machine without a GPU; no option turns it off.
 _NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 
 
@@ -89,7 +90,7 @@ _STEP_FILES = (
 
 
 def loads(device: torch.device, dtype: torch.dtype) -> list[Callable[[], None]]:
-    """Returns functions that load the kernels of a training step for a dtype of weights; only new kernels compile."""
+    """Returns functions that load a training step's kernels for a dtype of weights, and compile only new kernels."""
     from voronerf.kernels.grouped_mlp import THREADS, kernels
 
     where = wp.device_from_torch(device)

@@ -14,7 +14,8 @@ from torch import Tensor
 def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float32) -> Any:
     """Returns a Warp view of a tensor, with its strides and without a copy.
 
-    For None, returns an empty array of `dtype` on the device of `like`, which kernels do not read but Warp needs.
+    For None, returns an empty array of `dtype` on the device of `like`: Warp requires an array, but kernels do not read
+    it.
     """
     if tensor is None:
         tensor = like.new_empty(0, dtype=dtype)
@@ -32,7 +33,7 @@ def filled(struct: Any, **fields: Any) -> Any:
 
 
 def of_both_dtypes(kernel: Any) -> None:
-    """Registers float32 and float64 overloads of a kernel of points and centres, to compile them with its file."""
+    """Registers a float32 and a float64 overload of a kernel of points and centres; both compile with the file."""
     for scalar in (wp.float32, wp.float64):
         wp.overload(kernel, dict.fromkeys(("points", "centres"), wp.array2d(dtype=scalar)))
 

@@ -46,7 +46,7 @@ def cell_sort(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
     cells, k, n = arguments.cells, arguments.k, arguments.n
     order, offsets = results
     check_range("cell_sort", "cells", cells, k)
-    # The sort needs memory for twice the pairs, and leaves the result in the first half.
+    # Warp's sort needs memory for twice as many pairs, and leaves the result in the first half.
     keys, rows = cells.new_empty(2, 2 * n)
     launch(_keys_kernel, n, [array(cells, cells), k, array(keys, cells), array(rows, cells)], cells)
     with on_stream(cells):

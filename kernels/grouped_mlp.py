@@ -1,11 +1,11 @@
-"""A network for each cell as Warp kernels, and ``grouped_linear``, a network of one layer.
+"""Warp kernels for one network per cell, and for ``grouped_linear``, a network of one layer.
 
 n samples, k cells, t tiles of rows, c columns.
 
 Data are tiled. Samples are sorted by cell, and the rows of each cell are padded to tiles of ``ROWS``, so that a tile
 belongs to one cell. The features of the encoded positions, of the directions and of each layer's output are padded to
-columns of ``WIDTH``. A weight matrix consists of blocks [WIDTH, WIDTH], each of which maps one column to another. So a
-network with skips, branches and any widths is a list of products::
+columns of ``WIDTH``. A weight matrix consists of blocks [WIDTH, WIDTH], each of which maps one column to another. A
+network with skips, branches and any widths is therefore a list of products::
 
     column o of the layers = bias o + sum over the products p of o: activation(column source[p]) @ block p ^T
 
@@ -85,7 +85,7 @@ def _slope(x: wp.float32, kind: wp.int32) -> wp.float32:
 
 @wp.struct
 class Products:
-    """The products of a network: products ``first[o]`` to ``first[o + 1]`` sum to column o of the layers.
+    """The products of a network: products ``first[o]`` to ``first[o + 1]`` are added to column o of the layers.
 
     Product p reads the column ``source[p]`` and applies ``activation[source[p]]`` to it.
     """
@@ -144,11 +144,12 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
         of_blocks: wp.array2d(dtype=wp.float32),
         of_biases: wp.array(dtype=wp.float32),
     ) -> None:
-        """Runs the products in reverse, each once for its weights and once for the column that it reads.
+        """Runs each product in reverse twice: for the gradient of its weights and for the gradient of its source.
 
-        ``gradients`` holds the gradients of the sums, initially of the outputs alone. A column's gradient is complete
-        when the loop reaches it, since all readers of the column come later in the list. Columns below ``lowest`` need
-        no gradient. The tiles of a cell sum the gradients of its weights by atomics, in any order on a GPU.
+        ``gradients`` holds the gradients of the sums; initially only the gradients of the outputs are set. A column's
+        gradient is complete when the loop reaches it, since all readers of the column come later in the list. Columns
+        below ``lowest`` need no gradient. The tiles of a cell add the gradients of its weights by atomics, so the order
+        of this sum varies on a GPU.
         """
         tile = wp.tid()
         cell = cells[tile]
@@ -311,7 +312,7 @@ def layers_of_cells(
     """Returns the outputs of a layer table on rows sorted by cell, float32 [n, layers.out_features].
 
     Args:
-        inputs: positions [n, p] and, if a layer reads them, directions, [n, q] or with ``ray_index`` [r, q].
+        inputs: positions [n, p]; then, if a layer reads directions, directions [n, q], or [r, q] with ``ray_index``.
         offsets: int32 [k + 1].
         weights: [k, o, i] for each layer.
         biases: [k, o] or None for each layer.

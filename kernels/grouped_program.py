@@ -36,11 +36,11 @@ class Chain(NamedTuple):
 
     Attributes:
         layers: the table; its outputs are the layers that a later step or an output of the program reads.
-        reads: the numbers of the inputs that the table reads, positions and then directions.
-        weights: the number of each layer's weight among the program's parameters.
-        biases: the number of each layer's bias, or None.
-        features: the number of the hash grid's table, or None.
-        behind: the text of the program of later steps, whose single input is the table's outputs.
+        reads: the indices of the inputs that the table reads: positions, then directions.
+        weights: the index of each layer's weight among the program's parameters.
+        biases: the index of each layer's bias, or None.
+        features: the index of the hash grid's table, or None.
+        behind: the text of a program of the later steps; its single input is the outputs of the table.
     """
 
     layers: MLP
@@ -157,7 +157,7 @@ class _Reader:
         )
 
     def _takes(self, step: Step) -> bool:
-        """Returns whether a step is a part of a layer, and reads it if so."""
+        """Reads a step if it is a part of a layer, and returns whether it is."""
         if step.op == "input":
             self.sources[step.out] = _INPUTS[int(step.numbers[0])]
         elif step.op == "encode":
@@ -217,7 +217,7 @@ class _Reader:
         return columns.of == VALUE and not columns.spread and columns.width == self.steps[columns.index].width
 
     def _layer(self, columns: Columns) -> int:
-        """Returns the number of the layer whose output contains the columns."""
+        """Returns the index of the layer whose output contains the columns."""
         source = self._source(Columns(VALUE, columns.index, 0, self.steps[columns.index].width))
         if isinstance(source, str):
             raise LookupError

@@ -1,8 +1,8 @@
 """The hash encoding as Warp kernels. n points, k tables, e entries in all levels, f features per level.
 
-In the forward pass one thread handles one level of one point, and likewise for the gradient of the table. Atomics sum
-this gradient, so that on a GPU its last bits depend on the order. For the gradient of the positions one thread handles
-one point. With directions, the derivatives of the corners' weights along them replace the weights.
+One thread handles one level of one point, in the forward pass and for the gradient of the table. Atomics sum this
+gradient, so that on a GPU its last bits depend on the order. For the gradient of the positions one thread handles one
+point. With directions, the weight of each corner is replaced by its derivative along the direction.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PRIME_Y, _PRIME_Z = wp.constant(wp.uint32(2654435761)), wp.constant(wp.uint32(8
 class Grid:
     """The grid's constants: box, interpolation, features per level, number of tables, entries of a table.
 
-    ``numbers`` [levels, 2] holds scale and shift, ``sizes`` [levels, 4] side, entries, offset and the hashed flag.
+    ``numbers`` [levels, 2] holds scale and shift; ``sizes`` [levels, 4] holds side, entries, offset and hashed flag.
     """
 
     low: wp.vec3
@@ -45,7 +45,7 @@ class Grid:
 
 @wp.struct
 class Place:
-    """A point on a level: its lower corner, and on each axis the upper corner's weight and two derivatives of it."""
+    """A point on a level: its lower corner; on each axis, the upper corner's weight and its first two derivatives."""
 
     x: wp.int32
     y: wp.int32

@@ -1,7 +1,7 @@
 """Ray marching as Warp kernels. r rays, s strata per ray, m samples of all rays (packed).
 
-One thread walks along one ray, twice: first to count its samples and then, with the offsets, to write them. So no bits
-of strata need to be stored. Operations and their order equal the reference's, each rounded separately (``fuse_fp``
+One thread walks along one ray, twice: first to count its samples and then, with the offsets, to write them. So no mask
+of strata needs to be stored. Operations and their order equal the reference's, each rounded separately (``fuse_fp``
 off), so that a sample falls in the same cell.
 """
 
@@ -126,7 +126,7 @@ class Inputs:
 
 @wp.struct
 class Samples:
-    """The outputs: ``counts``, the rays' numbers of samples, in the first walk; the samples in the second."""
+    """The outputs. The first walk writes ``counts``, each ray's number of samples; the second writes the samples."""
 
     counts: wp.array(dtype=wp.int32)
     ray_index: wp.array(dtype=wp.int32)

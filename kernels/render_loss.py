@@ -4,8 +4,8 @@ One thread handles one ray, whose samples are adjacent. Let o_i = sigma_i delta_
 F_i the sum of the optical depths in front of it. Its weight is exp(-F_i) (1 - exp(-o_i)), and the background's weight
 is exp(-F), with the sum F over the whole ray. F is summed in float64, other values are float32. With G_i the gradient
 of weight i, the gradient of o_i is ``G_i exp(-F_i - o_i) - sum over j > i of G_j w_j``. A first sweep computes the
-colour of the ray and stores F_i in the memory of the density's gradient; a second sweep runs from far to near with the
-sum over the samples behind.
+colour of the ray and stores F_i in the memory of the density's gradient; a second sweep, from far to near, maintains
+the sum over the samples behind.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from voronerf.ops.render_loss.reference import robust_error
 wp.set_module_options({"enable_backward": False})
 
 _OPAQUE = wp.constant(wp.float32(1.0e30))
-"""The finite substitute for infinite density: opaque over any length except 0, where the product is 0."""
+"""The finite value for infinite density: every sample is opaque, but at length 0 the product is 0."""
 
 
 @wp.func

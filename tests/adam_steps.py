@@ -6,7 +6,7 @@ from voronerf.ops import Guard, Rule, adam
 
 
 def assert_adam(count, *, backend, device="cpu", scale=None, spoilt=None, limit=1e18, rate=0.01):
-    """Compares three Adam steps with the formula; every second parameter is sparse (moves by entries).
+    """Compares three Adam steps with the formula; every second parameter is sparse (entries without a gradient stay).
 
     ``spoilt`` makes the second step invalid: "loss" for a NaN loss, or the index of a dense parameter whose gradient
     exceeds ``limit``.

@@ -12,7 +12,7 @@ from PIL import Image
 FLAGS = """--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update
 --disable-sync --hide-scrollbars --force-device-scale-factor=1"""
 WEBGL = "--headless --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
-#: WebGPU on the CPU. A canvas can only be drawn to with Vulkan.
+#: WebGPU on the CPU. Drawing to a canvas needs Vulkan.
 WEBGPU = """--headless=new --enable-unsafe-webgpu --use-webgpu-adapter=swiftshader --enable-features=Vulkan
 --use-vulkan=swiftshader --use-angle=swiftshader"""
 
@@ -37,7 +37,7 @@ def chromium(profile: Path, width: int = 1000, height: int = 700, *, flags: str 
 
 
 def until(done, seconds=30.0):
-    """Calls ``done`` until its value is true and returns it; fails after ``seconds``."""
+    """Calls ``done`` until it returns a true value, and returns this value; fails after ``seconds``."""
     end = time.monotonic() + seconds
     while not (value := done()):
         assert time.monotonic() < end, f"timed out after {seconds} s"

@@ -13,8 +13,8 @@ PARTS = ("colour", "opacity", "depth", "weights")
 def scene(counts: list[int], c: int = 3, background: str = "ray", outside: tuple[int, int] = (0, 0)) -> dict:
     """Returns packed float64 arguments of `composite`.
 
-    ``counts`` holds the number of samples of each ray, ``outside`` the numbers of samples before and after them that
-    belong to no ray.
+    ``counts`` holds the number of samples of each ray, ``outside`` the numbers of samples that belong to no ray, before
+    and after the samples of the rays.
     """
     m, r = sum(counts) + sum(outside), len(counts)
     double = torch.float64
@@ -35,7 +35,7 @@ def dense(r: int, s: int, c: int = 3, background: str = "ray") -> dict:
 
 
 def leaves_of(arguments: dict, dtype: torch.dtype) -> tuple[dict, list[Tensor]]:
-    """Returns (arguments in a dtype, list of the floating-point ones), which require gradients."""
+    """Returns (arguments, list of the floating-point tensors); these get the dtype and require gradients."""
     cast = {
         name: tensor.to(dtype).requires_grad_() if tensor is not None and tensor.is_floating_point() else tensor
         for name, tensor in arguments.items()

@@ -11,8 +11,8 @@ CPU::
     def test_empty(device):  # cpu, cuda
         ...
 
-``@pytest.mark.native``, ``@pytest.mark.cuda`` and ``@pytest.mark.warp`` say that a test needs this part. A test whose
-part is absent is skipped with the reason; ``--require native,cuda,warp`` turns these skips into failures.
+``@pytest.mark.native``, ``@pytest.mark.cuda`` and ``@pytest.mark.warp`` say that a test needs the part of this name. A
+test whose part is absent is skipped with the reason; ``--require native,cuda,warp`` turns these skips into failures.
 
 ``--emulate-cuda SEED`` runs the native backend's CUDA kernels in place of its CPU ones, on the CPU (cuda_emulation/).
 """
@@ -83,7 +83,7 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 @pytest.fixture(params=["portable", "neon", "avx2", "avx512", "avx512_bf16", "amx"])
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Runs the native CPU kernels with each instruction set of this processor; its value is the set's name."""
+    """Runs the native CPU kernels with each instruction set of this processor; the fixture's value is its name."""
     native = pytest.importorskip("voronerf.ops._core.native")
     if request.param not in native.SUPPORTED_ISAS:
         pytest.skip(f"this processor has no {request.param}")
@@ -93,9 +93,10 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 @pytest.fixture
 def poisoned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.Tensor]]:
-    """Poisons ``Tensor.new_empty`` and ``torch.empty``; its value is the growing list of guards.
+    """Makes ``Tensor.new_empty`` and ``torch.empty`` return poison; the fixture's value is the growing list of guards.
 
-    New tensors hold NaN, 121 or False, and lie between guards of the same value. The test fails if a guard changes.
+    New tensors hold NaN, 121 or False, and lie between two guards with the same values. The test fails if a guard
+    changes.
     """
     guards: list[torch.Tensor] = []
 
@@ -137,7 +138,7 @@ def _emulated_cuda(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselects all but the first of a test's rows that need an absent GPU; the first reports the skip."""
+    """Keeps only the first of a test's rows that need an absent GPU; this row reports the skip."""
     seen: set[str] = set()
     rows: tuple[list[pytest.Item], list[pytest.Item]] = [], []
     for item in items:

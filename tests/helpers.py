@@ -1,4 +1,4 @@
-"""Helpers of all tests: expected errors, pairwise parameters, seeds, tensor equality, threads, scripts, JSON files."""
+"""Helpers for all tests: expected errors, pairwise parameters, seeds, tensor equality, threads, scripts, JSON files."""
 
 import contextlib
 import io
@@ -28,7 +28,7 @@ def refuses(message, call, *args, error=ValueError, **options):
 
 
 def all_pairs(values):
-    """Returns arguments for ``parametrize`` with few rows in which all pairs of values of two parameters occur.
+    """Returns arguments for ``parametrize``: few rows, in which every pair of values of two parameters occurs.
 
     A key may name several parameters, such as "i, o"; its values are tuples.
     """
@@ -62,7 +62,7 @@ def same(first, second):
 
 
 def anonymous_memory():
-    """Returns this process's anonymous memory (pages of no file) in bytes; skips the test except on Linux."""
+    """Returns this process's anonymous memory (pages that no file backs) in bytes; skips the test except on Linux."""
     if sys.platform != "linux":
         pytest.skip("reads /proc, which only Linux has")
     return 1024 * int(re.search(r"RssAnon:\s+(\d+)", Path("/proc/self/status").read_text())[1])

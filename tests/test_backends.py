@@ -82,7 +82,7 @@ def test_table_agrees_with_resolve() -> None:
         assert "\n" not in row.reason
         for dtype in row.dtypes:
             for device in row.devices:
-                kind = getattr(torch, dtype, torch.float32)  # for "any" and "plain torch"
+                kind = getattr(torch, dtype, torch.float32)  # float32 for "any" and "plain torch"
                 resolve(row.op, backend=row.backend, device=torch.device(device), dtype=kind)
 
 
@@ -134,7 +134,7 @@ assert main(["info"]) == 1
 
 
 def test_sources_without_their_compiled_module_say_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The message names the compiled module's place, for a checkout after ``pip install .`` that shadows it."""
+    """If a checkout shadows the result of ``pip install .``, the message says where the compiled module is."""
     monkeypatch.delitem(sys.modules, "voronerf.ops._core.native")
     monkeypatch.setitem(sys.modules, "voronerf.ops._core._C", None)
     backends._warn_once.cache_clear()
@@ -280,7 +280,7 @@ def test_what_warp_has_no_kernel_of_runs_as_plain_torch_with_its_operations_on_w
 
 @pytest.mark.slow
 def test_a_source_folder_that_is_not_installed_says_so() -> None:
-    """Sources without an install, which lack ``voronerf.kernels``, give a message that says how to install."""
+    """A source folder that is not installed lacks ``voronerf.kernels``; the message says how to install."""
     code = f"""
 import sys
 sys.meta_path = [finder for finder in sys.meta_path if "editable" not in repr(finder).lower()]

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture
 def build(monkeypatch):
-    """The globals of setup.py, which runs without its call of `setup`."""
+    """The globals of setup.py, which runs with a stub of `setup`."""
     if not (ROOT / "setup.py").is_file():
         pytest.skip("setup.py is missing: the tests need the source tree")
     pytest.importorskip("pybind11")
@@ -69,7 +69,7 @@ def test_arithmetic_is_exact_whatever_flags_are_given(build, monkeypatch, given)
 
 
 def test_every_module_lies_in_a_package():
-    """Every folder has an ``__init__.py``; without it a folder works in a checkout but is missing in wheels."""
+    """Every folder has an ``__init__.py``; without this file a folder works in a checkout but is missing in wheels."""
     setuptools = pytest.importorskip("setuptools")
     modules = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / "voronerf").rglob("*.py")}
     packages = setuptools.find_packages(str(ROOT), include=["voronerf", "voronerf.*"])
@@ -77,7 +77,7 @@ def test_every_module_lies_in_a_package():
 
 
 def test_clang_on_linux_is_refused_before_it_builds(build, monkeypatch):
-    """clang is refused on Linux: it would need symbols that torch's OpenMP, GCC's, lacks."""
+    """clang is refused on Linux: it needs symbols that torch's OpenMP library, which is GCC's, lacks."""
     answer = SimpleNamespace(stdout="Ubuntu clang version 18.1.3\nTarget: x86_64")
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
     monkeypatch.setattr(sys, "platform", "linux")
@@ -125,7 +125,7 @@ def test_cuda_is_compiled_for_the_gpu_that_is_there(build, monkeypatch, tmp_path
     for said, auto in (("exit 1", None), ("echo 8.9; echo 8.0; echo 8.9", ("80", "89")), ("echo 13.0", supported)):
         program(tmp_path / "nvidia-smi", said)
         if auto is None and any(Path(device).exists() for device in ("/dev/nvidiactl", "/dev/dxg")):
-            continue  # a GPU whose driver does not answer
+            continue  # this machine has a GPU whose driver does not answer
         for wish, architectures in (("auto", auto), ("1", supported)):
             monkeypatch.setenv("VORONERF_CUDA", wish)
             cuda = build["find_cuda"]()
@@ -238,7 +238,7 @@ def test_cuda_check_leaves_the_toolkits_own_kernels_alone(reporting):
 def test_cuda_check_compares_with_the_table(check, monkeypatch, tmp_path):
     row = {"registers": 40, "spilled_bytes": 8, "shared_bytes": 0, "warps": 48}
     monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
-    # A kernel that is not in the table must have no spills; the table is absent.
+    # The table is absent; a kernel that is not in the table must have no spills.
     assert len(check.regressions("V13", {"kernel": {"sm_80": row}})) == 1
     check.TABLE.write_text(check.as_text("V13", {"kernel": {"sm_80": row}}))
     assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []
@@ -272,7 +272,7 @@ def test_cuda_check_notes_the_architectures_it_was_asked_for(check, monkeypatch,
 
 @pytest.fixture
 def installed(tmp_path):
-    """A function that runs programs of a new virtual environment with the wheel of `make wheel`.
+    """A function that runs programs of a new virtual environment, in which the wheel of `make wheel` is installed.
 
     Nothing is downloaded or compiled: the environment links to the requirements in this one.
     """

@@ -79,7 +79,7 @@ def test_a_missing_torch_is_one_line(tmp_path) -> None:
 
 
 def test_threads_of_the_command_sleep_while_they_wait() -> None:
-    """Only the command sets the OpenMP wait policy, not the library, and the user's variables take precedence."""
+    """The command, not the library, sets the OpenMP wait policy; the user's variables take precedence."""
     code = "import os, sys; sys.modules['torch'] = None; {}"
     code += "; print(*map(os.environ.get, ('OMP_WAIT_POLICY', 'GOMP_SPINCOUNT')))"
     command = "from voronerf.app.cli import main; main()"

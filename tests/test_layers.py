@@ -11,8 +11,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# The layers from the bottom up: the library (ops to nerf), the application, the town. A module may import its own room
-# (a member of a layer) and the rooms of lower layers.
+# The layers from the bottom up: the library (ops to nerf), the application, the town. A "room" is a member of a layer.
+# A module may import from its own room and from rooms of lower layers.
 LAYERS = (
     {"ops._core"},
     {"ops", "kernels"},
@@ -83,7 +83,7 @@ def faults(source: str, module: str) -> list[str]:
             if allowed is not None and top not in allowed | sys.stdlib_module_names:
                 wrong.append(f"{module}:{line} imports {top}; {importer} may import {' and '.join(sorted(allowed))}")
             continue
-        # Names of the package itself, such as __version__, are no modules.
+        # Names of the package itself, such as __version__, are not modules.
         target = room(name)
         if name != "voronerf" and target.startswith("__") and target != "__main__":
             continue
@@ -136,7 +136,7 @@ def test_faults_are_found(source: str, module: str, fault: str) -> None:
 
 
 def needed(source: str, module: str, modules: set[str]) -> set[str]:
-    """Returns the modules that a module imports, without the viewer's type-only imports, which form circles."""
+    """Returns the modules that a module imports, without the viewer's type-only imports, which form cycles."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and "app.viewer" in module:
@@ -204,7 +204,7 @@ def test_core_knows_no_framework() -> None:
 
 
 def test_instruction_set_files_share_no_inline_functions() -> None:
-    """Files of an instruction set include no header with inline functions: the linker could keep an AVX-512 copy."""
+    """Source files for an instruction set include no inline functions: the linker could keep an AVX-512 copy."""
     waiting = [path for path in CORE if path.name.endswith("_isa.cpp")]
     assert waiting
     seen = set()

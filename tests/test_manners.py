@@ -71,7 +71,7 @@ class Field(nn.Module):
 
 
 def host() -> list[Any]:
-    """Returns the state of PyTorch and of the process that the library could change."""
+    """Returns all state of PyTorch and of the process that the library could change."""
     function = torch.autograd.function
     classes = [nn.Module, nn.Linear, function.Function, function._SingleLevelFunction, torch.optim.Optimizer, Tensor]
     optimizer, module = sys.modules[torch.optim.Optimizer.__module__], nn.modules.module
@@ -89,7 +89,7 @@ def test_a_process_that_trains_is_as_it_was() -> None:
 
 @pytest.mark.native
 def test_limits_of_malloc_are_the_programs() -> None:
-    """Only the command line sets malloc's limits, which nobody can read back."""
+    """Only the command line sets malloc's limits, which no program can read back."""
     from voronerf.ops._core.native import compiled
 
     assert b"mallopt" not in Path(compiled.__file__).read_bytes()

@@ -77,7 +77,7 @@ def test_calls_from_several_python_threads_at_once():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
 def test_a_forked_child_runs_on_one_thread():
-    """A forked child works on one thread after its parent used several; with more it would wait for the parent's."""
+    """A forked child works on one thread after its parent used several; with more it would wait for parent threads."""
     code = """
 import os, torch, voronerf
 torch.set_num_threads(2)

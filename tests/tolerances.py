@@ -1,7 +1,7 @@
 """Compares results with float64 results; the table of tolerances is in `voronerf/ops/_core/tolerances.py`.
 
 The error of a result is its largest absolute difference from the float64 result, divided by the largest magnitude of
-the float64 result. It may be twice the error of plain PyTorch in the same dtype, plus a floor. The floor is the
+the float64 result. It may be at most twice the error of plain PyTorch in the same dtype, plus a floor. The floor is the
 rounding of the result itself, plus about 30 roundings for float32 and float64, since sums may be taken in any order.
 """
 

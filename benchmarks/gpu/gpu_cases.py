@@ -253,7 +253,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
 
 
 def captured_steps(device: str, n: int = 4096, replays: int = 3) -> list[tuple[str, Callable[[], None]]]:
-    """Returns names and checks: replayed steps give the results of the eager step, which match the reference."""
+    """Returns (name, check) pairs: replayed steps give the results of the eager step, which match the reference."""
     return [(name, functools.partial(_replay, settings, device, n, replays)) for name, settings in STEPS.items()]
 
 
@@ -301,7 +301,7 @@ def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -
         options["direction_index"] = torch.randint(0, 16, (n,), dtype=torch.int32).to(device)
 
     def step(backend: str = "native", dtype: Any = None) -> list[Any]:
-        """Returns the gradients; ``dtype`` converts all inputs."""
+        """Returns the gradients; all inputs are converted to ``dtype``, if it is given."""
 
         def cast(value: Any) -> Any:
             return value.to(dtype) if isinstance(value, torch.Tensor) and value.is_floating_point() else value
@@ -318,7 +318,7 @@ def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -
 
 
 def captured_trainings(device: str, count: int = 20, **small: Any) -> list[tuple[str, Callable[[], str]]]:
-    """Returns names and checks: trainings with replayed graphs give the results of eager trainings."""
+    """Returns (name, check) pairs: trainings with replayed graphs give the results of eager trainings."""
     whole: dict[str, Any] = {"cells": (), "split_at": ()}
     kinds = {"training": whole, "training of a nerf": {**whole, "field": "nerf"}, "training before a split": {}}
     kinds["training in bfloat16"] = {"precision": "bf16"}

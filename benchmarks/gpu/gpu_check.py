@@ -1,9 +1,8 @@
 """Runs all GPU checks in fifteen minutes of a GPU, in two calls: ``gpu_check.py {first,second} --out DIR``.
 
 It runs on a bare machine with torch for CUDA, nvcc and ninja, without network. The parts of a call run one after
-another.
-A failed or timed-out part is reported with its last lines, and the next part begins. The next parts inherit a part's
-unused time.
+another. If a part fails or times out, its last lines are reported, and the next part begins. Later parts inherit unused
+time.
 
     first, 390 s    build      links the objects of --prebuilt (prebuilt.py), else compiles
                     cases      gpu_parts.py: every operation, networks at 2^22 samples, steps in CUDA graphs, rows of
@@ -11,7 +10,7 @@ unused time.
                     counters   ncu over six launches, if ncu is installed
                     memcheck   compute-sanitizer over 21 of the small cases, if it is installed
     second, 240 s   build      as above
-                    cases      the cases of --cases, such as wrong cases of the first call, and the rows again
+                    cases      the cases of --cases, such as wrong cases of the first call, and all rows again
                     tests      tests/ops on CUDA, a process for each file
                     racecheck, synccheck   compute-sanitizer over 14 of the small cases
 
@@ -19,7 +18,7 @@ DIR gets two files: summary-CALL.json with the command, the outcome and the find
 parts-CALL.tar.gz with their outputs. The last printed lines are the verdict, fewer than 11,000 characters. The exit
 status is the number of failures. ``--emulated`` tries the call with small cases on a machine without a GPU.
 
-The program does not change the settings of the card: ncu keeps its clocks.
+The program does not change the settings of the card; ncu does not lock the clocks.
 """
 
 from __future__ import annotations
@@ -50,11 +49,11 @@ PYTHON = sys.executable
 TAIL = 30
 """The number of printed lines of a failed part."""
 SHORTEST = 5.0
-"""A part does not begin with fewer seconds left."""
+"""If fewer seconds are left, no further part begins."""
 LINE, WRONG, VERDICT = 100, 160, 10_900
-"""Most characters of a line of the verdict, of a line about a failure, and of the whole verdict."""
+"""Maximum characters of a line of the verdict, of a line about a failure, and of the whole verdict."""
 MOST_WRONG = 30
-"""Most lines about failures."""
+"""Maximum number of lines about failures."""
 KERNELS = 10
 """The number of reported kernels of a profiled step."""
 CALLS = ("first", "second")
@@ -79,9 +78,9 @@ COUNTED = {
 }
 """Reported metrics of ncu: label -> (name in ncu, factor)."""
 STALLED = "smsp__average_warps_issue_stalled_", "_per_issue_active.ratio"
-"""Prefix and suffix of the metric of a stall; its reason stands between them."""
+"""Prefix and suffix of the names of ncu's stall metrics; the reason of the stall stands between them."""
 KEPT = (STALLED[0], "launch__", "l1tex__t_sector_hit", "lts__t_sector_hit", "dram__bytes.sum")
-"""Prefixes of the other stored metrics; a launch has 700 metrics."""
+"""Prefixes of the names of further metrics that are stored; ncu reports 700 metrics per launch."""
 SECTIONS = (
     *("SpeedOfLight", "WarpStateStats", "SchedulerStats", "MemoryWorkloadAnalysis", "ComputeWorkloadAnalysis"),
     *("InstructionStats", "Occupancy", "LaunchStats"),
@@ -92,8 +91,9 @@ SECTIONS = (
 class Part:
     """One part of a call.
 
-    Its commands are alternatives: the next one runs if one fails. A text instead is the reason to omit the part. The
-    part is stopped at second ``until`` of the call. ``found`` is the file of its findings.
+    The commands are alternatives: if one fails, the next one runs. A string instead of commands is the reason why the
+    part is omitted. The part is stopped ``until`` seconds after the start of the call, and writes its findings into the
+    file ``found``.
     """
 
     commands: list[list[str]] | str
@@ -181,7 +181,7 @@ def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: b
         options += [each for section in SECTIONS for each in ("--section", section)]
         options += ["--csv", "--page", "raw", "--print-units", "base", "--log-file", str(out / "counters.csv")]
         counted = None if profiler is None else [profiler, *options, *program, "counted", str(out)]
-        # Separate allocations, so that an access out of bounds does not hit another tensor.
+        # Tensors have separate allocations, so that an access out of bounds does not hit another tensor.
         return common | {
             "cases": tried(285),
             "counters": on_gpu(330, counted, out / "counters.csv"),
@@ -238,7 +238,7 @@ def go_on(
     end, before = time.perf_counter() + limit, -1
     while isinstance(status, int):
         number = unfinished(found, status)
-        if number is None or number == before:  # it reached no case, for example without a device
+        if number is None or number == before:  # no case was reached, for example without a device
             break
         before = number
         status = run_group([*command, "--start", str(number)], environment, log, end - time.perf_counter())
@@ -269,7 +269,7 @@ def read(path: Path | None) -> Any:
 
 
 def counters(text: str) -> dict[str, Any] | None:
-    """Parses ncu's raw page: names, units, and a line of values per launch. Returns None without launches."""
+    """Parses ncu's raw page (names, units, and a line of values per launch); returns None without launches."""
     rows = [row for row in csv.reader(text.splitlines()) if len(row) > 20]  # skips ncu's messages
     launches, told = [], {name for name, _ in COUNTED.values()}
     for row in rows[2:]:
@@ -343,7 +343,7 @@ def _cases(findings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _took(findings: dict[str, Any]) -> dict[str, float]:
-    """Returns the seconds of each part of the cases."""
+    """Returns the seconds that each part of the cases took."""
     cases, seconds = findings.get("cases"), dict[str, float]()
     for row in cases.get("cases", ()) if isinstance(cases, dict) else ():
         seconds[row["part"]] = seconds.get(row["part"], 0.0) + row.get("took", 0.0)
@@ -366,7 +366,7 @@ def _wrong(findings: dict[str, Any]) -> list[str]:
 
 
 def _beside(cases: list[dict[str, Any]]) -> list[str]:
-    """Compares rows with the rows of the same name by alternatives."""
+    """Returns lines that compare rows "NAME" with the rows "NAME by ALTERNATIVE"."""
     times = {row["name"]: row["seconds"] for row in cases if "share" in row}
     lines = []
     for name, seconds in times.items():
@@ -419,7 +419,7 @@ def run_group(command: list[str], environment: dict[str, str], log: TextIO, limi
 
 @functools.cache
 def asked_of_the_driver(what: str) -> str | None:
-    """Queries nvidia-smi about the first GPU, once; None without a GPU. Importing torch would take seconds."""
+    """Queries nvidia-smi about the first GPU and caches the answer; None without a GPU. Importing torch is slower."""
     try:
         command = ["nvidia-smi", f"--query-gpu={what}", "--format=csv,noheader"]
         said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout

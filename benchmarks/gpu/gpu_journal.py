@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 BROKEN = 101
-"""Exit status of a process that must be restarted; other values are the number of failed cases."""
+"""Exit status of a process that must be restarted; any other status is the number of failed cases."""
 
 
 class Journal:
@@ -48,9 +48,9 @@ class Case:
     Attributes:
         part: The name of its part.
         name: The name of the case.
-        run: A function that raises on errors. It returns a dict for the journal, whose ``said`` is printed, or
-            ``said``.
-        seconds: Seconds after which it counts as hanging.
+        run: A function that raises on errors. It returns a dict for the journal, whose entry ``said`` is printed, or
+            only the printed text.
+        seconds: Seconds after which the case counts as hanging.
     """
 
     part: str
@@ -135,7 +135,7 @@ def one_by_one(
 
 
 def unfinished(path: Path, status: int | str) -> int | None:
-    """Returns the case with which an interrupted program continues; None if it ran all cases.
+    """Returns the index of the case with which an interrupted program continues; None if it ran all cases.
 
     A case that ended the process, for example by a crash, is recorded as wrong.
     """

@@ -12,16 +12,16 @@ from dataclasses import replace
 from typing import Any
 
 N = 1 << 22
-"""The number of samples, at which every loop of the kernels runs several times."""
+"""The number of samples, with which every loop of the kernels runs several times."""
 SUBSET = 1 << 12
 """The most rows per cell that the reference computes in float64."""
 ALLOWED = {"bfloat16": (2e-2, 0.25), "float32": (2e-4, 3e-2)}
-"""Allowed relative errors (by norm) of outputs and of gradients. ReLU units that rounding switches change gradients: by
-0.12 in bfloat16, and by 0.011 with a hash grid, on a CPU."""
+"""Allowed relative errors (by norm) of outputs and of gradients. Rounding switches some ReLU units, which changes
+gradients: on a CPU by 0.12 in bfloat16, and by 0.011 with a hash grid."""
 
 
 def large_cases(device: str, n: int = N) -> list[tuple[str, Callable[[], str]]]:
-    """Returns names and checks, which raise or return a text with the relative errors."""
+    """Returns (name, check) pairs; a check raises, or returns a text with the relative errors."""
     return [
         (f"{name} {precision}", functools.partial(compare, device, name, precision, n))
         for precision in ALLOWED
@@ -30,7 +30,7 @@ def large_cases(device: str, n: int = N) -> list[tuple[str, Callable[[], str]]]:
 
 
 def compare(device: str, name: str, precision: str, n: int) -> str:
-    """Compares outputs with float64, gradients with float32, and float32 gradients of some rows with float64."""
+    """Compares outputs with float64, 16-bit gradients with float32, and float32 gradients with float64."""
     import torch
 
     inputs = batch(device, name, precision, n)
@@ -126,9 +126,9 @@ def evaluate(inputs: dict[str, Any]) -> list[Any]:
 
 
 def in_float64(inputs: dict[str, Any]) -> tuple[list[Any], Any]:
-    """Returns the reference's outputs for some rows, their gradients, and the rows' indices.
+    """Returns the reference's results for some rows (outputs and gradients), and the indices of the rows.
 
-    The rows are spread over every cell and include its last row."""
+    The rows are evenly spaced in every cell and include its last row."""
     import torch
 
     rows, counts, begin = [], [], 0

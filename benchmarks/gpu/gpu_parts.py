@@ -1,12 +1,13 @@
 """The programs of ``gpu_check.py``: ``gpu_parts.py PROGRAM OUT``.
 
-    cases     the parts of --parts in one process, each case separately
+    cases     the parts of --parts in one process, one case after another
                   small      every operation, forward and backward, against float64
                   large      networks at 2^22 samples, with gradients
                   captured   steps of the route, and of trainings, in CUDA graphs
-                  rows networks, lookups and sorts at full size, beside the machine's peak rates and torch's products
+                  rows       networks, lookups and sorts at full size, beside the machine's peak rates and torch's
+                             products
                   training   short trainings, with PSNR
-                  profile    a default step: launches, waits of the host, the slowest kernels
+                  profile    a default step: launches, host waits, the slowest kernels
     counted   six launches between cudaProfilerStart and cudaProfilerStop, for ncu
     tests     tests/ops on CUDA, a process for each file
 
@@ -40,16 +41,16 @@ from gpu_large import large_cases  # noqa: E402
 from gpu_timings import counted, profile, rows  # noqa: E402
 
 BUDGETS = {"small": 60.0, "large": 25.0, "captured": 35.0, "rows": 65.0, "training": 35.0, "profile": 30.0}
-"""Seconds of each part, in their order. Later parts inherit unused time."""
+"""Seconds of each part, in the order of the parts. Later parts inherit unused time."""
 TRAININGS: dict[str, dict[str, Any]] = {"default": {}, "4,096 rays, bf16": {"rays": 4096, "precision": "bf16"}}
 FILE_SECONDS = 90.0
 """The time limit of one test file."""
 PROCESSES = 12
-"""Test processes at a time; imports and contexts take most of their time."""
+"""The number of simultaneous test processes; imports and CUDA contexts take most of their time."""
 CHOICE = "cuda and not reference-cuda and not compiles and not opcheck"
-"""The selection of tests: only this project's kernels, since torch traces alike on every device."""
+"""The selected tests (``pytest -k``): only tests of kernels, since torch traces in the same way on every device."""
 LISTS = {"@checked": CHECKED, "@racing": RACING}
-"""Names of lists of cases."""
+"""Lists of cases, by name."""
 STEP: dict[str, Any] = {"width": 16, "samples": (8,), "rays": 16, "cells": (), "split_at": ()}
 LITTLE: dict[str, dict[str, Any]] = {
     "large": {"n": 150},
@@ -97,7 +98,8 @@ def cases_of(parts: list[str], device: str, journal: Journal, *, emulated: bool 
 
 
 def chosen(cases: list[Case], names: list[str]) -> list[Case]:
-    """Returns the cases of some names or parts, with * as a wildcard; an unknown name gives a failing case."""
+    """Returns the cases whose name or part matches one of ``names`` (* is a wildcard), and a failing case for each name
+    without a match."""
 
     def absent() -> None:
         raise LookupError("there is no case of this name")
@@ -108,7 +110,7 @@ def chosen(cases: list[Case], names: list[str]) -> list[Case]:
 
 
 def train(scene: Any, device: str, options: dict[str, Any]) -> dict[str, Any]:
-    """Trains for 12 seconds; returns milliseconds of a step, and PSNR."""
+    """Trains for 12 seconds; returns milliseconds per step, and PSNR."""
     from voronerf.app.train import Scores, TrainConfig, build, run
 
     settings: dict[str, Any] = {"budget": 12.0, "cells": (12,), "evaluations": 4, "eval_views": 5, **options}
@@ -132,7 +134,7 @@ def about() -> dict[str, Any]:
 
 
 def run_counted(device: str) -> None:
-    """Runs every counted launch, after a warm-up."""
+    """Runs every launch of `counted`, after a warm-up."""
     import torch
 
     settle = settling(device)

@@ -17,10 +17,10 @@ from gpu_journal import Case, Journal, settling
 SECONDS = 1.5
 """The seconds of a row; a single slow call may take longer."""
 MOST_CALLS, MOST_REPEATS = 8, 30
-"""Most calls in a graph, and most timings of a row."""
+"""Maximum number of calls in a graph, and of timings of a row."""
 LIMITS = ("bfloat16", "float32", "copy")
 SETS = 4
-"""Input sets of lookups that take turns; sorts have four times as many. All sets together exceed a GPU's caches."""
+"""Input sets that lookups use in turn; sorts use four times as many. All sets together exceed a GPU's caches."""
 HOPPER = {"bfloat16": 989e12, "float32": 67e12, "copy": 3.35e12, "issue": 4 * 132 * 1.98e9}
 """Peak rates of an H100 by its data sheet, used for the emulated device: operations, bytes, and warp instructions a
 second."""
@@ -214,7 +214,7 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
 
 
 def counted(device: str, n: int = 1 << 18) -> list[tuple[str, Run, Run]]:
-    """Returns launches for ncu, one kernel each: a name, a function that prepares the launch, and the launch."""
+    """Returns the launches that ncu counts, one kernel each: (name, function that prepares the launch, launch)."""
     import torch
     from ops.case import BACKWARD
     from ops.networks import NETS, make_batch
@@ -253,7 +253,7 @@ def _pair(name: str, forward: Run, leaves: list[Any], backward: bool) -> list[tu
 
 
 def profile(scene: Any, device: str, seconds: float = 0.5, **small: Any) -> list[Case]:
-    """Returns the case that profiles training: launches, device utilisation, host waits, and the slowest kernels."""
+    """Returns the cases that profile trainings: launches, device utilisation, host waits, and the slowest kernels."""
     kinds: dict[str, dict[str, Any]] = {"default": {}, "4,096 rays, bf16": {"rays": 4096, "precision": "bf16"}}
     return [
         Case("profile", name, functools.partial(_profile, scene, device, seconds, {**options, **small}), 30.0)
@@ -274,7 +274,7 @@ def _profile(scene: Any, device: str, seconds: float, options: dict[str, Any]) -
     state = build(TrainConfig(device=device, **{**settings, **options}), scene)
 
     def more() -> tuple[float, int]:
-        """Trains on; returns the seconds of a step and the number of steps."""
+        """Continues the training; returns seconds per step and the number of steps."""
         begin, before = time.perf_counter(), state.step
         train(state, until=state.seconds + seconds)
         settle()

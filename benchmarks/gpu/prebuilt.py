@@ -96,7 +96,7 @@ def prepare(build: dict[str, Any], folder: Path, architecture: str) -> str:
 
 
 def edges(text: str) -> dict[str, list[str]]:
-    """Returns the lines of each edge of a build.ninja, by its output."""
+    """Returns the lines of each edge of a build.ninja, by output."""
     edges_by_output: dict[str, list[str]] = {}
     for line in text.splitlines():
         if line.startswith("build "):

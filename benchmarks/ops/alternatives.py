@@ -1,8 +1,8 @@
 """Alternatives to grouped_mlp and grouped_linear, each at its best setting.
 
-Samples are sorted by cell. The alternatives get encoded inputs, whose encoding is not timed, while grouped_mlp encodes
-inside. Every call returns its output as one new tensor with a gradient. n samples, k cells, i inputs and o outputs of a
-layer.
+Samples are sorted by cell. The alternatives get encoded inputs; the encoding is not timed. grouped_mlp encodes its
+inputs itself. Every call returns its output as one new tensor with a gradient. n samples, k cells, i inputs and o
+outputs of a layer.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def compile_now(run: Callable[[], Any]) -> None:
 
 
 def padded_bmm(batch: Batch, encoded: Encoded) -> Contender:
-    """Returns a way that pads all cells to the rows of the largest and runs one batched product per layer."""
+    """Returns a contender that pads all cells to the largest cell's rows and runs one batched product per layer."""
     net, bounds, dtype = batch.net, torch.tensor(batch.bounds), encoded.positions[0].dtype
     most, device = int(bounds.diff().max()), batch.positions[0].device
     kept = sum(layer.width for layer in net.layers) * (2 if batch.direction == BACKWARD else 0)
@@ -177,10 +177,10 @@ def _finish(batch: Batch, forward: Callable[[int], Tensor], leaves: list[Tensor]
 
 
 def grouped_mm(batch: Batch, encoded: Encoded) -> Contender:
-    """Returns a way by torch's grouped product.
+    """Returns a contender that uses torch's grouped product.
 
-    ``F.grouped_mm`` takes no bias and needs rows of multiples of 16 bytes. Every source has an additional column of
-    ones, whose weights are the bias, and is zero-padded to a multiple of eight columns.
+    ``F.grouped_mm`` takes no bias, and its rows must be multiples of 16 bytes long. Every source has an additional
+    column of ones, whose weights are the bias, and is zero-padded to a multiple of eight columns.
     """
     net, dtype = batch.net, encoded.positions[0].dtype
     if not hasattr(F, "grouped_mm"):
@@ -242,7 +242,7 @@ def onednn(batch: Batch, encoded: Encoded, *, piece: int | None = None) -> Conte
     rows = piece or max(max(b - a for a, b in itertools.pairwise(batch.bounds)), 1)
     try:
         packed = [[pack(own.to(dtype), rows) for own in weight.detach()] for weight in batch.weights]
-    except RuntimeError as error:  # bfloat16 on a processor with AVX2 alone
+    except RuntimeError as error:  # bfloat16 on a processor with only AVX2
         raise NotApplicable(str(error)) from error
     cells = list(zip(*packed)), list(zip(*[bias.detach().to(dtype).unbind() for bias in batch.biases]))
     pieces = list(row_pieces(batch.bounds, piece))

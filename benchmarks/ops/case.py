@@ -16,7 +16,7 @@ from torch import Tensor
 
 FORWARD, BACKWARD = "forward", "forward+backward"
 ROTATED_BYTES = 1 << 26
-"""The total bytes of the input sets that consecutive calls take in turn, more than most processors' caches."""
+"""The total bytes of the input sets, which consecutive calls use in turn: more than most processors' caches."""
 
 
 class NotApplicable(Exception):
@@ -28,8 +28,8 @@ class Contender:
     """A way to compute a case's result.
 
     Attributes:
-        run: A function call number -> result.
-        adapt: A function result -> value for ``Work.error``. Default: the result itself.
+        run: A function: call number -> result.
+        adapt: A function: result -> value for ``Work.error``. Default: the result itself.
     """
 
     run: Run
@@ -41,15 +41,16 @@ class Work:
     """A case that is ready to run.
 
     Attributes:
-        ours: A function backend -> contender.
+        ours: A function: backend -> contender.
         alternatives: Functions that set up alternatives, by name; each may raise ``NotApplicable``.
-        error: A function result of call 0 -> largest error against float64: relative to the largest entry for floats,
+        error: A function: result of call 0 -> largest error against float64: relative to the largest entry for floats,
             the number of wrong entries for integers.
         tolerance: The largest error of an alternative that counts as correct.
-        amount: The least operations, or bytes read and written, of a call; samples if ``bound`` is empty.
+        amount: The least number of operations, or of bytes read and written, of a call; the number of samples if
+            ``bound`` is empty.
         bound: The peak rate that the amount is compared with: "float32", "bfloat16" or "copy"; "" for none.
-        executed: The operations of a call including recomputation, if more than ``amount``.
-        moved: The least bytes read and written, if ``amount`` counts operations and memory may be the limit too.
+        executed: The number of operations of a call with recomputation, if larger than ``amount``.
+        moved: The least number of bytes read and written, if ``amount`` counts operations but memory may be the limit.
     """
 
     ours: Callable[[str], Contender]
@@ -115,12 +116,12 @@ def optional(name: str) -> Any:
 
 
 def rotation(tensor_bytes: int) -> int:
-    """Returns the number of input sets of this size, at most 64; small inputs are in cache in real use as well."""
+    """Returns the number of input sets of this size, at most 64, since small inputs are in cache in real use, too."""
     return min(max(ROTATED_BYTES // max(tensor_bytes, 1), 2), 64)
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Returns the largest difference over the largest expected entry; inf for other shapes or NaN."""
+    """Returns the largest difference divided by the largest expected entry; inf for different shapes or NaN."""
     if found.shape != expected.shape:
         return float("inf")
     if expected.numel() == 0:

@@ -1,9 +1,9 @@
 """Cases of VoronoiRouter around fields of other codebases (``foreign_fields.py``). n samples, k cells.
 
 A row's main time is the default router's, without ``fuse``. Its alternatives are the router with ``fuse=True``, which
-chooses the fastest way; the router with ``way="fused"``; the loop over boolean masks with a module per cell; and one
-module for all samples. Results and gradients are compared with the loop over masks. The loop also uses the library's
-cell lookup.
+chooses the fastest evaluation path; the router with ``way="fused"``; the loop over boolean masks with a module per
+cell; and one module for all samples. Results and gradients are compared with the loop over masks. The loop also uses
+the library's cell lookup.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from voronerf import VoronoiRouter, ops
 Arguments = tuple[Tensor, ...]
 Call = Callable[..., Tensor]
 TOLERANCE = 1e-2
-"""Largest error against the loop over masks. ReLU units that rounding switches change gradients by some per mille."""
+"""Largest error against the loop over masks. Gradients change by some per mille if rounding switches a ReLU unit."""
 SMALL, MIDDLE, LARGE = 1 << 10, 1 << 16, 1 << 18
 
 
@@ -82,11 +82,11 @@ class Field:
 
     Attributes:
         make: A function that makes a new module.
-        arguments: A function positions [n, 3] -> arguments of the module's forward.
+        arguments: A function: positions [n, 3] -> arguments of the module's forward.
         evaluate: A function of the module and its arguments that returns the compared results.
-        most: The largest number of samples; more samples of second derivatives and splines would take several GiB.
-        most_cells: The largest number of cells; tables of more cells would not fit into memory.
-        share: Names of the parameters of ``encode``, shared by all cells; ``decode`` has the other parameters.
+        most: The largest number of samples, since second derivatives and splines of more samples take several GiB.
+        most_cells: The largest number of cells, since the tables of more cells do not fit into memory.
+        share: Names of the parameters of ``encode``, which all cells share; ``decode`` has the other parameters.
     """
 
     make: Callable[[], nn.Module]
@@ -173,7 +173,7 @@ def _sharing(module: nn.Module, first: nn.Module, names: set[str]) -> nn.Module:
 
 
 class Batch:
-    """Modules, samples and gradients of a case, and the result of the loop over masks for the first samples.
+    """The modules, samples and gradients of a case, and the result of the loop over masks for the first samples.
 
     Args:
         field: The field.
@@ -227,7 +227,7 @@ class Batch:
     def masks(self, encoded: bool = False) -> Contender:
         """Returns the usual loop over masks: each cell's module runs on its samples, whose results are scattered back.
 
-        ``encoded`` computes an encoding that cells share before the loop, for all samples at once.
+        With ``encoded``, an encoding shared by all cells is computed for all samples at once, before the loop.
         """
         parameters = [leaf for leaves in self.leaves for leaf in leaves]
         calls: Sequence[Call] = self.modules

@@ -110,7 +110,7 @@ def hash_work(n: int, log2_entries: int, direction: str, compiled: bool, device:
     def error(found: Any) -> float:
         return max(relative_error(a, b) for a, b in zip(found, exact(), strict=True))
 
-    # Least bytes: read positions and the table, write features; backward the same, and the table's gradient.
+    # Minimum bytes: read positions and the table, write features; backward moves as many bytes again.
     amount = float(n) * 4 * (3 + grid.out_features) + table.nbytes
     if direction == BACKWARD:
         amount += float(n) * 4 * (3 + grid.out_features) + table.nbytes
@@ -184,7 +184,7 @@ def network_work(n: int, direction: str, device: torch.device) -> Work:
         return max(relative_error(a, b) for a, b in zip(found, exact(), strict=True))
 
     operations = 2.0 * n * sum(o * i for o, i in shapes) * (1 if direction == FORWARD else 3)
-    # Least bytes: positions, indices, cells, outputs and the table; backward again all of them, and the features twice.
+    # Minimum bytes: positions, indices, cells, outputs and the table; backward moves all again, and the features twice.
     moved = n * 4.0 * (3 + 1 + 1 + 4) + parameters[0].nbytes
     if direction == BACKWARD:
         moved = 2 * moved + n * 4.0 * 2 * grid.out_features

@@ -16,7 +16,7 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.voronoi import MANY_CELLS
 
 CHUNK = 1 << 19
-"""Distances that torch and numpy compute at a time: 2 MiB, the fastest size."""
+"""The number of distances that torch and numpy compute at a time: 2 MiB, the fastest size."""
 CHECKED = 1 << 14
 """The number of points whose result is compared with float64."""
 PAIRS = 1 << 25
@@ -117,7 +117,7 @@ def _nearest_work(
 
         return set_up
 
-    bound = "float32" if dtype == torch.float32 and not way else ""  # without an index, the operations of all pairs
+    bound = "float32" if dtype == torch.float32 and not way else ""  # without an index, all pairs are computed
     lookups = {**LOOKUPS, **(TREES if way else {}), **({"torch searchsorted": _sorted_lookup} if d == 1 else {})}
     return Work(
         ours,
@@ -159,7 +159,7 @@ def _torch_lookup(centres: Tensor) -> Lookup:
 
 
 def _numpy_lookup(centres: Tensor) -> Lookup:
-    """Returns a lookup by the expanded square in numpy, single-threaded but for the product."""
+    """Returns a lookup by the expanded square in numpy, single-threaded except for the product."""
     table = _host(centres).numpy()
     squares, transposed = np.square(table).sum(1), np.ascontiguousarray(table.T) * -2
     rows = max(256, CHUNK // table.shape[0])
@@ -274,7 +274,7 @@ def _locate_work(n: int, shape: tuple[int, int], device: torch.device) -> Work:
         return set_up
 
     def error(leaves: Tensor) -> float:
-        """Counts points in a wrong cell at either level, in float64."""
+        """Counts the points that are in a wrong cell at either level, in float64."""
         leaves = leaves.long().cpu()
         parents = leaves // inner
         wrong = _wrong_cells(points[0], levels[0], parents)
@@ -347,7 +347,7 @@ def _sort_work(n: int, k: int, device: torch.device) -> Work:
     alternatives: dict[str, Callable[[], Contender]] = {f"torch sort {narrow}": torch_sort(getattr(torch, narrow))}
     if k <= 256:
         alternatives["torch sort uint8"] = torch_sort(torch.uint8)
-    # Least bytes: read all cells, write the order and the offsets.
+    # Minimum bytes: read all cells, write the order and the offsets.
     amount = 8.0 * n + 4 * (k + 1)
     alternatives |= {f"numpy argsort {narrow}": numpy_sort, "Numba counting sort": numba_sort}
     return Work(ours, alternatives, error, 0.0, amount, "copy")

@@ -1,6 +1,6 @@
 """Cases of march_rays and balance_centres.
 
-r rays, s strata of a ray, n strata of all rays or samples; k centres.
+r rays, s strata of a ray, n strata of all rays, or n samples; k centres.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ STRATA = 64
 GRID = 64
 """Cells of the marched grid along each axis."""
 STEPS = 500
-"""Steps of balancing."""
+"""Balancing steps."""
 
 
 def cases() -> list[Case]:
@@ -80,13 +80,13 @@ def _march_work(n: int, jitter: bool, device: torch.device) -> Work:
         return Contender(run)
 
     def error(found: Any) -> float:
-        """Returns the error of the depths against float64, or the share of rays whose number of samples differs."""
+        """Returns the error of the depths against float64, or the fraction of rays whose number of samples differs."""
         others = float((found[0].diff() != exact.ray_offsets.diff()).double().mean())
         if found[1].shape != exact.ray_index.shape or not torch.equal(found[1], exact.ray_index):
             return others or float("inf")  # counts agree, but samples belong to other rays
         return relative_error(found[2], _exact_depths(*sets[0], exact))
 
-    # Least bytes: read the rays (and the jitter), look up a byte for each stratum, write the kept samples.
+    # Minimum bytes: read the rays (and the jitter), look up a byte for each stratum, write the kept samples.
     amount = 32.0 * rays + n * (5.0 if jitter else 1.0) + 24.0 * exact.ray_index.shape[0] + 8.0 * rays
     return Work(
         lambda backend: contender(functools.partial(ops.march_rays, backend=backend)),
@@ -108,7 +108,7 @@ def _shell() -> Tensor:
 def _exact_depths(rays: list[Tensor], uniforms: Tensor | None, found: Any) -> Tensor:
     """Returns the float64 depths of the kept samples."""
     near, far = (rays[i].double()[found.ray_index.long()] for i in (2, 3))
-    # The depth gives the stratum: rounding does not move a depth out of its stratum.
+    # The depth determines the stratum, because rounding does not move a depth out of its stratum.
     share = (found.depths.double() - near) / (far - near) * STRATA
     stratum = (share - 0.5).round() if uniforms is None else share.floor().clamp(0, STRATA - 1)
     inside = 0.5 if uniforms is None else uniforms[found.ray_index.long(), stratum.long()].double()
@@ -158,7 +158,7 @@ def _balance_work(n: int, k: int, device: torch.device) -> Work:
         return Contender(lambda call: function(*sets[call % len(sets)]))
 
     def error(found: Any) -> float:
-        """Returns the remaining share of the imbalance; 500 steps amplify rounding, so values cannot be compared."""
+        """Returns the remaining fraction of the imbalance; centres differ, because 500 steps amplify rounding."""
         return _spread_of_masses(sets[0], found[0]) / before
 
     def tree() -> Contender:

@@ -15,7 +15,7 @@ from ops.route import route_work
 FULL, HALF = torch.float32, torch.bfloat16
 BASE = 1 << 18
 TOLERANCE = {(FULL, FORWARD): 1e-4, (FULL, BACKWARD): 0.02, (HALF, FORWARD): 0.05, (HALF, BACKWARD): 0.9}
-"""Largest error of an alternative. A ReLU unit near 0 that rounding switches changes gradients by some percent, and in
+"""Largest error of an alternative. If rounding switches a ReLU unit near 0, gradients change by some percent, in
 bfloat16 by half of the largest gradient. Missing gradients have an error of 1."""
 BOTH = ("native", "reference")
 

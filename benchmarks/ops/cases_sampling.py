@@ -20,7 +20,7 @@ ALL = ("native", "reference", "warp")
 OCTAVES = 10
 DEGREE = 4
 SAMPLES = 64
-"""Samples of a ray; the mean of packed rays."""
+"""Samples per ray; for packed rays, their mean number."""
 FINE = 128
 """The number of depths that resample draws from SAMPLES bins."""
 CHECKED = 4096
@@ -107,12 +107,12 @@ def _work(
 
     Args:
         op: The operation, with an argument ``backend``.
-        functions: The alternatives, which take the arguments of the op, by name.
+        functions: The alternatives by name; they take the arguments of the op.
         sets: The arguments of consecutive calls.
         gradients: Gradients of the first results; None for a forward case.
         checked: A function of a flat result that returns the compared tensors.
         exact: A function that returns the compared tensors in float64.
-        amount: The least bytes of a call.
+        amount: The least number of bytes that a call reads and writes.
         compiled: Names of the alternatives that are also measured with torch.compile.
         tolerance: The largest error of an alternative.
     """
@@ -167,7 +167,7 @@ def _encode_work(op: str, n: int, dtype: torch.dtype, direction: str, compiled: 
         if integrated
         else {"torch, octave by octave": _frequency_by_octave, "torch, all octaves at once": _frequency_at_once}
     )
-    # Least bytes: forward reads points and writes features; backward reads points and gradients, and writes gradients.
+    # Minimum bytes: forward reads points and writes features; backward reads points and gradients, writes gradients.
     raw = (6 if integrated else 3) * dtype.itemsize
     amount = float(n) * (raw + features * dtype.itemsize)
     if direction == BACKWARD:
@@ -180,7 +180,7 @@ def _encode_work(op: str, n: int, dtype: torch.dtype, direction: str, compiled: 
         lambda found: [tensor[::step] for tensor in found],
         exact,
         amount,
-        ["torch, octave by octave"] if compiled else [],  # the other form is slower, especially backward
+        ["torch, octave by octave"] if compiled else [],  # the other alternative is slower, especially backward
         1e-3 if dtype == FULL else 1.5,  # bfloat16 rounds angles of hundreds of radians by more than a radian
     )
 
@@ -301,7 +301,7 @@ def _composite_work(n: int, packed: bool, direction: str, device: torch.device) 
         if ray_offsets is not None
         else {"torch cumprod": _composite_cumprod, "torch cumsum": _composite_cumsum}
     )
-    # Least bytes: forward reads density, colour, depth and length of a sample and writes its weight. Backward reads
+    # Minimum bytes: forward reads density, colour, depth and length of a sample and writes its weight. Backward reads
     # these inputs again and writes their gradients.
     bytes_a_sample = 28.0 if direction == FORWARD else 28.0 + 24.0 + 24.0
     return _work(

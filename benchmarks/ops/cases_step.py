@@ -1,7 +1,7 @@
 """Cases of a training step's ops besides networks: pixel_rays, render_loss, observe_occupancy and adam.
 
-b rays of a batch, m samples of all rays, n rows of the table: rays, samples or entries. Sizes are as in a step on Lego
-at 100 x 100. All cases run on one thread.
+b rays of a batch, m samples of all rays; n is the number of rays, samples or entries. Sizes are as in a step on Lego at
+100 x 100. All cases run on one thread.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from voronerf.nerf.cameras import orbit_cameras
 from voronerf.ops.formulas import voxels_of
 
 RAYS, SAMPLES = 1 << 10, 1 << 13
-"""Rays of a step."""
+"""Rays and samples of a step."""
 GRID = 64
 """Cells of the occupancy grid along each axis."""
 SCALE = 10.0
@@ -210,7 +210,7 @@ def _observe_all(
 
 
 def adam_work(entries: int, touched: float, device: torch.device) -> Work:
-    """Builds the case of a table of ``entries`` x 2 features; a share ``touched`` of the entries has a gradient."""
+    """Builds the case of a table of ``entries`` x 2 features; a fraction ``touched`` of the entries has gradients."""
     draw = generator(0)
     table = torch.randn(entries, 2, generator=draw).to(device)
     present = torch.rand(entries, 1, generator=draw) < touched
@@ -244,7 +244,7 @@ def adam_work(entries: int, touched: float, device: torch.device) -> Work:
         {"torch.optim.Adam, fused": torchs},
         _worst(exact),
         1e-5,
-        # gradient read; parameter and two moments of touched entries read and written
+        # Reads the gradient; reads and writes the parameters and two moments of the touched entries.
         gradient.nbytes * (1 + 6 * touched),
         "copy",
     )

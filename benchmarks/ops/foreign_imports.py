@@ -20,7 +20,7 @@ from unittest import mock
 import torch
 from torch import Tensor, nn
 
-ENTRIES = 1 << 10  # most entries of a level
+ENTRIES = 1 << 10  # maximum number of entries of a level
 
 
 class GridEncoder(nn.Module):
@@ -187,7 +187,7 @@ def _imported(name: str) -> Any:
 
 
 def _unchanged(made: Any = None) -> Any:
-    """A decorator, with or without parentheses, that does nothing."""
+    """Replaces a decorator, with or without parentheses, by one that does nothing."""
     return made or _unchanged
 
 

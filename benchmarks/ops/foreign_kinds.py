@@ -48,7 +48,7 @@ PARTS: dict[str, Part] = {"a": (3, W), "b": (W, W), "o": (W, 4), "net": 3}
 def own(name: str, call: Callable[..., Any], *inputs: Any, second: bool = False, **parts: Part) -> Row:
     """Returns the row of a :class:`Module`.
 
-    A part of two sizes is a linear layer; a part of one size is a network with four outputs. Layers a, b and o and a
+    Two sizes make a linear layer; one size makes a network with four outputs. Layers a, b and o and a
     network `net` always exist, used or unused, as in public code.
     """
 
@@ -205,7 +205,7 @@ Field = namedtuple("Field", ["rgb", "sigma"])
 
 
 def spelled(name: str, call: Callable[[Tensor], Any]) -> Row:
-    """Returns the row of a way to return four outputs."""
+    """Returns the row of a module that applies ``call`` to the four outputs of its network."""
     return own(name, lambda s, x: call(s.net(x)))
 
 
@@ -274,7 +274,7 @@ PERIODIC = [
     periodic("cosines", lambda s, h: torch.cos(3 * h) + s.c.cos(), c=parameter(W)),
 ]
 
-# functions that are no steps of a program -----------------------------------------------------------------------------
+# functions that are not steps of a program ----------------------------------------------------------------------------
 
 
 class Clipped(torch.autograd.Function):
@@ -386,13 +386,13 @@ DISTANCES = [
 
 
 def slope(y: Tensor, x: Tensor) -> Tensor:
-    """Returns the gradient of a sum, as public code does."""
+    """Returns the gradient of the sum of ``y`` with respect to ``x``, computed as in public code."""
     ones = torch.ones_like(y, requires_grad=False, device=y.device)
     return torch.autograd.grad(y, x, ones, create_graph=True, retain_graph=True, only_inputs=True)[0]
 
 
 def inside(name: str, call: Callable[..., Any], **parts: Part) -> Row:
-    """Returns the row of a field that computes gradients in its forward."""
+    """Returns the row of a field whose forward differentiates a network with respect to its inputs."""
 
     def forward(s: Any, x: Tensor) -> Any:
         with torch.enable_grad():
@@ -673,7 +673,7 @@ WEIGHTS = [
     raw("tensordot", lambda s, x: torch.tensordot(x, s.w, dims=1) + s.b),
 ]
 
-# convolutions of one place --------------------------------------------------------------------------------------------
+# convolutions with kernel size 1 --------------------------------------------------------------------------------------
 
 
 def conv(i: int, o: int, kind: Callable[..., nn.Module] = nn.Conv1d, **options: Any) -> Callable[[], nn.Module]:
@@ -788,4 +788,4 @@ KINDS = {
     "between": BETWEEN,
 }
 IN_RUNS = ("gradients", "tables", "between")
-"""The kinds that PyTorch computes in part, between fused runs; all other kinds are fused whole."""
+"""The kinds that are partly computed by PyTorch, between fused runs; all other kinds are fused completely."""

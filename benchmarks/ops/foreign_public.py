@@ -1,4 +1,4 @@
-"""Modules of public repositories, by repository and file, with their construction and call.
+"""Modules of public repositories: the repository, file, construction and call of each.
 
 A key is "owner/name", followed by the folder of the import path, a colon and the file's dotted name.
 """

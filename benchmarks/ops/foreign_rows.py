@@ -1,4 +1,4 @@
-"""A module of other code in VoronoiRouter, compared with a loop over masks of distinct modules.
+"""Compares a module of other code in VoronoiRouter with a loop over masks of distinct modules.
 
 A new module needs only a :class:`Row`; :func:`compare` does the rest. n samples, k cells.
 """
@@ -21,9 +21,9 @@ from voronerf import VoronoiRouter
 
 N, K, SEED = 300, 4, 1
 ROUNDED = 1e-4
-"""A module with a larger float32 error is compared in float64, too."""
+"""If the float32 error of a module exceeds this value, the module is compared in float64, too."""
 NO_PART = 1e-6
-"""A tensor below this share of the largest tensor counts as zero up to rounding."""
+"""A tensor below this fraction of the largest tensor counts as zero up to rounding."""
 
 
 def uniform(lead: tuple[int, ...], *shape: int) -> Tensor:
@@ -37,7 +37,7 @@ class Row:
 
     Attributes:
         module: The name in the results.
-        make: Makes the module; takes the imported file, if there is one.
+        make: A function that makes the module; its argument is the imported file, if there is one.
         inputs: The arguments: a number d stands for a tensor [n, d] of d features, a function makes an argument from
             the leading shape, everything else is passed on.
         method: The method that is called.
@@ -45,7 +45,7 @@ class Row:
         coords: A function of the arguments that returns positions; None for the first features of the first tensor.
         lead: The leading shape of the samples, (n,) or (rays, samples).
         options: Further options of the router.
-        second: Whether gradients of (|d y / d x| - 1)^2 are compared, as an eikonal loss takes them.
+        second: Whether the gradients of an eikonal loss, (|d y / d x| - 1)^2, are compared, too.
     """
 
     module: str
@@ -59,7 +59,7 @@ class Row:
     second: bool = False
 
     def arguments(self, dtype: torch.dtype) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        """Returns arguments and keyword arguments, whose float tensors take a gradient."""
+        """Returns arguments and keyword arguments, whose float tensors require gradients."""
 
         def build(item: Any) -> Any:
             value = uniform(self.lead, item) if type(item) is int else item(self.lead) if callable(item) else item
@@ -104,7 +104,7 @@ class Row:
 
 
 def compare(row: Row, *imported: Any) -> dict[str, Any]:
-    """Returns a result: the way a module runs in the router and its largest errors, or the reason of a refusal."""
+    """Returns how a module runs in the router and its largest errors, or why the router refuses it."""
     kind = type(row.make(*imported))
     found: dict[str, Any] = {"module": row.module, "class": f"{kind.__module__}.{kind.__qualname__}"}
     try:
@@ -134,7 +134,7 @@ def _compared(row: Row, dtype: torch.dtype, imported: tuple[Any, ...]) -> tuple[
     router = VoronoiRouter.from_modules(modules, centres, fuse=True, way="fused", **options)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row already reports an unfused module
-        for _ in range(2):  # the first call chooses the way of the next call
+        for _ in range(2):  # the first call selects the evaluation path of the next call
             routed = _tensors(getattr(router, row.method)(*args, **kwargs))
     looped = _loop(row, modules, cells, args, kwargs)
     if [value.shape for value in routed] != [value.shape for value in looped]:
@@ -199,12 +199,12 @@ def _error(got: list[Tensor], right: list[Tensor], size: Callable[[Tensor], Tens
 
 
 def _short(reason: str) -> str:
-    """Returns a reason without its quoted lines of the module."""
+    """Returns a reason without the lines that it quotes from the module."""
     return re.sub(r" \([\w.]+\.py:\d+: .*\)", "", reason.splitlines()[0])
 
 
 def _way(router: VoronoiRouter, method: str) -> dict[str, Any]:
-    """Returns the way that `explain` reports for a method, and the functions between fused runs."""
+    """Returns the evaluation path that `explain` reports for a method, and the functions between fused runs."""
     line = next(line for line in router.explain().splitlines() if line.startswith(f"{method}: "))
     name, _, why = line.removeprefix(f"{method}: ").partition(": ")
     if name != "fused in runs":

@@ -39,7 +39,7 @@ NETS: dict[str, MLP] = {
     "nerf128": NeRF(width=128).layers,
     "nerf256": NeRF(width=256).layers,
 }
-# Single layers with ReLU, inputs-outputs: first layers on encoded positions, and middle layers.
+# Single layers with ReLU, named INPUTS-OUTPUTS: first layers on encoded positions, and middle layers.
 LAYERS: dict[str, tuple[int, MLP]] = {
     "63-64": (63, _linear(64)),
     "64-64": (64, _linear(64)),
@@ -54,7 +54,7 @@ class Cost:
     Attributes:
         forward: Two operations for each weight.
         backward: Operations for the gradients of all weights and of inputs from earlier layers.
-        again: Operations to recompute activations in the backward, for code that does not store them.
+        again: Operations to recompute activations in the backward pass, for code that does not store them.
     """
 
     forward: float
@@ -94,7 +94,7 @@ class Batch:
         weights: A tensor [k, o, i] for each layer.
         biases: A tensor [k, o] for each layer.
         gradients: Two output gradients [n, out]: for call 0, zero except in checked rows; for later calls, dense.
-        checked: The rows compared with float64, rising.
+        checked: The rows compared with float64, in rising order.
         direction: ``FORWARD`` or ``BACKWARD``.
     """
 
@@ -202,7 +202,7 @@ def make_batch(
 
 
 def with_gradients(batch: Batch, forward: Callable[[int], Tensor], leaves: Sequence[Tensor]) -> Callable[[int], Any]:
-    """Returns ``forward`` without autograd for a forward case, else a function call -> (output, leaf gradients)."""
+    """Returns ``forward`` without autograd for a forward case, else a function: call -> (output, leaf gradients)."""
     if batch.direction != BACKWARD:
 
         def run(call: int) -> Tensor:
@@ -219,10 +219,10 @@ def with_gradients(batch: Batch, forward: Callable[[int], Tensor], leaves: Seque
 
 
 def network_error(batch: Batch, cells: Tensor | None = None) -> Callable[[Any], float]:
-    """Returns a function of call 0's result: the largest error of outputs and gradients, relative to their largest.
+    """Returns a function that computes the largest relative error of outputs and gradients from call 0's result.
 
-    Call 0 has output gradients only in the rows ``Batch.checked``, so that float64 needs only these rows. A result
-    (output, None) has no comparable gradients; only its output is checked.
+    Call 0 has output gradients only in the rows ``Batch.checked``, so that the float64 reference needs only these
+    rows. A result (output, None) has no comparable gradients; only its output is checked.
 
     Args:
         batch: The inputs.

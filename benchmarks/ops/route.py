@@ -1,8 +1,8 @@
 """Cases of routed_mlp, the whole route: from unsorted positions to outputs in the same order. n samples, k cells.
 
 The alternatives in torch look up the cells by the fastest installed method. Then they sort and loop over cells, or loop
-over boolean masks like Mega-NeRF, or gather a copy of the cell's parameters for each of few samples. All alternatives
-encode the positions themselves.
+over boolean masks like Mega-NeRF, or, for few samples, gather a copy of the cell's parameters for each sample. All
+alternatives encode the positions themselves.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def _of_rows(batch: Batch, directions: Tensor | None, rows: Tensor) -> Tensor | 
 
 
 def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece: int | None) -> Contender:
-    """Returns a loop over sorted cells: sorts by the narrowest key, runs each cell's network, scatters the results."""
+    """Returns a loop over sorted cells: sorts by the narrowest dtype, runs each cell, scatters the results."""
     lookup, own, net = find(), Parameters(batch, dtype), batch.net
     key = torch.uint8 if batch.k <= 256 else torch.int16
     bounds = torch.arange(batch.k + 1, device=batch.positions[0].device)
@@ -185,7 +185,7 @@ def masked_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Co
 
 
 def gathered(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Contender:
-    """Returns a way that gathers a copy of the cell's parameters for each sample, which pays off for few samples."""
+    """Returns a contender that gathers a copy of the cell's parameters for each sample; fast for few samples."""
     lookup, net, training = find(), batch.net, batch.direction == BACKWARD
     leaves = [tensor.detach().to(dtype).requires_grad_(training) for tensor in batch.parameters]
 

@@ -186,7 +186,7 @@ def _cell_count_variants(settings: Settings, scene: str) -> list[Variant]:
     reference = TrainConfig(**{"data": scene, **AS_PUBLISHED, "cells": (PUBLISHED_CELLS,)})
     total = count_parameters(resolve(reference, open_scene(scene, settings)))
     own = [Variant(levels_name(cells), {"cells": cells}) for cells in levels]
-    # The other variants match the parameters of 12 cells, so that one training serves both series.
+    # The other variants match the parameters of 12 cells, so that the training with 12 cells serves both series.
     matched = [{"cells": cells} | ({} if cells == (PUBLISHED_CELLS,) else {"parameters": total}) for cells in levels]
     return own + [Variant(f"{levels_name(cells)}, matched", changes) for cells, changes in zip(levels, matched)]
 

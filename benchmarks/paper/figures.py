@@ -85,7 +85,7 @@ def banded(axes: Any, label: str, curves: Sequence[Sequence[Point]], number: int
 
 
 def shown(evaluation: dict[str, Any]) -> Point:
-    """Returns the seconds and the PSNR of the mean squared error; the plain PSNR for a single picture."""
+    """Returns the seconds and the PSNR: of the mean squared error over the views, or of the only picture."""
     return evaluation["seconds"], evaluation.get("psnr_of_mean_error", evaluation["psnr"])
 
 
@@ -150,7 +150,7 @@ def counts(path: Path, rows: Sequence[Row]) -> Path:
 
 
 def balance(path: Path, rows: Sequence[Row]) -> Path:
-    """Plots std(W / max W) before and after balancing, one box each."""
+    """Plots std(W / max W) before and after balancing, as two boxes."""
     figure, axes = panes(1)
     values, labels = [], []
     for row in rows:

@@ -1,7 +1,7 @@
 """Snapshots of a training ("looks"): a held-out view, a slice of the density, the cells.
 
-A look is a file looks/NAME.npz of a run directory. NAME tells its time: "before" and "after" the first split, quarters
-of the run, and "end".
+A look is a file looks/NAME.npz of a run directory. NAME is "before" or "after" (the first split), "at-25", "at-50"
+or "at-75" (the percentage of the run), or "end".
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def reached(training: Training, second: float) -> None:
     """Writes the looks of a training that are due at ``second`` training seconds."""
     names = [name for name, at in stops(training) if at == second]
     if "after" in names and training.state.strategy.splits == 0:
-        # A step may be longer than the time between the two stops; one more step makes the split.
+        # A step may be longer than the time between the two stops; one more step then performs the split.
         training.advance(math.nextafter(training.seconds, math.inf))
     for name in names:
         look(training, second, name)

@@ -25,10 +25,10 @@ from voronerf import NeRF, SampleReservoir, VoronoiDiagram, VoronoiRouter, frequ
 from voronerf.app.evaluate.panels import contact_sheet, palette, picture_of_colour, picture_of_error, save_picture
 
 CHILDREN, LEVELS = 4, 3
-SPLITS = (0.15, 0.35, 0.55)  # shares of the budget, one per level
+SPLITS = (0.15, 0.35, 0.55)  # fractions of the budget, one per split
 WIDTH, DEPTH = 16, 3
 BATCH = 4096
-RATE, RATE_FINAL = 0.01, 0.05  # learning rate of networks of WIDTH, and its final fraction
+RATE, RATE_FINAL = 0.01, 0.05  # learning rate for the width WIDTH, and its final fraction
 LEAST_SAMPLES = 16
 EVALUATIONS = 20
 ONE, MATCHED, NESTED = "one network", "one network, as many parameters", "nested Voronoi cells"
@@ -88,7 +88,7 @@ class ImageFit:
         image: The picture [h, w, 3] in 0..1.
         budget: The training seconds.
         width: The width of the networks.
-        splits: Shares of the budget at which each cell is split into ``CHILDREN`` cells.
+        splits: The fractions of the budget at which each cell is split into ``CHILDREN`` cells.
         seed: The seed of all random choices.
         backend: The backend of the operations.
     """
@@ -106,7 +106,7 @@ class ImageFit:
             torch.manual_seed(seed)
             field = ImageField(width, DEPTH, octaves_of(image))
         self.router = VoronoiRouter(field, VoronoiDiagram(torch.zeros(1, 3)), coords="first3", backend=backend)
-        # the rule of `voronerf train` for all widths
+        # The learning rate depends on the width as in `voronerf train`.
         self.rate = RATE * NeRF.learning_rate(width) / NeRF.learning_rate(WIDTH)
         self.optimizer = torch.optim.Adam(self.router.parameters(), lr=self.rate, betas=(0.9, 0.99), eps=1e-15)
         self.reservoir = SampleReservoir(10_000, 100)

@@ -1,8 +1,9 @@
 """The trainings behind the paper's tables and figures: their settings and their execution.
 
-A training is named by a hash of its configuration: experiments share equal trainings, and a training in the output
-folder is reused. All missing trainings of a scene and a seed take turns of a few seconds in one process. An interrupted
-training continues from its last turn. A failed training leaves its group and writes the error into its result.json.
+A training is named by a hash of its configuration: experiments share equal trainings, and trainings in the output
+folder are reused. All missing trainings of a scene and a seed take turns of a few seconds in one process. An
+interrupted training continues from its last turn. A failed training leaves its group and writes the error into its
+result.json.
 
     OUT/runs/SCENE-SEED-HASH/   a run directory of `voronerf train`, with result.json and looks/
 """
@@ -35,9 +36,9 @@ Row = dict[str, Any]
 PUBLISHED_SIZE = 400
 #: The settings of the published method.
 AS_PUBLISHED = {"field": "nerf", "occupancy": False, "contraction": "none", "average": 0.0, "centres": "balanced"}
-#: The number of latest batches whose samples are kept, if not `voronerf train`'s: 512 cells need samples of few steps.
+#: The number of latest batches whose samples are kept, where not the default: 512 cells need samples of few steps.
 BATCHES = {"kilonerf": 100}
-#: The least values of settings; two passes need one sample each.
+#: The minimum values of the settings; each of two passes needs a sample.
 LEAST = {"downscale": 1, "seeds": 1, "rays": 1, "samples": 2, "evaluations": 1, "eval_views": 1, "cells": 2}
 
 

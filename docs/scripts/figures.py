@@ -133,7 +133,7 @@ def draw_sort() -> None:
 
 
 def draw_loops() -> None:
-    """Draws the times of networks of many cells, here and in the fastest loop over cells in PyTorch."""
+    """Plots the times of many cells' networks, with the library and in PyTorch's fastest loop over cells."""
     measured = json.loads((DOCS.parent / "benchmarks" / "results" / "throughput.json").read_text())
     rows = {
         (row["case"], row["dtype"], row["direction"]): row

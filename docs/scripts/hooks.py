@@ -1,4 +1,4 @@
-"""Hooks of the site: generates pages from the code, cleans up docstring markup, sets formulas, and adds a scene."""
+"""Hooks of the site: generates pages from the code, cleans up docstring markup, converts formulas, and adds a scene."""
 
 from __future__ import annotations
 

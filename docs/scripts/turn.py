@@ -19,7 +19,7 @@ OUT = Path(__file__).resolve().parents[1] / "images" / "turn.webp"
 
 
 def main(folder: Path) -> None:
-    """Renders a turn of a run and writes it as an animated picture of at most 2 MB."""
+    """Renders a camera turn around the scene of a run and writes it as an animated picture of at most 2 MB."""
     run, summary = open_run(folder, scene=read_scene(folder / "scene.json")), read_json(folder / "summary.json")
     score = f"{summary['psnr']:.1f} dB after {run.config.budget:g} s"
     first, *others = (Image.fromarray(frame.numpy()) for frame in frames(run, turn(FRAMES), range(FRAMES), score))

@@ -5,5 +5,5 @@ from voronerf.app.web import page
 
 @pytest.fixture(autouse=True)
 def small_turntables(monkeypatch):
-    """Makes the still pictures of a page small, since a page has 24."""
+    """Makes the 24 still pictures of a page small, which saves time."""
     monkeypatch.setattr(page, "SIDE", 40)

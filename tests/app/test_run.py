@@ -57,7 +57,7 @@ def test_any_camera_is_rendered(folder, scene) -> None:
 
 
 def mappings(folder):
-    """Returns a list of (start, end, anonymous bytes), a row for each mapping of a file in the folder."""
+    """Returns (start, end, anonymous bytes) of each memory mapping of a file in the folder."""
     if sys.platform != "linux":
         pytest.skip("reads /proc, which only Linux has")
     lines = Path("/proc/self/smaps").read_text()
@@ -76,7 +76,7 @@ def test_networks_stay_in_their_file(scene, tmp_path) -> None:
     assert run.diagram.num_cells == 8
     run.render(0)
     mapped = mappings(tmp_path)
-    # less than half of the networks' bytes
+    # Fewer than half of the networks' bytes are copied.
     assert mapped and sum(copied for _, _, copied in mapped) < 2 * summary["parameters"]
     for parameter in run.router.parameters():
         assert any(start <= parameter.data_ptr() < end for start, end, _ in mapped)

@@ -1,4 +1,4 @@
-"""Attacks the library with random calls, kills, damaged and hostile files: ``python tests/attack --help``.
+"""Attacks the library with random calls, killed processes, damaged and hostile files: ``python tests/attack --help``.
 
 Each attempt has its own seed. The last line of a failure is the command that repeats it.
 """
@@ -26,7 +26,7 @@ import training_attacks
 import viewer_attacks
 from attempts import FAILED, MEMORY, REFUSED, RIGHT, Part, Tally, prepare, run_part
 
-#: Each part, with its number of attempts in a long and in a short run.
+#: The parts by name, with the numbers of attempts in a long and in a short run.
 PARTS = {
     part.name: (part, long, short)
     for part, long, short in (
@@ -77,7 +77,7 @@ def main() -> int:
             count = options.count or (short if options.short else long)
             if not count:  # too slow for the short run
                 continue
-            folder = Path(scratch) / getattr(part.prepare, "__name__", "nothing")  # parts share it
+            folder = Path(scratch) / getattr(part.prepare, "__name__", "nothing")  # parts may share the folder
             if not folder.exists():
                 prepare(part, folder)
             seeds = range(options.seed, options.seed + count)

@@ -1,4 +1,4 @@
-"""Runs attempts to break the library, each from a seed in a forked process, so that a crash counts as a failure.
+"""Runs attempts to break the library: each has a seed and runs in a forked process, so that a crash is a failure.
 
 A part of the attack is a function of a random generator and an empty folder. It returns the outcome of the attempt, and
 raises :class:`Failed` if the library broke a promise. The parent process must not run autograd before it forks, because
@@ -26,7 +26,7 @@ from pathlib import Path
 import torch
 
 REFUSED, RIGHT, FAILED = "refused", "right", "failed"
-#: The most memory in bytes that hostile input may take; the library must refuse it before it takes more.
+#: The memory limit in bytes for hostile input, which the library must refuse before it exceeds the limit.
 MEMORY = 2 << 30
 
 
@@ -118,7 +118,7 @@ class _Worker:
         return bool(text)
 
     def end(self, tally: Tally) -> list[int]:
-        """Adds the outcomes of the attempts; returns the remaining seeds if an attempt ended the process."""
+        """Adds the outcomes to the tally; returns the remaining seeds if an attempt ended the process."""
         os.close(self.pipe)
         status, peak = _finish(self.pid)
         _stop_children(self.folder)
@@ -164,7 +164,7 @@ def _attempts(part: Part, seeds: list[int], inputs: Path, folder: Path, pipe: in
 
 
 def _fork(run: Callable[[], object]) -> int:
-    """Forks a process, which leads a group and runs a function; returns its id."""
+    """Forks a process that runs a function and leads a process group; returns the process id."""
     pid = os.fork()
     if pid:
         return pid
@@ -179,12 +179,12 @@ def _fork(run: Callable[[], object]) -> int:
 
 
 def fork_command(run: Callable[[], int]) -> int:
-    """Forks a process of the same group, whose exit status the function returns; returns its id."""
+    """Forks a process in the same group, which exits with the function's result; returns the process id."""
     pid = os.fork()
     if pid:
         return pid
     try:
-        signal.alarm(120)  # it holds the attempt's pipe open
+        signal.alarm(120)  # the process holds the attempt's pipe open
         os._exit(run())
     except BaseException:
         os._exit(70)

@@ -1,4 +1,4 @@
-"""Numbers of rows around the sizes of blocks, tiles and tasks of kernels, read from the constants in C++."""
+"""Row counts near the sizes of the kernels' blocks, tiles and tasks, which are read from the C++ constants."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ CSRC = Path(__file__).resolve().parents[2] / "csrc"
 DECLARED = re.compile(r"constexpr (?:int|int32_t|int64_t) (k[A-Z][^;]*);")
 VALUE = re.compile(r"k\w+ = (?:int64_t\{(\d+)\}|(\d+))(?: << (\d+))?(?=,|$)")
 SMALL, MOST = 5, 1 << 20
-#: For blocks of at least this size, three blocks are tried only with one row more: full blocks and a short last one.
+#: For blocks of at least this size, three blocks are tried only with one row more: full blocks, then one row.
 LARGE = 1 << 14
 
 
 @functools.cache
 def blocks() -> tuple[int, ...]:
-    """Returns the constants of all CPU kernels, rising; an operation may also run another operation's kernels."""
+    """Returns the sizes of all CPU kernels, in ascending order; an op may also run another op's kernels."""
     constants = set()
     for file in (*CSRC.rglob("*.cpp"), *CSRC.rglob("*.h")):
         for line in DECLARED.findall(file.read_text()):
@@ -26,7 +26,7 @@ def blocks() -> tuple[int, ...]:
 
 @functools.cache
 def sizes(most: int) -> tuple[int, ...]:
-    """Returns numbers of rows up to ``most``: one and three blocks of each size, with one row less or more."""
+    """Returns row counts up to ``most``: one and three blocks of each size, exactly or with one row less or more."""
     about = {count * block + more for block in blocks() for count in (1, 3) for more in (-1, 0, 1)}
     about -= {3 * block - less for block in blocks() if block >= LARGE for less in (0, 1)}
     return tuple(sorted(size for size in about if size <= most))

@@ -14,7 +14,7 @@ from attempts import REFUSED, RIGHT, Failed
 from voronerf import ops
 from voronerf.app.cli import main
 
-# Imported once before the forks: faster, and a later change of a file does not affect attempts.
+# These modules are imported before the forks, for speed and so that changed files do not affect later attempts.
 every_op = [module.name for module in pkgutil.walk_packages(ops.__path__, "voronerf.ops.")]
 for slow in ("matplotlib.pyplot", "imageio_ffmpeg", "rich._emoji_codes", *every_op):
     importlib.import_module(slow)
@@ -34,7 +34,7 @@ def run(*args: str | Path) -> tuple[int, str, str]:
 
 
 def judged(*args: str | Path) -> str:
-    """Runs a command; returns RIGHT if it succeeds, and REFUSED if it prints one clear line of error.
+    """Runs a command; returns RIGHT if it succeeds, and REFUSED if it prints one clear error line.
 
     Raises:
         Failed: The output is unclear, or has control characters that a terminal would execute.

@@ -17,7 +17,7 @@ class Fault:
         file: The file's path from the root of the repository.
         line: The replaced part of a line, which occurs once in the file.
         wrong: The replacement.
-        tests: Arguments of pytest that select the tests of the part from `make test-all`.
+        tests: Pytest arguments that select the tests of the changed part from `make test-all`.
     """
 
     what: str
@@ -28,7 +28,7 @@ class Fault:
 
 
 def _kernel(op: str, what: str, file: str, line: str, wrong: str) -> Fault:
-    """Returns the fault of an operation's kernel, with the operation's tests and the tests of all operations."""
+    """Returns a fault in an op's kernel, which the op's tests or the tests of all ops should detect."""
     own = ("tests/town/test_sums.py",) if op in ("own_samples", "compose_runs") else (f"tests/ops/test_{op}.py",)
     words = f"{op} or test_sums" if "town" in own[0] else op
     tests = ("tests/attack/test_blocks.py", *own, "tests/ops/test_every_op.py", "-k", words)

@@ -1,4 +1,4 @@
-"""Input files of attempts: scenes of 16 x 16 pixels, a finished run of each field, and a folder outside them."""
+"""Writes input files of attempts: scenes of 16 x 16 pixels, a finished run of each field, and a folder outside."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TINY = shlex.split(
     "--steps 16 --cells 3 --split-at 0.5 --width 8 --depth 2 --rays 64 --samples 8 --evaluations 2 --eval-views 1 "
     "--lpips off"
 )
-#: A field of plain networks, and the default one with a smaller hash grid.
+#: Options of a field of plain networks, and of the default field with a smaller hash grid.
 FIELDS = {
     "nerf": shlex.split("--field nerf --no-occupancy"),
     "hashgrid": shlex.split("--field-options log2_entries=10 levels=3"),

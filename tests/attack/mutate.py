@@ -1,7 +1,7 @@
 """Plants faults in a copy of the tree, one at a time, and runs the tests that should detect them.
 
 The copy has its own build folder, so that a fault recompiles only the changed files. A fault is detected if a test
-fails with it and passes without it; the latter is checked at the end.
+fails; at the end, these tests must pass without a fault.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def plant(words: Sequence[str], results: Path | None = None) -> int:
 
 
 def copied(tree: Path) -> Path:
-    """Copies this tree's files (tracked and not ignored) and compiled objects, with file times."""
+    """Copies this tree's files, except ignored ones, and its compiled objects; keeps file times."""
     listed = ["git", "-C", str(ROOT), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     for name in subprocess.run(listed, check=True, capture_output=True, text=True).stdout.split("\0"):
         if name and (ROOT / name).is_file():

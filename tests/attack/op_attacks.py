@@ -73,7 +73,7 @@ def compare(op: str, call: dict[str, Any], viewed: dict[str, Any], *, gradients:
 
 
 def nearer(part: Tensor, other: Tensor, exact: Tensor) -> bool:
-    """Returns whether a result is closer to float64 than the reference, which may suffer from cancellation."""
+    """Returns whether `part` is at least as close to float64 as the reference `other`, which may have cancellation."""
     if part.shape != other.shape:
         return False
     far, near = ((each.double() - exact).norm(torch.inf) for each in (other, part))
@@ -91,7 +91,7 @@ def negated(value: Any) -> Any:
 
 
 def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tuple[list[Tensor], list[Tensor]]:
-    """Returns the output tensors of an op (also in-place outputs), and the gradients of their sum if requested."""
+    """Returns an op's output tensors (in-place outputs too), and the gradients of their sum if `gradients` is set."""
     case = CASES[op]
     own = tree_map(lambda value: value.detach().clone() if isinstance(value, Tensor) and case.in_place else value, call)
     leaves = []
@@ -114,10 +114,10 @@ def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tup
 
 
 def invalid_call(rng: random.Random, folder: Path, inputs: Path) -> str:
-    """Runs a call with an invalid argument, or an invalid part of one, on each backend that has the op.
+    """Runs a call with an invalid argument, or with an invalid part of an argument, on each backend of the op.
 
-    Either all backends refuse it with the argument's name, or none does. An accepted call must not crash, nor may its
-    gradients.
+    Either all backends refuse the call with the argument's name, or none does. An accepted call and its gradients must
+    not crash.
     """
     op, seed, gradients = rng.choice(list(CASES)), rng.getrandbits(32), rng.random() < 0.3
     said: dict[str, str] = {}
@@ -150,7 +150,7 @@ def invalid_call(rng: random.Random, folder: Path, inputs: Path) -> str:
 
 
 def huge(call: dict[str, Any]) -> bool:
-    """Returns whether an argument stands for gigabytes."""
+    """Returns whether a size or a number in the arguments is so large that a call may need gigabytes."""
     sizes = [leaf.numel() if isinstance(leaf, Tensor) else leaf for leaf in tree_leaves(call)]
     return any(isinstance(size, int) and size > 2**24 for size in sizes)
 
@@ -165,7 +165,7 @@ def harmed_call(rng: random.Random, op: str) -> tuple[dict[str, Any], list[str]]
     for name in names:
         if name == "backend":
             call[name] = rng.choice(("", "cuda", None, 3, "Native", [], "a" * 10_000))
-        elif rng.random() < 0.15:  # from another call
+        elif rng.random() < 0.15:  # the argument of another call
             call[name] = other.get(name, call[name])
         elif call[name] is None:
             tensors = [part for part in tree_leaves(arguments) if isinstance(part, Tensor)]
@@ -177,11 +177,11 @@ def harmed_call(rng: random.Random, op: str) -> tuple[dict[str, Any], list[str]]
 
 
 def check_message(op: str, call: dict[str, Any], names: list[str], error: Exception) -> None:
-    """Checks that the error is one short line with the names of an argument and of the op (or an op it consists of)."""
+    """Checks that the error is one short line that names an argument and the op (or an op that the op calls)."""
     text = str(error)
     arguments = {*inspect.signature(called(op)).parameters, *named(call)}
     arguments |= {*inspect.signature(ops.routed_mlp).parameters} if "network" in call else set()
-    arguments |= {argument.removesuffix("s") for argument in arguments}  # the name of a list's entry
+    arguments |= {argument.removesuffix("s") for argument in arguments}  # errors name a list's entry
     clear = re.match(rf"({'|'.join(backends.ops())})(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
     if not clear or "\n" in text or len(text) > 500:
         raise Failed(f"{op}: the error for {names} is not clear: {type(error).__name__}: {text:.300}; {describe(call)}")
@@ -261,7 +261,7 @@ def other_tensor(rng: random.Random, tensor: Tensor) -> Any:
         return rng.choice(
             (lambda: tensor.to_sparse(), lambda: tensor.to("meta"), lambda: tensor.expand(2, *tensor.shape))
         )()
-    if kind == 9 and tensor.dim() and tensor.shape[0]:  # more rows than int32 indexes, by stride 0
+    if kind == 9 and tensor.dim() and tensor.shape[0]:  # more rows than int32 can index, with stride 0
         rows = 2**31 - (tensor.dim() == 1 and not tensor.is_floating_point() and rng.random() < 0.5)
         return tensor[:1].expand(rows, *tensor.shape[1:])
     if kind == 10 and tensor.is_floating_point():
@@ -282,7 +282,7 @@ def difference(found: Tensor, expected: Tensor) -> str:
 
 
 def describe(call: dict[str, Any]) -> str:
-    """Returns a text with shapes and dtypes of the arguments."""
+    """Returns the shapes and dtypes of the arguments as text."""
 
     def one(value: Any) -> str:
         if isinstance(value, Tensor):

@@ -29,10 +29,10 @@ VARIANTS = (
     [*FIELDS["hashgrid"], "--contraction", "sphere"],
     ["--field", "nerf", "--cells", "2", "2", "--split-at", "0.3", "0.6"],
 )
-#: Faults of ranks and their weights (killed, stopped for good, stopped for some seconds), and faults in an attempt.
+#: The weights of faults (ranks are killed, stopped for good, or paused), and the number of faults in an attempt.
 FAULTS, COUNT = {"kill": 10, "stop": 10, "pause": 2}, 4
 PAUSE = 1.5
-#: The share of faults after which a bit of the last checkpoint is flipped.
+#: The fraction of faults after which a bit of the last checkpoint is flipped.
 DAMAGED = 0.25
 #: Seconds that ranks of an attack wait for each other (50 in a training), and seconds until the fault must be reported.
 PATIENCE, TOLD = 8, 60
@@ -54,7 +54,7 @@ class Ranks:
         size: The number of ranks.
         options: Options of ``voronerf train-territories``.
         also: Additional options of the last rank.
-        file_size: The largest bytes of a file of the last rank.
+        file_size: The maximum size in bytes of a file of the last rank.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Ranks:
             raise Failed(f"ranks that were left alone ended with {self.end()}: {self.complaints}")
 
     def is_refused(self, sign: str) -> None:
-        """Checks that all ranks end, and that one rank reports the reason in one line."""
+        """Checks that all ranks end with an error, and that they print one line, which contains `sign`."""
         codes, lines = self.end(), self.complaints
         if not all(codes) or len(lines) != 1 or sign not in lines[0]:
             raise Failed(f"ranks that are to say {sign!r} ended with {codes}: {lines}")
@@ -116,7 +116,7 @@ def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[st
     """Kills or stops ranks at random moments and resumes the run; returns the number of faults."""
     faults = rng.choices([*FAULTS], [*FAULTS.values()], k=COUNT)
     done, runs, length = 0, 0, 4.0
-    while faults:  # a run may end before all faults
+    while faults:  # a run may end before all faults occurred
         part, ended = folder / f"part-{runs}", False
         while not ended:
             ranks, began = Ranks(part, rng.choice((2, 3, 4)), options), time.monotonic()
@@ -133,7 +133,7 @@ def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[st
                 continue
             fault = faults.pop()
             os.kill(number, signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
-            if fault == "pause":  # a pause is no fault
+            if fault == "pause":  # ranks must survive a pause
                 time.sleep(PAUSE)
                 os.kill(number, signal.SIGCONT)
                 ranks.ends_well()
@@ -159,7 +159,7 @@ def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[st
 
 
 def _same_runs(whole: Path, part: Path) -> None:
-    """Compares the tensors of all territories."""
+    """Compares the tensors of all territories of two runs."""
     first, second = town_tensors(whole), town_tensors(part)
     other = [name for name in first.keys() | second.keys() if name not in first or not first[name].equal(second[name])]
     if other:

@@ -1,4 +1,4 @@
-"""Random calls and changes of a router, compared with a loop over masks with a plain module per cell."""
+"""Compares random calls of a changing router with a loop over masks, which runs a plain module per cell."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ sys.path.append(str(Path(__file__).parents[1] / "router"))
 from router_fields import Heads, Sine, SkipNet, tensors
 
 WAYS = ("fastest", "fused", "grouped", "loop")
-#: Numbers of samples of a call.
+#: The numbers of samples in a call, to choose from.
 SAMPLES = (0, 1, 1, 2, 7, 8, 41, 300)
 MOST_CELLS = 12
 
@@ -55,7 +55,7 @@ class Changing(nn.Module):
         return {"density": F.softplus(y[..., :1]), "colour": [torch.sigmoid(y[..., 1:])]}
 
     def change(self, rng: random.Random) -> None:
-        """Sets an attribute, or writes into the buffer."""
+        """Sets an attribute, writes into the buffer, or replaces a layer."""
         name = rng.choice(("gain", "level", "doubled", "bands", "scale", "part"))
         if name == "scale":
             self.scale.mul_(rng.uniform(0.8, 1.2))
@@ -78,7 +78,7 @@ class Normed(nn.Module):
 
 
 class Looked(nn.Module):
-    """A module with a table beside layers."""
+    """A module with an embedding table and layers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ class Looked(nn.Module):
 
 
 class Split(nn.Module):
-    """A module that computes on pieces of tensors and returns them."""
+    """A module that splits tensors, computes with the pieces and returns some of them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ class OfRays(nn.Module):
 
 
 class Custom(nn.Module):
-    """A module with a custom autograd function, and shared layers before the layers of cells."""
+    """A module with a custom autograd function, and an encoder that cells may share."""
 
     class Exp(torch.autograd.Function):
         @staticmethod
@@ -204,7 +204,7 @@ def random_sequence(rng: random.Random, folder: Path, inputs: Path) -> str:
     measure = dispatch.measure
 
     def drawn(ways: Any, call: Any, grouping: Any) -> list[float]:
-        """Runs the measured ways, and returns random times."""
+        """Runs the evaluation paths as in a measurement, but returns random times."""
         return [rng.random() for _ in measure(ways, call, grouping)]
 
     sequence = Sequence(rng)
@@ -220,7 +220,7 @@ def random_sequence(rng: random.Random, folder: Path, inputs: Path) -> str:
 
 
 class Sequence:
-    """A router and the events of its sequence."""
+    """A router, and a record of its calls and changes."""
 
     def __init__(self, rng: random.Random) -> None:
         self.rng, name = rng, rng.choice(list(KINDS))
@@ -332,7 +332,7 @@ class Sequence:
         return lead if len(lead) == 1 or lead[0] != lead[1] or lead == (1, 1) else (n,)
 
     def arguments(self, lead: tuple[int, ...], rng: random.Random) -> tuple[list[Tensor], list[Tensor]]:
-        """Returns the arguments with one row per sample, and in the shapes that the router takes."""
+        """Returns the arguments twice: with one row per sample, and in the shapes for the router."""
         n = math.prod(lead)
         flat = [torch.rand(n, f, dtype=self.dtype) for f in self.kind.features]
         args = [a.reshape(*lead, a.shape[1]) for a in flat]
@@ -347,7 +347,7 @@ class Sequence:
 
     @torch.no_grad()
     def _tensors(self, result: Any, method: str, lead: tuple[int, ...]) -> list[Tensor]:
-        """Returns the tensors of a result, after a check of its structure and shapes against the module's."""
+        """Checks that a result has the module's structure and shapes; returns its tensors."""
         some = [torch.rand(2, f, dtype=self.dtype) for f in self.kind.features]
         plain = getattr(self.router.cell(0), method)(*(some if method == "forward" else some[:1]))
         shapes = [(*lead, *tensor.shape[1:]) for tensor in tensors(plain)]
@@ -356,7 +356,7 @@ class Sequence:
         return tensors(result)
 
     def _expected(self, method: str, flat: list[Tensor]) -> tuple[list[Tensor], list[nn.Module]]:
-        """Returns the results of the loop over masks, and its modules; results of frozen cells are constants."""
+        """Returns the results of the loop over masks (constants in frozen cells), and the module of each cell."""
         router, results = self.router, list[Tensor]()
         cells, frozen = router.assign(flat[0][:, :3].detach()), router.frozen
         modules = [router.cell(i) for i in range(router.num_cells)]

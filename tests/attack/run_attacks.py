@@ -1,4 +1,4 @@
-"""Damaged checkpoints and hostile runs."""
+"""Attacks with damaged checkpoints and hostile runs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def bits(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def flipped_bit(rng: random.Random, folder: Path, inputs: Path) -> str:
-    """Damages a checkpoint: it must be refused, and the previous checkpoint loaded instead."""
+    """Damages a checkpoint: the library must refuse it and load the previous checkpoint."""
     run = copied_run(inputs, rng.choice(list(FIELDS)), folder)
     path = checkpoint_path(run)
     whole, data = load_checkpoint(path), path.read_bytes()
@@ -101,7 +101,7 @@ def config(rng: random.Random, run: Path, outside: Path) -> None:
 
 
 def values(rng: random.Random, run: Path, outside: Path) -> None:
-    """Changes values and fixes the checksum; settings often change in config.json too."""
+    """Changes values of a checkpoint with a valid checksum; often changes settings in config.json too."""
     path = checkpoint_path(run)
     checkpoint = load_checkpoint(path)
     other = mutated(rng, checkpoint.values)
@@ -154,7 +154,7 @@ def metrics(rng: random.Random, run: Path, outside: Path) -> None:
 
 
 def links(rng: random.Random, run: Path, outside: Path) -> None:
-    """Replaces a folder or a file by a link out of the run."""
+    """Replaces a folder or a file by a link that leads out of the run."""
     there = run / rng.choice(("checkpoints", "images", "plots", "samples", "eval.json", "video.mp4", "metrics.jsonl"))
     if there.is_dir():
         shutil.rmtree(there)

@@ -1,4 +1,4 @@
-"""Hostile scenes."""
+"""Attacks with hostile scenes."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def text(rng: random.Random, scene: Path, outside: Path) -> None:
 
 
 def path(rng: random.Random, scene: Path, outside: Path) -> None:
-    """Makes a frame's path or a linked folder lead to an image outside."""
+    """Makes a frame's path or a linked folder lead to an image outside the scene."""
     file = transforms(rng, scene)
     value = json.loads(file.read_text())
     frame = rng.choice(value["frames"])

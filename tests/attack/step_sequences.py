@@ -1,4 +1,4 @@
-"""Random changes around recorded training steps, whose results must equal eager steps bit for bit."""
+"""Makes random changes between recorded training steps, whose results must equal eager steps bit for bit."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def changed_steps(rng: random.Random, folder: Path, inputs: Path) -> str:
 
 
 class Own(SplitStrategy):
-    """A split strategy that counts its calls and calls its base."""
+    """A split strategy that counts samples, and then runs its base class."""
 
     seen = 0
 
@@ -136,7 +136,7 @@ def _move(training: Training, rng: random.Random) -> None:
 
 
 def _lay_out(training: Training, rng: random.Random) -> None:
-    """Changes the strides of images or poses in the same memory: flipped, or expanded from one."""
+    """Transposes or flips the images or the poses, or expands the first one."""
     tensor = rng.choice((training.batches.images, training.batches.cameras.poses))
     every = [-1] * (tensor.dim() - 1)
     tensor.data = rng.choice(
@@ -221,7 +221,7 @@ def _no_gradients(training: Training, rng: random.Random) -> None:
 
 
 def _hook(training: Training, rng: random.Random) -> None:
-    """Replaces the hook by another kind, or removes it."""
+    """Replaces the hook of a parameter, or removes it."""
     for handle in training.handles:
         handle.remove()
     parameter = rng.choice(_parameters(training))
@@ -238,7 +238,7 @@ def _learn(training: Training, rng: random.Random) -> None:
 
 
 def _second_optimizer(training: Training, rng: random.Random) -> None:
-    """Moves a parameter to a second optimiser, or steps it there and maybe moves it back."""
+    """Moves a parameter to a second optimiser; if there is one, runs its step and may move the parameter back."""
     group = training.optimizer.param_groups[0]
     if training.other is None:
         parameter = rng.choice(group["params"])

@@ -1,4 +1,4 @@
-"""Attacks on the image cache: files are damaged, truncated, replaced, or planted links."""
+"""Attacks on the image cache: files are damaged, truncated, or replaced by other images or by links."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def pixels(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
 
 
 def record(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
-    """Changes a value of the record."""
+    """Damages store.json, or changes a value in it."""
     path = store / "store.json"
     text = path.read_bytes()
     path.write_bytes(damaged(rng, text) if rng.random() < 0.5 else json_text(mutated(rng, json.loads(text))))
@@ -79,7 +79,7 @@ def link(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
 
 
 def cut(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
-    """Truncates the file while a training reads it; the next batch must report it."""
+    """Truncates the pixel file of an open scene; the next batch must report this."""
     used = load_scene(scene, images="disk")
     batches = make_batches(TrainConfig(device="cpu"), used)
     os.truncate(store / "pixels", rng.randrange((store / "pixels").stat().st_size))

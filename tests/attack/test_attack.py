@@ -16,7 +16,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="forks, and limits me
 
 
 def harmed(rng, folder, inputs):
-    """Runs an attempt, whose folder is named after its seed."""
+    """Crashes, hangs, fails or succeeds, depending on the seed of the attempt."""
     seed = int(folder.name)
     if seed == 1:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -36,7 +36,7 @@ def test_a_crash_is_a_failure_like_another(tmp_path):
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.what)
 def test_a_fault_can_be_planted(fault):
-    """Checks that the fault's line occurs once in its file; ``python tests/attack --mutate`` plants it, in minutes."""
+    """Checks that the fault's line occurs once in its file; ``python tests/attack --mutate`` plants the fault."""
     text = (ROOT / fault.file).read_text()
     assert text.count(fault.line) == 1 and fault.line != fault.wrong
     tests = fault.tests[: fault.tests.index("-k")] if "-k" in fault.tests else fault.tests

@@ -1,4 +1,4 @@
-"""Calls of every op with one row less and one row more than a multiple of each kernel's block size."""
+"""Calls every op with row counts just below and just above multiples of each kernel's block size."""
 
 import blocks
 import op_attacks
@@ -19,7 +19,7 @@ def test_constants_of_kernels_are_found():
 @pytest.mark.native
 @pytest.mark.parametrize("op", COMPARED)
 def test_over_the_blocks_of_kernels(op):
-    """Compares with the reference on one and three threads; few rays and cells, so that blocks cross them."""
+    """Compares with the reference on one and three threads; rays and cells are few, so that blocks split them."""
     case, most, before = op_attacks.CASES[op], 5_000 if op in op_attacks.SLOW else 200_000, torch.get_num_threads()
     try:
         for n in blocks.sizes(most):

@@ -1,4 +1,4 @@
-"""Attacks on training: kills at any moment, full disks, little memory, and absurd settings."""
+"""Attacks on training: interruptions at any moment, full disks, little memory, and absurd settings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ VARIANTS = (
     [*FIELDS["nerf"], "--assignment", "stochastic"],
     [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6", "--init", "random"],
 )
-#: Signals that end a training; None is a full disk.
+#: Signals that end a training; None stands for a full disk.
 SIGNALS = (*[signal.SIGKILL] * 6, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGINT, None)
 #: The number of interruptions of a training.
 KILLS = 5
@@ -138,7 +138,7 @@ def settings(rng: random.Random, folder: Path) -> str:
             options += [option, _value(rng, name, hints[name])]
     out = folder / "run"
     verdict = judged("train", "--data", "blender", "--out", out, *TINY, *rng.choice(list(FIELDS.values())), *options)
-    began = bool(checkpoint_paths(out)) or (out / "metrics.jsonl").exists()  # it may have diverged
+    began = bool(checkpoint_paths(out)) or (out / "metrics.jsonl").exists()  # the training may have diverged
     if verdict == REFUSED and out.exists() and not began:
         raise Failed(f"{[str(path) for path in out.rglob('*')]} were written before {options} were refused")
     return verdict
@@ -152,13 +152,13 @@ def _value(rng: random.Random, name: str, kind: Any) -> str:
     return str(rng.choice([number for number in NUMBERS if "float" in str(kind) or isinstance(number, int)]))
 
 
-#: Outputs of processes that other libraries end when memory is exhausted (Pillow by SIGSEGV), or that hang in Python's
-#: ``Thread.start`` (python/cpython#140746).
+#: Signs that memory was exhausted inside another library, which ended the process (Pillow by SIGSEGV), or in Python's
+#: ``Thread.start``, which hangs (python/cpython#140746).
 BENEATH = ("PanicException", "out of memory", "memory allocation", "allocate", "in _getdecoder\n", "in start\n")
 
 
 def memory(rng: random.Random, folder: Path) -> str:
-    """Runs a training with a limit of the address space (``ulimit -v``) above the current size."""
+    """Runs a training with an address space limit (``ulimit -v``) above the current size."""
     extra = rng.randrange(1 << 20, 1 << 29)
     large = rng.choice(("--width 64", "--width 2000", "--rays 20000", "--samples 500", "--seed 1"))
     command = ("train", "--data", "blender", "--out", folder / "run", *TINY, *FIELDS["nerf"])

@@ -1,4 +1,4 @@
-"""Hostile messages to the viewer, which its page never sends."""
+"""Attacks on the viewer with hostile messages, which its page never sends."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MESSAGES = 20
 
 def hostile_client(rng: random.Random, folder: Path, inputs: Path) -> str:
     """Sends hostile messages from one client: the viewer must log each in a line and keep serving another client."""
-    import msgspec  # here, since the viewer is an extra
+    import msgspec  # imported here, since the viewer's packages are optional
     from tab import Tab
     from websockets.exceptions import ConnectionClosed
 

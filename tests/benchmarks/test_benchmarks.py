@@ -124,7 +124,7 @@ def test_foreign_contenders_compute_what_masks_do(name):
 
 @pytest.mark.parametrize("name", [name for name in cases_foreign.FIELDS if not re.search("2.19|torch-ngp", name)])
 def test_fused_foreign_fields_compute_what_masks_do(name):
-    """Compares values and the gradients of every parameter, through second derivatives where a field has them."""
+    """Compares the values and the gradients of every parameter; some fields have second derivatives in them."""
     work = cases_foreign.foreign_work(cases_foreign.FIELDS[name], 300, 4, "forward+backward", CPU)
     fused = work.alternatives["fused"]()
     assert work.error(fused.adapt(fused.run(0))) < 1e-3
@@ -227,7 +227,7 @@ def test_wrong_answers_are_found():
         (nearest, lambda right: right + 7, infinite),
         (lookup._sort_work(500, 7, CPU), lambda right: (right[0].flip(0), right[1]), 1e-6),
         (marched, lambda right: right._replace(depths=right.depths * 1.1), 0.05),
-        (marched, lambda right: marched.ours("reference").run(1), 0.1),  # rays of another call
+        (marched, lambda right: marched.ours("reference").run(1), 0.1),  # results for the rays of another call
     ):
         right = work.ours("reference").run(0)
         assert work.error(right) < 1e-6 and work.error(spoilt(right)) >= least

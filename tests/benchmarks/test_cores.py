@@ -1,4 +1,4 @@
-"""Tests of benchmarks/cores.py: rows have all ways and a model, and a parallel region has a cost."""
+"""Tests of benchmarks/cores.py: rows have all variants and a model, and a parallel region has a cost."""
 
 import cores
 import pytest
@@ -24,7 +24,7 @@ def test_steps_and_regions_are_measured(tmp_path, capsys):
 
 
 def test_more_cores_are_bound_by_what_is_serial_and_by_memory():
-    # 1 ms of Python, and 9 ms in two evenly shared regions
+    # A step has 1 ms of Python, and 9 ms in two parallel regions with evenly distributed work.
     step = cores.parts(0.010, [("op", 0.009, 2, 0.009, [0.009 / team for team in cores.TEAMS])])
     found = cores.model([step] * 3, 0.0, 0.0)
     assert found["traced_ms"] == pytest.approx(10) and found["serial_percent"] == 10 and found["regions"] == 2

@@ -1,4 +1,4 @@
-"""Tests of benchmarks/edges.py: the figures of silhouettes, plain patches and holes for a ball before a wall."""
+"""Tests of benchmarks/edges.py: the measures of silhouettes, plain patches and holes, for a ball in front of a wall."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BOX = torch.tensor([[-3.0, -3, -3], [3, 3, 3]])
 
 
 def figures(fur=0.0, bumps=0.0, hole=0.0):
-    """Measures a ball of radius 0.4 with half-transparent fur before a wall with bumps and a hole."""
+    """Measures a ball of radius 0.4 with half-transparent fur, in front of a wall with bumps and a hole."""
 
     def field(positions, directions, ray_index):
         x, y, z = positions.unbind(-1)

@@ -13,7 +13,7 @@ from voronerf.nerf import SplitStrategy
 
 
 def test_the_distortion_of_the_page_is_that_of_its_source() -> None:
-    """Compares with a double sum over the samples of each ray in float64, and both terms' gradients with each other."""
+    """Compares both terms with a float64 double sum over the samples of each ray, and compares their gradients."""
     own = own_parts.examples()
     gradients = []
     for term in (own["distortion"], own["Distortion"](0.01)):

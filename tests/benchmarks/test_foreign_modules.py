@@ -1,4 +1,4 @@
-"""Modules in the style of public code run fused, kind by kind; modules of public repositories have stored results."""
+"""Tests that all kinds of modules in public code's style run fused, and that public modules have stored results."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Tests of benchmarks/many_cells.py: trainings with few and many cells have a row each."""
+"""Tests of benchmarks/many_cells.py: each training, with few or many cells, has a row."""
 
 import many_cells
 from helpers import read_json

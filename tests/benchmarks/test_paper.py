@@ -73,7 +73,7 @@ def test_turns():
     assert all(fake.seconds >= 3.0 for fake in fakes)
     refuses("--turn must be positive, got 0", turns.take_turns, fakes, budget=1, turn=0, error=ConfigError)
 
-    # A run resumed within a turn still gets the stop that a long step had passed.
+    # A run that is resumed within a turn still makes a stop that an earlier long step had passed.
     looks = []
     stops, on_stop = lambda fake: (3.0, 4.5, 5.0), lambda fake, second: looks.append(second)
     turns.take_turns([Fake("a", 4.7, 0.5)], budget=6.0, turn=2.0, stops=stops, on_stop=on_stop)
@@ -97,7 +97,7 @@ def test_experiments_write_their_files_and_are_not_run_again(settings, capsys, m
     with Image.open(settings.out / "initialisation.png") as picture:
         assert picture.width > 400 and len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 10
 
-    # its first variant keeps the samples for the experiment on balance
+    # The first variant of the experiment stores the samples for the balance experiment.
     trained = [run for run in EXPERIMENTS["initialisation"].runs(settings) if run.variant.name == "inherited"]
     rows = balance.measure(trained, "auto", diagrams=3)
     assert [row["variant"] for row in rows] == ["kept by a training, builtin", "separate objects"]
@@ -108,7 +108,7 @@ def test_experiments_write_their_files_and_are_not_run_again(settings, capsys, m
         raise AssertionError("must not be trained again")
 
     monkeypatch.setattr(runs, "Training", refuse)
-    paper.repeat(settings, ("initialisation", "density", "ghosting"))  # these reuse the trainings
+    paper.repeat(settings, ("initialisation", "density", "ghosting"))  # these experiments reuse the trainings
     assert read_json(settings.out / "initialisation.json")["results"] == stored["results"]
     assert read_json(settings.out / "ghosting.json")["results"] == stored["results"]
     assert (settings.out / "density-pictures.png").is_file()
@@ -125,7 +125,7 @@ def test_defaults_at_size(settings):
 
 
 def one(settings, seed=0, scene="builtin", **changes):
-    """Makes the training of one network."""
+    """Creates the training of one network."""
     return runs.make_run(runs.Variant("one", {"cells": (), **changes}), scene, seed, settings)
 
 

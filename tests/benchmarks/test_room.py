@@ -34,7 +34,7 @@ def test_points_and_cameras_are_those_of_the_pictures(folder):
         away = (points[inside] - scene.test.cameras.poses[0, :3, 3]).norm(dim=-1)
         off.append((away / (scale * torch.from_numpy(known[0])[row, column]) - 1).abs())
     off = torch.cat(off)
-    assert off[off < 0.1].median() < 0.02  # of the visible points
+    assert off[off < 0.1].median() < 0.02  # the median of the visible points
 
 
 @pytest.mark.parametrize("density, before", [(0.0, 0.0), (1e6, 1.0)])

@@ -1,4 +1,4 @@
-"""Tests of time_to_quality.py from end to end, and of its rival."""
+"""Tests of benchmarks/time_to_quality.py from end to end, and of its rival, Instant NGP."""
 
 import dataclasses
 import itertools

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The C++ tests for 64-bit Arm, cross-compiled and run by qemu: every kernel with NEON against its portable path.
+# Cross-compiles the C++ tests for 64-bit Arm and runs them in qemu: every kernel with NEON against its portable path.
 # arm.sh [cases]; needs g++-aarch64-linux-gnu and qemu-user (Debian's names).
 set -euo pipefail
 build=$(mktemp -d)

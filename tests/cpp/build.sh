@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds the C++ tests of the CPU kernels, ops and programs: build.sh FOLDER FLAGS... by $CXX (g++), for its architecture.
+# Builds the C++ tests of CPU kernels (ops and programs) with $CXX (g++) for its architecture: build.sh FOLDER FLAGS...
 set -euo pipefail
 folder=$1
 shift
@@ -11,7 +11,7 @@ case $("${cxx[@]}" -dumpmachine) in
   aarch64-* | arm64-*) isas+=("neon -DVN_ISA=3") ;;
 esac
 mkdir -p "$folder"
-# Each line: source, object, flags of its own.
+# Each line has a source, its object, and flags for this source only.
 for source in tests/cpp/*.cpp $(find csrc -name "*.cpp" -not -path "*/bindings/*" -not -path "*/cuda/*"); do
   object=$folder/$(basename "$source" .cpp)
   if [[ $source == *_isa.cpp ]]; then

@@ -16,7 +16,7 @@ template <typename T>
 using Array = std::vector<T>;
 
 inline std::mt19937 generator(0);
-inline bool wild = false;  // NaN and infinity among the inputs
+inline bool wild = false;  // whether inputs have NaN and infinity
 
 inline int64_t below(int64_t n) {
   return static_cast<int64_t>(generator() % static_cast<uint32_t>(n));
@@ -63,7 +63,7 @@ void same(const Array<T>& a, const Array<T>& b, const char* what) {
 }
 
 // Results of the portable path in a case. The other instruction sets repeat its calls on the same random numbers.
-// Integers must be equal. Differences of floats must be small by norm, since rounding may switch single ReLU units.
+// Integers must be equal. Floats may differ by a small norm, since rounding may switch single ReLU units.
 inline std::vector<Array<double>> portable;
 inline size_t compared = 0;
 

@@ -1,7 +1,7 @@
 // Runs every CPU kernel except networks on random and edge sizes, with every instruction set of the machine. The tests
-// in Python (tests/) compare numbers with the reference. Here every array has exactly its size, so that sanitizers
-// guard its ends, and outputs start poisoned. Every eighth case has NaN and infinity among its inputs. One and three
-// threads must agree bit for bit. All instruction sets must agree with the portable path.
+// in Python (tests/) compare numbers with the reference. Here every array has exactly the needed size, so that
+// sanitizers guard its ends, and outputs start poisoned. Every eighth case has NaN and infinity among its inputs. One
+// and three threads must agree bit for bit. All instruction sets must agree with the portable path.
 #include <algorithm>
 #include <cstdio>
 #include <cstdlib>
@@ -48,7 +48,7 @@ void search(Isa isa) {
 
 template <typename T>
 void locate(Isa isa) {
-  // Refines every other centre of the root by diagrams of different sizes.
+  // Subdivides every second centre of the root by diagrams of different sizes.
   const int64_t n = some_rows(), root = 1 + below(20);
   Array<int32_t> offsets = {0, static_cast<int32_t>(root)}, child(root);
   int32_t leaves = 0;
@@ -313,7 +313,7 @@ int main(int count, char** arguments) {
         loss(isa);
         adam(isa);
       };
-      i % 2 == 0 ? ops() : voronerf::with_team(3, ops);  // with a team, as in replays
+      i % 2 == 0 ? ops() : voronerf::with_team(3, ops);  // odd cases run with a team, as replays do
     }
     sort();
     resample();

@@ -249,7 +249,7 @@ struct Case {
   }
 };
 
-// A way to run a program. The portable path emulates tile registers.
+// An instruction set and an operand layout for a program. The portable path emulates tile registers.
 struct Way {
   Isa isa;
   voronerf::ProgramTable Description::* table;
@@ -282,8 +282,8 @@ void run_case(const Description& description, int number) {
         for (const float value : values) {
           if (!std::isfinite(value)) fail(what + " is not finite");
         }
-        if (i + description.floats.lookups.size() >= alone.size()) continue;  // a stored lookup
-        // Programs of any steps may subtract values rounded to bfloat16, which leaves a large relative error.
+        if (i + description.floats.lookups.size() >= alone.size()) continue;  // stored lookups are not compared
+        // Programs with all kinds of steps may subtract values rounded to bfloat16, with a large relative error.
         const double pairs = number % 4 < 2 ? 0.2 : 0.5;
         like_portable(values, what.c_str(), rounds ? pairs : one.tolerance);
       }

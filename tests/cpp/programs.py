@@ -1,8 +1,8 @@
 """Writes random programs as numbers for programs.cpp: ``programs.py CASES FILE``.
 
-The cases are, in turn: a layer table, the gradient of one, a program of any steps, and the first or second gradient of
-one. The requested gradients are drawn too. Each program is lowered for every operand layout of products. The numbers
-have the order of the records' members; enumerators are written as numbers.
+The cases are, in turn: a layer table, the gradient of a layer table, a program with all kinds of steps, and the first
+or second gradient of such a program. The requested gradients are random too. Each program is lowered for every operand
+layout of products. The numbers have the order of the records' members; enumerators are written as numbers.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def any_steps(draw: random.Random) -> Program:
 
 
 def random_program(draw: random.Random, number: int) -> tuple[Program, int]:
-    """Draws a program; returns it and the index of its first gradient input, whose zero rows add nothing, or -1."""
+    """Returns a random program, and the index of its first gradient input if zero rows there add nothing, else -1."""
     while True:
         program, first = (layer_table if number % 4 < 2 else any_steps)(draw), -1
         for _ in range(draw.choice(((0,), (1,), (0,), (1, 1, 2))[number % 4])):

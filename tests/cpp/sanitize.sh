@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Builds the C++ tests with sanitizers and runs them: sanitize.sh [cases]. First AddressSanitizer and
-# UndefinedBehaviorSanitizer, then ThreadSanitizer, for which teams are of std::thread (csrc/common/parallel.h): it takes the
-# barriers of an OpenMP runtime that was built without it for races.
+# Builds the C++ tests with sanitizers and runs them: sanitize.sh [cases]. AddressSanitizer and
+# UndefinedBehaviorSanitizer come first, then ThreadSanitizer. The latter runs with teams of std::thread
+# (csrc/common/parallel.h), since it would report the barriers of an uninstrumented OpenMP runtime as races.
 set -euo pipefail
 here=$(dirname "$0")
 build=$(mktemp -d)

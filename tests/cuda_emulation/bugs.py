@@ -1,4 +1,4 @@
-"""Runs a planted bug without torch: ``bugs.py MODULE BUG SEED``; BUG is its number in planted.cu.
+"""Runs a kernel with a planted bug, without torch: ``bugs.py MODULE BUG SEED``; BUG is a number in planted.cu.
 
 The last printed line is the verdict. Under a sanitizer each bug needs a separate process.
 """
@@ -10,7 +10,7 @@ from emulation_build import load
 
 
 def planted(module, bug, seed):
-    """Runs the kernel; returns the largest error of its results, three times the sum of each block."""
+    """Runs the kernel, which computes three times the sum of each block; returns its largest error."""
     blocks, threads = 2, 64
     values = ((7 * np.arange(blocks * threads)) % 13).astype(np.float32)
     out, counter = np.full_like(values, -1), np.zeros(1, np.int32)

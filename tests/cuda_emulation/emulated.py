@@ -28,7 +28,7 @@ def module() -> ModuleType:
 
 
 class _Both:
-    """The compiled module, whose entries are overridden by the emulated module's."""
+    """The compiled module, in which the emulated module's entries take precedence."""
 
     def __init__(self, over: Any, under: Any) -> None:
         self._over, self._under = over, under
@@ -44,7 +44,7 @@ def emulated(
     """Runs the native backend on the emulated device inside the block.
 
     Args:
-        seed: The seed of the order of threads.
+        seed: The seed of the thread order.
         capability: The compute capability of the device.
         compiled: The architecture that the kernels are compiled for.
         shared_bytes: The bytes of shared memory per block.

@@ -15,7 +15,7 @@ KIB = 1024
 # Allowed relative errors (Frobenius norm) by the precision of products.
 ALLOWED = {"float32": 3e-6, "tf32": 3e-3, "float16": 3e-3, "bfloat16": 2.5e-2}
 
-# Smooth activations, which rounding does not switch; every kind of source, and outputs of middle layers.
+# A network with smooth activations, which rounding does not switch, all kinds of sources, and outputs of middle layers.
 BRANCHED = MLP(
     (
         Layer((POSITIONS,), 24, "sine"),
@@ -32,7 +32,7 @@ BRANCHED = MLP(
 )
 WIDE = MLP((Layer((POSITIONS,), 130, "sine"), Layer((0, POSITIONS), 70, "sigmoid"), Layer((1,), 4)), (2,))
 GAUSSIANS = MLP((Layer((POSITIONS,), 16, "sigmoid"), Layer((0,), 2)), (1,), 3, position_encoding="integrated")
-# Harmonics of the directions in the first and in a later layer; degree 3 leaves some padding columns.
+# A network whose first and last layers read harmonics of the directions; degree 3 leaves some padding columns.
 HARMONICS = MLP(
     (Layer((POSITIONS, DIRECTIONS), 24, "softplus"), Layer((0, DIRECTIONS), 5)),
     (1,),
@@ -41,15 +41,15 @@ HARMONICS = MLP(
     direction_degree=3,
 )
 
-# Nineteen layers that read all earlier layers: more layers and sources than the fused kernel takes.
+# A network of nineteen densely connected layers: more layers and sources than the fused kernel takes.
 DENSE = MLP(
     (*(Layer((POSITIONS, *range(index)), 5 + index % 3, "softplus") for index in range(18)), Layer((17, 3), 2)),
     (18, 4, 4),
 )
 BROAD = MLP((Layer((POSITIONS,), 270, "sigmoid"), Layer((0, POSITIONS), 300, "sine"), Layer((1,), 3)), (2,), 2)
 
-# ReLU outputs that are read late, twice, side by side, and while another value is live; two chunks of outputs, one of
-# them narrow; encodings that are read again; every kind of head.
+# A network whose ReLU outputs are read late, twice, side by side, and while another value is live. A layer has two
+# chunks of outputs, and one chunk is narrow. Encodings are read twice, and there is every kind of head.
 SKIPS = MLP(
     (
         Layer((POSITIONS,), 100, "relu"),
@@ -71,12 +71,12 @@ THICK = MLP(
     position_octaves=10,
 )
 
-# 32 features, for the kernel with the fewest registers.
+# A network of 32 features, for the kernel with the fewest registers.
 NARROW = MLP((Layer((POSITIONS,), 32, "relu"), Layer((0,), 32, "relu"), Layer((1,), 4, "sigmoid")), (2,), 10)
 
 
 def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.float32) -> dict:
-    """Draws arguments in float64, whose values `dtype` represents exactly."""
+    """Draws float64 arguments with values that `dtype` represents exactly."""
     n, k = sum(counts), len(counts)
     directions = torch.rand(4, 3) if layers.uses_directions else None
     shapes = layers.weight_shapes(d, 3 if directions is not None else 0)
@@ -100,7 +100,7 @@ def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.floa
 
 @functools.cache
 def wave(*shape: int) -> Tensor:
-    """Returns a gradient, computed once: PyTorch's first sine of a process is off by 1e-4 on its second thread."""
+    """Returns a cached gradient, since PyTorch's first sine in a process is off by 1e-4 on the second thread."""
     return torch.linspace(-1, 1, math.prod(shape)).reshape(shape).sin()
 
 

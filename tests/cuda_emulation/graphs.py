@@ -1,9 +1,9 @@
 """Emulates CUDA graphs: ``with emulated(), graphs() as seen: ...``.
 
 A capture computes nothing: it stores launches of this project's kernels and of torch's operations, and only replays run
-them. Each replay poisons memory at its allocation in the capture, since a GPU may reuse the memory of a freed tensor. A
-read by the host, which ends a capture on a GPU, raises an error in a capture, and warns in torch's sync debug mode.
-Streams are always ordered.
+them. Where the capture allocated memory, each replay poisons this memory, since a GPU may reuse the memory of a freed
+tensor. A read by the host, which ends a capture on a GPU, raises an error here. In torch's sync debug mode, a read only
+warns. Streams are always ordered.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ ASKED = "_workspace", "multiplies_halves"
 
 
 def reads(function: Any, args: Any) -> bool:
-    """Returns whether the host waits for the device."""
+    """Returns whether a call makes the host wait for the device."""
     masks = args[1] if function is aten.index.Tensor else ()
     by_bool = any(index is not None and index.dtype == torch.bool for index in masks)
     return by_bool or function in READING or function is aten.lift_fresh.default
 
 
 class Warned(TorchDispatchMode):
-    """A mode that warns of reads, like ``torch.cuda.set_sync_debug_mode("warn")``."""
+    """A dispatch mode that warns of reads by the host, like ``torch.cuda.set_sync_debug_mode("warn")``."""
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
         if reads(function, args):
@@ -77,7 +77,7 @@ class Graph(TorchDispatchMode):
         if function.is_view or name in FREE:
             result = function(*args, **kwargs)
             if "empty" in name:
-                result.zero_()  # torch may read it as an index to find shapes
+                result.zero_()  # torch may read the memory as an index to find shapes
                 self.add(result.fill_, float("nan") if result.is_floating_point() else 77)
             return result
         generator = kwargs.get("generator")

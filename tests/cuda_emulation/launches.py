@@ -31,7 +31,7 @@ FREE = {
 
 
 class Asked(TorchDispatchMode):
-    """A mode that counts torch's operations.
+    """A dispatch mode that counts torch's operations.
 
     Attributes:
         operations: The number of calls of each computing operation, by name.

@@ -31,7 +31,7 @@ __global__ void planted_kernel(const float* values, float* out, int* counter, in
     if (bug != kBarrierTooSoon) __syncthreads();
     if (bug == kBarrierTooSoon) staged[i] = 0.0f;
   }
-  // The right neighbour's value, within the warp.
+  // Reads the right neighbour's value within the warp.
   staged[i] = values[blockIdx.x * threads + i];
   if (bug == kShuffleForBarrier) {
     __shfl_sync(0xffffffffu, i, 0);

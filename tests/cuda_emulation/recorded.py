@@ -23,8 +23,8 @@ from voronerf.ops._core import native as _native
 from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops.cell_sort.native import sort as sort_cells
 
-# Products and KiB of shared memory. The cases' 227 KiB have tiles of 64 rows; these sizes have tiles of 32 rows, and
-# values in the workspace.
+# The precision of products, and KiB of shared memory. The cases' 227 KiB give tiles of 64 rows, 40 KiB give tiles of 32
+# rows, and 12 KiB keep values in the workspace.
 NETWORKS = (("bfloat16", 40), ("float16", 12), ("float32", 12))
 
 
@@ -88,7 +88,7 @@ def call_case(op: str, pins: dict[str, Any], n: int) -> None:
 
 
 def recorded() -> list[tuple[int, str, list[Any]]]:
-    """Returns for each op: bytes of shared memory, the arguments that may be hostile (`Case.hostile`), its calls."""
+    """Returns each case's bytes of shared memory, kind of hostile arguments (`Case.hostile`), and calls."""
     records = []
 
     def record(op: str, run: Any, *arguments: Any, shared: int = 227) -> None:
@@ -106,7 +106,8 @@ def recorded() -> list[tuple[int, str, list[Any]]]:
     for (precision, shared), kind in itertools.product(NETWORKS, ("", "hashed")):
         pins = {**cases()["grouped_mlp"].kinds[kind], "dtype": getattr(torch, precision)}
         record("grouped_mlp", call_case, "grouped_mlp", pins, 64, shared=shared)
-    # Counting and radix sorts. Keys of 4 bytes would need 65,535 cells with a thread each: too many for a sanitizer.
+    # These are counting and radix sorts. Keys of 4 bytes would need 65,535 cells with a thread each: too many for a
+    # sanitizer.
     for n, k, way in ((3000, 5, "automatic"), (9000, 2, "counting"), (600, 3, "radix"), (300, 1100, "automatic")):
         cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32)
         memory = torch.full_like(cells, -7), cells.new_full((k + 1,), -7)

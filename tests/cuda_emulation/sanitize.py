@@ -63,7 +63,7 @@ def harm(numbers, before, after):
 
 
 def same(found, expected):
-    """Returns whether values equal the recorded values; sums may differ by their order."""
+    """Returns whether values equal the recorded values; sums may differ slightly, since their order is free."""
     if found.dtype.kind != "f" or not found.size:
         return found.dtype.itemsize < 4 or np.array_equal(found, expected)
     size = max(np.abs(np.nan_to_num(expected, posinf=0, neginf=0)).max(), 1e-6)

@@ -1,4 +1,4 @@
-"""Networks of layer tables on the emulated CUDA kernels: each kind of product and of tile."""
+"""Tests of layer tables on the emulated CUDA kernels, with each kind of product and of tile."""
 
 from __future__ import annotations
 
@@ -116,8 +116,8 @@ def test_rows_are_gathered_and_scattered_and_every_order_of_threads_gives_the_sa
 
 WHOLE = {
     "two parts": MLP((Layer((POSITIONS,), 40, "relu"), Layer((0,), 70, "relu"), Layer((1, 0), 5)), (2,)),
-    # Values pass from layer to layer in registers: from one or two chunks to one or two, sums of two and three
-    # products, and values that the next layer and a later layer read.
+    # Values of one or two chunks stay in registers from layer to layer. Layers sum up to three products, and both the
+    # next and a later layer read a value.
     "in registers": MLP(
         (
             *(Layer((POSITIONS,), 64, "relu"), Layer((0,), 64, "relu"), Layer((1,), 32, "relu")),

@@ -1,4 +1,4 @@
-"""Programs on the emulated CUDA kernels, with threads in several orders, against the reference in float64."""
+"""Tests of programs on the emulated CUDA kernels, in several thread orders, against the reference in float64."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KIB = 1024
 TILES = [227 * KIB, 40 * KIB, 12 * KIB]
 """Bytes of shared memory: enough for rows per warp, for rows shared by a team of warps, and for neither."""
 ALLOWED = {"float32": 2e-5, "tf32": 4e-3, "float16": 4e-3, "bfloat16": 3e-2}
-"""Allowed relative errors by norm."""
+"""Allowed relative errors (norm) by the precision of products."""
 LARGEST = 65504.0
 """The largest number of float16."""
 
@@ -46,7 +46,7 @@ def tensors_of(
 
 
 def outcome(program: Program, tensors: list[Tensor], offsets: Tensor, products: str = "", **given: Any) -> list[Tensor]:
-    """Returns results and gradients; by the reference in float64 unless ``products`` is given."""
+    """Returns results and gradients, from the float64 reference unless ``products`` is given."""
     count = len(program.inputs)
 
     def run(*leaves: Tensor) -> list[Tensor]:
@@ -100,7 +100,7 @@ def test_values_and_derivatives_of_second_order() -> None:
 @pytest.mark.parametrize("products", ALLOWED)
 @pytest.mark.parametrize("widths", [[3, 5, 1], [17, 70, 33, 66], [64, 64, 64, 4]], ids=str)
 def test_products_of_every_precision(products: str, widths: list[int], shared_bytes: int) -> None:
-    """Covers widths around a block's and a strip's."""
+    """Covers widths near the width of a block and of a strip."""
     program, sizes = layers_of(widths), [65, 0, 31, 1]
     tensors = tensors_of(program, sizes)
     exact = outcome(program, tensors, offsets_of(sizes))
@@ -147,7 +147,7 @@ def learning_a_table() -> Program:
 
 
 def reading_a_part() -> Program:
-    """Returns a program in which one product reads a whole value, and the next product a part of it."""
+    """Returns a program in which one product reads a whole value, and the next product reads a part of the value."""
     b = Builder()
     h = b.apply("relu", b.linear(b.input(32), b.parameter(32, 32), 32))
     whole = b.linear(h, b.parameter(48, 32), 48)
@@ -155,14 +155,14 @@ def reading_a_part() -> Program:
 
 
 def cut_by_its_input() -> Program:
-    """Returns a program with a product that is masked by the ReLU that it reads."""
+    """Returns a program with a product that reads a ReLU and is masked by the same ReLU."""
     b = Builder()
     h = b.apply("relu", b.linear(b.input(128), b.parameter(128, 128), 128))
     return b.program([b.linear(b.binary("gate", b.linear(h, b.parameter(128, 128), 128), h), b.parameter(4, 128), 4)])
 
 
 def learning_nothing() -> Program:
-    """Returns a program without steps."""
+    """Returns a gradient program without steps."""
     b = Builder()
     program = b.program([b.apply("step", b.linear(b.input(4), b.parameter(3, 4), 3))])
     return gradient(program, (False,), (True,), (True,), ())
@@ -187,7 +187,7 @@ def test_what_must_not_stay_in_registers(make: Callable[[], Program], products: 
 @pytest.mark.parametrize("shared", [False, True], ids=["tables of cells", "one table"])
 @pytest.mark.parametrize("ordered", [False, True], ids=["sorted", "in any order"])
 def test_encodings_rays_and_tables(products: str, shared: bool, ordered: bool) -> None:
-    """Covers all encodings, per-ray inputs and outputs, rows of no cell, and all gradients, tables included."""
+    """Covers all encodings, per-ray inputs and outputs, rows of no cell, and all gradients, also of tables."""
     program, sizes = encoded(20), [37, 0, 70]
     n = sum(sizes) + 5
     generator = torch.Generator().manual_seed(1)
@@ -205,7 +205,7 @@ def test_encodings_rays_and_tables(products: str, shared: bool, ordered: bool) -
 
 
 def test_rows_of_no_cell_keep_nothing() -> None:
-    """Checks that stored lookups of rows of no cell are 0, before the first cell and after the last."""
+    """Checks that stored lookups are 0 in rows of no cell, before the first and after the last cell."""
     b = Builder()
     e = b.encode("hash", b.input(3), b.grid(GRID.text), b.parameter(*GRID.table_shape))
     program = b.program([e])
@@ -254,7 +254,7 @@ def test_what_was_looked_up_is_not_looked_up_again() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_types_in_memory(dtype: torch.dtype) -> None:
-    """Compares with the rounded results of float32 for the rounded arguments."""
+    """Compares with float32 results for the same arguments, rounded afterwards."""
     program = every_step()
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
     inputs = plans.Rows(rows, [p.float() for p in parameters], offsets, None, None)
@@ -311,7 +311,7 @@ def test_rows_of_no_cell_and_unsound_indices(shared_bytes: int) -> None:
 
 
 def test_cells_that_overlap_stay_inside_the_workspace(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Checks cells with more tasks than partial sums: the NaN after the partial sums is not read."""
+    """Checks cells with more tasks than partial sums: kernels must not read the NaN after the partial sums."""
     program, n, beyond = smooth(), 600, 1 << 20
     sizes = []
     with emulated() as loaded:
@@ -345,7 +345,7 @@ def test_numbers_that_are_none_stay_in_their_rows() -> None:
 
 
 def test_float16_cuts_values_off_and_leaves_gradients() -> None:
-    """Checks that too large values are clamped in products, while gradients overflow for a GradScaler to see."""
+    """Checks that products clamp too large values, but let gradients overflow, which a GradScaler detects."""
     b = Builder()
     h = b.linear(b.input(1), b.parameter(16, 1), 16)
     program = b.program([b.linear(h, b.parameter(3, 16), 3)])
@@ -404,7 +404,7 @@ def test_values_of_many_columns() -> None:
 
 
 def test_derivatives_again_on_the_device() -> None:
-    """Compares second derivatives with deterministic sums, by the other tests' helper."""
+    """Compares second derivatives with and without deterministic algorithms."""
     program = random_program(2)
     given = arguments(program, [37, 0, 33], torch.float32)
     with emulated():

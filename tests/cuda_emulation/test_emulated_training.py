@@ -1,4 +1,4 @@
-"""Whole training steps on the emulated device: every CUDA kernel of a step, in the training loop's order and types."""
+"""Tests of whole training steps on the emulated device: all CUDA kernels in the training loop's order and dtypes."""
 
 import contextlib
 from unittest import mock
@@ -23,7 +23,7 @@ class Losses(Callback):
 
 
 def losses(field, precision, *, on_device):
-    """Returns the losses of a run's steps; the run splits in the middle."""
+    """Returns the losses of a run's steps and its last state; the run splits in the middle."""
     config = TrainConfig(
         field=field, **SMALL[field], steps=16, cells=(4,), split_at=(0.5,), width=16, rays=32, samples=(8,),
         lr=0.005, evaluations=1, precision=precision,

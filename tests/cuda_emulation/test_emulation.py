@@ -1,4 +1,4 @@
-"""The emulation finds every planted bug: by results, by its checks, or by a sanitizer."""
+"""Tests that the emulation finds every planted bug: by wrong results, by its checks, or by a sanitizer."""
 
 import os
 import pickle
@@ -33,7 +33,7 @@ BUGS = [
     ("9", "thread", "data race"),
     ("10", "thread", "data race"),
 ]
-"""Number of a bug in planted.cu, sanitizer, and expected verdict."""
+"""The number of a bug in planted.cu, the sanitizer, and the expected verdict."""
 
 
 def run(command, sanitizer=None):

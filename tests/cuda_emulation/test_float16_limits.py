@@ -1,7 +1,7 @@
-"""Networks on CUDA with values near and above float16's largest: no NaN where float32 has none.
+"""Tests of networks on CUDA with values near and above float16's largest number: no NaN where float32 has none.
 
 The tests cover every activation, in tiles of 64 rows and with values in the workspace. Values are clamped to 65,504
-when a layer reads them. Gradients overflow to infinity, for a GradScaler to see. Other samples and cells keep their
+when a layer reads them. Gradients overflow to infinity, which a GradScaler detects. Other samples and cells keep their
 precision.
 """
 
@@ -24,7 +24,7 @@ def network(activation):
 
 
 def given(layers, size):
-    """Draws positions, weights and biases, exact in float16.
+    """Draws positions, and weights and biases that float16 represents exactly.
 
     In an eighth of the rows, the first layer's values have magnitude ``size``, positive in half of the columns. In the
     other rows they have magnitude 1."""
@@ -34,7 +34,7 @@ def given(layers, size):
     shapes = layers.weight_shapes(3, 0)
     weights = [torch.randn(CELLS, o, i) / i**0.5 for o, i in shapes]
     weights[0][:, :, 0] = torch.tensor([1.0, -1.0]).repeat(8)
-    # Layers after the large values scale them down.
+    # Later layers scale the large values down.
     parameters = [weights[0], *(weight / 64 for weight in weights[1:]), *(torch.zeros(CELLS, o) for o, _ in shapes)]
     return [positions, *(parameter.half().float() for parameter in parameters)]
 

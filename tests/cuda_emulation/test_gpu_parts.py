@@ -1,4 +1,4 @@
-"""The programs of ``make gpu-check`` on the CPU, to find their mistakes before a run on a GPU."""
+"""Tests of the programs of ``make gpu-check`` on the CPU, to find mistakes before a run on a GPU."""
 
 import importlib.util
 import itertools
@@ -22,7 +22,7 @@ def program(name):
         sys.path.append(str(GPU))  # as when the program runs
     spec = importlib.util.spec_from_file_location(name, GPU / f"{name}.py")
     assert spec is not None and spec.loader is not None
-    loaded = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up there
+    loaded = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look up their module there
     spec.loader.exec_module(loaded)
     return loaded
 
@@ -81,7 +81,7 @@ def test_cases_by_name(parts, tmp_path):
 
 @pytest.mark.native
 def test_a_row_of_a_network_is_captured(parts, monkeypatch, tmp_path):
-    """Captures a row with gradients, too slow for the whole emulated call; a row with an obstacle is not captured."""
+    """Captures a row with gradients, which is too slow for the emulated call; a row that waits is not captured."""
     timings, journal = sys.modules["gpu_timings"], parts.Journal(tmp_path / "cases.json")
     monkeypatch.setattr(timings, "MOST_CALLS", 2)
     monkeypatch.setattr(timings, "MOST_REPEATS", 1)
@@ -137,7 +137,7 @@ sys.exit(gpu_parts.main(sys.argv[1:]))
 
 
 def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(check, tmp_path):
-    """Restarts real processes, whose device stays broken."""
+    """Uses real processes: a broken device stays broken until the next process."""
     (tmp_path / "faults.py").write_text(FAULTS.format(gpu=str(GPU)))
     command = [sys.executable, str(tmp_path / "faults.py"), "cases", str(tmp_path / "out"), "--parts", "small"]
     part = check.Part([command], 50, (), tmp_path / "out" / "cases.json")
@@ -226,7 +226,7 @@ def test_a_part_that_hangs_is_ended_with_all_that_it_started(check, monkeypatch,
 
 
 def test_the_summary_has_all_that_a_part_has_found(check, monkeypatch, tmp_path):
-    """Checks that findings of an earlier run are removed, and that a partly written file gives what it can."""
+    """Checks that findings of an earlier run are removed, and that a partly written file is reported."""
     (tmp_path / "old.json").write_text('{"cases": ["of an earlier run"]}')
     write = "import sys; open(sys.argv[1], 'w').write(sys.argv[2]); print('done')"
 
@@ -248,7 +248,7 @@ def test_the_summary_has_all_that_a_part_has_found(check, monkeypatch, tmp_path)
 
 
 def test_calls_fit_their_time(check, parts, monkeypatch, tmp_path):
-    """Checks that parts follow each other, the last one ends with the call, and no tool changes the card's settings."""
+    """Checks that parts run in turn, the last part ends with the call, and no tool changes the GPU's settings."""
     monkeypatch.setattr(check.shutil, "which", lambda name, **_: f"/bin/{name}")
     for call, seconds in (("first", 390), ("second", 240)):
         known = check.parts(call, tmp_path, tmp_path, ["adam"], emulated=False)
@@ -260,7 +260,7 @@ def test_calls_fit_their_time(check, parts, monkeypatch, tmp_path):
             assert ("regex:program_kernel|hash_encode" in command) == (name == "counters")
             if name == "counters":
                 assert command[command.index("--clock-control") + 1] == "none"
-        # 20 s for linking, 15 s for imports and a CUDA context.
+        # Linking takes 20 s; imports and a CUDA context take 15 s.
         assert call == "second" or sum(parts.BUDGETS.values()) + 35 <= known["cases"].until
 
 
@@ -330,7 +330,7 @@ def test_launches_that_ncu_counted(check, tmp_path):
 
 @pytest.mark.native
 def test_gradients_at_full_size_that_are_wrong_are_found(parts, monkeypatch):
-    """Checks that spoilt gradients, and lost rows of a task anywhere in a cell, are found."""
+    """Checks that wrong gradients and lost output rows are found."""
     large = sys.modules["gpu_large"]
     monkeypatch.setattr(large, "SUBSET", 16)
     with emulated():
@@ -373,7 +373,7 @@ default _C.so
 
 
 def test_objects_that_are_carried_are_linked_and_not_compiled(monkeypatch, tmp_path):
-    """Links by ninja; objects of other sources or for another GPU are refused."""
+    """Links with ninja, and checks that objects of other sources or for another GPU are refused."""
     prebuilt = program("prebuilt")
     monkeypatch.setattr(prebuilt, "module_name", lambda: "_C.so")
     (tmp_path / "a").mkdir()

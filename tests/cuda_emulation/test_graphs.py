@@ -1,4 +1,4 @@
-"""Training steps as CUDA graphs on the emulated device: what is captured, and that replays give the same steps."""
+"""Tests of training steps as CUDA graphs on the emulated device: captures, and replays that equal eager steps."""
 
 import contextlib
 import gc
@@ -25,7 +25,7 @@ def on_device(monkeypatch):
     monkeypatch.setattr(torch.Tensor, "is_cpu", False)
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
     monkeypatch.setattr(State, "read_output", lambda state, output: None)
-    monkeypatch.setattr(reference, "check_range", lambda *_: None)  # it reads only on a CPU
+    monkeypatch.setattr(reference, "check_range", lambda *_: None)  # the check reads only on a CPU
     for place, op in (
         (batches, "unseen_rays"),
         (terms, "sparse_depth_gradient"),
@@ -65,7 +65,7 @@ def everything(state):
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_replays_are_the_same_steps(precision, monkeypatch):
-    """Compares replays with eager steps, with splits, changing learning rates and numbers of rays."""
+    """Compares replays with eager steps, across a split and changes of the learning rate and of the number of rays."""
     found, calls, pools = [], [], []
     for as_it_is in (False, True):
         with emulated(), graphs() as seen:
@@ -84,9 +84,9 @@ def test_replays_are_the_same_steps(precision, monkeypatch):
             pools = pools or [pool is not None for pool in seen.pools]
     assert len(found[0]) == len(found[1]) and state.router.num_cells == 4 and len(losses) == 13
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-    # Before the split: an eager step, a captured step, and two replays; and so on.
+    # Before the split come an eager step, a captured step, and two replays; later captures follow in the same way.
     assert calls == [[*captured(2), *captured(3), *captured(3)], []]
-    assert pools == [False, False, True]  # after a split, and with other numbers of rays
+    assert pools == [False, False, True]  # the first capture, after the split, and with more rays
 
 
 def captured(replays):
@@ -204,7 +204,7 @@ def test_another_precision_is_captured_anew():
 
 
 def test_no_graph_of_autograd_outlives_a_step():
-    """Checks that autograd tapes are freed; their nodes would run on the stream of an earlier step."""
+    """Checks that the autograd tapes of steps are freed, since their nodes would run on an earlier step's stream."""
     with emulated(), graphs() as seen:
         training, alive = Training(cells=2), list[weakref.ref]()
         training.step.autocast = torch.bfloat16
@@ -223,4 +223,4 @@ def test_no_graph_of_autograd_outlives_a_step():
         finally:
             gc.enable()
         assert len(held) == 4 and "capture" in seen.calls
-        assert len(alive) == 3 and not any(each() is not None for each in alive[:2])  # a graph holds tensors
+        assert len(alive) == 3 and not any(each() is not None for each in alive[:2])  # a CUDA graph holds the third

@@ -1,4 +1,4 @@
-"""The index maps of the CUDA kernels (csrc/common/index_maps.h) cover every element once, none out of range."""
+"""Tests that the CUDA kernels' index maps (csrc/common/index_maps.h) cover every element once, in range."""
 
 import bisect
 import itertools

@@ -1,4 +1,4 @@
-"""Counts the launches of a training step on a GPU, and its blocking reads by the host, without a GPU."""
+"""Counts, without a GPU, the launches and the host's blocking reads of a training step on a GPU."""
 
 import itertools
 
@@ -12,7 +12,7 @@ from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
 
 LAUNCHES, READS = 23, 0
-"""The launches of a default step; the number may only be lowered."""
+"""The most launches and reads of a default step; the numbers may only be lowered."""
 
 
 def test_what_is_asked_is_counted():
@@ -36,9 +36,9 @@ def on_device(monkeypatch):
 
 
 def trained(steps, monkeypatch, *, empty=False):
-    """Runs some steps of a small default run; returns its state and the last output. It splits before the fifth step.
+    """Runs some steps of a small default run, which splits before the fifth step; returns its state and last output.
 
-    ``empty`` leaves most of space empty. The GPU host's reads at every fiftieth step do not occur.
+    ``empty`` makes most of space empty. The reads of outputs, every fiftieth step on a GPU, are left out.
     """
     config = TrainConfig(
         steps=16, field_options=("levels=2", "log2_entries=10"), cells=(4,), split_at=(0.25,), width=16,
@@ -50,14 +50,14 @@ def trained(steps, monkeypatch, *, empty=False):
         if empty:
             for table in (state.sampler.grid.density, state.sampler.grid.occupied):
                 table[:, :, 8:] = 0
-            state.step = 1  # the first step re-evaluates voxels
+            state.step = 1  # skips the first step, which evaluates voxels
         train(state, [Callback()], until=steps - state.step, clock=itertools.count().__next__)  # groups of one step
     return state, outputs[-1]
 
 
 @pytest.mark.native
 def test_rows_beyond_the_samples_change_nothing(monkeypatch, request):
-    """Compares runs in which the host knows the number of samples, or only the device; with one and four cells."""
+    """Compares a run in which the host knows the number of samples with a run in which only the device does."""
     found = []
     for known in (True, False):
         if not known:

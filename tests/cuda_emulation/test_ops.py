@@ -1,4 +1,4 @@
-"""Lookups and sorts on the emulated CUDA kernels, with threads in three orders, against the reference.
+"""Tests of lookups and sorts on the emulated CUDA kernels, in three thread orders, against the reference.
 
 Sizes are small: a block of 256 threads is 256 fibers. test_emulation.py runs the tests of the operations.
 """
@@ -33,7 +33,7 @@ def both(op, *args, **options):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_look_ups(dtype):
     for n, k in ((0, 3), (1, 1), (300, 17), (270, 700)):
-        # Integers give many ties, which the lowest index wins.
+        # Integers give many ties; the lowest index wins.
         points, centres = (torch.randint(-3, 4, (count, 3)).to(dtype) for count in (n, k))
         assert torch.equal(*both(voronerf.nearest_centre, points, centres))
         assert torch.equal(*both(voronerf.nearest_centre, points, centres, index=index_centres(centres)))

@@ -1,4 +1,4 @@
-"""The plans of cell_sort: the kind of sort, and the layout of the workspace."""
+"""Tests of the plans of cell_sort: the kind of sort, and the layout of the workspace."""
 
 import itertools
 
@@ -35,7 +35,7 @@ def test_parts_of_the_workspace_lie_side_by_side(way, k):
         if plan["radix"]:
             sizes = [n * plan["key_bytes"], n * plan["key_bytes"], 4 * n, temporary]
         else:
-            # Full blocks of eight chunks, which cover all rows.
+            # Full blocks of eight chunks cover all rows.
             assert plan["chunks"] % 8 == 0 and plan["chunks"] * plan["chunk_rows"] >= n
             assert n > (plan["chunks"] - 8) * plan["chunk_rows"]
             counts = plan["chunks"] * (k + 2)

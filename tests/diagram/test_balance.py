@@ -1,4 +1,4 @@
-"""Balancing: one update against slow loops, and the paper's figure of merit."""
+"""Tests of balancing: one update against slow loops, and the paper's figure of merit."""
 
 import math
 import statistics
@@ -61,7 +61,7 @@ def test_same_generator_same_centres(centres):
     )
     assert torch.equal(first.centres, second.centres)
     assert not torch.equal(first.centres, other.centres)
-    # The global generator serves only where no generator is given.
+    # The global generator is used only if the call passes no generator.
     torch.manual_seed(3)
     assert torch.equal(balance(points, importance, 12, centres=centres, steps=50).centres, first.centres)
     state = torch.get_rng_state()

@@ -1,4 +1,4 @@
-"""Centroidal centres: against a plain loop, weighted, re-seeded, and nested."""
+"""Centroidal centres against a plain loop: weighted, re-seeded and nested ones."""
 
 import sys
 
@@ -10,11 +10,11 @@ from voronerf import ops
 from voronerf.diagram import VoronoiDiagram, balance, split_diagram
 from voronerf.diagram.balance import lloyd
 
-balance_module = sys.modules["voronerf.diagram.balance"]  # the package has a function of that name
+balance_module = sys.modules["voronerf.diagram.balance"]  # the package also has a function named `balance`
 
 
 def blobs(seed=0, m=2000):
-    """Returns samples in three clumps, whose importance grows along the x axis."""
+    """Returns samples in three clumps, and their importance, which grows along the x axis."""
     generator = seeded(seed)
     places = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 4, 1]])
     points = places[torch.randint(3, (m,), generator=generator)] + 0.4 * torch.randn(m, 3, generator=generator)
@@ -22,7 +22,7 @@ def blobs(seed=0, m=2000):
 
 
 def centroids(points, importance, result):
-    """Returns the weighted centroids, float64 [k, 3], by one loop over the cells."""
+    """Returns the weighted centroids, float64 [k, 3], computed in a loop over the cells."""
     cells = VoronoiDiagram(result.centres).locate(points)
     results = []
     for cell in range(result.centres.shape[0]):
@@ -52,7 +52,7 @@ def test_centres_are_the_weighted_centroids_of_their_cells(k):
     expected = centroids(points, importance, result)
     apart = float((result.centres - expected).norm(dim=1).max())
     assert bool((result.after > 0).all()) and apart < 0.02
-    # Without the weights the centroids lie elsewhere.
+    # The unweighted centroids lie elsewhere.
     unweighted = balance(points, torch.ones_like(importance), k, centres="centroidal", generator=seeded(1))
     assert float((unweighted.centres - result.centres).norm(dim=1).max()) > 0.02
 
@@ -62,10 +62,10 @@ def test_a_cell_without_samples_goes_to_the_sample_that_costs_most():
     centres = torch.tensor([[0.5, 0, 0], [100.0, 0, 0]])
     result = lloyd(points, torch.tensor([1.0, 1, 1, 1]).double(), centres)
     assert torch.equal(result, torch.tensor([[0.5, 0, 0], [11, 0, 0]]))
-    # The samples at 0 and 1 cost 400 * 0.25 each, the sample at 10 only 1 * 90.25.
+    # The samples at 0 and 1 cost 400 * 0.25 each; the sample at 10 costs only 1 * 90.25.
     result = lloyd(points[:3], torch.tensor([400.0, 400, 1]).double(), centres)
     assert torch.equal(torch.sort(result[:, 0]).values[:1], torch.zeros(1))
-    # Two empty cells go to different places, and a cell that could gain nothing stays.
+    # Two empty cells move to different places; a cell stays if no move would reduce the cost.
     result = lloyd(points, torch.ones(4).double(), torch.tensor([[0.5, 0, 0], [100.0, 0, 0], [200.0, 0, 0]]))
     assert len({tuple(row) for row in result.tolist()}) == 3 and float(result.max()) <= 12
     result = lloyd(torch.zeros(3, 3), torch.ones(3).double(), torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
@@ -73,7 +73,7 @@ def test_a_cell_without_samples_goes_to_the_sample_that_costs_most():
 
 
 def test_more_centres_than_samples_of_mass_end_at_once(monkeypatch):
-    """The search does not go on for centres that no sample needs."""
+    """The search stops if no sample has a cost that the remaining centres could reduce."""
     points, looks = torch.rand(60, 3, generator=seeded(0)), []
     masses = torch.zeros(60).double()
     masses[:5] = 1.0

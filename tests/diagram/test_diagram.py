@@ -1,4 +1,4 @@
-"""Nested Voronoi diagrams against a slow descent, one point at a time."""
+"""Nested Voronoi diagrams against a slow descent for one point at a time."""
 
 import copy
 import io
@@ -26,7 +26,7 @@ def slow_locate(diagram, point):
 
 
 def uneven_diagram():
-    """Returns a diagram of three levels with 4 + 3 - 1 + 5 - 1 = 10 leaves; with integer coordinates ties are exact."""
+    """Returns a diagram of three levels with 4 + 3 - 1 + 5 - 1 = 10 leaves; its integer coordinates make ties exact."""
     generator = seeded(3)
 
     def centres(k):
@@ -212,7 +212,7 @@ def test_stochastic_assignment_is_the_softmax_of_the_distances_along_the_path():
     level = [torch.softmax(-(point - centres).norm(dim=1) / 0.5, 0) for centres in (root, inner)]
     expected = torch.cat([level[0][:1], level[0][1] * level[1]])
     frequencies = torch.bincount(drawn, minlength=4) / n
-    # Five standard deviations of a binomial frequency.
+    # The tolerance is five standard deviations of a binomial frequency.
     assert bool(((frequencies - expected).abs() < 5 * (expected * (1 - expected) / n).sqrt()).all())
 
 

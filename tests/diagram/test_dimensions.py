@@ -48,11 +48,11 @@ def test_many_cells_have_an_index(d: int, generator: torch.Generator) -> None:
 
     assert is_right(diagram)
     index = diagram.index()
-    assert diagram.index() is index  # the index is kept
+    assert diagram.index() is index  # the index is cached
     assert is_right(copy.deepcopy(diagram)) and is_right(pickle.loads(pickle.dumps(diagram)))
-    diagram.centres.neg_()  # in place, so that the index is outdated
+    diagram.centres.neg_()  # an in-place change outdates the index
     assert is_right(diagram)
-    diagram.centres.data.copy_(torch.rand(2500, d, generator=generator))  # changes no version counter
+    diagram.centres.data.copy_(torch.rand(2500, d, generator=generator))  # the version counter stays
     assert is_right(diagram)
     assert torch.equal(diagram.locate(points.double()), diagram.locate(points))
     compiled = torch.compile(diagram.locate, fullgraph=True, backend="eager")

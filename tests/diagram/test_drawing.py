@@ -1,4 +1,4 @@
-"""Cells drawn by their distances, level by level, against the formula one point at a time."""
+"""Cells drawn at random by their distances, level by level, against the formula for one point at a time."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torch import Tensor
 
 from voronerf.diagram.drawing import draw_cell
 
-# Diagram 0 has three centres: the first a leaf, the second refined by diagram 1, the third by diagram 2, whose second
-# centre is refined by diagram 3. Leaves are numbered depth first.
+# Diagram 0 has three centres: the first is a leaf, diagram 1 refines the second, and diagram 2 refines the third.
+# Diagram 3 refines the second centre of diagram 2. Leaves are numbered depth first.
 CHILD_OFFSETS = torch.tensor([0, 3, 5, 7, 10], dtype=torch.int32)
 CHILD = torch.tensor([-1, 1, 2, -2, -3, -4, 3, -5, -6, -7], dtype=torch.int32)
 DEPTH = 3
 
 
 def flat(k, device="cpu"):
-    """Returns the tables of one diagram."""
+    """Returns the tables of a diagram without children."""
     return (
         torch.tensor([0, k], dtype=torch.int32, device=device),
         -torch.arange(k, dtype=torch.int32, device=device) - 1,
@@ -26,12 +26,12 @@ def flat(k, device="cpu"):
 
 
 def draw(points, centres, uniforms, temperature):
-    """Draws in one diagram, with one uniform number for each point."""
+    """Draws cells of a diagram without children, with one uniform number for each point."""
     return draw_cell(points, centres, *flat(centres.shape[0], centres.device), uniforms[:, None], temperature)
 
 
 def slow(points, centres, tables, uniforms, temperature, depth):
-    """Returns leaves by the formula in float64, and the distance of each number from the border to another leaf."""
+    """Returns the leaves by the float64 formula, and how far each uniform number is from the border to another leaf."""
     offsets, child = tables
     leaves, margins = [], []
     for point, own in zip(points.double(), uniforms.double()):
@@ -51,7 +51,7 @@ def slow(points, centres, tables, uniforms, temperature, depth):
 
 
 def agree(leaves, expected, margins, tolerance):
-    """Checks equality except where numbers are within rounding of a border; nearly all numbers are not."""
+    """Checks equality, except for uniform numbers within rounding of a border, which must be few."""
     assert leaves.dtype == torch.int32
     clear = [i for i, margin in enumerate(margins) if margin > tolerance]
     assert len(clear) >= 0.95 * len(margins)
@@ -78,7 +78,7 @@ def test_many_cells(device, k, temperature):
 
 
 def test_numbers_at_and_beyond_the_ends(device):
-    """A number of 0 draws the last centre with mass, nearly 1 the first; no centre without mass is drawn."""
+    """0 draws the last centre that has mass, and a number just below 1 draws the first such centre."""
     centres = torch.tensor([[50.0, 0, 0], [0, 0, 0], [1, 0, 0], [60, 0, 0]], device=device)
     uniforms = torch.tensor([0.0, -3.0, math.nan, 1 - 2**-24, 1.0, 7.0], device=device)
     leaves = draw(torch.zeros(6, 3, device=device), centres, uniforms, 0.5)
@@ -86,7 +86,7 @@ def test_numbers_at_and_beyond_the_ends(device):
 
 
 def test_the_reference_where_sums_do_not_rise(monkeypatch):
-    """With sums in a tree, as on a GPU, rounding puts the last padded column above the last centre."""
+    """If sums are added in a tree, as on a GPU, rounding makes the last padded column exceed the last centre's sum."""
 
     def tree(values, dim):
         step = 1
@@ -97,7 +97,7 @@ def test_the_reference_where_sums_do_not_rise(monkeypatch):
 
     monkeypatch.setattr(Tensor, "cumsum", tree)
     points, centres = torch.rand(5000, 3), torch.rand(32, 3)
-    centres[:2] = torch.tensor([[0.0, 0, 0], [1000, 0, 0]])  # no point is near the second one
+    centres[:2] = torch.tensor([[0.0, 0, 0], [1000, 0, 0]])  # no point is near the second centre
     offsets = torch.tensor([0, 2, 9, 32], dtype=torch.int32)
     child = torch.cat([torch.tensor([1, 2]), -1 - torch.arange(30)]).to(torch.int32)
     uniforms = torch.zeros(5000, 2)
@@ -113,7 +113,7 @@ def test_the_reference_where_sums_do_not_rise(monkeypatch):
 def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device):
     points = torch.tensor([[math.nan, 0, 0], [0, math.inf, 0], [1e30, 0, 0]], device=device)
     centres, uniforms = torch.rand(10, 3, device=device), torch.tensor([0.0, 0.5, 0.9], device=device)
-    # Here the first centre of the root is refined too.
+    # In this tree the first centre of the root is refined too.
     child = torch.tensor([1, -1, 2, -6, -3, -4, 3, -5, -2, -7], dtype=torch.int32, device=device)
     leaves = draw_cell(
         points, centres, CHILD_OFFSETS.to(device), child, uniforms[:, None].expand(3, DEPTH), temperature=0.2
@@ -132,5 +132,5 @@ def test_many_points_cross_the_pieces_and_do_not_depend_on_their_neighbours(devi
     leaves = run(slice(None))
     expected = slow(points[::97].cpu(), centres.cpu(), (CHILD_OFFSETS, CHILD), uniforms[::97].cpu(), 0.2, DEPTH)
     agree(leaves[::97].cpu(), *expected, tolerance=1e-5)
-    # Sums may be taken in another order for other shapes.
+    # The order of the sums may depend on the shape.
     assert int((run(slice(5, 4242)) != leaves[5:4242]).sum()) <= 1

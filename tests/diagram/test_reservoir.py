@@ -1,4 +1,4 @@
-"""The reservoir of importance samples against sorting every batch by hand."""
+"""The reservoir of importance samples against a plain sort of every batch."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Splitting cells by the samples that lie in them."""
+"""Tests that cells are split by the samples inside them."""
 
 import pytest
 import torch
@@ -45,7 +45,7 @@ def test_only_the_worst_cell():
     points, importance = three_clouds()
     split = split_diagram(ROOT, points, importance, 4, cells="worst", generator=seeded(1))
     assert split.parents.tolist() == [0, 1, 1, 1, 1, 2]
-    # Only cells with enough samples count: one sample that outweighs everything does not make a cell the worst.
+    # Only cells with enough samples can be the worst, even if another cell has one sample of huge weight.
     heavy = torch.cat([points, torch.tensor([[2.0, 0, 0]])]), torch.cat([importance, torch.tensor([1e6])])
     split = split_diagram(ROOT, *heavy, 8, cells="worst", generator=seeded(1))
     assert sorted(split.balances) == [1]
@@ -64,7 +64,7 @@ def test_named_cells_and_minimum_of_samples():
 
 
 def test_just_enough_samples_are_enough():
-    """A cell splits with as many distinct samples as children and as the minimum; with one fewer it stays a leaf."""
+    """A cell splits if its distinct samples number at least the children and the minimum, and else stays a leaf."""
     root = VoronoiDiagram(torch.tensor([[0.0, 0, 0], [10.0, 0, 0]]))
     points = torch.cat((torch.rand(4, 3, generator=seeded(2)), torch.rand(3, 3, generator=seeded(3)) + root.centres[1]))
     split = split_diagram(root, points, torch.ones(7), 4, generator=seeded(1))

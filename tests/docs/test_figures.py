@@ -1,4 +1,4 @@
-"""Tests that the figures in the pages are numbers of the files in benchmarks/results.
+"""Tests that the figures in the pages occur in the files of benchmarks/results.
 
 A line ``<!-- figures of FILE.json -->`` names the file for the next table or paragraph.
 """
@@ -43,7 +43,7 @@ def entries(name: str) -> list[list[float]]:
 
 
 def holds(entry: list[float], text: str) -> bool:
-    """Returns whether all figures in a text are numbers of an entry, rounded to the digits shown."""
+    """Returns whether all figures in a text occur in an entry, rounded to the digits shown."""
 
     def shown(figure: str) -> bool:
         digits = figure.replace(",", "")

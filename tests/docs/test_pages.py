@@ -1,4 +1,4 @@
-"""Tests of the pages: their Python runs, and the options and files that they name exist."""
+"""Tests of the pages: their Python code runs, and the options and files that they name exist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Warp kernels as PyTorch ops: cases beyond the tests of every backend (tests/ops)."""
+"""The Warp kernels as PyTorch ops: more cases than in tests/ops, which tests every backend."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROWS = 64  # the rows of a tile
 
 
 def gradients(width: int, counts: list[int], backend: str) -> list[Tensor]:
-    """Returns the output and gradients of three layers with a skip, for cells of ``counts`` rows."""
+    """Returns the output and gradients of three layers with a skip; the cells have ``counts`` rows."""
     generator = torch.Generator().manual_seed(0)
     layers = (Layer(("positions",), width, "relu"), Layer((0, "positions"), width, "softplus"), Layer((1,), 3, "sine"))
     table = MLP(layers, outputs=(2, 0), position_octaves=2)

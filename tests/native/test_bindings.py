@@ -60,7 +60,7 @@ def test_an_instruction_set_that_is_not_there_is_refused() -> None:
 
 
 def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Functions are bound by name, not by number, so a function that one side lacks is never confused with another."""
+    """Functions are bound by name, not by number, so one side cannot confuse a function that the other lacks."""
     monkeypatch.setitem(FUNCTIONS, "cube", Function(lambda x, a, b: x**3))
     b = Builder()
     program = b.program([b.apply("cube", b.input(3))])
@@ -77,7 +77,7 @@ def test_a_product_takes_as_many_sources_as_the_compiled_module_has_room_for(mon
 
 
 def test_layers_hand_words_and_sums_to_the_next_on_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A result stays in registers if only the next product needs it; a value with other readers also has a slot."""
+    """A result stays in registers if only the next product reads it; if other steps read it, it also has a slot."""
     programs, most = list[Any](), native.compiled.most_held
     monkeypatch.setattr(native.compiled, "make_program", programs.append)
 
@@ -93,7 +93,7 @@ def test_layers_hand_words_and_sums_to_the_next_on_cuda(monkeypatch: pytest.Monk
         ("words", True, False),
         ("nothing", True, True),
     ]
-    # The sum of two products goes on in registers, and the held words wait meanwhile.
+    # The partial sum of two products stays in registers, and so do the words that the first layer hands on.
     assert linear(first, Layer(("positions", 0), 5)) == [
         ("words", False, False),
         ("sums", False, False),

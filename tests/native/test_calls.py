@@ -1,4 +1,4 @@
-"""Calls that the compiled module checks and runs by itself (csrc/bindings/signature.cpp)."""
+"""Calls that the compiled module checks and runs without Python (csrc/bindings/signature.cpp)."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ CASES = {name: case for name, case in cases().items() if "native" in backends.im
 
 
 def refused_dtypes(name):
-    """Returns the dtypes that the native implementation does not take."""
+    """Returns the dtypes that the native implementation refuses."""
     reason = backends.why_not(CASES[name].call or name, "native", torch.device("cpu"), torch.bfloat16)
     return () if reason is None else (torch.bfloat16,)
 
 
 def results(name, arguments):
-    """Returns an op's results, its arguments (it may write into them), and the gradients of arguments that learn."""
+    """Returns an op's results, its arguments (the op may write into them), and the gradients of the arguments."""
     result = getattr(ops, CASES[name].call or name)(**arguments, backend="native")
     leaves = [leaf for leaf in tree_leaves((result, arguments)) if isinstance(leaf, Tensor)]
     if hasattr(result, "raw"):
@@ -47,7 +47,7 @@ def results(name, arguments):
 
 @contextlib.contextmanager
 def without_the_exchange():
-    """Makes torch look like a version before 2.10, which has no exchange of tensors."""
+    """Simulates a torch version before 2.10, which has no tensor exchange API."""
     native.compiled.know_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
     yield
     native.know_torch(native.compiled)
@@ -56,7 +56,7 @@ def without_the_exchange():
 @pytest.mark.parametrize("learns", [False, True])
 @pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, case in CASES.items() for kind in case.kinds])
 def test_the_same_bits_as_by_the_methods_of_tensors(name, kind, learns):
-    """Without torch's exchange of tensors, every call is checked and actual in Python, with the same bits."""
+    """Without torch's tensor exchange API, Python checks and runs every call, with bitwise equal results."""
     case = CASES[name]
     for n, dtype in ((0, torch.float32), (1, torch.float32), (33, torch.float32), (33, torch.bfloat16)):
         if (learns and not case.differentiable) or dtype in refused_dtypes(name):
@@ -113,7 +113,7 @@ def test_calls_keep_nothing():
 
 
 def test_arguments_of_other_kinds_are_checked_in_python():
-    """Integers of other classes, names that are not interned and numbers beyond 64 bits are checked in Python."""
+    """Python checks integers of other classes, names that are not interned, and numbers beyond 64 bits."""
     cells = torch.zeros(3, dtype=torch.int32)
     assert cell_sort(**{"".join(["ce", "lls"]): cells, "k": 2})[1].tolist() == [0, 3, 3]
     for k, error in ((True, "must be an integer, got bool"), (2**70, "must be at most 134217728"), (0, "at least 1")):
@@ -122,7 +122,7 @@ def test_arguments_of_other_kinds_are_checked_in_python():
 
 
 def test_freed_memory_is_refused():
-    """Transposed inputs of programs and scalars of Adam, whose addresses are taken directly, are refused too."""
+    """This holds also for transposed inputs of programs and for scalars of Adam, whose addresses are read directly."""
     gone = torch.tensor(0.0)
     gone.untyped_storage().resize_(0)
     ones = [torch.ones(3)], [torch.ones(3)], [torch.zeros(3)], [torch.zeros(3)]

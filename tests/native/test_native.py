@@ -1,4 +1,4 @@
-"""The compiled ops against the reference, exactly: ties, shifted scenes, every instruction set, any thread count."""
+"""The compiled ops equal the reference exactly: ties, shifted scenes, every instruction set, any thread count."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ if backends.missing("native", torch.device("cpu")) is None:
     from voronerf.ops._core import native as _native
 
 CELLS = (1, 2, 15, 16, 17, 255, 256, 257, 4096)
-# Row counts around the lanes and tiles of every instruction set, and around the block of a task.
+# Row counts next to the numbers of lanes and tile rows of every instruction set; BLOCK is the number of rows in a task.
 ROWS = (0, 1, 3, 7, 8, 9, 15, 17, 31, 33, 63, 64, 65, 129)
 BLOCK = 2048
 DTYPES = (torch.float32, torch.float64)
 
 
 def chosen(points: Tensor, centres: Tensor) -> Tensor:
-    """Returns cells after two checks: at the float64 minimum, and the same index as the reference."""
+    """Returns the nearest cells; checks that their distance is minimal in float64 and that they equal the reference."""
     cells = nearest_centre(points, centres, backend="native")
     assert cells.dtype == torch.int32
     table = distances(points, centres)
@@ -68,7 +68,7 @@ def test_nearest_breaks_ties_to_the_lowest_index(isa: str, dtype: torch.dtype) -
 
 
 def test_nearest_decides_in_float64_what_float32_cannot(isa: str) -> None:
-    """Two centres with distances equal in float32 are told apart at every lane, either way round."""
+    """The nearer of two centres is found in every lane and order even if their float32 distances are equal."""
     points = torch.zeros(200, 3)
     near = torch.nextafter(torch.tensor(1.0), torch.tensor(0.0)).item()
     for sign in (1.0, -1.0):
@@ -123,7 +123,7 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     torch.set_num_threads(before)
 
 
-# Up to k / 64 rows are sorted by digits, up to 4096 cells with two chunks a thread, many rows with prefetches.
+# Up to k / 64 rows are sorted by digits. Up to 4096 cells take two chunks per thread. Long sorts prefetch.
 @pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 4096, 4097, 5000, 100_000])
 @pytest.mark.parametrize("n", [0, 1, 2, 33, 64, 1562, 1563, 2047, 2048, 2049, 8191, 8192, 50_001, 131_329])
 def test_sort(threads: int, n: int, k: int) -> None:
@@ -159,7 +159,7 @@ def test_sort_refuses_cells_out_of_range(threads: int, n: int, k: int, bad: int 
 
 
 def random_tree(sizes: tuple[int, ...], uneven: bool = True) -> dict[str, Tensor | int]:
-    """Returns a tree with `sizes` children at each level; if uneven, every third centre is a leaf already."""
+    """Returns a tree with `sizes` children at each level; if uneven, every third centre is a leaf at any level."""
     rows: list[list[Tensor]] = [[]]
     child: list[list[int]] = [[]]
     level, leaves = [0], 0
@@ -239,13 +239,13 @@ assert len(loaded) == 1 or (not loaded and not _native.describe()["openmp"]), lo
 
 
 def test_a_trace_says_what_threads_would_share() -> None:
-    """A parallel region takes half of its time on two threads, at best; a serial one takes as long on any number."""
+    """On two threads a parallel region takes at least half of its serial time; a serial region gains nothing."""
     compiled, before, points = _native.compiled, torch.get_num_threads(), torch.rand(1 << 18, 3)
     torch.set_num_threads(1)
     try:
         compiled.trace(True)
         nearest_centre(points, points[:64], backend="native")
-        nearest_centre(points[:1], points[:64], backend="native")  # one run, for one thread
+        nearest_centre(points[:1], points[:64], backend="native")  # one serial run
     finally:
         torch.set_num_threads(before)
         (name, seconds, regions, inside, on), (_, _, _, inside_one, on_one) = compiled.trace(False)
@@ -333,7 +333,7 @@ def test_peak_errors() -> None:
 
 
 def test_a_driver_older_than_the_toolkit_is_refused(monkeypatch):
-    """With an older driver all calls of the runtime would fail, after "auto" has chosen CUDA."""
+    """With an older driver "auto" would choose CUDA, and then all calls of the runtime would fail."""
     built = SimpleNamespace(cuda=True, cuda_major=13, cuda_architectures="90")
     monkeypatch.setattr(_native, "compiled", built)
     monkeypatch.setattr("torch.cuda.get_device_capability", lambda device: (9, 0))
@@ -350,7 +350,7 @@ def test_a_driver_older_than_the_toolkit_is_refused(monkeypatch):
 @pytest.mark.native
 @pytest.mark.parametrize("threads", [1, 2])
 def test_numbers_below_the_normal_range_are_zero_in_kernels_alone(threads: int) -> None:
-    """Denormal numbers cost some hundred cycles each. The caller's threads, which torch uses too, keep them."""
+    """Each denormal costs some hundred cycles, so kernels flush it to 0; torch keeps denormals on the same threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

@@ -1,4 +1,4 @@
-"""composite of the compiled module: cases beyond the tests of every backend (tests/ops/test_composite.py)."""
+"""The compiled `composite`: more cases than in tests/ops/test_composite.py, which tests every backend."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_any_number_of_rays(isa: str, counts: list[int]) -> None:
 @pytest.mark.parametrize("c", [3, 2])
 def test_same_bits_for_any_number_of_threads(isa: str, c: int) -> None:
     packed = scene([0, 5000, 1, 9000, *[70] * 100], c, "all", outside=(5, 9))
-    many = dense(40_000, 2, c, "all")  # the gradient of its shared background is worth splitting
+    many = dense(40_000, 2, c, "all")  # enough rays to split the gradient of the shared background
     for arguments in (packed, many):
         on_any_number_of_threads(lambda arguments=arguments: evaluate(arguments, torch.float32, "native"))
 

@@ -1,4 +1,4 @@
-"""grouped_linear of the compiled module: storage types, forms of rows, instruction sets, against float64."""
+"""The compiled `grouped_linear` against float64: storage types, row layouts and instruction sets."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from voronerf.ops.grouped_linear import reference as specification
 native = pytest.importorskip("voronerf.ops.grouped_linear.native")
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
-# Rows with and without pairs, whole vectors of 16 or 32, and more than a panel; o over and under a granule.
+# Even and odd widths, whole vectors of 16 or 32, more than a panel; o above and below a granule.
 WIDTHS = ((63, 64), (64, 63), (64, 64), (48, 16), (16, 48), (1, 1), (3, 90), (90, 4), (256, 32), (32, 129))
-# Cells of 0, 1, 96, 0, 199 and 2 rows, for tiles of 96 rows; rows of no cell lie before and after.
+# The cells have 0, 1, 96, 0, 199 and 2 rows; a tile has 96. Rows without a cell lie before and after them.
 OFFSETS = (2, 2, 3, 99, 99, 298, 300)
 ROWS = 303
 
@@ -42,8 +42,8 @@ def evaluate(run, x: Tensor, weight: Tensor, bias: Tensor | None, g: Tensor, act
 
 
 def compare(x: Tensor, weight: Tensor, bias: Tensor | None, g: Tensor, activation: str) -> None:
-    """Compares with float64 on the stored values, within the rounding of results and of the operands of products."""
-    if activation == "relu":  # off the kink, where two right implementations may differ
+    """Compares with float64 results of the same values; allows rounding of results and of products' operands."""
+    if activation == "relu":  # no gradient at the kink, where two correct implementations may differ
         raised = None if bias is None else bias.double()
         y = evaluate(specification.grouped_linear, x.double(), weight.double(), raised, g.double(), "none")[0]
         g = torch.where(y.abs() < 0.05, 0, g)
@@ -101,7 +101,7 @@ def test_what_is_no_number_stays_in_its_row(dtype: torch.dtype) -> None:
 
 
 def test_calls_past_the_dispatcher_give_what_it_gives() -> None:
-    """Under a profiler, a mode or a transform the custom op runs; otherwise the compiled function is called at once."""
+    """Under a profiler, a mode or a transform the custom op runs; otherwise the compiled function runs directly."""
     arguments = *inputs(63, 64, torch.float32), "sine"
     direct = evaluate(native.grouped_linear, *arguments)
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
@@ -116,7 +116,7 @@ def test_calls_past_the_dispatcher_give_what_it_gives() -> None:
 
 
 def test_large_results_ask_for_huge_pages() -> None:
-    """A fresh process has no freed memory that the allocator could give again."""
+    """The test runs in a fresh process, whose allocator has no freed memory to reuse."""
     if not sys.platform.startswith("linux"):
         pytest.skip("Linux alone has transparent huge pages")
     path = Path("/sys/kernel/mm/transparent_hugepage/enabled")
@@ -137,7 +137,7 @@ print(faults() - before, int(out.count_nonzero()))
 
 
 def test_what_a_step_frees_is_kept() -> None:
-    """In a fresh process, a step reuses the memory that an equal step before it has freed."""
+    """In a fresh process, a step reuses the memory that the previous equal step has freed."""
     if platform.libc_ver()[0] != "glibc":
         pytest.skip("glibc alone can be asked")
     program = """
@@ -154,7 +154,7 @@ for _ in range(6):
 print(sorted(found[1:])[2])
 """
     results = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert int(results) < 2000  # of 65,536 pages; the median of five, since the system may reclaim some
+    assert int(results) < 2000  # the median of five steps, since the system may reclaim pages; a step uses 65,536
 
 
 def test_large_results_reuse_the_memory_of_those_that_are_gone() -> None:
@@ -167,7 +167,7 @@ def test_large_results_reuse_the_memory_of_those_that_are_gone() -> None:
     assert not torch.equal(first, second) and torch.equal(encode(1.0), kept) and torch.equal(first, kept)
     del first
     third = encode(1.0)
-    del second  # `part` is still a view of it
+    del second  # `part` is a view of `second`
     wanted = part.clone()
     others = [encode(0.5 + i) for i in range(3)]
     assert torch.equal(part, wanted) and torch.equal(third, kept)

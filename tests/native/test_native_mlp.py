@@ -1,4 +1,4 @@
-"""grouped_mlp and grouped_linear of the compiled module against the float64 reference."""
+"""The compiled `grouped_mlp` and `grouped_linear` against the float64 reference."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def chain(width: int, depth: int, out: int = 4, activation: str = "softplus", oc
 
 
 def nerf(width: int, depth: int, activation: str = "softplus") -> MLP:
-    """NeRF with a skip after the first layer, a density head and a view branch."""
+    """Returns a NeRF with a skip after the first layer, a density head and a view branch."""
     trunk = [Layer(("positions",), width, activation), Layer(("positions", 0), width, activation)]
     trunk += [Layer((i - 1,), width, activation) for i in range(2, depth)]
     heads = [
@@ -37,7 +37,7 @@ def nerf(width: int, depth: int, activation: str = "softplus") -> MLP:
 
 
 def hashed(layers: MLP, degree: int, **grid) -> MLP:
-    """Returns the layers on a hash grid, and on spherical harmonics of the directions."""
+    """Returns the layers with a hash grid of positions and spherical harmonics of directions as inputs."""
     grid = HashGrid(log2_entries=10, base=4, **grid)
     return MLP(layers.layers, layers.outputs, None, None, "hash", grid, "spherical", degree)
 
@@ -59,7 +59,7 @@ NETWORKS = {
     "hashed 256": hashed(nerf(256, 2), 2, levels=5, features=8, finest=30, box=((-1, -1, -1), (0, 1, 2))),
     "sigmoid": chain(20, 2, activation="sigmoid"),
     "sine": chain(20, 2, activation="sine"),
-    # Few outputs of whole vectors of inputs, in one piece and concatenated, read by other layers, with activations.
+    # Layers with few outputs: inputs fill whole vectors, some are concatenated, and other layers read some outputs.
     "heads": MLP(
         (
             Layer(("positions",), 64, "softplus"),
@@ -73,7 +73,7 @@ NETWORKS = {
         (6, 2, 5, 4),
         3,
     ),
-    # Repeated sources, more than fit one product, outputs that other layers read, and a layer that nothing reads.
+    # Repeated sources, more sources than one product takes, outputs that other layers read, and an unread layer.
     "graph": MLP(
         (
             Layer(("positions", "directions", "positions"), 7, "sine"),
@@ -92,9 +92,9 @@ NETWORKS = {
 def arguments(
     layers: MLP, counts: list[int], rays: int = 0, bias: bool = True, p: int = 3, q: int = 3, own: bool = False
 ) -> dict:
-    """Returns float64 arguments of grouped_mlp for cells of ``counts`` rows.
+    """Returns float64 arguments of `grouped_mlp`; the cells have ``counts`` rows.
 
-    With ``rays=0`` each sample has a direction; with ``own`` each cell has a hash grid.
+    With ``rays=0`` each sample has a direction; with ``own`` each cell has its own hash grid.
     """
     n, k = sum(counts), len(counts)
     p = 6 if layers.integrated else p
@@ -225,7 +225,7 @@ def test_linear_of_odd_sizes(i: int, o: int, isa: str) -> None:
 
 
 def test_without_biases_and_with_relu_off_the_kink() -> None:
-    # A ReLU whose input is within rounding of 0 may differ between two correct implementations; integers are not.
+    # Near 0 a ReLU may differ between two correct implementations; these numbers keep its inputs away from 0.
     layers = chain(12, 2, activation="relu", octaves=None)
     call = arguments(layers, [30, 41], bias=False)
     call["positions"] = call["positions"].mul(8).round() + 0.5
@@ -239,12 +239,12 @@ def test_without_biases_and_with_relu_off_the_kink() -> None:
 @pytest.mark.parametrize("o", [2, 40])
 def test_relu_stops_an_infinite_gradient_and_passes_what_is_not_a_number(o: int, dtype: torch.dtype, isa: str) -> None:
     weight = torch.ones(1, o, 1)
-    weight[0, 1::2] = -1  # inactive for a positive x
+    weight[0, 1::2] = -1  # the ReLU is 0 for positive x
     x, offsets = torch.tensor([[1.0], [2.0], [torch.nan]]), torch.tensor([0, 3], dtype=torch.int32)
     slopes = torch.tensor([[torch.inf], [1.0], [1.0]])
     heads = torch.ones(1, 1, o)
     active = Layer(("positions",), o, "relu")
-    # The ReLU is the last layer, or another layer reads it.
+    # In the first network the ReLU is the last layer; in the second, another layer reads it.
     for layers, weights in ((MLP((active,), (0,)), [weight]), (MLP((active, Layer((0,), 1)), (1,)), [weight, heads])):
         results = []
         for backend in ("native", "reference"):
@@ -294,7 +294,7 @@ def test_large_positions() -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_bfloat16_storage(name: str, isa: str) -> None:
-    """Errors in the Euclidean norm are at most 1.5 times the errors of the reference with the same storage."""
+    """Errors (Euclidean norm) are at most 1.5 times the errors of the reference with bfloat16 storage."""
     call = arguments(NETWORKS[name], [0, 61, 1, 0, 250, 7, 0])
     call = {**call, **{key: cast(call, torch.bfloat16)[key] for key in ("weights", "biases")}}
     exact = evaluate(call, torch.float64, "reference")

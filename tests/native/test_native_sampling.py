@@ -1,4 +1,4 @@
-"""The encodings of the compiled module: cases beyond the tests of the operations."""
+"""The compiled encodings: more cases than in tests/ops."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from voronerf.ops import frequency_encode, integrated_encode, spherical_harmonic
 
 pytestmark = pytest.mark.native
 
-# Row counts around the rows of a tile.
+# Row counts next to the rows of a tile.
 ROWS = (0, 1, 2, 31, 32, 33, 100)
 
 
@@ -24,7 +24,7 @@ def points(n: int, d: int = 3) -> Tensor:
 
 
 def encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], list[Tensor]]]:
-    """Returns both encodings, each with float64 inputs."""
+    """Returns the frequency and integrated encodings, each with its float64 inputs."""
     return [
         (lambda x, backend: frequency_encode(x, octaves, backend=backend), [points(n)]),
         (lambda x, backend: frequency_encode(x, octaves, include_input=False, backend=backend), [points(n)]),
@@ -36,7 +36,7 @@ def encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], lis
 
 
 def all_encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], list[Tensor]]]:
-    """Returns the encodings and spherical harmonics, which have no small values for large directions."""
+    """Returns the encodings, and spherical harmonics, which are not small for large directions."""
 
     def harmonics(degree: int, x: Tensor, backend: str) -> Tensor:
         return spherical_harmonics(x, degree, backend=backend)

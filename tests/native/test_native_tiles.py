@@ -1,4 +1,4 @@
-"""Products in tile registers: in an emulation on every machine, and in AMX where the processor has it."""
+"""Products in tile registers: emulated on every machine, and in AMX if the processor has it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ native = pytest.importorskip("voronerf.ops._core.native")
 programs = pytest.importorskip("voronerf.ops.grouped_program.native")
 
 PRECISIONS = {"highest": 2e-6, "high": 1e-4, "medium": 0.05}
-"""Values of ``torch.set_float32_matmul_precision``, and the largest error of results and gradients against float64."""
+"""Values of ``torch.set_float32_matmul_precision``, and the largest allowed errors against float64."""
 
 
 @pytest.fixture(params=["double", "amx"])
@@ -49,7 +49,7 @@ def network(
     seed: int = 0,
     activation: str = "softplus",
 ) -> dict[str, object]:
-    """Returns arguments of layers one after the other; the last layer reads the positions again."""
+    """Returns arguments for a chain of layers, whose last layer reads the positions again."""
     layers = [Layer(("positions",), widths[0], activation)]
     layers += [Layer((i,), width, activation) for i, width in enumerate(widths[1:])]
     layers.append(Layer((len(layers) - 1, "positions"), 4))
@@ -67,7 +67,7 @@ def network(
 
 
 def outcome(call: dict[str, object], dtype: torch.dtype, backend: str) -> list[Tensor]:
-    """Returns the result, then the gradients of positions, weights and biases."""
+    """Returns the result and the gradients of positions, weights and biases."""
     leaves = [call["positions"], *call["weights"], *call["biases"]]  # type: ignore[misc]
     leaves = [leaf.to(dtype, copy=True).requires_grad_() for leaf in leaves]
     count = len(call["weights"])  # type: ignore[arg-type]
@@ -100,7 +100,7 @@ def test_each_precision_is_as_exact_as_it_says(
 
 
 @pytest.mark.parametrize(("asked", "most"), [("high", 1e-5), ("medium", 2.0**-9 + 4e-6)])
-@pytest.mark.parametrize("largest", [1.0, 15.0, 1e5])  # angles of 512, 7,680, and beyond the range of the vector sine
+@pytest.mark.parametrize("largest", [1.0, 15.0, 1e5])  # angles to 512, to 7,680, and beyond the vector sine
 @pytest.mark.parametrize("d", [1, 3, 5])
 def test_octaves_are_no_less_exact_than_what_they_are_rounded_to(
     d: int, largest: float, asked: str, most: float, registers: str, precision: Callable[[str], None]
@@ -131,7 +131,7 @@ def test_any_number_of_rows(rows: int, asked: str, registers: str, precision: Ca
 
 
 def test_layers_with_a_relu_read_nothing_behind_their_columns(registers: str, precision: Callable[[str], None]) -> None:
-    # The 16 columns of a layer take the place of 32 other columns, which are not 0.
+    # A layer of 16 columns overwrites the slot of 32 columns, whose other 16 are nonzero.
     arguments = network((32, 16, 16), 3, 4, [97, 0, 1, 400], activation="relu")
     exact = outcome(arguments, torch.float64, "reference")
     precision("high")
@@ -142,7 +142,7 @@ def test_other_threads_and_forked_children_compute_the_same(precision: Callable[
     call = network((64, 64), 3, 4, [500, 33])
     precision("high")
     before = torch.get_num_threads()
-    torch.set_num_threads(1)  # a forked child can run with one thread
+    torch.set_num_threads(1)  # a forked child can run only with one thread
     try:
         want = outcome(call, torch.float32, "native")
         results: list[list[Tensor]] = []

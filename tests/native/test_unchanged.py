@@ -1,4 +1,4 @@
-"""The guard of routers, fields and steps sees every change of a noted object, and nothing else."""
+"""The change guard of routers, fields and steps detects every change of a watched object, and nothing else."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ CHANGED = {
 
 @contextlib.contextmanager
 def exchange(there):
-    """Makes the guard use torch's exchange of tensors, or Python's methods alone."""
+    """Makes the guard use torch's tensor exchange API, or only Python's methods."""
     if not there:
         native.compiled.know_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
     try:
@@ -109,7 +109,7 @@ def test_without_the_compiled_module_nothing_is_known():
 
 
 def test_who_asks_is_freed_with_what_is_noted():
-    """Python frees a cycle through the guard, which holds the object that holds it."""
+    """Python frees the reference cycle of a guard and an object that hold each other."""
     thing = Thing()
     thing.guard = unchanged()
     notes(thing.guard, thing, dict.fromkeys(("here", "place", "kind", "read"), thing.made), {})

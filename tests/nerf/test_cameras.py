@@ -1,4 +1,4 @@
-"""Pixels to rays and back, against the definitions."""
+"""Tests of cameras: rays of pixels, and projections of points to pixels, against the definitions."""
 
 import math
 
@@ -59,7 +59,7 @@ def test_project_inverts_rays(distortion):
 
 
 def test_a_camera_that_sees_all_around():
-    """The middle is ahead, a quarter of the width is 90 degrees, and the upper edge is straight up (nerfstudio)."""
+    """The middle looks ahead, a quarter of the width is 90 degrees, and the upper edge looks up, as in nerfstudio."""
     some = Cameras.all_around(orbit_cameras(3, radius=3, elevation=20, width=1, height=1, focal=1).poses, 40)
     one = Cameras.all_around(torch.eye(4)[None], 40)
     seen = one.rays(0, torch.tensor([40.0, 60, 20, 0, 40, 50]), torch.tensor([20.0, 20, 20, 20, 0, 30]))

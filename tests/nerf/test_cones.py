@@ -1,4 +1,4 @@
-"""Cones: the radius of a pixel's cone, and the Gaussians of its frustums, against random points and a finer sum."""
+"""Tests of cones: the radii of pixels, and the Gaussians of frustums, against random points and exact formulas."""
 
 import math
 
@@ -14,11 +14,11 @@ ORBIT = {"radius": 2.0, "elevation": 20.0, "width": 4, "height": 4, "focal": 4.0
 
 
 def cone_points(edges, radius, count):
-    """Returns points spread evenly over a conical frustum, [count, 2]: the distances along the axis and from it."""
+    """Draws uniform points in a conical frustum, [count, 3]: one coordinate along the axis and two across it."""
     generator = seeded(0)
     u = torch.rand(count, 3, generator=generator, dtype=WIDE)
     near, far = edges
-    # The disc at distance t has an area in proportion to t^2.
+    # The area of the disc at distance t is proportional to t^2.
     t = (near**3 + u[:, 0] * (far**3 - near**3)) ** (1 / 3)
     off = radius * t * u[:, 1].sqrt()
     angle = 2 * math.pi * u[:, 2]
@@ -31,7 +31,7 @@ def cone_points(edges, radius, count):
 def test_moments_against_monte_carlo(edges, radius):
     points = cone_points(edges, radius, 400_000)
     mean, along, across = frustum_moments(torch.tensor([edges], dtype=WIDE), torch.tensor([radius], dtype=WIDE))
-    # The errors of mean and variance over 400,000 draws are well below a hundredth of the spread.
+    # The error of the mean of 400,000 draws is well below a hundredth of the standard deviation.
     spread = float(points[:, 0].std())
     assert float(mean) == pytest.approx(float(points[:, 0].mean()), abs=0.01 * spread)
     assert float(along) == pytest.approx(float(points[:, 0].var()), rel=0.02)
@@ -66,7 +66,7 @@ def test_radii_are_those_of_pixels():
     rays = cameras.rays(1, x, y, cones=True)
     beside = cameras.rays(1, x + 1, y)
     assert rays.radii is not None and cameras.rays(1, x, y).radii is None
-    # Where the ray of a pixel crosses the image plane at depth 1, a pixel is 1 / focal wide; the ray is farther away.
+    # Pixels are 1 / focal wide on the image plane at depth 1, which rays reach at a distance of at least 1.
     forward = cameras.forward[1]
     at_plane = [r.directions / (r.directions @ forward)[:, None] for r in (rays, beside)]
     width = (at_plane[0] - at_plane[1]).norm(dim=1)
@@ -154,6 +154,6 @@ def test_a_sphere_has_a_centre_and_a_radius(centre, radius):
 )
 def test_contractions_can_be_undone(space):
     points = torch.rand(50, 3, generator=seeded(1)) * 8 - torch.tensor([4.0, 4.0, -1.0])
-    if isinstance(space, Perspective):  # it maps no point closer than half its near plane
+    if isinstance(space, Perspective):  # the space maps no point closer than half its near plane
         points = points @ space.axes + space.centre
     torch.testing.assert_close(space.inverse(space.points(points)), points, rtol=1e-3, atol=1e-4)

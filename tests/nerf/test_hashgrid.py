@@ -1,4 +1,4 @@
-"""The field on a hash grid, alone and in a router, and its settings from the scene."""
+"""Tests of the hash grid field, alone and in a router, and of its settings, which depend on the scene."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_large_images_and_long_trainings_get_more_of_both(side, contraction, bud
     arguments = dict(text.split("=", 1) for text in config.field_options)
     assert config.samples == (samples,) and arguments.get("log2_entries") == (entries and str(entries))
     assert resolve(TrainConfig(samples=(7,), contraction=contraction), scene).samples == (7,)
-    # On a machine four times as fast, and with a budget in steps on machines of any speed.
+    # The result is the same on a machine four times as fast, and for a budget in steps at any speed.
     arguments = [(TrainConfig(contraction=contraction, budget=budget / 4), 4.0)]
     arguments += [(TrainConfig(contraction=contraction, steps=100 * budget), speed) for speed in (0.01, 1.0, 64.0)]
     for settings, speed in arguments:

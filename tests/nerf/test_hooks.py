@@ -1,4 +1,4 @@
-"""Steps with Python hooks between recorded segments: samplers, split rules, ray sources and terms of a user."""
+"""Tests of steps with Python hooks between recorded segments: a user's samplers, split rules, ray sources and terms."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.native
 
 
 class Counting(SplitStrategy):
-    """A split rule that counts its calls, and calls its base."""
+    """A split rule that counts its calls, and then runs its base class."""
 
     seen = 0
 
@@ -61,7 +61,7 @@ class Learning(Occupancy):
 
 
 class Helper(Occupancy):
-    """A sampler that overrides a method that its hooks call."""
+    """A sampler that overrides `march`, which its hooks call."""
 
     marched = 0
 
@@ -88,7 +88,7 @@ class Own:
 
 
 class Anneal:
-    """A term with its own gradient, and a factor that changes from step to step."""
+    """A loss term that computes its gradient, with a factor that grows in each step."""
 
     def __init__(self):
         self.factor = 0.0
@@ -145,7 +145,7 @@ HOOKS = {
 
 @pytest.mark.parametrize("name", HOOKS)
 def test_same_bits_as_steps_that_run_as_they_are(name):
-    """Each hook runs once a step, also where a step needs more memory, and where a tensor has moved."""
+    """Each hook runs once per step, also if the step outgrows its memory or a tensor has moved."""
     options, change, count, said = HOOKS[name]
     results = []
     for as_it_is in (False, True):
@@ -185,7 +185,7 @@ def test_own_rays_are_taken(threads):
 
 
 def test_hooks_are_called_in_each_step_of_a_call():
-    """The hook before a step is called each time, though replays ask for it only as often as ``steps_alike`` says."""
+    """The sampler's own hooks run in each of the 40 steps of a call, not once for a group of steps."""
     training = Training(sampler=Learning)
     training.step(64, 40, at=0)
     assert training.sampler.before == training.sampler.after == 40
@@ -195,7 +195,7 @@ def test_hooks_are_called_in_each_step_of_a_call():
 
 
 def test_what_a_hook_sets_is_followed():
-    """A change counts from the next step on: another number of samples, a robust loss, a frozen parameter."""
+    """Changed numbers of samples, a robust loss and a frozen parameter take effect at the next step."""
 
     class Changing(Counting):
         def step_post_backward(self, output):
@@ -219,7 +219,7 @@ def test_what_a_hook_sets_is_followed():
 
 
 def test_what_moves_in_a_hook_is_followed_at_once():
-    """The segment behind the hook runs eagerly on the new memory, and is recorded anew."""
+    """The segment after the hook runs eagerly on the new memory, and is recorded again."""
 
     def moving(training):
         def term(seen, batch):
@@ -242,7 +242,7 @@ def test_what_moves_in_a_hook_is_followed_at_once():
 
 
 def test_a_term_that_begins_later():
-    """The term reads other results of the rays than when the step was recorded."""
+    """The term reads other results of the rays in later steps than in the recorded step."""
     results = []
     for as_it_is in (False, True):
         training = Training(cells=2)
@@ -306,7 +306,7 @@ class Called(RayLoss):
 
 
 def test_no_behaviour_of_a_subclass_is_passed_over():
-    """A property, a call, and the hook of a base behind a replayed class all run in Python."""
+    """A property, an overridden ``__call__``, and a base's hook behind a class marked as replayed all run in Python."""
 
     @replayed
     class Marked(SplitStrategy):
@@ -341,7 +341,7 @@ def test_what_changes_in_the_grid_is_followed(change):
 
 
 def test_attributes_of_ones_own_record_nothing_anew():
-    """Counters and tensors that no library class reads cause no new recording; an attribute that one reads does."""
+    """Counters and tensors that the library does not read cause no new recording; an attribute that it reads does."""
     training = Training(sampler=Learning)
     with_strategy(training)
     training.train(4)

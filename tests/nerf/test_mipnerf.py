@@ -1,4 +1,4 @@
-"""mip-NeRF: its encoding, its heads, and its cells, chosen by the mean of a Gaussian."""
+"""Tests of mip-NeRF: its encoding, its heads, and its cells, which are chosen by the Gaussians' means."""
 
 import torch
 import torch.nn.functional as F

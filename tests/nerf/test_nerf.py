@@ -1,4 +1,4 @@
-"""The NeRF field: its shapes against the published architecture, its initial state, its errors."""
+"""Tests of the NeRF field: its published architecture, its initial state, and its errors."""
 
 import pytest
 import torch
@@ -98,7 +98,7 @@ def test_missing_directions(inputs):
 
 
 def test_kilonerf_has_the_published_size():
-    """The network has two layers of 32, density, feature, and 32 view channels, with 63 and 27 encoded inputs."""
+    """Trunk, feature and view layers have 32 channels; encoded positions have 63 columns, encoded directions 27."""
     field = KiloNeRF()
     shapes = [tuple(layer.weight.shape) for layer in field.linears()]
     assert shapes == [(32, 63), (32, 32), (1, 32), (32, 32), (32, 59), (3, 32)]

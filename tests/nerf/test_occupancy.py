@@ -1,4 +1,4 @@
-"""The occupancy grid, and rendering through it: skipped space must not be visible."""
+"""Tests of the occupancy grid, and of rendering with it: images must not change where space is skipped."""
 
 import math
 
@@ -32,7 +32,7 @@ WHITE = torch.ones(3)
 
 
 class Ball:
-    """A coloured ball of radius 0.5 in empty space, which counts the queried positions."""
+    """A field with a coloured ball of radius 0.5 in empty space; it counts the queried positions."""
 
     def __init__(self, density=60.0):
         self.density, self.asked = density, 0
@@ -56,7 +56,7 @@ def grid_of(field, resolution=8, looks=3):
 
 
 def tight_grid(resolution=24):
-    """Returns a grid with all cells that the ball reaches into, however little, and few others."""
+    """Returns a grid in which all voxels that intersect the ball are occupied, and few others."""
     grid = OccupancyGrid(BOX, resolution, threshold=0.1)
     middles = grid.points(torch.arange(resolution**3)).norm(dim=-1)
     grid.occupied = (middles < 0.5 + 3**0.5 / resolution).reshape(grid.occupied.shape)
@@ -159,7 +159,7 @@ def test_points_lie_in_their_cells():
 
 
 def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
-    """Rays from all around a ball keep its shell; the air around it and the dark inside fade."""
+    """Rays from all directions keep a ball's shell occupied; the air and most of the hidden interior become empty."""
     grid, ball = OccupancyGrid(BOX, 16, threshold=0.1), Ball(200.0)
     random = seeded(0)
     for _ in range(60):
@@ -174,7 +174,7 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
     half = 3**0.5 / 16
     corners = grid.points(torch.arange(16**3)).abs().amax(-1).reshape(16, 16, 16) > 0.8
     assert not bool(grid.occupied[(distance > 0.5 + half) & ~corners].any())
-    # A ray that slips through a corner of the shell brings back single cells behind it.
+    # Single voxels inside become occupied again, since rays pass through corners of the shell.
     assert float(grid.occupied[distance < 0.5 - 2.5 * half].float().mean()) < 0.2
     options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 64, "background": WHITE}
     plain, quick = (
@@ -184,7 +184,7 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
     before = ball.asked
     render_rays(ball, rays[hit], near[hit], far[hit], samples=Occupancy(grid, 64))
     assert (ball.asked - before) * 5 < 64 * int(hit.sum())
-    # A look that finds density brings a cell back, and does not fade it further.
+    # An update restores the density of a voxel inside the ball.
     inside = grid.voxels(torch.zeros(1, 3))
     grid.update(ball, inside, decay=1.0)
     assert float(grid.density.reshape(-1)[inside]) == 200.0
@@ -195,7 +195,7 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
 
 
 def test_holes_in_a_surface_are_filled_where_the_field_is_dense():
-    """A cell in the middle of a ball comes back; lone cells, thin parts and air stay empty."""
+    """Emptied voxels in a dense ball become occupied; separate voxels, thin balls and air stay empty."""
     radius = torch.stack(torch.meshgrid(*[torch.linspace(-15 / 16, 15 / 16, 16)] * 3, indexing="ij")).norm(dim=0)
 
     def emptied(density, contraction=None):
@@ -217,14 +217,14 @@ def test_holes_in_a_surface_are_filled_where_the_field_is_dense():
     grid, filled = emptied(60.0)
     assert bool(filled[8, 8, 8]) and bool(filled[10, 8, 8]) and float(grid.density[8, 8, 8]) == 2.0
     assert bool((radius[filled] < 0.5 + 3**0.5 / 16).all())
-    assert not bool(emptied(1.5)[1].any())  # thinner than two thresholds
-    # In contracted space, densities count per contracted unit, which is longer in the world off the centre.
+    assert not bool(emptied(1.5)[1].any())  # the density is below twice the threshold
+    # Thresholds apply to density per contracted unit, which is longer in the world away from the centre.
     contracted = emptied(1.5, Contraction(torch.zeros(3), 0.2))[1]
     assert bool(contracted[10, 8, 8]) and not bool(contracted[8, 8, 8])
 
 
 def test_specks_are_dropped_and_thin_things_stay():
-    """One voxel or two that touch, by a corner too, are dust; a line of three is a rope."""
+    """Groups of one or two voxels that touch (at a corner suffices) are dropped as dust; a line of three is kept."""
     grid = OccupancyGrid(BOX, 12, threshold=1.0)
     grid.occupied = torch.zeros(12, 12, 12, dtype=torch.bool)
     kept = [(0, 0, 0), (1, 1, 1), (2, 2, 2), *((8, y, z) for y in (4, 5, 6) for z in (4, 5))]
@@ -264,7 +264,7 @@ def test_images_are_the_same_with_a_fraction_of_the_samples():
     ],
 )
 def test_the_empty_space_of_a_contracted_scene_is_skipped(space):
-    """A far wall as thin as fog stands behind a ball: the grid learns both, and pictures lose nothing."""
+    """A distant wall, as thin as fog, stands behind a ball: the grid keeps both, and images do not change."""
     asked, random = [0], seeded(0)
 
     def scene(positions, directions, ray_index):
@@ -301,7 +301,7 @@ def test_the_empty_space_of_a_contracted_scene_is_skipped(space):
 
 
 def test_a_translucent_field_is_walked_to_its_end():
-    """Rays that never become opaque need every wave."""
+    """Rays that never become opaque are sampled up to the last wave."""
     options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 128, "background": WHITE}
     plain = render_image(Ball(0.7), cameras(), 1, **options)
     quick = render_image(Ball(0.7), cameras(), 1, occupancy=tight_grid(), **options)
@@ -311,7 +311,7 @@ def test_a_translucent_field_is_walked_to_its_end():
 
 
 def test_a_ray_that_ends_has_the_colour_before_its_end():
-    """A ray that ends in fog of one colour has that colour, although its last light never reached the background."""
+    """A ray that ends early in fog of one colour has this colour: the background gets none of the remaining light."""
     asked = [0]
 
     def fog(positions, directions, ray_index):
@@ -322,10 +322,10 @@ def test_a_ray_that_ends_has_the_colour_before_its_end():
     sampler = Occupancy(OccupancyGrid(BOX, 4, threshold=0.1), 200, picture_samples=200)
     ends = torch.zeros(2), torch.tensor([2.0, 0.1])
     seen = sampler.see(fog, rays, *ends, background=WHITE, heaviest=True)
-    left = math.exp(-0.8)  # light behind the second ray, which does not end
+    left = math.exp(-0.8)  # light from behind the second ray, which is not ended early
     torch.testing.assert_close(seen.colour[:, 0], torch.tensor([0.25, 0.25 * (1 - left) + left]))
     torch.testing.assert_close(seen.opacity, torch.tensor([1.0, 1 - left]))
-    # 1 - exp(-8 t) is 0.98 at t = 0.49; the depth is the mean distance of the fog until there
+    # The opacity 1 - exp(-8 t) is 0.98 at t = 0.49; the depth is the mean distance of the fog up to this t.
     assert asked[0] < 200 + 64 and 0.1 < float(seen.depth[0]) < 0.125
 
 
@@ -393,7 +393,7 @@ def test_refuses_what_is_no_grid():
         (BOX, 8, {"remembered": 0.5}, "remembered must be at least 1 and finite, got 0.5"),
     ):
         refuses(message, OccupancyGrid, box, resolution, **{"threshold": 1, **options})
-    # In 32 bits, 2**32 would be cell 0.
+    # As a 32-bit index, 2**32 would be voxel 0.
     update = OccupancyGrid(BOX, 4, threshold=0.1).update
     for cell in (-1, 64, 2**32):
         refuses("voxels must lie in 0 to 63, got", update, Ball(), torch.tensor([cell]))
@@ -421,7 +421,7 @@ def ends(rays):
 )
 @pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
 def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse_depth, robust):
-    """The loss includes points at which the last rays end, before, in and behind the grid."""
+    """The loss includes the sparse depths of the last rays, which lie before, inside and behind the grid."""
     grid = tight_grid()
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
     rays = cameras().image_rays(0)
@@ -438,7 +438,7 @@ def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse
         return results, torch.autograd.grad(results.loss, list(router.parameters()))
 
     results, gradients = compare(renderer)
-    plain = renderer_of({"field": lambda *arguments: router(*arguments)}, **options)  # a field without a table
+    plain = renderer_of({"field": lambda *arguments: router(*arguments)}, **options)  # a field without a layer table
     expected, same = compare(plain)
     assert len(results.weights) > 0 and torch.equal(results.samples.positions, expected.samples.positions)
     for part, other in zip(
@@ -448,12 +448,12 @@ def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse
 
 
 def test_samples_that_no_light_reaches_have_no_gradient():
-    """Samples behind the surface of a solid field have no gradient; the others give the gradient to a thousandth."""
+    """Samples behind a solid surface have no gradient; the gradient of the other samples is right to a thousandth."""
     field = HashGridField(width=16, levels=2, log2_entries=10)
     torch.nn.init.constant_(field.density.bias, 10.0)
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **field.router_options)
     rays, gradients = cameras().image_rays(0), []
-    for of in (router, lambda *arguments: router(*arguments)):  # the second is a field without a table
+    for of in (router, lambda *arguments: router(*arguments)):  # the second field has no layer table
         renderer = renderer_of({"field": of}, samples=96, occupancy=tight_grid())
         batch = Batch(rays, *ends(rays), torch.zeros(len(rays), 3))
         result = RayLoss(renderer)(batch, torch.Generator().manual_seed(3))

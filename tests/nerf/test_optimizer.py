@@ -1,4 +1,4 @@
-"""The optimiser of tables: few entries have a gradient, and moments are inherited and saved."""
+"""Tests of the optimiser: tables with few gradients, and moments that are inherited and saved."""
 
 import functools
 
@@ -27,7 +27,7 @@ def test_dense_groups_are_torchs():
 
 @pytest.mark.parametrize("option", ["weight_decay", "amsgrad", "maximize", "differentiable"])
 def test_options_that_are_not_there_are_refused(option):
-    """Options are refused in a group, and at a step if they are set later; parameters have not moved then."""
+    """Unsupported options are refused in a new group, and before a step changes anything if they are set later."""
     weight = torch.nn.Parameter(torch.ones(3))
     value = 0.1 if option == "weight_decay" else True
     with pytest.raises(ValueError, match=f"Adam: {option} of a group must be 0 or False, got {value}"):
@@ -84,7 +84,7 @@ def test_frozen_cells_do_not_shrink():
 def test_steps_count_once_for_a_parameter_whose_cells_are_partly_frozen():
     torch.manual_seed(0)
     results, centres, gradients = [], torch.rand(5, 3), torch.randn(3, 5, 2, 3)
-    for frozen in ([], [1, 3]):  # the two frozen cells leave three parts
+    for frozen in ([], [1, 3]):  # the two frozen cells leave three ranges of cells
         torch.manual_seed(1)
         router = VoronoiRouter(torch.nn.Linear(3, 2), centres)
         weight = router.module.weight

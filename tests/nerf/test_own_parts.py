@@ -1,4 +1,4 @@
-"""Samplers and split rules of a user replace the library's own; no code asks for their class."""
+"""Tests that a user's samplers and split rules can replace the library's: no code checks for their class."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from voronerf.nerf import Batch, Occupancy, RayLoss, Rays, Renderer, Sampler, St
 
 
 class Borrowed(Sampler):
-    """A sampler of another class that has a grid."""
+    """A sampler that has a grid, but does not inherit from `Occupancy`."""
 
     def __init__(self, other):
         super().__init__(other.samples, space=other.space)
@@ -31,7 +31,7 @@ class Borrowed(Sampler):
 
 
 class Never(Strategy):
-    """A split rule that counts its hooks and never splits."""
+    """A split rule that counts the calls of its hook, and never splits."""
 
     def __init__(self):
         self.steps = 0

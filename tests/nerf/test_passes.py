@@ -1,4 +1,4 @@
-"""Several passes along a ray, against slow loops and known pictures."""
+"""Tests of several passes along a ray, against slow loops and known images."""
 
 import math
 
@@ -25,7 +25,7 @@ WHITE = torch.ones(3)
 
 
 class Slab:
-    """Red fog of one density between two heights, which records the queried positions."""
+    """A field of red fog between two heights, which records the queried positions."""
 
     def __init__(self, low=-0.05, high=0.05, density=30.0):
         self.low, self.high, self.density = low, high, density
@@ -38,14 +38,14 @@ class Slab:
 
 
 def rays(count=3):
-    """Returns rays straight down from height 2, one beside the other."""
+    """Returns parallel rays straight down from height 2."""
     origins = torch.tensor((0.0, 0.0, 2.0)).repeat(count, 1)
     origins[:, 0] = torch.arange(count)
     return Rays(origins, torch.tensor((0.0, 0.0, -1.0)).repeat(count, 1), torch.full((count,), 0.01))
 
 
 def test_a_second_pass_finds_a_thin_surface():
-    """16 strata see a slab a fortieth of the ray thick with a wrong thickness; the second pass does not."""
+    """With 16 strata, a slab as thick as a fortieth of the ray has a wrong opacity; a second pass corrects it."""
     expected = 1 - math.exp(-30 * 0.1)
     one = renderer_of({"field": Slab()}, samples=17).render(rays(), 0.0, 4.0)
     assert len(one) == 1 and abs(float(one[0].opacity[0]) - expected) > 0.04
@@ -53,7 +53,7 @@ def test_a_second_pass_finds_a_thin_surface():
         passes = renderer_of(fields, samples=17, fine_samples=64, cones=cones).render(rays(), 0.0, 4.0)
         assert len(passes) == 2
         assert abs(float(passes[1].opacity[0]) - expected) < 0.02
-        # Fog of density 30 begins at 1.95 and is a tenth thick: the mean of an exponential that is cut off there.
+        # Fog of density 30 reaches from 1.95 to 2.05: its depth is the mean of a truncated exponential distribution.
         within = 1 / 30 - 0.1 * math.exp(-3) / expected
         assert float(passes[1].depth[0]) == pytest.approx(1.95 + within, abs=0.005)
 

@@ -1,4 +1,4 @@
-"""Fields with a known program: the fast step and pictures equal separate operations."""
+"""Tests of fields with a known program: the fast step and images equal separate operations."""
 
 import math
 import re
@@ -35,7 +35,7 @@ def encoded(x, octaves):
 
 
 class Foreign(nn.Module):
-    """A field as in other codebases."""
+    """A field in the style of other codebases."""
 
     activations: ClassVar = {
         "softplus": lambda self, x: F.softplus(x) * self.scale,
@@ -61,7 +61,7 @@ class Foreign(nn.Module):
 
 
 class Own(RadianceField):
-    """A layer table with its own activations."""
+    """A field with a layer table and its own activations."""
 
     def __init__(self):
         super().__init__()
@@ -109,7 +109,7 @@ def batch_of(rays=64, sparse=0, unseen=0):
 
 
 def losses(field, monkeypatch, backend="auto", **terms):
-    """Returns the losses of the fast step and of separate operations, both over all samples."""
+    """Returns a loss with the fast step and one with separate operations; both differentiate all samples."""
     monkeypatch.setattr("voronerf.nerf.loss.HIDDEN", 0.0)
     grid = OccupancyGrid(BOX, 8, threshold=0.1)
     grid.occupied = torch.rand(8, 8, 8, generator=seeded(5)) < 0.7
@@ -151,7 +151,7 @@ def test_with_points_of_a_sparse_model(name, monkeypatch):
 
 
 def term_of_all(seen, batch):
-    """Returns a term of all results of a ray."""
+    """Returns a loss term that reads all results of the rays."""
     near = (seen.colour - batch.target).abs().mean() + (seen.depth / batch.far).mean()
     fog = (seen.density / (1 + seen.density) * seen.samples.deltas).mean() + (seen.rgb * seen.weights[:, None]).mean()
     return near + fog + seen.opacity.square().mean() + seen.weights.square().sum() / len(batch.rays)
@@ -167,7 +167,7 @@ def test_with_a_term_in_torch(name, monkeypatch):
 
 @pytest.mark.parametrize("name", ["relu", "hash"])
 def test_equals_a_rendering_that_torch_differentiates(name, monkeypatch):
-    """The colour error and all kinds of terms equal the formulas of their references."""
+    """The loss of colours and all kinds of terms equals the formulas of the references."""
     router, field = make(name)
     terms = [SparseDepth(0.3), term_of_all, SmoothDepth(0.2), Surface(distortion=0.4, orientation=0.3)]
     fast, separate = losses(field, monkeypatch, terms=terms, robust=0.05)
@@ -220,7 +220,7 @@ def test_a_term_that_reads_nothing_adds_to_the_loss_alone(monkeypatch):
 
 @pytest.mark.parametrize("name", ["relu", "hash"])
 def test_with_rays_from_where_no_camera_was(name, monkeypatch):
-    """The depths of these rays are learnt from, their colours are not."""
+    """The loss reads the depths of rays without a camera, but not their colours."""
     router, field = make(name)
     fast, separate = losses(field, monkeypatch, terms=[SmoothDepth(0.3), SparseDepth(0.3)], robust=0.05)
     batch = batch_of(sparse=20, unseen=12)
@@ -322,7 +322,7 @@ def test_pictures_and_densities_are_those_of_the_field(name):
             seen.append(renderer.see(batch.rays, batch.near, batch.far, torch.ones(3)))
             densities.append(density_of(of, points))
     torch.testing.assert_close(*densities, rtol=1e-4, atol=1e-5)
-    # A ray ends with a wave, and the waves have other lengths, so that the light left at the end differs.
+    # Rays end after a wave. The lengths of waves differ here, and so does the remaining light at the end.
     torch.testing.assert_close(seen[0].colour, seen[1].colour, rtol=0, atol=0.06)
     with torch.no_grad():
         assert isinstance(radiance_of(field), Radiance)
@@ -376,7 +376,7 @@ def test_explains_the_step_in_one_way(monkeypatch):
 
 @pytest.mark.parametrize("name", ["relu", "table", "own table"])
 def test_on_every_backend(name, monkeypatch, device, backend):
-    """The layers run in Warp kernels, whatever activations follow."""
+    """Layers run on each backend (Warp kernels too), whatever activations follow."""
     if torch.device(device).type != "cpu":
         pytest.skip("the same as on the CPU")
     router, field = make(name, backend=backend if name != "relu" or backend != "warp" else "auto")

@@ -1,4 +1,4 @@
-"""Box intersection and stratified sampling, against slow loops and known properties."""
+"""Tests of box intersection and stratified sampling, against slow loops and known properties."""
 
 import pytest
 import torch

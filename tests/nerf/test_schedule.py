@@ -1,4 +1,4 @@
-"""The schedules of a training: the learning rate and the rays of a step."""
+"""Tests of a training's schedules: the learning rate, and the number of rays per step."""
 
 import pytest
 

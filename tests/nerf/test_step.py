@@ -1,4 +1,4 @@
-"""A training step that is recorded and replayed."""
+"""Tests of training steps that are recorded and replayed."""
 
 import gc
 import threading
@@ -27,7 +27,7 @@ def threads(request):
 
 @pytest.mark.parametrize(("cells", "photograph"), [(1, False), (6, False), (6, True)])
 def test_same_bits_as_steps_that_run_as_they_are(cells, photograph, threads):
-    """Parameters, moments, grid and results have the same bits; the rays outgrow the memory, and shrink."""
+    """Parameters, moments, grid and results are equal bit for bit, also if the rays outgrow the memory or get fewer."""
 
     def rays(step):
         return 64 + 5 * step if step < 30 else 150 - 3 * (step - 30)
@@ -40,7 +40,7 @@ def test_same_bits_as_steps_that_run_as_they_are(cells, photograph, threads):
 
 
 def test_more_samples_than_there_is_memory_for(monkeypatch):
-    """The step runs again eagerly with the same random numbers, and is recorded anew."""
+    """The step runs again eagerly with the same random numbers, and is recorded again."""
     results = []
     for as_it_is in (False, True):
         training = Training()
@@ -58,7 +58,7 @@ def test_more_samples_than_there_is_memory_for(monkeypatch):
 
 
 def test_more_and_more_samples_and_none():
-    """Step after step outgrows the memory; then steps have no samples, and some again."""
+    """Several steps in a row outgrow the memory; then steps have no samples, and later steps have some."""
     results = []
     for as_it_is in (False, True):
         training, steps = Training(), []
@@ -77,13 +77,13 @@ def test_more_and_more_samples_and_none():
 
 @pytest.mark.parametrize("cells", [1, 6])
 def test_steps_in_one_call_are_the_same_bits(cells, threads):
-    """The hooks of sampler and optimiser before and after the steps run too; parts of a call may exceed the memory."""
+    """The hooks before and after steps run too, and steps in the middle of a call may exceed the memory."""
     results = []
     for calls in ([16] * 14, [1] * 224, [5, 11, 3, 13] * 7):
         training, done = Training(cells), 0
         training.optimizer.average, grid = 0.9, training.sampler.grid
         for steps in calls:
-            if done == 160:  # many more samples, in the middle of calls of 16
+            if done == 160:  # many more samples, after ten calls of 16 steps
                 grid.density[:], grid.occupied[:] = 1e3, True
             training.optimizer.set_learning_rate(0.01 / (1 + done // 16))
             result = training.step(40 + done // 16, steps, at=done)
@@ -113,7 +113,7 @@ def test_a_training_is_freed_with_its_recording():
 
 
 def test_gradients_are_there_after_each_step():
-    """Gradients exist, also if a loop drops them, or a step in between was not replayed."""
+    """Gradients exist, also if the loop has dropped them or an earlier step was not replayed."""
     one, other = Training(), Training()
     for training, as_it_is in ((one, False), (other, True)):
         training.train(5, as_it_is=as_it_is)
@@ -127,7 +127,7 @@ def test_gradients_are_there_after_each_step():
 
 
 def test_numbers_of_rows_that_were_the_same():
-    """Two row counts are told apart, though they were equal when the calls were recorded."""
+    """A replay distinguishes two row counts that were equal in the recording."""
     centres = torch.rand(5, 3)
     with Recording() as recording:
         results = [nearest_centre(recording.take(torch.rand(6, 3)), centres) for _ in range(2)]
@@ -139,7 +139,7 @@ def test_numbers_of_rows_that_were_the_same():
 
 
 def test_a_number_of_rows_that_is_no_count_is_refused():
-    """A replay would make the same rows again and again, or write to memory of fewer rows."""
+    """A replay would repeat the recorded number of rows, or write to memory with fewer rows."""
     points, centres = torch.rand(6, 3), torch.rand(5, 3)
     with Recording() as recording:
         nearest_centre(points, centres)
@@ -154,7 +154,7 @@ def test_a_number_of_rows_that_is_no_count_is_refused():
 
 
 def test_torch_entry_by_entry_is_computed_again():
-    """Pointwise operations run again in place, in new memory and on a column; other operations are refused."""
+    """Replays repeat pointwise operations in place, into new memory and on a column; others are refused."""
     with Recording() as recording:
         x = recording.take(torch.rand(6, 3))
         y = torch.sigmoid(x[:, 1]) * 2
@@ -173,7 +173,7 @@ def test_torch_entry_by_entry_is_computed_again():
 
 
 def test_a_replay_refuses_what_a_call_finds_wrong():
-    """A replay refuses cells that have come to lie out of range, like the call itself."""
+    """A replay refuses cells that have become out of range, like a call does."""
     cells = torch.tensor([0, 2, 1, 2, 0, 1], dtype=torch.int32)
     with Recording() as recording:
         order, _ = cell_sort(recording.take(cells), 3)
@@ -229,7 +229,7 @@ def test_what_changes_is_followed(change):
 
 
 def new_data(*tensors):
-    """Moves tensors to other memory with the same values; images get other values."""
+    """Moves tensors to other memory; values stay the same, but images are inverted."""
     for tensor in tensors:
         tensor.data = 255 - tensor.data if tensor.dtype == torch.uint8 else tensor.data.clone()
 
@@ -240,7 +240,7 @@ def new_vector(training):
     torch.nn.utils.vector_to_parameters(torch.nn.utils.parameters_to_vector(parameters), parameters)
 
 
-#: Moves of tensors to other memory or to another layout, while the objects stay.
+#: Functions that move tensors to other memory or to another layout, and keep the tensor objects.
 MOVES = {
     "gradients": lambda t: new_data(*(p.grad for p in t.router.parameters() if p.grad is not None)),
     "moments": lambda t: new_data(*(state["exp_avg"] for state in t.optimizer.state.values())),
@@ -266,14 +266,14 @@ MOVES = {
 
 
 def test_what_moves_is_followed():
-    """A step writes to no memory that a tensor has left, and reads the tensor's new memory."""
+    """After a tensor has moved, a step uses its new memory and does not write to the old memory."""
     results = []
     for as_it_is in (False, True):
         training, steps = Training(cells=3), {}
         training.router.module.density.bias.requires_grad_(False)
         training.optimizer.average = 0.9
         for name, move in {"nothing": lambda t: None, **MOVES}.items():
-            for _ in range(2):  # recorded, and replayed
+            for _ in range(2):  # the first step is recorded, the second replayed
                 training.train(1, as_it_is=as_it_is)
                 training.step(64, 2, at=1023)
             recorded = training.recorded
@@ -288,7 +288,7 @@ def test_what_moves_is_followed():
 
 
 def test_centres_that_have_an_index_are_followed():
-    """Centres are followed if they change in place, move to other memory, or belong to another diagram."""
+    """Steps use the current centres after a change in place, a move to other memory, or a new diagram."""
     results = []
     for as_it_is in (False, True):
         training, steps = Training(cells=2100), []
@@ -321,7 +321,7 @@ def test_recordings_that_are_never_replayed_are_made_less_often():
 
 
 def test_gradients_that_were_dropped_are_given_back():
-    """After gradients were set to None, a step restores its tensors, even if a loop replaced or added a gradient."""
+    """A step restores its gradient tensors if the loop has set gradients to None, replaced or added them."""
     one, other = Training(), Training()
     for training, as_it_is in ((one, False), (other, True)):
         list(training.router.parameters())[-2].requires_grad_(False)
@@ -367,7 +367,7 @@ def test_steps_without_gradients_are_refused_as_ever():
 
 @pytest.mark.parametrize("field", [None, "another"])
 def test_a_second_optimizer_learns(field):
-    """A parameter of another optimizer, in or around the router, is named, and moves in each of its steps."""
+    """`explain` names a parameter that only another optimizer has; the steps of that optimizer move the parameter."""
     moved = []
     for as_it_is in (False, True):
         training = Training(field=Scaled, fuse=True, way="fused") if field else Training()
@@ -378,7 +378,7 @@ def test_a_second_optimizer_learns(field):
         other, values = torch.optim.SGD([parameter], lr=1.0), []
         for step in range(6):
             training.train(1, as_it_is=as_it_is)
-            if step % 2:  # gradients accumulate in between
+            if step % 2:  # gradients accumulate between these steps
                 other.step()
                 other.zero_grad()
             values.append(parameter.detach().clone())
@@ -395,7 +395,7 @@ def test_a_second_optimizer_learns(field):
 
 @pytest.mark.parametrize("steps", [6, 7, 10, 32])
 def test_any_number_of_steps_of_a_call_keeps_averages_and_decay(steps):
-    """The grid also begins to learn at its own step, not at the end of a call."""
+    """The grid also starts to learn at the right step, even in the middle of a call."""
     results = []
     for calls in (96 // steps * [steps] + [96 % steps], 96 * [1]):
         training, done = Training(cells=2), 0
@@ -445,7 +445,7 @@ def test_a_field_of_torch_runs_as_it_is():
 
 
 def test_a_fused_field_is_replayed():
-    """A change of the field's attributes is followed."""
+    """Replays use changed attributes of the field."""
     results = []
     for as_it_is in (False, True):
         training = Training(cells=2, field=Scaled, fuse=True, way="fused")
@@ -459,7 +459,7 @@ def test_a_fused_field_is_replayed():
 
 @replayed
 class Keeping(SplitStrategy):
-    """A split rule marked as replayed, though torch sums in its hook."""
+    """A split rule that is marked as replayed, although its hook calls a sum of torch."""
 
     line = 0
 

@@ -1,4 +1,4 @@
-"""Volume rendering against slow loops and known integrals."""
+"""Tests of volume rendering, against slow loops and known integrals."""
 
 import math
 
@@ -11,12 +11,13 @@ from voronerf.nerf.cameras import Rays, orbit_cameras
 
 BOX = torch.tensor([[-0.7, -0.7, -0.7], [0.7, 0.7, 0.7]])
 WHITE = torch.ones(3)
-#: For two points at 2.0 and 2.9: the samples before the first near one, and the number of near ones, of 8 from 1 to 3.
+#: For points at 2.0 and 2.9: the number of samples in front of the nearby samples, and the number of nearby samples. A
+#: ray has 8 samples from 1 to 3.
 ENDS = ((3, 2), (6, 2))
 
 
 def ball(positions, directions, ray_index):
-    """Returns colour and density of a dense ball of radius 0.6, coloured by position and by the ray's direction."""
+    """Returns colour (by position and ray direction) and density of a dense ball of radius 0.6."""
     rgb = 0.5 + 0.4 * positions * directions[ray_index.long()]
     return rgb, torch.where(positions.norm(dim=-1) < 0.6, 30.0, 0.0)
 
@@ -66,7 +67,7 @@ def test_against_slow_loop(spacing):
 
 
 def test_homogeneous_medium():
-    """Constant density: opacity is 1 - exp(-sigma length) whatever the sampling."""
+    """With a constant density, opacity is 1 - exp(-sigma length) for any sampling."""
 
     def fog(positions, directions, ray_index):
         return torch.full_like(positions, 0.25), torch.full_like(positions[:, 0], 0.7)
@@ -127,7 +128,7 @@ def test_what_is_near_the_camera_learns_less(marched):
 
 
 def test_the_last_rays_end_at_points():
-    """The loss is minus the logarithm of the weights within 0.03 of the distance and a sample's length of 0.25."""
+    """The loss is minus the log of the weights near a point: within 3 % of its distance plus a sample length, 0.25."""
     ahead = Rays(torch.zeros(3, 3), torch.tensor([[0.0, 0, 1]]).expand(3, 3))
     fog = lambda positions, *_: (torch.zeros_like(positions), torch.full_like(positions[:, 0], 0.5))  # noqa: E731
     renderer = renderer_of({"field": fog}, samples=8)

@@ -1,4 +1,4 @@
-"""Layers and networks as plain loops over cells, with torch's own gradients: the oracle of every backend."""
+"""Layers and networks as plain loops over cells, differentiated by torch: the oracle for every backend."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ COUNTS = {
     "unequal": [1, 0, 9001, 2],
     "single cell": [33],
 }
-"""The numbers of samples in the cells: all 0, a single 1, odd with empty cells, more than two pieces, and one cell."""
+"""The numbers of samples in the cells: none, one, odd numbers and empty cells, more than two pieces, a single cell."""
 
 
 def need(op, backend, device, dtype):
@@ -35,7 +35,7 @@ def offsets_of(counts, device="cpu"):
 
 
 def strided(tensor):
-    """Returns the same values, stored so that no two of them are adjacent in memory."""
+    """Returns a tensor with the same values, of which no two are adjacent in memory."""
     wide = tensor.new_full((*tensor.shape[:-1], 2 * tensor.shape[-1]), torch.nan if tensor.is_floating_point() else -7)
     wide[..., ::2] = tensor
     return wide[..., ::2]
@@ -43,7 +43,7 @@ def strided(tensor):
 
 @contextmanager
 def refused(kind, message):
-    """Passes if the block raises exactly this message; "..." stands for any text."""
+    """Passes if the block raises this exception with exactly this message; "..." stands for any text."""
     with pytest.raises(kind) as caught:
         yield
     begin, _, end = message.partition("...")
@@ -55,7 +55,7 @@ def refused(kind, message):
 def refusals(call, name=None, /, **good):
     """Calls an op with the valid arguments ``good``; returns a function that checks the error for changed arguments.
 
-    The expected message follows the op's name; the error is a TypeError if it mentions a type, else a ValueError.
+    The error begins with the op's name; it must be a TypeError if the message mentions a type, else a ValueError.
     """
     call(**good)
 

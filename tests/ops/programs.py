@@ -1,4 +1,4 @@
-"""Programs in plain PyTorch, differentiated to any order by their gradient programs."""
+"""Runs programs by the reference and differentiates them to any order by their gradient programs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ByPrograms(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *arriving):
-        """Runs the gradient program by this class, so that it is differentiable again."""
+        """Runs the gradient program through this class, so that the gradients are differentiable too."""
         offsets, order, ray_index, *tensors = ctx.saved_tensors
         program, k = Program.parse(ctx.text), len(offsets) - 1
         count, split, wanted = len(program.inputs), len(program.outputs), ctx.needs_input_grad[4:]
@@ -44,15 +44,15 @@ class ByPrograms(torch.autograd.Function):
 
 
 def derivatives(run, tensors, orders=3):
-    """Returns the results of ``run(*leaves)`` and their derivatives, each of a weighted sum of the last.
+    """Returns the results of ``run(*leaves)`` and derivatives; each order differentiates a weighted sum of the last.
 
     Args:
         run: a function of tensors that returns a list of tensors.
-        tensors: its arguments.
+        tensors: the arguments of ``run``.
         orders: the number of derivatives.
 
     Returns:
-        The results, then for each order the gradients to all arguments.
+        The results, followed by the gradients to all arguments for each order.
     """
     generator = torch.Generator().manual_seed(5)
     leaves = [tensor.clone().requires_grad_() for tensor in tensors]

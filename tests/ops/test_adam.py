@@ -28,7 +28,7 @@ def test_leaves_out_a_step_that_is_not_finite(device, backend, spoilt):
 
 
 def test_leaves_out_a_step_wherever_a_gradient_is_not_finite(device, backend):
-    """The entry lies at borders of the blocks: on CUDA, 127 blocks of 4,096 entries make one pass."""
+    """The NaN is put next to block borders; on CUDA one pass takes 127 blocks of 4,096 entries."""
     sizes, judged = [3, 90, 530_001, 0, 4097], [True, False, True, True, True]
     tensors = [[torch.ones(n, device=device) for n in sizes] for _ in range(4)]
     gradients, guard = tensors[1], Guard.on(device)
@@ -40,14 +40,14 @@ def test_leaves_out_a_step_wherever_a_gradient_is_not_finite(device, backend):
         assert bool(guard.found) and float(guard.in_a_row) == float(guard.skipped) == number + 1
         assert all(bool((parameter == 1).all()) for parameter in tensors[0]) and not any(rule.step for rule in rules)
         gradients[which][place] = 1
-    gradients[1][89] = torch.nan  # a gradient of a table
+    gradients[1][89] = torch.nan  # the gradient of a table, which is not checked
     adam(rules, *tensors, guard=guard, loss=guard.found + 1, backend=backend)
     assert not guard.found and not guard.in_a_row and float(guard.skipped) == len(places)
     assert all(bool((parameter != 1).all()) and rule.step for parameter, rule in zip(tensors[0], rules, strict=True))
 
 
 def test_a_table_may_have_any_gradient(device, backend):
-    """The gradient of a table is not checked: its entries are products of gradients that are checked."""
+    """The gradient of a table is not checked, since its entries are products of checked gradients."""
     table = [torch.ones(4, device=device) for _ in range(4)]
     table[1][2] = torch.nan
     guard, step = Guard.on(device), torch.zeros((), device=device)
@@ -66,7 +66,7 @@ def test_what_was_found_before_leaves_out_a_step(device, backend):
 
 
 def test_refuses_what_would_be_read_out_of_bounds():
-    """Wrong arguments come one at a time: a fast pass over all tensors decides whether they are checked one by one."""
+    """Each call has one wrong argument, since one fast check of all tensors decides whether each is checked alone."""
 
     def call(rules=None, **changed):
         arguments = {name: [torch.ones(())] for name in ("parameters", "gradients", "means", "squares")}
@@ -120,11 +120,11 @@ def test_refuses_what_would_be_read_out_of_bounds():
         adam(two, *lists)
 
 
-# --- entries without a gradient stay as they are -------------------------------------------------------------------
+# --- entries without a gradient are left unchanged -----------------------------------------------------------------
 
 
 def table(shape, share, seed=0):
-    """Returns a parameter, its gradient with a ``share`` of nonzero entries, and both moments."""
+    """Returns a parameter, its gradient with the fraction ``share`` of nonzero entries, and both moments."""
     generator = torch.Generator().manual_seed(seed)
     parameter, gradient, mean = (torch.randn(shape, generator=generator) for _ in range(3))
     gradient *= torch.rand(shape, generator=generator) < share

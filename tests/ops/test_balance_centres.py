@@ -17,7 +17,7 @@ def samples(m):
 
 
 def slow(points, masses, centres, steps, alpha, nearby):
-    """Balances sample by sample and neighbour by neighbour; centres are rounded to float32 between the steps."""
+    """Balances in loops over samples and neighbours; centres are rounded to float32 between the steps."""
 
     def weigh():
         weights = [0.0] * len(places)

@@ -1,4 +1,4 @@
-"""Programs on Warp: its kernel runs the layers, and PyTorch runs the following steps and all other programs."""
+"""Programs on Warp: its kernel runs chains of layers, and PyTorch runs later steps and all other programs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KINDS = {
 
 
 def with_activations(table, biased, ray):
-    """Returns the program of a table and its activations: all outputs halved, beside the tanh of one and its square."""
+    """Returns the program of a table with halved outputs; it also outputs the tanh of the first and its square."""
     inner = table.program(6 if table.integrated else 3, 3 if table.uses_directions else 0, None, biased, ray)
     b = Builder()
     inputs = {i: b.input(width, ray=i in inner.rays) for i, width in enumerate(inner.inputs)}
@@ -53,7 +53,7 @@ def test_chains_are_those_of_the_reference(name, shared, ray, ordered):
     program, tensors, count, index = call_of(name, shared, ray)
     assert chain_of(program.text) is not None
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1)).int() if ordered else None
-    offsets = offsets_of([11, 0, 25]) + 2  # two rows before the cells and two behind them
+    offsets = offsets_of([11, 0, 25]) + 2  # two rows before the cells and two after them
     outcomes = []
     for backend in ("warp", "reference"):
         arguments = {"program": program, "order": order, "ray_index": index, "backend": backend}
@@ -103,7 +103,7 @@ def test_positions_of_rays_are_no_chain():
 
 
 def test_an_activation_of_a_part_of_a_layer():
-    """An activation of a part of a layer is a separate step behind the layers."""
+    """An activation of only some columns of a layer is a separate step after the layers."""
     b = Builder()
     raw = b.linear(b.input(3), b.parameter(4, 3), 4)
     program = b.program([b.apply("sigmoid", raw.part(2, 2))])

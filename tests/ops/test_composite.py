@@ -17,7 +17,7 @@ INF, NAN = math.inf, math.nan
 
 
 def slow(sigma, rgb, depths, deltas, background=None):
-    """Composites one sample at a time, in float64."""
+    """Composites the samples one at a time in float64."""
     rays = []
     for ray in range(sigma.shape[0]):
         light, colour, opacity, depth, weights = 1.0, rgb.new_zeros(rgb.shape[2], dtype=torch.float64), 0.0, 0.0, []

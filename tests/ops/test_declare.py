@@ -1,4 +1,4 @@
-"""The parts of an op that follow from its signature: function, docstring, memory and checks."""
+"""Function, docstring, memory and checks of an op, which follow from its signature."""
 
 from __future__ import annotations
 

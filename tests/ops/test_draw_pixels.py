@@ -1,4 +1,4 @@
-"""The pixels that a batch is drawn from."""
+"""Tests that pixels of a batch are drawn from the runs."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from voronerf.ops import draw_pixels as draw
 from voronerf.ops.draw_pixels.reference import Known, Runs, draw_pixels
 
 SEED = torch.tensor([-7], dtype=torch.int32)
-# The first pixels and the lengths of runs: one pixel, many runs of the same length, and some that are much longer.
+# The first pixels and the lengths of runs: one pixel, many runs of equal length, and runs of very different lengths.
 RUNS = {
     "one": ([5], [1]),
     "even": (range(0, 3000, 10), [7] * 300),
@@ -26,7 +26,7 @@ def test_every_pixel_of_the_runs_is_drawn_as_often(name):
     there = torch.cat([torch.arange(first, first + count) for first, count in zip(*RUNS[name])])
     pixels, uniforms, _ = draw_pixels(SEED, 100 * len(there), len(there), runs, None)
     drawn, counts = pixels.unique(return_counts=True)
-    assert torch.equal(drawn, there) and bool(((counts - 100).abs() < 50).all())  # five standard deviations
+    assert torch.equal(drawn, there) and bool(((counts - 100).abs() < 50).all())  # within five standard deviations
     assert uniforms.shape == (100 * len(there), 3) and bool(((uniforms >= 0) & (uniforms < 1)).all())
 
 

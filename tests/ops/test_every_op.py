@@ -1,8 +1,8 @@
-"""Rules for every op: it compiles whole for any size, takes any strides and sizes, refuses wrong arguments, and its
-custom ops pass opcheck.
+"""Rules for every op: it compiles to one graph for any size, takes any strides and sizes, refuses wrong arguments, and
+its custom ops pass opcheck.
 
-Each kind of an op's case (``voronerf/ops/<op>/case.py``) is a test. Rules of a single op, such as its formula, are in
-the test file of that op.
+Each kind of arguments in an op's case (``voronerf/ops/<op>/case.py``) is a test. The test file of an op tests rules of
+this op alone, such as its formula.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ RUNS = [
 ]
 NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "routed_program", "adam", "average")
 NETWORKS += ("hash_encode",)
-"""The ops whose arguments determine the number of tensors and their shapes."""
+"""The ops for which other arguments determine the number of tensors and their shapes."""
 SINGLE = ("balance_centres", "cell_sort", "march_rays", "pixel_rays")
 """The ops without floating-point tensors, or with a single floating-point dtype."""
 
 
 def rows(runs):
-    """Returns a parametrization by name, backend and device."""
+    """Returns a parametrization over op names, backends and devices."""
     ids = ["-".join(getattr(run, "values", run)) for run in runs]
     return pytest.mark.parametrize(("name", "backend", "device"), runs, indirect=["device"], ids=ids)
 
 
 every_op = rows(RUNS)
-# Each op is compiled for its first kind only; opcheck traces the custom ops of the other kinds.
+# The compile test covers the first kind of each op; opcheck traces the custom ops for the other kinds.
 first_kinds = rows(
     [
         run if run[1] == "native" else pytest.param(*run, marks=pytest.mark.slow)
@@ -94,7 +94,7 @@ def holds_tensors(value):
 
 
 def results(run, arguments):
-    """Returns the outputs of an op, and the gradients of their squares if some outputs are differentiable."""
+    """Returns the outputs of an op, and the gradients of the sum of their squares if some are differentiable."""
     tensors = [part for part in tree_leaves(run(arguments)) if isinstance(part, Tensor)]
     leaves = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.requires_grad]
     smooth = [part for part in tensors if part.requires_grad]
@@ -114,7 +114,7 @@ def assert_close(actual, expected):
 def test_compiles_for_any_size(device, backend, name):
     torch.compiler.reset()
     run, tensors = prepare(name, backend, device)
-    # The reference consists of torch's own operations, whose gradients torch traces itself.
+    # The reference consists of PyTorch operations, and PyTorch itself traces their gradients.
     backend = "eager" if backend == "reference" else "aot_eager"
     compiled = torch.compile(run, fullgraph=True, dynamic=True, backend=backend)  # one graph for any size
     for n in (9, 14):
@@ -128,7 +128,7 @@ def columns(tensor):
 
 
 def negated(tensor):
-    """Returns the same values as a view with the negative bit, like ``.conj().imag``; memory holds them negated."""
+    """Returns a view with the negative bit, like ``.conj().imag``: memory holds the negated values."""
     return torch._neg_view(-tensor) if tensor.is_floating_point() else tensor
 
 
@@ -158,7 +158,7 @@ def test_any_size_gives_what_the_reference_gives(device, backend, name):
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64], ids=str)
 @rows([run for run in RUNS if run[1] != "reference" and run[0].partition(",")[0] not in SINGLE])
 def test_dtypes(device, backend, name, dtype):
-    """Values and gradients have the dtypes of the reference, and are as close to the float64 results."""
+    """Values and gradients have the reference's dtypes, and are as close to the float64 results as the reference's."""
     need(name.partition(", ")[0], backend, device, dtype)
     run, tensors = prepare(name, backend, device, dtype)
     arguments = tensors(65)
@@ -172,7 +172,7 @@ def test_dtypes(device, backend, name, dtype):
     "name", dict.fromkeys(run[0] for run in RUNS if CASES[run[0].partition(",")[0]].differentiable)
 )
 def test_gradcheck(name):
-    """Both derivatives of the reference pass gradcheck in float64, along random directions."""
+    """First and second derivatives of the reference pass gradcheck in float64, along random directions."""
     run, tensors = prepare(name, "reference", torch.device("cpu"), torch.float64)
     wide = lambda tensor: tensor.detach().double().requires_grad_() if tensor.is_floating_point() else tensor  # noqa: E731
     arguments = tree_map_only(Tensor, wide, tensors(3))
@@ -206,7 +206,7 @@ def test_autocast(device, backend, name):
 
 @smooth_op
 def test_only_the_gradients_asked_for(device, backend, name):
-    """A gradient computed alone equals the same gradient among all, also for an expanded incoming gradient."""
+    """A gradient computed alone, from an expanded incoming gradient, equals the gradient computed with all others."""
     run, tensors = prepare(name, backend, device)
     arguments = tensors(33)
     leaves = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.requires_grad]
@@ -243,7 +243,7 @@ def test_same_bits_for_any_number_of_threads(isa, name):
 @pytest.mark.native
 @native_op
 def test_every_output_is_written(request, name):
-    """No output shows the old contents of its memory, and the guards around the memory survive."""
+    """No output keeps old contents of its memory, and the guard bytes around the memory are unchanged."""
     run, tensors = prepare(name, "native", torch.device("cpu"))
     wanted = [results(run, tensors(n)) for n in (0, 1, 33, 70)]
     guards = request.getfixturevalue("poisoned")
@@ -281,7 +281,7 @@ def test_what_only_steps_call_compiles(name):
 
 
 class Calls(TorchFunctionMode):
-    """A mode that collects the called custom ops of the library, with one call for each kind of arguments."""
+    """A mode that collects calls of the library's custom ops: one call for each op and kind of arguments."""
 
     def __init__(self):
         super().__init__()
@@ -289,7 +289,7 @@ class Calls(TorchFunctionMode):
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         if isinstance(function, torch._ops.OpOverload) and function.namespace == "voronerf":
-            # A custom op that is called without recorded gradients need not be differentiable.
+            # Without recorded gradients a custom op need not be differentiable.
             held = args if torch.is_grad_enabled() else tree_map_only(Tensor, Tensor.detach, args)
             kinds = [leaf.requires_grad if isinstance(leaf, Tensor) else leaf is None for leaf in tree_leaves(held)]
             self.found[function, str(kinds)] = (function, held)
@@ -298,7 +298,7 @@ class Calls(TorchFunctionMode):
 
 @every_op
 def test_custom_ops_pass_opcheck(device, backend, name):
-    """The custom ops of the values, of the gradients and of the second derivatives pass opcheck."""
+    """The custom ops for values, gradients and second derivatives pass opcheck."""
     if backend == "reference":
         pytest.skip("has none")
     run, tensors = prepare(name, backend, device)
@@ -306,14 +306,14 @@ def test_custom_ops_pass_opcheck(device, backend, name):
     leaves = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.requires_grad]
     with Calls() as calls:
         results(run, arguments)
-        for power in (1, 2):  # with power 1 the incoming gradients are constant
+        for power in (1, 2):  # power 1: constant incoming gradients
             smooth = [part for part in tree_leaves(run(arguments)) if isinstance(part, Tensor) and part.requires_grad]
             if smooth:
                 total = sum(part.pow(power).sum() for part in smooth)
                 options = {"create_graph": True, "allow_unused": True, "materialize_grads": True}
                 bent = [first for first in torch.autograd.grad(total, leaves, **options) if first.requires_grad]
                 torch.autograd.backward([first.square().sum() for first in bent])
-    assert calls.found or (backend == "warp" and name.startswith("grouped_program"))  # programs that are no chains
+    assert calls.found or (backend == "warp" and name.startswith("grouped_program"))  # Warp runs only chains
     for function, args in calls.found.values():
         torch.library.opcheck(function, args)
 
@@ -345,12 +345,12 @@ def test_refuses_offsets_that_are_no_offsets(op, backend):
 
 
 def shapes_of(name, call, arguments):
-    """Returns the shapes that a call checks, by tensor name, and how often the shapes mention each letter."""
+    """Returns the shapes that a call checks, by tensor name, and the number of times that they mention each letter."""
     shapes, letters = {}, Counter()
 
     def tensor(self, key, value, dtypes, *shape):
         if self.op == name:
-            letters.update(self.sizes.keys() - known)  # a size of no tensor, such as a number of samples
+            letters.update(self.sizes.keys() - known)  # a size that is an argument, such as a number of samples
         whole(self, key, value, dtypes, *shape)
         if self.op == name:
             shapes[key] = [str(entry).removesuffix("+1") for entry in shape]
@@ -376,7 +376,7 @@ def in_python(name):
 @pytest.mark.native
 @pytest.mark.parametrize("op", [op for op in CASES if op not in NETWORKS])
 def test_the_compiled_module_checks_what_python_checks(op):
-    """The compiled module accepts all valid arguments; `test_refuses_tensors_that_do_not_fit` covers the others."""
+    """The compiled module accepts all valid arguments; `test_refuses_tensors_that_do_not_fit` tests invalid ones."""
     case = CASES[op]
     call, name = getattr(ops, case.call or op), case.call or op
     for kind in case.kinds.values():
@@ -386,7 +386,7 @@ def test_the_compiled_module_checks_what_python_checks(op):
 
 @pytest.mark.parametrize("op", CASES)
 def test_refuses_tensors_that_do_not_fit(op):
-    """An argument of another type, shape, dtype or device is refused by its name."""
+    """An argument of a wrong type, shape, dtype or device is refused, and the error names it."""
     case = CASES[op]
     call, name = getattr(ops, case.call or op), case.call or op
     for kind in case.kinds.values():

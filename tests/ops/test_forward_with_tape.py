@@ -24,7 +24,7 @@ TABLE = MLP(
 
 
 def network(device, n=40, k=3):
-    """Returns the arguments of a network of k cells that share a table, with directions for each of seven rays."""
+    """Returns the arguments of a network of k cells, which share a table, with one direction for each of seven rays."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):
@@ -62,13 +62,13 @@ def parameters_of(arguments):
 
 
 def squares(out):
-    """Returns a loss and its gradient, which differs from row to row."""
+    """Returns a loss that weights the rows differently, and its gradient."""
     factor = torch.linspace(0.5, 2, max(len(out), 1), device=out.device)[: len(out), None]
     return (factor * out.square()).sum(), 2 * factor * out
 
 
 def learn(arguments, *, backward=False, backend="auto"):
-    """Returns the loss; ``backward`` adds its gradients at once instead of deferring them."""
+    """Returns the loss; with ``backward`` its gradients are added immediately instead of deferred."""
     tape = forward_with_tape(as_program(arguments), backend=backend)
     assert not tape.raw.requires_grad
     return tape.backward(*squares(tape.raw), defer=not backward)
@@ -98,7 +98,7 @@ def test_equals_its_parts(device, backend, n, k, backward):
 
 
 def assert_same(actual, expected):
-    """Compares bit for bit, except the table of a hash grid on a GPU, whose sums have any order."""
+    """Compares bit for bit, except gradients of a hash grid's table on a GPU, which are sums in any order."""
     for place, (one, other) in enumerate(zip(actual, expected, strict=True)):
         if one.is_cuda and place == len(actual) - 1:
             torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-4)
@@ -107,7 +107,7 @@ def assert_same(actual, expected):
 
 
 def test_gradients_at_once_are_those_of_backward_bit_for_bit(device, backend):
-    """The gradients are added to existing gradients, as in autograd."""
+    """Gradients are added to existing gradients, as autograd does."""
     arguments, expected = network(device), network(device)
     for _ in range(2):
         learn(arguments, backward=True, backend=backend)
@@ -127,7 +127,7 @@ def test_only_what_needs_gradients_gets_them(device, backend):
 
 
 def test_gradients_reach_what_parameters_are_made_of(device, backend):
-    """Autograd sums the cells' gradients of a shared layer, which is one parameter expanded to all cells."""
+    """A shared layer is one parameter expanded to all cells, and autograd sums its gradients over the cells."""
     results = []
     for backward in (True, False):
         arguments = network(device)

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.op("frequency_encode")
 
 
 def slow(x, octaves, include_input=True):
-    """Encodes one number at a time, in float64."""
+    """Encodes the numbers one at a time in float64."""
     rows = []
     for point in x.double().tolist():
         row = list(point) if include_input else []

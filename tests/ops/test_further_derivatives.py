@@ -1,4 +1,4 @@
-"""Losses on second derivatives, such as a curvature: their gradients are third derivatives of the ops."""
+"""Losses on second derivatives, such as a curvature, whose gradients need third derivatives of the ops."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ CASES: dict[str, tuple[Call, list[Tensor]]] = {
 
 
 def gradients(call, backend, values, device, dtype):
-    """Returns the gradients of a loss on values, slopes and curvatures (of a nonlinear function of the slopes)."""
+    """Returns the gradients of a loss on values, slopes, and derivatives of a nonlinear function of the slopes."""
     leaves = [value.to(device, dtype).requires_grad_() for value in values]
     y = call(backend, *leaves)
     weights = draw(*y.shape, seed=9).to(y)
@@ -110,7 +110,7 @@ def test_a_loss_on_second_derivatives(name, device, backend):
 
 @pytest.mark.op("grouped_mlp")
 def test_slopes_of_no_samples_by_frozen_networks(device, backend):
-    """Slopes without samples occur if a march finds only empty space while normals are trained."""
+    """This occurs while normals are trained, if a march finds only empty space."""
     need("grouped_mlp", backend, device, torch.float32)
     x = torch.zeros(0, 3, device=device, requires_grad=True)
     weights = [draw(K, 6, 15, seed=2).to(device), draw(K, 2, 6, seed=3).to(device)]

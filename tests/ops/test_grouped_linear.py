@@ -17,14 +17,14 @@ WIDTHS = [(1, 1), (63, 64), (90, 3), (3, 90)]
 
 
 def layer(counts, i, o, dtype=torch.float32):
-    """Returns the samples, the weight and the bias of one layer."""
+    """Returns the samples, the weight and the bias for one layer."""
     k = len(counts)
     tensors = torch.randn(sum(counts), i), torch.randn(k, o, i) / i**0.5, torch.randn(k, o)
     return [tensor.to(dtype) for tensor in tensors]
 
 
 def results(linear, inputs, offsets, dtype, device, g, **options):
-    """Returns the output and its gradients in a dtype, on a device."""
+    """Returns the output and the gradients, computed in a dtype on a device."""
     leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
     x, weight, bias = leaves
     y = linear(x, offsets.to(device), weight, bias, **options)
@@ -71,7 +71,7 @@ def test_sums_over_many_samples_are_wide(device, backend, dtype):
     x = torch.ones(n, 1, dtype=dtype, device=device)
     y = grouped_linear(x, offsets_of([n], device), weight, bias, backend=backend)
     y.backward(torch.ones_like(y))
-    # A sum in a half type would stop at 256 or 2,048.
+    # A sum of ones in a half type would stop growing at 256 or 2,048.
     assert weight.grad.item() == bias.grad.item() == torch.tensor(float(n), dtype=dtype).item()
 
 

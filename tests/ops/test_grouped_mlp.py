@@ -18,7 +18,7 @@ CPU = torch.device("cpu")
 TABLES = {
     "one layer": MLP((Layer((POSITIONS,), 1),), (0,)),
     "plain": MLP((Layer((POSITIONS,), 9, "softplus"), Layer((0,), 4)), (1,), position_octaves=4),
-    # A small version of the original architecture: a skip connection, a density head and a view branch.
+    # A small version of the original NeRF: a skip connection, a density head and a view branch.
     "nerf": MLP(
         (
             Layer((POSITIONS,), 16, "sine"),
@@ -33,7 +33,7 @@ TABLES = {
         position_octaves=3,
         direction_octaves=2,
     ),
-    # Harmonics of the direction, beside a skip connection and alone.
+    # Three layers read harmonics of the direction: two with other inputs, one without.
     "spherical": MLP(
         (
             Layer((POSITIONS,), 16, "softplus"),
@@ -46,14 +46,14 @@ TABLES = {
         direction_encoding="spherical",
         direction_degree=4,
     ),
-    # The positions of mip-NeRF, which are Gaussians.
+    # The positions are Gaussians, as in mip-NeRF.
     "integrated": MLP(
         (Layer((POSITIONS,), 9, "softplus"), Layer((0, POSITIONS), 6, "sine"), Layer((DIRECTIONS, 1), 4)),
         outputs=(2, 0),
         position_octaves=5,
         position_encoding="integrated",
     ),
-    # One layer read three times, one as output and input, one that nothing reads, and one output listed twice.
+    # One layer is read three times, one is an output and an input, one is not read, and one output is listed twice.
     "tangled": MLP(
         (
             Layer((DIRECTIONS, POSITIONS, DIRECTIONS), 5, "sigmoid"),
@@ -172,7 +172,7 @@ def test_harmonics_inside_and_before(device, backend, degree):
 def test_integrated_inside_and_before(device, backend, scale):
     case = Case.make("integrated", COUNTS["odd"])
     leaves = [tensor.to(device) for tensor in case.inputs]
-    leaves[0] *= scale  # beyond the range of the vector sine
+    leaves[0] *= scale  # larger than the range of the vector sine
     leaves[0][:3, 3:] = torch.tensor([[0.0], [1e5], [torch.inf]], device=device)
     inside = case.run(grouped_mlp, leaves, backend=backend)
     encoded = integrated_encode(*leaves[0].chunk(2, dim=1), 5, backend=backend)
@@ -183,7 +183,7 @@ def test_integrated_inside_and_before(device, backend, scale):
 
 @pytest.mark.parametrize("width", [15, 30, 31, 32, 63])
 def test_infinity_in_bfloat16_stays_what_it_is(device, backend, width, request):
-    """The padding of a pair of columns times infinity is NaN; on CUDA and Warp this NaN stays in its row."""
+    """CUDA and Warp pad columns to pairs; the padding times infinity is NaN, which stays in its row."""
     cuda = device.type == "cuda" or request.config.getoption("--emulate-cuda") is not None
     padded = backend == "warp" or (backend == "native" and cuda)
     weights = [torch.ones(1, width, 2, device=device), torch.ones(1, 5, width, device=device)]
@@ -207,7 +207,7 @@ def test_wide_positions_with_half_weights_keep_their_octaves(device, backend):
     exact = case.run(loops.grouped_mlp, [tensor.double() for tensor in halves])
     actual = case.run(grouped_mlp, [tensor.to(device) for tensor in halves], backend=backend)
     assert actual.dtype == torch.bfloat16
-    # Positions rounded to bfloat16 before the encoding would be wrong by 512 / 256 radians.
+    # Positions rounded to bfloat16 before the encoding would give angles wrong by 512 / 256 radians.
     assert error(actual, exact) < 0.02
 
 

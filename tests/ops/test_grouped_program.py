@@ -1,4 +1,4 @@
-"""grouped_program: each step against autograd in float64, and random programs against the reference."""
+"""`grouped_program`: each step against autograd in float64, and random programs against the reference."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def derivatives(program: Program, rows: list, parameters: list, offsets: Tensor,
 
 
 def check(program: Program, sizes: list[int], shared: bool = False, order: Tensor | None = None) -> None:
-    """Compares native with the float64 reference; allows twice the error of the float32 reference."""
+    """Compares the native backend with the float64 reference; allows twice the error of the float32 reference."""
     wide = derivatives(program, *arguments(program, sizes, torch.float64, shared), "reference", order)
     narrow = derivatives(program, *arguments(program, sizes, torch.float32, shared), "reference", order)
     native = derivatives(program, *arguments(program, sizes, torch.float32, shared), "native", order)
@@ -117,7 +117,7 @@ def check(program: Program, sizes: list[int], shared: bool = False, order: Tenso
     [(name, i) for name, f in FUNCTIONS.items() if name != "stop" for i in range(min(f.orders, 3) + 1)],
 )
 def test_derivative_of_every_function(name: str, order: int) -> None:
-    """Each line of functions_tile.h equals autograd of the formula."""
+    """Each derivative in functions_tile.h equals autograd of the function's formula."""
     b = Builder()
     x = b.input(19)
     columns = b.function(name, x, *NUMBERS.get(name, (0.7, 0.0)), order=order)
@@ -140,7 +140,7 @@ FAR = [*(sign * 10.0**size for size in (-30, -3, 0, 1, 1.5, 2, 3, 10, 19, 30, 38
     "name", ["exp", "sigmoid", "tanh", "silu", "gelu", "softplus", "elu", "clamp", "relu", "abs", "erf", "atan"]
 )
 def test_derivatives_far_away_and_at_borders(name: str, order: int) -> None:
-    """Derivatives are right for very large arguments, at 0, and at the kinks of a function."""
+    """Derivatives are correct for very small and very large arguments, at 0, and near the kinks of a function."""
     b = Builder()
     columns = b.function(name, b.input(1), *{"clamp": (-1.0, 10.0)}.get(name, (1.0, 20.0)), order=order)
     if columns is None:
@@ -157,7 +157,7 @@ def test_derivatives_far_away_and_at_borders(name: str, order: int) -> None:
 @pytest.mark.parametrize("isa", native.SUPPORTED_ISAS)
 @pytest.mark.parametrize("name", list(FUNCTIONS))
 def test_columns_do_not_touch_each_other(name: str, isa: str) -> None:
-    """The bits of a column do not depend on the columns beside it, such as stale floats behind the last one."""
+    """The bits of a column do not depend on other columns, nor on stale floats after the last column."""
     b = Builder()
     program = b.program([b.apply(name, b.input(5), *NUMBERS.get(name, (0.7, 0.0)))])
     rows = 3 * torch.randn(64, 5, generator=torch.Generator().manual_seed(0))
@@ -172,7 +172,7 @@ def test_columns_do_not_touch_each_other(name: str, isa: str) -> None:
 
 
 def test_sums_spread_over_a_layer_and_products_with_relu() -> None:
-    """A layer adds a spread sum, and a ReLU behind a layer is multiplied by an input."""
+    """A layer adds a sum broadcast to all columns; the ReLU of a layer is multiplied by an input."""
     b = Builder()
     x, y = b.input(5), b.input(7)
     one = b.total(x, 5)._replace(width=7, spread=True)
@@ -185,7 +185,7 @@ def test_sums_spread_over_a_layer_and_products_with_relu() -> None:
 @pytest.mark.parametrize("order", range(4))
 @pytest.mark.parametrize("power", [0.3, -1.25, 2.4, 1 / 3, 5.0, -3.5, 70.0])
 def test_powers(power: float, order: int) -> None:
-    """Integer, half-integer and other powers are right for positive numbers, 0 and negative numbers."""
+    """Integer, half-integer and other powers are correct for positive numbers, 0 and negative numbers."""
     b = Builder()
     columns = b.function("power", b.input(1), power, order=order)
     assert columns is not None
@@ -201,20 +201,20 @@ def test_powers(power: float, order: int) -> None:
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("shared", [False, True])
 def test_every_step(sizes: list[int], shared: bool) -> None:
-    """Values, gradients and second derivatives are right for cells of all sizes."""
+    """Values, gradients and second derivatives are correct for cells of all sizes."""
     check(every_step(), sizes, shared)
 
 
 @pytest.mark.parametrize("seed", range(40))
 def test_random_programs(seed: int) -> None:
-    """Values, gradients and second derivatives of random programs are right."""
+    """Values, gradients and second derivatives of random programs are correct."""
     check(random_program(seed), [97, 0, 30])
 
 
 @pytest.mark.parametrize("order_of", [1, 2])
 @pytest.mark.parametrize("seed", range(12))
 def test_gradient_program_against_autograd(seed: int, order_of: int) -> None:
-    """The gradient program equals autograd of the program; so does the gradient program of a gradient."""
+    """The gradient program equals autograd of the program; the same holds for the gradient program's own gradient."""
     program = every_step() if seed == 0 else random_program(100 + seed)
     rows, parameters, offsets = arguments(program, [9, 0, 6], torch.float64)
     for _ in range(order_of):
@@ -236,7 +236,7 @@ def test_gradient_program_against_autograd(seed: int, order_of: int) -> None:
 
 
 def test_order_strays_and_layouts() -> None:
-    """Results are right for rows in any order, rows of no cell, and inputs that are not contiguous."""
+    """Results are correct for rows in any order, rows of no cell, and inputs that are not contiguous."""
     program = every_step()
     sizes = [30, 0, 71]
     check(program, sizes, order=torch.randperm(101, generator=torch.Generator().manual_seed(0)).int())
@@ -255,7 +255,7 @@ def test_order_strays_and_layouts() -> None:
 
 @pytest.mark.parametrize("isa", native.SUPPORTED_ISAS)
 def test_instruction_sets(isa: str) -> None:
-    """Results are right with every instruction set of this machine."""
+    """Results are correct with every instruction set of this machine."""
     program = every_step()
     with native.using_isa(isa):
         check(program, [97, 0, 30])
@@ -264,7 +264,7 @@ def test_instruction_sets(isa: str) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_types(dtype: torch.dtype) -> None:
-    """Half-type results equal the float32 results of the rounded arguments, up to the rounding of products."""
+    """Half-type results equal the float32 results for the same arguments, up to the rounding of products."""
     program = random_program(3)
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
     wide = [[t.float() for t in part] for part in (rows, parameters)]
@@ -278,7 +278,7 @@ def test_half_types(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("width", [1, 2, 33])
 def test_one_column_in_the_place_of_all_is_put_out(width: int, dtype: torch.dtype, backend: str) -> None:
-    """A spread column fills all columns, in an output and in the gradient of a sum over columns."""
+    """A column marked `spread` is broadcast to all columns: in an output, and in the gradient of a sum over columns."""
     b = Builder()
     x = b.input(width)
     program = b.program([x.part(width - 1, 1)._replace(width=width, spread=True), b.total(x, width)])
@@ -292,7 +292,7 @@ def test_one_column_in_the_place_of_all_is_put_out(width: int, dtype: torch.dtyp
 
 
 def test_refuses_what_is_no_program() -> None:
-    """A string as program and wrong offsets are refused; the other rules are in the op's case."""
+    """Strings as programs and wrong offsets are refused; the op's case covers all other rules."""
     with pytest.raises(TypeError, match="grouped_program: program must be a Program, got str"):
         grouped_program([torch.ones(2, 2)], [], offsets_of([2]), program="x")  # type: ignore[arg-type]
     rows, parameters, _ = arguments(every_step(), [6], torch.float32)
@@ -315,21 +315,21 @@ def test_an_order_that_leaves_the_rows_is_refused(backend, wrong):
 
 
 def test_a_spread_parameter_in_what_a_linear_step_adds_is_refused():
-    """The compiled module would read the spread parameter as consecutive columns."""
+    """The compiled module would read a parameter marked `spread` as consecutive columns."""
     b = Builder()
     x, matrix, bias = b.input(3), b.parameter(4, 3), b.parameter(4)
     added = Columns(PARAMETER, bias, 0, 4, spread=True)
     result = b.linear(x, matrix, 4, add=added)
     program = b.program([result])
     (linear,) = (step for step in program.steps if step.op == "linear")
-    assert not linear.operands[1].spread  # the builder expands it to columns
+    assert not linear.operands[1].spread  # the builder copies the value to all columns
     steps = tuple(step._replace(operands=(x, added)) if step is linear else step for step in program.steps)
     rule = "Program: steps must be without spread columns in the addends of a linear step, got Step(op='linear'"
     refuses(rule, replace, program, steps=steps)
 
 
 def test_a_program_of_what_is_not_there_is_refused():
-    """The compiled module trusts a program, so the constructor refuses every number that is out of range."""
+    """The constructor of Program refuses every number out of range, since the compiled module does not check."""
     program = every_step()
 
     def larger(value):
@@ -349,7 +349,7 @@ def test_a_program_of_what_is_not_there_is_refused():
                 taken += 1
             except ValueError as error:
                 assert str(error).startswith("Program: ") and "\n" not in str(error)
-    assert taken == 4  # allowed: parameters with unread entries, and two steps with more columns, which are 0
+    assert taken == 4  # allowed: larger parameters with unread entries, and two steps with more columns, which are 0
     program = gradient(gradient(encoded(), *ALL), (True,) * 5, (True,) * 3, (True,) * 3, (True,) * 3)
     assert {"encode", "scatter"} <= {step.op for step in program.steps}
     kept = []
@@ -365,7 +365,7 @@ def test_a_program_of_what_is_not_there_is_refused():
 
 
 ALL = (True,) * 3, (True,) * 3, (True,) * 2, ()
-"""The arguments of ``gradient`` for :func:`encoded`: all gradients are wanted, and all outputs have one."""
+"""The arguments of ``gradient`` for :func:`encoded`: all gradients are wanted, and all outputs have gradients."""
 ENCODED = {
     **{
         name: (name, *next((d, size) for d in (3, 6) for size in (4, 2) if encoding.fits(d, size)))
@@ -380,7 +380,7 @@ ENCODED = {
 
 
 def of_encoding(kind: str, ray: bool = False) -> tuple[Program, HashGrid]:
-    """Returns a program with sin(W e(x)) for each row, and e(x) times another input, summed by ray; and its grid."""
+    """Returns a program with the outputs sin(W e(x)) for each row and e(x) * other summed by ray, and its grid."""
     name, raw, size = ENCODED[kind]
     grid = replace(GRID, interpolation="linear") if kind == "linear hash" else GRID
     b = Builder()
@@ -393,7 +393,7 @@ def of_encoding(kind: str, ray: bool = False) -> tuple[Program, HashGrid]:
 
 
 def formula(kind: str, grid: HashGrid, x: Tensor, table: Tensor | None, cells: Tensor) -> Tensor:
-    """Returns the encoding, computed in PyTorch."""
+    """Computes the encoding without programs."""
     name, _, size = ENCODED[kind]
     if name in ENCODINGS:
         return ENCODINGS[name].formula(x, size)
@@ -403,7 +403,7 @@ def formula(kind: str, grid: HashGrid, x: Tensor, table: Tensor | None, cells: T
 
 
 def encoding_arguments(program: Program, kind: str, sizes: list[int], rays: int) -> list[Tensor]:
-    """Returns inputs, then parameters, in float64; each cell has its own table if the kind says so."""
+    """Returns float64 inputs, followed by parameters; in the kind "hash of each cell" each cell has a table."""
     generator, n, k = torch.Generator().manual_seed(3), sum(sizes) + 5, len(sizes)
     tensors = [
         torch.rand(rays if i in program.rays else n, w, generator=generator, dtype=torch.float64)
@@ -419,13 +419,13 @@ def encoding_arguments(program: Program, kind: str, sizes: list[int], rays: int)
 @pytest.mark.parametrize("ray", [False, True], ids=["of samples", "of rays"])
 @pytest.mark.parametrize("kind", ENCODED)
 def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None:
-    """Values and three orders of gradients are right, for the reference and for gradient programs."""
+    """Values and three orders of gradients are correct: with autograd of the reference, and with gradient programs."""
     if ray and kind.endswith(("hash", "cell")):
         pytest.skip("the positions of a grid are samples")
     program, grid = of_encoding(kind, ray)
     sizes, rays = [4, 0, 5], 6
     tensors = encoding_arguments(program, kind, sizes, rays)
-    offsets = offsets_of(sizes) + 2  # two rows before, three behind
+    offsets = offsets_of(sizes) + 2  # two rows before the cells, three after them
     n = sum(sizes) + 5
     generator = torch.Generator().manual_seed(1)
     order = torch.randperm(n, generator=generator).int() if ordered else None
@@ -474,7 +474,7 @@ def test_gradient_programs_of_encodings_by_differences(kind: str) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="pages are protected otherwise")
 @pytest.mark.parametrize("name", ENCODINGS)
 def test_nothing_is_read_behind_a_gradient(name: str) -> None:
-    """The gradient of an encoding reads few rows in place; a protected page follows them."""
+    """The gradient of an encoding, read in place for few rows, is followed by a protected page."""
     _, raw, size = ENCODED[name]
     b = Builder()
     program = b.program([b.encode(name, b.input(raw), size)])
@@ -496,21 +496,21 @@ def test_nothing_is_read_behind_a_gradient(name: str) -> None:
 
 
 def test_which_derivatives_the_compiled_module_has() -> None:
-    """The compiled module has F_0, G_1 and T_0; any other derivative counts as one of a high order."""
+    """The compiled module has F_0, G_1 and T_0; a program with any other derivative has high orders."""
     program = encoded()
     first = gradient(program, *ALL)
     assert program.orders == 0 and first.orders == 1
     numbers = {step.numbers[2:] for step in first.steps if step.op == "encode"}
     assert numbers == {(0, 0), (1, 1)} and [s.numbers for s in first.steps if s.op == "scatter"] == [(0, 0, 0)]
     assert gradient(first, (True,) * 5, (False,) * 3, (True,) * 3, (False,) * 3).orders > 3
-    # The second derivative with respect to the table alone looks up the new table.
+    # A second derivative with respect to the table alone is a look-up in the incoming gradient of the table.
     last = [i == 0 for i in range(len(first.sums))]
     only = gradient(first, (False,) * 3 + (True,) * 2, (False,) * 3, (False,) * 3, tuple(last))
     assert only.orders <= 3 and 3 in only.tables
 
 
 def test_tables_have_dtypes_of_their_own() -> None:
-    """Tables keep their dtype beside inputs of any dtype, and their gradients have the dtype of the table."""
+    """Tables may have another dtype than the inputs, and the gradient of a table has its dtype."""
     program = encoded()
     generator = torch.Generator().manual_seed(0)
     inputs = [torch.rand(4 if i in program.rays else 7, w, generator=generator) for i, w in enumerate(program.inputs)]
@@ -540,7 +540,7 @@ def test_tables_have_dtypes_of_their_own() -> None:
 
 @pytest.mark.parametrize("backend", ["reference", "native"])
 def test_the_sum_of_a_shared_table_is_one(backend: str) -> None:
-    """A shared table has one sum; other parameters and tables of cells have one sum for each cell."""
+    """A shared table has a single gradient sum; other parameters and tables of cells have one for each cell."""
     program = gradient(encoded(), *ALL)
     rays, n = 4, 7
     inputs = [torch.rand(rays if i in program.rays else n, w) for i, w in enumerate(program.inputs)]
@@ -559,7 +559,7 @@ def test_the_sum_of_a_shared_table_is_one(backend: str) -> None:
 
 @pytest.mark.parametrize("what", ["rows", "rays", "nothing"])
 def test_programs_of_rays_of_no_size(what: str) -> None:
-    """Programs of rays run without samples, and without rays."""
+    """Programs with per-ray inputs run without samples, and without rays."""
     program = encoded()
     n, rays = {"rows": (0, 3), "rays": (0, 0), "nothing": (0, 0)}[what]
     inputs = [torch.rand(rays if i in program.rays else n, w) for i, w in enumerate(program.inputs)]
@@ -571,7 +571,7 @@ def test_programs_of_rays_of_no_size(what: str) -> None:
 
 
 def test_high_derivatives_within_a_custom_op() -> None:
-    """Derivatives are right inside a custom op, where autograd records nothing, as under torch.compile."""
+    """Derivatives are correct inside a custom op, where, as under torch.compile, autograd records nothing."""
     b = Builder()
     x, along = b.input(3), b.input(3)
     sine = b.function("sine", x, 1.0, order=4)
@@ -587,7 +587,7 @@ def test_high_derivatives_within_a_custom_op() -> None:
 
 @pytest.mark.parametrize("dynamic", [None, True])
 def test_programs_of_rays_compile(dynamic: bool | None) -> None:
-    """The program compiles to one graph, also where its integers are taken for sizes."""
+    """The program compiles to one graph, also if the compiler makes integers symbolic (`dynamic`)."""
     torch.compiler.reset()
     program = encoded()
     parameters = [torch.rand(1, *shape).requires_grad_() for shape in program.parameters]
@@ -606,7 +606,7 @@ def test_programs_of_rays_compile(dynamic: bool | None) -> None:
 
 
 def test_refuses_rays_that_do_not_fit() -> None:
-    """Every rule about rays and tables has its message; the other rules are in the op's case."""
+    """Every rule about rays and tables has its own message; the op's case covers all other rules."""
     program = encoded()
     inputs = [torch.rand(4 if i in program.rays else 6, w) for i, w in enumerate(program.inputs)]
     parameters = [torch.rand(1, *shape) for shape in program.parameters]
@@ -628,13 +628,13 @@ def test_refuses_rays_that_do_not_fit() -> None:
     refused("inputs[2] must have shape [r, 3], got [4, 2]", inputs=[*inputs[:2], inputs[2][:, 1:]])
     message = "parameters[0] must have dtype float16, bfloat16, float32 or float64, got int32"
     refused(message, TypeError, parameters=[parameters[0].int(), *parameters[1:]])
-    # An order is not taken for a ray index, even after a successful call with a ray index.
+    # An order does not replace a missing ray index, even after a successful call with a ray index.
     grouped_program(inputs, parameters, offsets_of([6]), program=program, ray_index=index)
     refused("ray_index must be given for a program with inputs of rays, got None", ray_index=None, order=index)
 
 
 def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
-    """Every rule about encodings has its message."""
+    """Every rule about encodings has its own message."""
     program = encoded()
     refuses("Program: rays must be distinct indices of inputs, got (3,)", replace, program, rays=(3,))
     refuses("Program: rays must be distinct indices of inputs, got (2, 2)", replace, program, rays=(2, 2))
@@ -666,7 +666,7 @@ def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
         {"name": "frequency", "numbers": (1, 1, 0, 0)},
     ):
         refuses("Program: steps must be made of existing", replace, program, steps=changed(**fields))
-    # A step reads a table only as a table, and a sum has one layout.
+    # Only steps that look up tables may read a table, and a sum has one layout.
     b = Builder(program)
     refuses(
         "Program: steps must be made of existing", b.program, [b.binary("mul", of_a_ray, Columns(PARAMETER, 0, 0, 3))]
@@ -685,7 +685,7 @@ def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
 
 
 def test_texts_of_programs() -> None:
-    """A program comes back from its text unchanged."""
+    """Parsing the text of a program returns an equal program."""
     for program in (every_step(), encoded(), gradient(encoded(), *ALL)):
         assert Program.parse(program.text) == program
         assert Program.parse(program.text).text == program.text
@@ -693,7 +693,7 @@ def test_texts_of_programs() -> None:
 
 
 def test_rows_without_a_gradient_where_tensors_lie_turned() -> None:
-    """Rows with a zero gradient are left out, also where inputs and gradients are stored as [w, n]."""
+    """Rows with a zero gradient are left out, also if inputs and gradients are stored as [w, n]."""
     b, n = Builder(), 200
     x = b.input(5)
     program = b.program([b.linear(x, b.parameter(4, 5), 4)])
@@ -712,7 +712,7 @@ def test_rows_without_a_gradient_where_tensors_lie_turned() -> None:
 
 
 def test_rows_of_rays_that_lie_turned() -> None:
-    """Column-major rays are right, also where there are as many rays as samples."""
+    """Results for column-major rays are correct, also for as many rays as samples."""
     b, n = Builder(), 6
     program = b.program([b.binary("add", b.input(4), b.input(4, ray=True))])
     x, rays = torch.rand(n, 4), torch.rand(4, n).t()
@@ -722,7 +722,7 @@ def test_rows_of_rays_that_lie_turned() -> None:
 
 
 def test_second_derivatives_where_rows_have_no_gradient() -> None:
-    """A hash grid keeps values of all rows, also of rows that add nothing to the first derivative."""
+    """Second derivatives include rows that add nothing to the first derivative, as a hash grid keeps all rows."""
     b, n = Builder(), 40
     table = b.parameter(*GRID.table_shape)
     e = b.encode("hash", b.input(3), b.grid(GRID.text), table)
@@ -741,7 +741,7 @@ def test_second_derivatives_where_rows_have_no_gradient() -> None:
 
 @pytest.mark.parametrize("products", ["float32", "bfloat16"])
 def test_shapes_of_a_gpu_that_is_not_there(products):
-    """Fake tensors have shapes and a device, and nothing asks a GPU."""
+    """A run with fake tensors on a GPU device returns their shapes; it works without a GPU."""
     b = Builder()
     program = b.program([b.linear(b.input(5), b.parameter(7, 5), 7)])
     with FakeTensorMode():

@@ -32,7 +32,7 @@ grids = pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
 
 
 def points(n, grid, dtype=torch.float32):
-    """Returns points of which a tenth lie outside of the box."""
+    """Returns points from a range that exceeds the box by 5% on each side."""
     low, high = torch.tensor(grid.box, dtype=torch.float64)
     return (low + (high - low) * (1.1 * torch.rand(n, 3, dtype=torch.float64) - 0.05)).to(dtype)
 
@@ -42,7 +42,7 @@ def features(grid, dtype=torch.float32):
 
 
 def peer(place, table, *, convention, levels, features, log2_entries, base, finest):
-    """Encodes one point in 0..1, a number at a time, by the sources of other libraries and with their names.
+    """Encodes one point in 0..1, number by number, as the sources of other libraries do, with the names used there.
 
     tiny-cuda-nn: grid.h, grid_scale, grid_resolution, grid_index. torch-ngp: gridencoder.cu, get_grid_index, and
     grid.py. nerfstudio: field_components/encodings.py, HashEncoding.pytorch_fwd.
@@ -132,7 +132,7 @@ def test_gradients_of_two_orders(device, backend, grid):
     actual = derivatives(lambda x, t, grid: hash_encode(x, t, grid, backend=backend), torch.float32)
     for a, b, c in zip(actual, plain, exact, strict=True):
         a, b, c = a.cpu().double(), b.double(), c
-        # A point within rounding of a corner may be interpolated on the other side of it.
+        # Rounding may move a point near a grid corner to the cell on the other side.
         assert (a - c).norm() <= 2 * (b - c).norm() + 1e-5 * c.norm() + 1e-30
 
 

@@ -1,4 +1,4 @@
-"""Networks whose positions are encoded by a hash grid, against hash_encode and a network of encoded positions."""
+"""Networks with a hash grid on positions, against `hash_encode` followed by a network of its features."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COUNTS = [5, 0, 130, 1]
 
 
 def table_of(grid, **options):
-    """Returns a layer table with a layer on positions, a skip that reads them again, and a head with directions."""
+    """Returns a layer table with a layer on positions, a skip connection from positions, and a head with directions."""
     layers = (
         Layer(("positions",), 17, "relu"),
         Layer((0, "positions"), 16, "softplus"),

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.op("keep_heaviest")
 
 
 def slow(points, importance, q):
-    """Returns the importance and the points that are kept of a batch."""
+    """Returns the importance and the points of the samples that are kept from a batch."""
     ranked = [(-value, i) for i, value in enumerate(importance.tolist()) if 0 < value < math.inf]
     kept, places = torch.zeros(q), torch.zeros(q, points.shape[1])
     for place, (_, i) in enumerate(sorted(ranked)[:q]):

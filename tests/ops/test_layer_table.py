@@ -138,7 +138,7 @@ PROGRAMS = {
 @pytest.mark.parametrize("ray", [False, True], ids=["of samples", "of rays"])
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_program_is_the_network(name, ray):
-    """The program and its gradient programs equal grouped_mlp, in values and two orders of gradients."""
+    """Values and two orders of gradients of the program equal `grouped_mlp`."""
     table, generator = PROGRAMS[name], torch.Generator().manual_seed(0)
     counts, rays, p, q = [4, 0, 6], 5, 6 if PROGRAMS[name].integrated else 3, 3
     n, k, offsets = sum(counts) + 3, len(counts), offsets_of(counts) + 1
@@ -195,7 +195,7 @@ def test_program_is_the_network(name, ray):
 
 
 def test_program_of_other_widths_and_without_what_is_not_read():
-    """Weights may be wider than the table says; inputs and parameters keep their indices."""
+    """Weights may have more rows than the table says; inputs and parameters keep their indices, even unread ones."""
     table = MLP((Layer((POSITIONS,), 8, "relu"), Layer((0, DIRECTIONS), 4), Layer((0,), 2)), (2,), 2)
     program = table.program(3, 3, (5, 6, 7), (True, True, False), True)
     assert program.inputs == (3, 3) and program.rays == (1,)

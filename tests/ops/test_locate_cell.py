@@ -11,15 +11,15 @@ from voronerf.ops import locate_cell, nearest_centre
 
 pytestmark = pytest.mark.op("locate_cell")
 
-# Diagram 0 has three centres: the first a leaf, the second refined by diagram 1, the third by diagram 2, whose second
-# centre is refined by diagram 3. Leaves are numbered depth first.
+# Diagram 0 has three centres: the first is a leaf, diagram 1 refines the second, and diagram 2 refines the third.
+# Diagram 3 refines the second centre of diagram 2. Leaves are numbered depth first.
 CHILD_OFFSETS = torch.tensor([0, 3, 5, 7, 10], dtype=torch.int32)
 CHILD = torch.tensor([-1, 1, 2, -2, -3, -4, 3, -5, -6, -7], dtype=torch.int32)
 DEPTH = 3
 
 
 def slow(points, centres):
-    """Descends the tree, one point at a time."""
+    """Descends the tree for one point at a time."""
     leaves = []
     for point in points:
         diagram = 0
@@ -59,7 +59,7 @@ def test_many_points_cross_the_pieces(device, backend):
 def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device, backend):
     points = torch.tensor([[float("nan"), 0, 0], [0, float("inf"), 0]], device=device)
     centres = torch.rand(10, 3, device=device)
-    # Here the first centre of the root is refined too.
+    # In this tree the first centre of the root is refined too.
     child = torch.tensor([1, -1, 2, -6, -3, -4, 3, -5, -2, -7], dtype=torch.int32, device=device)
     leaf = locate_cell(points, centres, CHILD_OFFSETS.to(device), child, depth=DEPTH, backend=backend)
     assert leaf.tolist() == [5, 5]

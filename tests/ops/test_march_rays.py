@@ -1,4 +1,4 @@
-"""Marching through a grid: against stratified depths and a slow loop; all backends equal the reference bit for bit."""
+"""Marching through a grid against stratified depths and a slow loop; all backends equal the reference bit for bit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.op("march_rays")
 
 
 def case(r, shape=(5, 4, 7), share=0.4):
-    """Returns rays from outside through a box; some of them begin in it, end in it, or miss it."""
+    """Returns rays that start outside a box; some depth ranges begin or end inside the box, and some rays miss it."""
     directions = torch.nn.functional.normalize(0.4 * torch.randn(r, 3) + torch.tensor([0.0, 0.0, 1.0]), dim=-1)
     near = 0.2 + torch.rand(r)
     return {
@@ -126,7 +126,7 @@ def test_many_rays_of_a_picture_equal_the_reference(device, backend, rest, spaci
         arguments["far"][:40], arguments["far"][40:80] = (
             arguments["near"][:40] * (1 + 1e-5),
             100.0,
-        )  # short strata, and long ones
+        )  # very short strata and long strata
         for more in ({}, {"most": 3}, {"start": torch.randint(0, 70, (900,), dtype=torch.int32), "most": 5}):
             expected = march(arguments, 64, torch.device("cpu"), "reference", **rest, **more)
             same(march(arguments, 64, device, backend, **rest, **more), expected)

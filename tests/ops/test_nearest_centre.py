@@ -13,7 +13,7 @@ pytestmark = pytest.mark.op("nearest_centre")
 
 
 def slow(points, centres):
-    """Compares one point with one centre at a time, in float64."""
+    """Compares each point with each centre in a float64 loop."""
     cells = []
     for point in points.double().tolist():
         distances = [sum((a - b) ** 2 for a, b in zip(point, centre)) for centre in centres.double().tolist()]
@@ -39,7 +39,7 @@ def test_chosen_centre_is_nearest_in_float64_wherever_the_scene_is(device, backe
     cells = nearest_centre(points.to(device), centres.to(device), backend=backend).cpu().long()
     distances = (points.double()[:, None] - centres.double()[None]).square().sum(-1)
     chosen = distances.gather(1, cells[:, None])[:, 0]
-    # float32 may not tell apart two centres whose distances differ by less than its rounding.
+    # In float32, two centres whose distances differ by less than the rounding may be confused.
     bound = 8 * 2.0**-24 * distances.min(dim=1).values
     assert (chosen <= distances.min(dim=1).values + bound).all()
 
@@ -69,8 +69,8 @@ def test_is_not_differentiable(device, backend):
 
 
 def some_centres(kind, k, d, dtype):
-    """Returns k centres: normal, on a lattice with duplicates, with a dense middle, all at one place, or on a line that
-    they traverse four times."""
+    """Returns k centres by ``kind``: normal, on a lattice with duplicates, heavy-tailed, all at one place, or along a
+    line that is traversed four times ("in turns")."""
     centres = torch.randn(k, d, dtype=torch.float64)
     if kind == "in turns":
         centres = torch.linspace(0, 1, k // 4 + 1, dtype=torch.float64).repeat(4)[:k, None].expand(k, d)
@@ -100,14 +100,14 @@ def test_an_index_finds_the_same_centres(device, backend, kind, d, dtype):
 
 
 def test_many_centres_and_points_without_an_index(device, backend):
-    """The call makes an index for itself, on the CPU."""
+    """On the CPU the call builds its own index."""
     points, centres = torch.rand(1500, 3), torch.rand(3000, 3)
     result = nearest_centre(points.to(device), centres.to(device), backend=backend)
     assert torch.equal(result.cpu(), nearest_centre(points, centres, backend="reference"))
 
 
 def test_centres_in_turns_take_as_long_as_others():
-    """Samples at equal distances would see only one part of each traversal."""
+    """Building the index must not sample centres at a fixed stride, which sees the same part of each repetition."""
     seconds = []
     for centres in (torch.rand(200_000, 1), torch.linspace(0, 1, 20_000).repeat(10)[:, None]):
         begin = time.process_time()

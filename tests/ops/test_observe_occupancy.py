@@ -21,10 +21,10 @@ SPACES = {
 
 
 def slow(density, positions, sigma, deltas, weights, decay, hidden, stretch):
-    """Observes one sample at a time, in a dictionary of the cells with samples."""
+    """Observes one sample at a time; collects the samples of each cell in a dictionary."""
     results = {}
     for place, *sample in zip(*(part.tolist() for part in (positions, sigma, deltas, weights, stretch))):
-        if sample[1] == 0:  # a length of 0 is no part of a ray
+        if sample[1] == 0:  # a sample of length 0 belongs to no ray
             continue
         cell = []
         for axis, size in enumerate(density.shape):
@@ -44,14 +44,14 @@ def slow(density, positions, sigma, deltas, weights, decay, hidden, stretch):
 @pytest.mark.parametrize(("decay", "space"), [(0.0, "sphere"), (0.75, "world"), (1.0, "world"), (0.5, "perspective")])
 def test_equals_a_slow_loop(device, backend, shape, m, decay, space):
     density = 2 * torch.rand(shape)
-    # Binary fractions within the cells, and some positions outside the box.
+    # Exact binary fractions that avoid cell borders; some positions lie outside the box.
     positions = BOX[0] + (BOX[1] - BOX[0]) * (torch.randint(-9, 137, (m, 3)) / 128 + 1 / 1024)
     sigma, deltas = 3 * torch.rand(m) * (torch.rand(m) < 0.7), torch.rand(m)
     weights = 0.02 * torch.rand(m) * (torch.rand(m) < 0.8)
     deltas[2::7] = 0.0
     sigma[::50], positions[3::50, 1] = torch.nan, torch.nan
     contraction = SPACES[space]
-    # A position that is NaN counts as infinitely far away.
+    # A NaN position counts as far away.
     far = positions.nan_to_num(1e9)
     stretch = torch.ones(m) if contraction is None else contraction.stretch(far.double())
     expected = slow(density, positions, sigma, deltas, weights, decay, 0.01, stretch)

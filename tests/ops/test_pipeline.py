@@ -1,4 +1,4 @@
-"""All operations one after another, as a renderer calls them."""
+"""All operations in sequence, as a renderer calls them."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, chan
 
 
 def test_rays_along_an_axis_are_in_a_slab_or_not(device, backend):
-    """A direction with a component of zero is inside or outside of a slab along its whole ray."""
+    """A ray with a zero direction component lies entirely inside or entirely outside the slab of this axis."""
     poses = torch.eye(4).repeat(3, 1, 1)
     poses[:, :3, 3] = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [-1.0, 1.0, 9.0]])
     lens, images = torch.tensor([[1.0, 1.0, 0.5, 0.5]]).repeat(3, 1), torch.zeros(3, 1, 1, 3, dtype=torch.uint8)

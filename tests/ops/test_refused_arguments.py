@@ -1,4 +1,4 @@
-"""Tensors of kinds that no operation takes; the case of each op lists the op's own refusals."""
+"""Tensors that every operation refuses; the case of each op lists the refusals of this op."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_cells_without_a_table_are_refused_by_every_backend(backend):
 @pytest.mark.parametrize("op", ["run_sums", "run_gradients"])
 @pytest.mark.parametrize("backend", ["reference", "native"])
 def test_runs_that_are_not_of_the_samples_are_refused(op, backend):
-    """A run without samples at the end would read the ray of a sample that does not exist."""
+    """If the last run had no samples, the op would read the ray of a sample that does not exist."""
     call = cases()[op].make(Draw(3), 9)
     offsets = call["samples"].run_offsets
     for change in (

@@ -13,7 +13,7 @@ SCALE = 10.0
 
 
 def rays(counts, dtype=torch.float64, outside=(0, 0)):
-    """Returns raw outputs, lengths and offsets of packed samples, and targets and backgrounds of their rays."""
+    """Returns raw outputs, lengths and offsets of packed samples, and the targets and backgrounds of the rays."""
     m, r = sum(counts) + sum(outside), len(counts)
     raw, deltas = 3 * torch.randn(m, 4, dtype=dtype), torch.rand(m, dtype=dtype) / 10
     offsets = offsets_of(counts) + outside[0]
@@ -21,7 +21,7 @@ def rays(counts, dtype=torch.float64, outside=(0, 0)):
 
 
 def step_by_step(raw, deltas, offsets, target, background, activated=False):
-    """Computes activations (unless ``activated``), composite and loss as three steps."""
+    """Computes activations (unless ``activated``), compositing and the loss in separate steps."""
     colour, density = raw[:, :3], raw[:, 3]
     if not activated:
         colour, density = torch.sigmoid(colour), SCALE * torch.nn.functional.softplus(density)
@@ -58,7 +58,7 @@ def evaluate(device, arguments, dtype, backend, hidden=0.0, activated=False):
 def test_is_activations_composite_and_squared_error(device, backend, counts, outside, activated):
     arguments = rays(counts, outside=outside)
     if activated:
-        arguments[0][:, 3].mul_(SCALE).clamp_(min=-0.5)  # a little of it negative, as no activation is
+        arguments[0][:, 3].mul_(SCALE).clamp_(min=-0.5)  # some densities are negative, which no activation returns
     of = {"activated": activated}
     exact = evaluate(device, arguments, torch.float64, None, **of)
     plain = evaluate(device, arguments, torch.float32, "reference", **of)
@@ -68,7 +68,7 @@ def test_is_activations_composite_and_squared_error(device, backend, counts, out
 
 @pytest.mark.parametrize("hidden", [0.0, 0.3])
 def test_gradients_to_activated_values(device, backend, hidden):
-    """A colour's gradient is weight times the ray's gradient; raw outputs also have the slopes of the activations."""
+    """A colour's gradient is its weight times the ray's gradient; for raw outputs, times the activation's slope."""
     raw, *rest = rays([40, 0, 3, 90])
     values = torch.cat([torch.sigmoid(raw[:, :3]), SCALE * torch.nn.functional.softplus(raw[:, 3:])], 1)
     slopes = torch.cat([values[:, :3] * (1 - values[:, :3]), SCALE * torch.sigmoid(raw[:, 3:])], 1)
@@ -84,7 +84,7 @@ def test_gradients_to_activated_values(device, backend, hidden):
 
 @pytest.mark.parametrize("hidden", [0.0, 0.3])
 def test_no_density_has_a_gradient_where_light_arrives(device, backend, hidden):
-    """A density of 0, as from a relu, has no weight, but more density would have."""
+    """A density of 0, as from a ReLU, has weight 0, but its gradient is nonzero if light arrives."""
     raw = torch.tensor([[0.9, 0.5, 0.1, 0.0], [0.2, 0.2, 0.2, 20.0], [0.9, 0.5, 0.1, 0.0]], device=device)
     rest = torch.full((3,), 0.5, device=device), offsets_of([3]).to(device), torch.zeros(1, 3, device=device)
     leaf = raw.requires_grad_()
@@ -157,14 +157,14 @@ def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend):
         assert torch.equal(result.colour[ray], clean.colour[ray])
     leaf = spoiled.requires_grad_()
     render_loss(leaf, deltas, offsets, target, **rest).loss.backward()
-    assert leaf.grad[7:9].isnan().all()  # unknown light reaches the samples behind it
+    assert leaf.grad[7:9].isnan().all()  # the light that reaches the samples behind the NaN is unknown
     assert leaf.grad[:4].isfinite().all() and leaf.grad[9:].isfinite().all()
 
 
 @pytest.mark.parametrize("counts", [[3, 0, 17, 1, 0, 40, 2], [300, 5, 200, 0, 1000], [0, 9, 0], [4] * 150])
 @pytest.mark.parametrize("robust", [0.0, 0.05])
 def test_unseen_rays_have_no_colour_to_learn(device, backend, counts, robust):
-    """Unseen rays have loss, error and gradient 0, even if targets and colours are NaN."""
+    """Loss, error and gradient of unseen rays are 0, even if their targets and colours are NaN."""
     raw, deltas, offsets, target, background = rays(counts, torch.float32, outside=(2, 3))
     r, triples = len(counts), (len(counts) + 1) // 4
     first, leaf = r - 3 * triples, raw.double().requires_grad_()

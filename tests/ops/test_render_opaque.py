@@ -1,4 +1,4 @@
-"""The rays of a picture: one operation against the waves of separate operations."""
+"""Tests of `render_opaque`: one operation for the rays of an image, against separate operations in waves."""
 
 import itertools
 
@@ -32,7 +32,7 @@ def test_native_sees_what_the_reference_sees(n, positions, cells, spacing, activ
 
 @pytest.mark.parametrize("backend", ["reference", pytest.param("native", marks=pytest.mark.native)])
 def test_activated_values_are_seen_as_they_are(backend):
-    """Activated values are rendered unchanged, also values that no activation gives."""
+    """Activated values are rendered unchanged, even values that no activation returns."""
     layers = {last: MLP((Layer(("positions",), 4, last),), outputs=(0,)) for last in ("none", "softplus")}
     origins, directions = torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]])
     ray = origins, directions, torch.zeros(1), torch.full((1,), 4.0)
@@ -56,7 +56,7 @@ def test_activated_values_are_seen_as_they_are(backend):
 @pytest.mark.native
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, "autocast"], ids=str)
 def test_networks_of_other_dtypes_are_seen(dtype):
-    """Tables of other dtypes and autocast do not use the one operation, but give the same results."""
+    """With a table of another dtype, or under autocast, separate operations run and give the same results."""
     arguments = CASE.make(Draw(1), 300)
     network = dict(arguments["network"])
     if isinstance(dtype, torch.dtype):
@@ -72,7 +72,7 @@ def test_networks_of_other_dtypes_are_seen(dtype):
 @pytest.mark.native
 @pytest.mark.parametrize("kind", [{}, {"cells": 9, "wave": 1}, {"contraction": torch.tensor([0.1, 0, 0, 0.4])}])
 def test_a_ray_sees_the_same_bits_beside_any_others(kind):
-    """The bits of a ray do not depend on the threads or the order of rays, which decide the rays of a wave."""
+    """A ray has the same bits for any threads and any order of rays, which decide which rays share a wave."""
     arguments = CASE.make(Draw(7, **kind), 5000)
     result = on_any_number_of_threads(lambda: render_opaque(**arguments, backend="native"))
     order = torch.randperm(5000, generator=torch.Generator().manual_seed(0))
@@ -82,7 +82,7 @@ def test_a_ray_sees_the_same_bits_beside_any_others(kind):
 
 
 def test_leaps_over_empty_cells_find_the_same():
-    """The larger batch has so many more strata than grid cells that its native rays leap."""
+    """Only the larger batch has enough strata, compared with the grid cells, for native rays to leap."""
     arguments = CASE.make(Draw(3, samples=130, side=4), 40)
     arguments["occupied"] = torch.zeros(12, 12, 12, dtype=torch.bool)
     arguments["occupied"][5:7, 4:8, 3:9] = True
@@ -95,7 +95,7 @@ def test_leaps_over_empty_cells_find_the_same():
 
 
 def test_a_tree_of_diagrams_tells_the_cells():
-    """One half of space is halved again: three networks of one colour each."""
+    """Space is split in halves and one half again; each of the three networks has one colour."""
     program = MLP((Layer(("positions",), 4),), outputs=(0,)).program(3, 0, None, (True,))
     colours = torch.tensor([[9.0, -9, -9, 9], [-9, 9, -9, 9], [-9, -9, 9, 9]])
     network = {"program": program, "parameters": [torch.zeros(3, 4, 3), colours], "depth": 2}

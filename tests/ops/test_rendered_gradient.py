@@ -1,4 +1,4 @@
-"""Gradients to the outputs of networks, from gradients to rendered rays: against autograd through a slow loop."""
+"""Tests of `rendered_gradient`, from rendered rays to network outputs, against autograd through a slow loop."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCALED, ACTIVATED = {"density_scale": 2.5}, {"activated": True}
 
 
 def case(counts, rule, names=NAMES, outside=(0, 0), backgrounds=()):
-    """Returns samples of rays with ``counts`` samples each, samples of no ray, and gradients of a loss by name."""
+    """Returns samples of rays with ``counts`` samples each, samples of no ray, and the loss gradients ``names``."""
     r, m = len(counts), sum(counts) + sum(outside)
     raw = torch.rand(m, 4) if rule == ACTIVATED else torch.randn(m, 4)
     raw[:, 3] += 1
@@ -35,7 +35,7 @@ def case(counts, rule, names=NAMES, outside=(0, 0), backgrounds=()):
 
 
 def complete(arguments, rule):
-    """Adds the densities and weights that follow from ``raw``."""
+    """Returns the arguments with densities and weights, which are computed from ``raw``."""
     rgb, density = activate(arguments["raw"], **rule)
     along = density, rgb, arguments["depths"], arguments["deltas"]
     weights = composite(*along, ray_offsets=arguments["ray_offsets"], backend="reference").weights
@@ -51,7 +51,7 @@ def learnt(arguments, backend, device="cpu", dtype=torch.float32, **rule):
 
 
 def slow(arguments, hidden=0.0, **rule):
-    """Computes the gradient in float64, one sample after the other."""
+    """Computes the gradient in float64, sample by sample."""
     arguments = {name: value.double() if value.is_floating_point() else value for name, value in arguments.items()}
     leaf = arguments["raw"].clone().requires_grad_()
     offsets, loss, none = arguments["ray_offsets"].tolist(), leaf.sum() * 0, torch.zeros(3)
@@ -93,7 +93,7 @@ def test_rays_without_samples_change_nothing(device, backend, counts, m):
 
 
 def test_infinite_density_and_what_is_not_a_number(device, backend):
-    """No gradient passes a wall, and samples behind it have their own gradient only. A NaN stays in its ray."""
+    """Samples behind an infinite density only have the gradient ``of_density``. A NaN does not reach other rays."""
     need("rendered_gradient", backend, device, torch.float32)
     arguments = case((6, 6, 6), ACTIVATED, backgrounds=(3,))
     arguments["raw"][:6, 3] = torch.tensor([1.0, torch.inf, 2.0, torch.inf, 0.0, 1.0])

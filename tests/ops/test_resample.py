@@ -12,7 +12,7 @@ pytestmark = pytest.mark.op("resample")
 
 
 def slow(weights, edges, targets):
-    """Walks along one ray until the mass in front exceeds each target."""
+    """Walks along one ray, for each target, to the depth where the accumulated mass reaches the target."""
     if sum(weights) == 0:
         weights = [1.0] * len(weights)
     total, depths = sum(weights), []
@@ -43,7 +43,7 @@ def test_matches_a_slow_walk(device, backend, r, s, count, given):
     for ray in range(r):
         targets = uniforms[ray].tolist() if given else midpoints
         expected = slow(weights[ray].tolist(), edges[ray].tolist(), targets)
-        # Rounding the running mass moves a depth by a share of its bin, and a light bin is long for its mass.
+        # Rounding of the accumulated mass moves a depth by a fraction of its bin, and more if the bin has little mass.
         share = weights[ray].sum() / weights[ray][weights[ray] > 0].min() if weights[ray].sum() > 0 else 1
         tolerance = float(1e-6 * s * max(1, share) * edges[ray].max())
         torch.testing.assert_close(depths[ray], torch.tensor(expected), rtol=0, atol=tolerance)
@@ -68,7 +68,7 @@ def test_converges_to_the_density(device, backend):
     weights = torch.tensor([[1.0, 0.0, 3.0]], device=device)
     edges = torch.tensor([[0.0, 1.0, 2.0, 4.0]], device=device)
     depths = resample(weights, edges, 4000, backend=backend)
-    # A quarter of the mass in the first bin, three quarters in the last, spread evenly in each.
+    # A quarter of the mass is in the first bin, three quarters are in the last, distributed evenly in each bin.
     assert (depths < 1).double().mean().item() == pytest.approx(0.25, abs=1e-3)
     assert (depths > 3).double().mean().item() == pytest.approx(0.375, abs=1e-3)
     assert depths.mean().item() == pytest.approx(0.25 * 0.5 + 0.75 * 3, abs=1e-3)

@@ -39,7 +39,7 @@ TABLES = {
     "spherical": replace(NERF, direction_octaves=None, direction_encoding="spherical", direction_degree=3),
     "integrated": replace(NERF, position_encoding="integrated"),
 }
-# A tree of two levels, the second uneven: leaf 0, leaves 1 to 3 in diagram 1, leaves 4 and 5 in diagram 2.
+# A tree of two levels: leaf 0 in the root, leaves 1 to 3 in diagram 1, leaves 4 and 5 in diagram 2.
 TREE = {
     "child_offsets": torch.tensor([0, 3, 6, 8], dtype=torch.int32),
     "child": torch.tensor([-1, 1, 2, -2, -3, -4, -5, -6], dtype=torch.int32),
@@ -105,7 +105,7 @@ class Case:
         return [tensor.detach().to(device, dtype).requires_grad_() for tensor in self.leaves]
 
     def specified(self, leaves):
-        """Evaluates one cell after another, by definition."""
+        """Evaluates the definition, cell by cell."""
         positions, directions, *parameters = leaves
         index = self.options.get("direction_index")
         seen = directions if index is None else directions[index]
@@ -284,7 +284,7 @@ def test_errors_of_the_kernel():
     refuses = refusals(functools.partial(tree.run, tree.leaves, backend="native"), "routed_mlp")
     refuses("child must name a diagram (below the number of diagrams) or a leaf (negative)", child=TREE["child"] + 9)
     refuses("depth must be the number of levels of the tree, got 1, which is too few", depth=1)
-    # A leaf without a network.
+    # This leaf has no network.
     refuses("cells must lie in 0 to 5, got values from ...", child=torch.where(TREE["child"] == -6, -7, TREE["child"]))
     refuses(
         "direction_index must be 0 to 4, got 5",
@@ -343,7 +343,7 @@ def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name, dty
 @pytest.mark.parametrize("rows", [0, 1, 23, 40])
 @pytest.mark.parametrize("k", [1, 3])
 def test_rows_beyond_those_that_count_are_in_no_cell(device, backend, rows, k):
-    """Rows beyond the row count may hold anything, like the tail of a march with a capacity."""
+    """Rows beyond the row count may hold anything, like unused rows of a march with a capacity."""
     table = MLP((Layer(("positions",), 8, "relu"), Layer((0,), 2)), outputs=(1,))
     torch.manual_seed(0)
     results = []

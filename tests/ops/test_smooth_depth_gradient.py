@@ -1,4 +1,4 @@
-"""The smoothness loss on depths of unseen rays: against autograd through a slow loop."""
+"""The smoothness loss on depths of unseen rays, compared with autograd through a slow loop."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def case(counts, skipped=0):
 
 
 def learnt(arguments, device="cpu", **rule):
-    """Returns a loss of 2 and a gradient of ones after the op has added to them."""
+    """Returns the loss, initially 2, and the gradient, initially ones, after the op has added to both."""
     arguments = [tensor.to(device) for tensor in arguments]
     loss, gradient = torch.full_like(arguments[-1].sum(), 2), arguments[0].new_ones(len(arguments[0]), 4)
     smooth_depth_gradient(loss, gradient, *arguments, **rule)
@@ -31,7 +31,7 @@ def learnt(arguments, device="cpu", **rule):
 
 
 def slow(density, depths, deltas, offsets, far, triples, hidden):
-    """Computes the loss in float64, one ray after the other, differentiable with respect to the densities."""
+    """Computes the loss ray by ray in float64, so that autograd can differentiate it."""
     seen = []
     for ray in range(len(far) - 3 * triples, len(far)):
         light, disparity = density.new_ones(()), density.new_zeros(())

@@ -1,4 +1,4 @@
-"""The loss of rays that end at known points: against autograd through a slow loop."""
+"""The loss of rays that end at known points, compared with autograd through a slow loop."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.op("sparse_depth_gradient")
 def case(counts, dtype=torch.float32, others=(), skipped=0):
     """Returns rays with ``counts`` samples each, some of them opaque; the end points lie among the samples.
 
-    Rays of ``others`` samples follow, without end points; the first ``skipped`` samples belong to no ray.
+    Rays with ``others`` samples follow, without end points. The first ``skipped`` samples belong to no ray.
     """
     counts = [*counts, *others]
     m = sum(counts)
@@ -36,7 +36,7 @@ def case(counts, dtype=torch.float32, others=(), skipped=0):
 
 
 def learnt(arguments, device="cpu", **rule):
-    """Returns the loss and the density gradient that the op adds to existing values."""
+    """Returns what the op adds to an existing loss and density gradient."""
     arguments = [tensor.to(device) for tensor in arguments]
     loss, gradient = torch.full_like(arguments[-1].sum(), 2), arguments[0].new_ones(len(arguments[0]), 4)
     sparse_depth_gradient(loss, gradient, *arguments, **rule)
@@ -45,7 +45,7 @@ def learnt(arguments, device="cpu", **rule):
 
 
 def slow(density, depths, deltas, offsets, distances):
-    """Computes the loss in float64, one ray after the other, differentiable with respect to the densities."""
+    """Computes the loss ray by ray in float64, so that autograd can differentiate it."""
     total = density.new_zeros(())
     for ray, distance in enumerate(distances):
         light, there = density.new_ones(()), density.new_zeros(())
@@ -78,7 +78,7 @@ def test_equals_autograd_through_a_slow_loop(device, backend, others, skipped, s
 
 
 def test_what_is_not_finite_stays_in_its_ray(device, backend):
-    """A NaN weight near the point leaves its ray without gradient; an infinite density lets no light through."""
+    """A ray with a NaN weight near its point has no gradient; an infinite density gives finite gradients."""
     need("sparse_depth_gradient", backend, device, torch.float32)
     counts = (12, 12, 12, 12)
     arguments = [tensor.clone() for tensor in case(counts)]
@@ -86,7 +86,7 @@ def test_what_is_not_finite_stays_in_its_ray(device, backend):
     near = (depths - distances.repeat_interleave(12)).abs() <= NEARBY * distances.repeat_interleave(12) + deltas
     weights[near] += 0.1
     fine, rule = learnt(arguments, device, factor=0.25, activated=True, backend=backend), {"factor": 0.25}
-    weights[:12][~near[:12]] = torch.nan  # in the first ray, away from its point
+    weights[:12][~near[:12]] = torch.nan  # weights of the first ray, away from its point
     density[12:24] = torch.inf
     _, gradient = learnt(arguments, device, **rule, activated=True, backend=backend)
     torch.testing.assert_close(gradient[:12], fine[1][:12])

@@ -16,7 +16,7 @@ def directions_of(n):
 
 
 def legendre(band, order, z):
-    """Returns the associated Legendre function of cos(theta) = z, with Condon-Shortley phase, by its recurrence."""
+    """Computes the associated Legendre function of z = cos(theta), with Condon-Shortley phase, by its recurrence."""
     before, value = 0.0, (-1) ** order * math.prod(range(1, 2 * order, 2)) * math.sqrt(1 - z * z) ** order
     for l in range(order + 1, band + 1):
         before, value = value, ((2 * l - 1) * z * value - (l + order - 1) * before) / (l - order)
@@ -24,7 +24,7 @@ def legendre(band, order, z):
 
 
 def slow(directions, degree):
-    """Computes one harmonic of one unit vector at a time, by its definition in spherical coordinates."""
+    """Computes each harmonic of each unit vector by its definition in spherical coordinates."""
     rows = []
     for x, y, z in directions.double().tolist():
         row, angle = [], math.atan2(y, x)
@@ -54,7 +54,7 @@ def test_poles_and_axes(device, backend):
 
 
 def tiny_cuda_nn(x, y, z):
-    """Returns the polynomials of tiny-cuda-nn's kernel_sh (sphericalharmonics.h, degree 4), as in its source."""
+    """Returns the polynomials as written in tiny-cuda-nn's kernel_sh (sphericalharmonics.h, degree 4)."""
     xy, xz, yz, x2, y2, z2 = x * y, x * z, y * z, x * x, y * y, z * z
     return [
         0.28209479177387814,

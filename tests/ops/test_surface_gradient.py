@@ -1,4 +1,4 @@
-"""The loss of rays whose light comes from several surfaces: against autograd through a slow loop over pairs."""
+"""The loss of rays whose light comes from several surfaces, compared with autograd through a slow loop over pairs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def case(counts, skipped=0):
 
 
 def learnt(arguments, device="cpu", **rule):
-    """Returns a loss of 2 and a gradient of ones after the op has added to them."""
+    """Returns the loss, initially 2, and the gradient, initially ones, after the op has added to both."""
     arguments = [tensor.to(device) for tensor in arguments]
     loss, gradient = torch.full_like(arguments[-1].sum(), 2), arguments[0].new_ones(len(arguments[0]), 4)
     surface_gradient(loss, gradient, *arguments, **rule)
@@ -35,7 +35,7 @@ def learnt(arguments, device="cpu", **rule):
 
 
 def slow(density, depths, deltas, offsets, near, far, hidden, distortion, orientation):
-    """Computes the loss in float64, one ray after the other, differentiable with respect to the densities."""
+    """Computes the loss ray by ray in float64, so that autograd can differentiate it."""
     total = density.new_zeros(())
     for ray in range(len(far)):
         light, lit, scale = density.new_ones(()), [], 1 / (1 / near[ray] - 1 / far[ray])
@@ -81,7 +81,7 @@ def test_equals_autograd_through_a_slow_loop(device, backend, counts, skipped, s
 
 @pytest.mark.parametrize("anything", [0.0, float("nan")])
 def test_samples_of_no_ray_hold_anything(device, backend, anything):
-    """Samples of no ray may hold anything, since steps on a GPU allocate more rows than samples."""
+    """Samples of no ray may hold anything: steps on a GPU allocate more rows than they fill."""
     need("surface_gradient", backend, device, torch.float32)
     *samples, offsets, near, far = case((4, 9, 30, 3), skipped=5)
     offsets, near, far = offsets[:-1], near[:-1], far[:-1]

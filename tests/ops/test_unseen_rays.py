@@ -1,4 +1,4 @@
-"""Triples of neighbouring rays from places without a camera."""
+"""Tests of triples of neighbouring rays from places without a camera."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def test_triples_begin_around_the_cameras_and_lie_on_a_line(device, backend):
     assert torch.equal(middle, one) and torch.equal(middle, other)
     moved = middle - cameras[1000:2500]
     assert float(moved.abs().max()) < 0.25001 and float(moved.mean(0).abs().max()) < 0.025
-    assert bool((moved.std(0) > 0.1).all())  # 0.144 for uniform numbers
+    assert bool((moved.std(0) > 0.1).all())  # uniform numbers give 0.144
     middle, one, other = (directions[1000:].view(3, 1500, 3)).unbind()
-    torch.testing.assert_close(one + other, middle * (one + other).norm(dim=1, keepdim=True))  # as far on both sides
-    apart = ((one - other) / (one + other).norm(dim=1, keepdim=True)).norm(dim=1)  # tangent of half the angle
+    torch.testing.assert_close(one + other, middle * (one + other).norm(dim=1, keepdim=True))  # equal angles
+    apart = ((one - other) / (one + other).norm(dim=1, keepdim=True)).norm(dim=1)  # tangents of half the angles
     assert float(apart.min()) > 0 and float(apart.max()) < 0.1 * 3**0.5
     assert 0.01 < float(apart.median()) < 0.03  # the expected median is 0.1 / 4 * 0.8

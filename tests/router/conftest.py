@@ -1,4 +1,4 @@
-"""Routers do not measure in these tests: they take the most promising way, on a loaded machine too."""
+"""Routers do not measure in these tests; they use the most promising evaluation path, even on a loaded machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fields whose arguments belong to samples, to rays or to neither, in containers and objects."""
+"""Fields with arguments per sample, per ray or for all samples, also in containers and objects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 
 class CodePerRay(nn.Module):
-    """Takes a view direction, a code and a time for each ray."""
+    """A field that takes a view direction, a code and a time for each ray."""
 
     def __init__(self, code: int = 5) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class Samples:
 
 
 class TakesSamples(nn.Module):
-    """A field that takes samples as an object; its result depends on a code for each camera."""
+    """A field that takes samples as an object, and looks up a code for each camera."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Fields beyond the listed codebases, by how they are called and by their operations on samples."""
+"""Fields of other codebases, with unusual calls or unusual operations on samples."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class ControlFlow(nn.Module):
 
 
 class Branches(nn.Module):
-    """view(-1, C), products of activations, chunks, in-place operations, buffers."""
+    """A field with ``view(-1, C)``, products of activations, chunks, in-place operations and buffers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,7 +69,7 @@ class Branches(nn.Module):
 
 
 class Normals(nn.Module):
-    """A field with a gradient inside forward, and with state on the module, as in nerfstudio."""
+    """A field that computes a gradient in ``forward`` and stores a tensor on the module, as in nerfstudio."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ class Checkpointed(nn.Module):
 
 
 class RowOrder(nn.Module):
-    """A field that splits or sorts its samples inside forward, and restores their order."""
+    """A field that selects or sorts its samples in ``forward``, and restores their order."""
 
     def __init__(self, way: str) -> None:
         super().__init__()
@@ -122,7 +122,7 @@ with warnings.catch_warnings():  # TorchScript is deprecated, but old code uses 
 
 
 class Scripted(nn.Module):
-    """A field with a TorchScript function, which no PyTorch function mode sees into."""
+    """A field with a TorchScript function, whose operations are hidden from PyTorch function modes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -133,7 +133,7 @@ class Scripted(nn.Module):
 
 
 class TruncExp(torch.autograd.Function):
-    """The trunc_exp of torch-ngp: the backward pass clamps the exponent, under automatic mixed precision."""
+    """torch-ngp's ``trunc_exp``, with its autocast decorators; the backward pass clamps the exponent."""
 
     @staticmethod
     @torch.amp.custom_fwd(device_type="cpu", cast_inputs=torch.float32)

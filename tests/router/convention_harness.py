@@ -1,7 +1,7 @@
-"""The reference of a routed field: a loop over the cells, with a mask and a separate module for each cell.
+"""The reference for a routed field: a loop over the cells, with a mask and a separate module for each cell.
 
-A `Case` is a field, its arguments as its codebase passes them, and the router's options. The case itself makes the
-modules of distinct cells, so the loop shares no code with the router. Letters: n samples, k cells.
+A `Case` is a field, its arguments as its codebase passes them, and the router's options. The case creates the modules
+of the cells without a router, so the loop shares no code with the router. Letters: n samples, k cells.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ K = 5
 
 
 def example(name: str) -> ModuleType:
-    """Imports the script of that name in `examples/`."""
+    """Imports the script `name` from `examples/`."""
     full = f"examples_{name}"
     if full not in sys.modules:
         spec = importlib.util.spec_from_file_location(full, EXAMPLES / f"{name}.py")
@@ -38,7 +38,7 @@ def example(name: str) -> ModuleType:
 
 
 Arguments = tuple[tuple[Any, ...], dict[str, Any]]
-RAYS = (9, 7)  # differ from all numbers of features
+RAYS = (9, 7)  # different from all numbers of features
 
 
 def uniform(lead: tuple[int, ...], features: int = 3) -> Tensor:
@@ -50,7 +50,7 @@ def first(x: Tensor, *_: Any, **__: Any) -> Tensor:
 
 
 def one(features: int = 7) -> Callable[[tuple[int, ...]], Arguments]:
-    """Returns a maker of one tensor argument, whose first three features are the position."""
+    """Returns a function that makes a single tensor argument, whose first three features are the position."""
     return lambda lead: ((uniform(lead, features),), {})
 
 
@@ -63,18 +63,18 @@ class Case:
 
     Attributes:
         name: the name of the test.
-        make: returns a fresh field with random float32 parameters.
-        arguments: leading shape -> (args, kwargs), float32.
-        positions: the arguments -> positions [..., 3].
+        make: a function that returns a new field with random float32 parameters.
+        arguments: a function from the leading shape to float32 (args, kwargs).
+        positions: a function from the arguments to positions [..., 3].
         lead: leading shape of the samples: (n,), or (rays, samples).
         options: the options of the router.
         passes_coords: whether to pass the positions as ``coords`` at the call.
         method: the name of the called method.
-        way: the expected way: "fused" or "grouped", where the module and each of its functions run once for all
-            cells, or "cell by cell".
-        fuses: whether to test the case with ``fuse=True`` too.
+        way: the expected evaluation path: "fused" or "grouped" (the module and each of its functions run once for
+            all cells), or "cell by cell".
+        fuses: whether the case is also tested with ``fuse=True``.
         rank: the number of dimensions of a sample's tensors in the loop; 3 means [m, 1, d].
-        by_parameters: whether to compare second derivatives by parameters; PyTorch's own are wrong for
+        by_parameters: whether second derivatives with respect to parameters are compared; PyTorch's are wrong for
             ``torch._weight_norm``.
     """
 
@@ -99,7 +99,7 @@ class Case:
         return dataclasses.replace(self, name=f"{self.name}, fused", options=options, way="fused")
 
     def modules(self, dtype: torch.dtype = torch.float32, k: int = K) -> list[nn.Module]:
-        """Returns a separate module for each of k cells, with random parameters; shared parameters are one object."""
+        """Returns a module with random parameters for each of k cells; modules hold the same shared parameters."""
         modules = [randomised(self.make()).to(dtype) for _ in range(k)]
         for name, parameter in modules[0].named_parameters():
             if any(fnmatch.fnmatch(name, pattern) for pattern in self.options.get("share", ())):
@@ -117,7 +117,7 @@ class Case:
 
 
 def randomised(module: nn.Module) -> nn.Module:
-    """Moves every trainable parameter, so that none is zero or one by initialisation."""
+    """Adds noise to every trainable parameter, so that none keeps an initial value of zero or one."""
     with torch.no_grad():
         for parameter in module.parameters():
             if parameter.requires_grad:
@@ -126,7 +126,7 @@ def randomised(module: nn.Module) -> nn.Module:
 
 
 def mapped(tree: Any, function: Callable[[Tensor], Any]) -> Any:
-    """Returns the arguments with every tensor replaced, in tuples, lists, dicts and dataclasses."""
+    """Applies ``function`` to every tensor in tuples, lists, dicts and dataclasses, and returns the new tree."""
     if isinstance(tree, Tensor):
         return function(tree)
     if isinstance(tree, dict):
@@ -142,7 +142,7 @@ def mapped(tree: Any, function: Callable[[Tensor], Any]) -> Any:
 
 
 def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields (path, value) of each leaf of an output; the path names the types of the containers."""
+    """Yields (path, value) for each leaf of an output; the path contains the types of the containers."""
     kind = type(tree).__name__
     if isinstance(tree, dict):
         for key, value in tree.items():
@@ -158,12 +158,12 @@ def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def tensors(tree: Any) -> dict[str, Tensor]:
-    """Returns tensors of an output by path; other leaves have path and text as a key, so that structures compare."""
+    """Returns the tensors of an output by path. Keys of other leaves contain the values, to compare them."""
     return {path if isinstance(v, Tensor) else f"{path}={v!r}": v for path, v in leaves(tree)}
 
 
 def prepared(case: Case, dtype: torch.dtype, lead: tuple[int, ...] | None = None) -> tuple[Any, Any, list[Tensor]]:
-    """Returns arguments of a dtype, and their floating-point tensors as leaf tensors with gradients."""
+    """Returns the arguments in a dtype; their floating-point tensors are leaves with gradients, also listed."""
     inputs: list[Tensor] = []
 
     def take(tensor: Tensor) -> Tensor:
@@ -177,13 +177,13 @@ def prepared(case: Case, dtype: torch.dtype, lead: tuple[int, ...] | None = None
 
 
 def nearest(case: Case, centres: Tensor, args: Any, kwargs: Any) -> Tensor:
-    """Returns the cell of each sample, int64 [n]."""
+    """Returns the cells of the samples, int64 [n]."""
     positions = case.positions(*args, **kwargs).detach().reshape(-1, 3).double()
     return (positions[:, None] - centres.double()).square().sum(-1).argmin(1)
 
 
 def loop(case: Case, modules: list[nn.Module], cells: Tensor, args: Any, kwargs: Any) -> dict[str, Tensor]:
-    """Returns the outputs by path; one cell after the other, its module evaluates its samples. ``cells``: int64 [n]."""
+    """Evaluates the samples of each cell by the cell's module; returns the outputs by path. ``cells``: int64 [n]."""
     n, lead = cells.shape[0], case.lead
 
     def rows(index: Tensor) -> Callable[[Tensor], Tensor]:
@@ -216,14 +216,14 @@ def loop(case: Case, modules: list[nn.Module], cells: Tensor, args: Any, kwargs:
 
 
 def routed(case: Case, modules: list[nn.Module], centres: Tensor | VoronoiDiagram, **options: Any) -> VoronoiRouter:
-    """Returns a router with these modules as cells."""
+    """Returns a router whose cells are these modules."""
     return VoronoiRouter.from_modules(modules, centres, **{**case.options, **options})
 
 
 def close(
     actual: dict[str, Any], expected: dict[str, Any], *, rtol: float | None = None, atol: float | None = None
 ) -> None:
-    """Checks that structure, shapes, dtypes and numbers are the same."""
+    """Checks that structures, shapes and dtypes are equal, and that numbers are close."""
     assert list(actual) == list(expected)
     for key, value in expected.items():
         if isinstance(value, Tensor):
@@ -231,7 +231,7 @@ def close(
 
 
 def scalar(outputs: dict[str, Any]) -> Tensor:
-    """Returns a loss with another weight for every number of the outputs, the same weights in each call."""
+    """Returns a loss that weights every number of the outputs differently; the weights are equal in all calls."""
     generator = torch.Generator().manual_seed(7)
     parts = []
     for value in outputs.values():
@@ -244,10 +244,10 @@ def scalar(outputs: dict[str, Any]) -> Tensor:
 def gradients(
     of: list[nn.Module] | VoronoiRouter, loss: Tensor, inputs: list[Tensor], **options: Any
 ) -> dict[str, Tensor]:
-    """Returns gradients by name: of parameters of a router, or of a loop's modules [k, ...], and of inputs."""
+    """Returns the gradients to parameters [k, ...] by name, and to inputs; ``of`` is a router or a loop's modules."""
     modules = [of.module] if isinstance(of, VoronoiRouter) else of
     names = [name for name, p in modules[0].named_parameters() if p.requires_grad]
-    own = [list(dict.fromkeys(m.get_parameter(name) for m in modules)) for name in names]  # one if cells share it
+    own = [list(dict.fromkeys(m.get_parameter(name) for m in modules)) for name in names]  # one if it is shared
     wanted = [*itertools.chain(*own), *inputs]
     options = {"allow_unused": True, "materialize_grads": True, "retain_graph": True, **options}
     following = iter(torch.autograd.grad(loss, wanted, **options))
@@ -259,7 +259,7 @@ def gradients(
 
 
 class Counter:
-    """A counter of a method's calls and of the rows in each call; the first argument holds the samples."""
+    """Counts the calls of a method and the rows of the first tensor in each call, which holds the samples."""
 
     def __init__(self, monkeypatch: Any, cls: type[nn.Module], method: str) -> None:
         self.rows: list[int] = []

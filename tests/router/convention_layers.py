@@ -1,4 +1,4 @@
-"""Fields beyond the listed codebases, by how they use parameters: layers, norms, handmade weights, tables."""
+"""Fields of other codebases, with many uses of parameters: layers, norms, raw weights, tables."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Siren(nn.Module):
 
 
 class LearnedScale(nn.Module):
-    """Parameters used elementwise: [d], [1, d] and a number (VolSDF's beta, NeuS's variance)."""
+    """A field with elementwise parameters: [d], [1, d] and a scalar (VolSDF's beta, NeuS's variance)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ class LearnedScale(nn.Module):
 
 
 class OldWeightNorm(nn.Module):
-    """NeuS's SDF network: weight_norm by hooks, softplus of beta 100, a skip divided by the square root of two."""
+    """NeuS's SDF network: weight norm, softplus with beta = 100, and a skip divided by the square root of two."""
 
     def __init__(self, norm: Callable[[nn.Module], nn.Module]) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class Residual(nn.Module):
 
 
 class RawWeights(nn.Module):
-    """A field without nn.Linear, with a product of weight and samples in one of many spellings."""
+    """A field without ``nn.Linear``, which multiplies weights and samples in one of several ways."""
 
     def __init__(self, way: str) -> None:
         super().__init__()
@@ -104,7 +104,7 @@ class RawWeights(nn.Module):
 
 
 class Tied(nn.Module):
-    """One layer used twice, and two layers with one weight."""
+    """A field with one layer used twice, and two layers that share one weight."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -118,7 +118,7 @@ class Tied(nn.Module):
 
 
 class LatentCode(nn.Module):
-    """A latent vector parameter, repeated for every sample."""
+    """A field with a latent vector as a parameter, which is repeated for every sample."""
 
     def __init__(self, way: str) -> None:
         super().__init__()
@@ -139,7 +139,7 @@ class LatentCode(nn.Module):
 
 
 class Lookup(nn.Module):
-    """An appearance code by image, from an Embedding, its average, and F.embedding."""
+    """A field with appearance codes: from nn.Embedding and F.embedding by image, or their average."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -154,7 +154,7 @@ class Lookup(nn.Module):
 
 
 class Convolution(nn.Module):
-    """A convolution over the features of each sample, which has no grouped version."""
+    """A field with a convolution over the features of each sample, which has no grouped version."""
 
     def __init__(self) -> None:
         super().__init__()

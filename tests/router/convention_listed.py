@@ -1,4 +1,4 @@
-"""The eight conventions of examples/, in every form that their codebases use."""
+"""The eight codebases of examples/, with all calling conventions that they use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Lead = tuple[int, ...]
 
 
 def encoded(octaves: int, direction_octaves: int | None) -> Any:
-    """Returns a maker of one tensor argument, encoded outside of the field."""
+    """Returns a function that makes a single tensor argument, encoded before it reaches the field."""
 
     def arguments(lead: Lead) -> Arguments:
         x = nerf_pytorch.encode(uniform(lead), octaves)
@@ -36,7 +36,7 @@ def with_rays(lead: Lead) -> Arguments:
 
 
 def mip_arguments(view: bool) -> Any:
-    # Three features are the means here, so that the loop finds them; the router gets them at the call.
+    # The first three features are the means, so that the loop finds positions; the router gets them at the call.
     def arguments(lead: Lead) -> Arguments:
         x = uniform(lead, 12)
         return ((x, uniform(lead[:1], 9)) if view else (x,)), {}
@@ -109,7 +109,7 @@ def studio_case(method: str, arguments: Any) -> Case:
 
 
 def other(method: str, options: Any, make: Any, arguments: Any, fuses: bool = True, **more: Any) -> Case:
-    """Returns the case of a method other than forward."""
+    """Returns a case for a method other than ``forward``."""
     return Case(f"{make.__name__} {method}", make, arguments, options=options, method=method, fuses=fuses, **more)
 
 
@@ -121,7 +121,7 @@ PART = Case(
     lambda lead: ((*pair(lead)[0], torch.rand(lead) < 0.5), {"geo_feat": uniform(lead, 4)}),
     options=NGP,
     method="color",
-    way="cell by cell",  # the module selects rows, so that cells end elsewhere
+    way="cell by cell",  # the module selects rows, so offsets of cells change
 )
 LISTED = [
     Case("nerf-pytorch", skips, encoded(2, 1), fuses=True),
@@ -149,7 +149,7 @@ LISTED = [
     studio_case("get_density", lambda lead: ((ray_samples(lead),), {})),
     studio_case("get_outputs", outputs_arguments),
     studio_case("density_fn", one(3)),
-    Case("torch-ngp", ngp_field, pair, options=NGP),  # a table for each cell; convention_shared.py has a shared one
+    Case("torch-ngp", ngp_field, pair, options=NGP),  # one table per cell; shared: convention_shared.py
     other("density", NGP, ngp_field, one(3), fuses=False),
     other("color", NGP, ngp_field, lambda lead: (pair(lead)[0], {"geo_feat": uniform(lead, 4)})),
     PART,

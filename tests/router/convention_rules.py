@@ -1,4 +1,4 @@
-"""Small fields in which parameters meet samples in one way each, with or without a grouped rule."""
+"""Small fields, each of which combines parameters and samples by one operation, with or without a grouped rule."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from voronerf.router import register
 
 
 class Odd(nn.Module):
-    """A field with parameters of many shapes, and a step that uses some of them."""
+    """A field with parameters of many shapes, and a step that uses some of these parameters."""
 
     def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
         super().__init__()
@@ -69,7 +69,7 @@ STEPS: list[Callable[[Any, Tensor], Tensor]] = [
 
 
 class Corners(nn.Module):
-    """Several look-ups into one table, and one into another, with positions between them."""
+    """A field with several look-ups in one table, mixed by the positions, and one look-up in another table."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ class Corners(nn.Module):
 
 
 class Planes(nn.Module):
-    """A plane with the samples in its second dimension, and a volume with the samples in the last but one."""
+    """A field with a plane and a volume, sampled on grids with samples in the second and the last but one dimension."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ class Planes(nn.Module):
 
 
 class Encoded(nn.Module):
-    """An encoder that all cells may share, and a table and a head."""
+    """A field with an encoder that all cells may share, a table and a head."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -113,7 +113,7 @@ def two_layers() -> nn.Module:
 
 
 class Scales(nn.Module):
-    """A field that applies a function of the caller."""
+    """A field that applies a function given by the caller."""
 
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor]) -> None:
         super().__init__()
@@ -124,7 +124,7 @@ class Scales(nn.Module):
 
 
 def seen(name: str) -> Callable[[Tensor, Tensor], Tensor]:
-    """Returns a function with that name that PyTorch's function modes see, like functions of other libraries."""
+    """Returns a function called ``name`` that PyTorch's function modes intercept, like functions of other libraries."""
 
     def function(rows: Tensor, factor: Tensor) -> Tensor:
         if torch.overrides.has_torch_function((rows, factor)):

@@ -1,4 +1,4 @@
-"""Encoders that all cells share (`share=["encoder.*"]`): one look-up for all samples, a small network for each cell."""
+"""Encoders that all cells share (`share=["encoder.*"]`): one look-up for all samples, then a network for each cell."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Lookup(torch.autograd.Function):
 
 
 class Encoder(nn.Module):
-    """A box, a table behind a custom function, layers with a norm between them, and harmonics written in place."""
+    """An encoder with a box, a table read by a custom function, layers, a norm, and harmonics written in place."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class Encoder(nn.Module):
 
 
 class Field(nn.Module):
-    """An encoder, a network, and a scale of its results, which cells may share."""
+    """A field with an encoder, a network, and a scale of the results; cells may share the encoder and the scale."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Small modules of many kinds, and the plain loop over masks that a router of any of them has to equal."""
+"""Small modules of many kinds, and a plain loop over masks, the reference for their routers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class SkipNet(nn.Module):
 
 
 class Sine(nn.Module):
-    """Sines of scaled layers, a learned frequency, a residual block."""
+    """A network with sines of scaled layers, a learned frequency and a residual block."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class Sine(nn.Module):
 
 
 class Heads(nn.Module):
-    """A field with several results in a dict, some of them 1-D; flags and an optional argument."""
+    """A field that returns a dict, with some 1-D results, and takes flags and an optional argument."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class Heads(nn.Module):
 
 
 def perturb(router: VoronoiRouter, generator: torch.Generator, size: float = 0.2) -> VoronoiRouter:
-    """Adds random numbers to the parameters, so that the cells differ."""
+    """Adds noise to the parameters, so that the cells differ."""
     with torch.no_grad():
         for parameter in router.parameters():
             parameter += size * torch.randn(parameter.shape, generator=generator).to(parameter)
@@ -93,7 +93,7 @@ def tensors(value: Any) -> list[Tensor]:
 def masked_loop(
     router: VoronoiRouter, cells: Tensor, args: Sequence[Any], method: str = "forward"
 ) -> tuple[list[Tensor], list[nn.Module]]:
-    """Returns the results of a loop over masks, and the cells' modules; arguments are flat, [n, ...]."""
+    """Returns the results of a loop over masks, and the cells' modules; tensors in ``args`` are flat, [n, ...]."""
     modules = [router.cell(i) for i in range(router.num_cells)]
     results: list[Tensor] = []
     for i, module in enumerate(modules):

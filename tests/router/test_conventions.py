@@ -1,8 +1,8 @@
-"""Fields of other people's codebases through VoronoiRouter: every case against a loop over masks.
+"""Tests of VoronoiRouter on fields of other codebases: every case against a loop over masks.
 
 The cases: `convention_listed.py` has the codebases of examples/. `convention_layers.py`, `convention_calls.py` and
 `convention_arguments.py` have other fields, `convention_rules.py` single steps, and `convention_shared.py` encoders
-that cells share. Each case that fuses is also a case with ``fuse=True``.
+that cells share. Each case that can be fused is also tested with ``fuse=True``.
 """
 
 from __future__ import annotations
@@ -59,15 +59,15 @@ def _quiet() -> Any:
 @every_case
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
 def test_distinct_cells_equal_a_loop_over_masks(case: Case, dtype: torch.dtype, centres: Tensor) -> None:
-    """Values, gradients, and gradients of gradients (as in the eikonal loss) equal the loop."""
+    """Values, gradients, and gradients of gradients (as in the eikonal loss) equal the results of the loop."""
     modules = case.modules(dtype)
     router = routed(case, modules, centres)
     args, kwargs, inputs = prepared(case, dtype)
     expected = loop(case, modules, nearest(case, centres, args, kwargs), args, kwargs)
-    # The first call chooses the way of the later calls.
+    # The first call chooses the evaluation path of later calls.
     close(tensors(case.call(router, args, kwargs)), expected, rtol=2e-3, atol=2e-4)
     actual = tensors(case.call(router, args, kwargs))
-    # In float32 the order of sums matters, and a sample near the kink of a ReLU may fall on either side.
+    # In float32 the order of sums matters, and an input near 0 of a ReLU may fall on either side.
     rtol, atol = (1e-9, 1e-10) if dtype == torch.float64 else (2e-3, 2e-4)
     slopes = gradients(modules, scalar(expected), inputs, create_graph=True)
     compared = [name for name in slopes if case.by_parameters or name.startswith("input")]
@@ -76,7 +76,7 @@ def test_distinct_cells_equal_a_loop_over_masks(case: Case, dtype: torch.dtype, 
     ours = gradients(router, scalar(actual), inputs, create_graph=True)
     close(ours, slopes, rtol=rtol, atol=10 * atol)
     bent = gradients(router, scalar({name: ours[name] for name in compared}), inputs)
-    # The second derivatives of a fine grid are large, and entries that cancel have the rounding of the largest.
+    # The second derivatives of a fine grid are large; where they cancel, the rounding of the largest remains.
     largest = max(float(curve.detach().abs().max()) for curve in curves.values() if curve.numel())
     close(bent, curves, rtol=rtol, atol=atol * max(100, 0.5 * largest))
 
@@ -85,7 +85,7 @@ def test_distinct_cells_equal_a_loop_over_masks(case: Case, dtype: torch.dtype, 
 def test_identical_cells_give_the_fields_own_output(
     case: Case, centres: Tensor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The field runs once for all cells, or if it cannot, once for each cell with samples."""
+    """The field runs once for all cells or, if this is impossible, once for each cell that has samples."""
     field = randomised(case.make())
     args, kwargs, _ = prepared(case, torch.float32)
     expected = tensors(case.call(field, args, kwargs))
@@ -93,7 +93,7 @@ def test_identical_cells_give_the_fields_own_output(
     # No sample is near the last centre, so its cell is empty.
     router = VoronoiRouter(field, torch.cat([centres, torch.full((1, 3), 50.0)]), **case.options)
     for _ in range(2):
-        counter.rows.clear()  # forget the calls that choose the way
+        counter.rows.clear()  # forget the calls that choose the path
         close(tensors(case.call(router, args, kwargs)), expected, rtol=1e-4, atol=1e-5)
     assert f"{case.method}: {case.way}" in router.explain()
     assert 0 not in counter.rows
@@ -101,7 +101,7 @@ def test_identical_cells_give_the_fields_own_output(
         assert len(counter.rows) <= 1, f"ran {len(counter.rows)} times for {K} cells"
     elif len(counter.rows) > 1:
         counts = nearest(case, centres, args, kwargs).unique(return_counts=True)[1].tolist()
-        # The router may first try a few samples, in case this batch can run without the loop.
+        # The router may first call the field on a few samples, to see whether this batch can run without the loop.
         assert sorted(counter.rows[-len(counts) :]) == sorted(counts)
 
 

@@ -1,4 +1,4 @@
-"""Modules that VoronoiRouter refuses since they mix samples, and calls that do not tell where samples are."""
+"""Modules that VoronoiRouter refuses because they mix samples, and calls from which it cannot get positions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def centres() -> Tensor:
 
 
 class Mixes(nn.Module):
-    """A linear layer, a step that mixes samples, and another layer."""
+    """A module with a step that mixes samples between two linear layers."""
 
     def __init__(self, step: Callable[[Any, Tensor], Any], **parts: nn.Module) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ def test_modules_that_mix_samples_are_refused(number: int, centres: Tensor) -> N
 
 
 class Field(nn.Module):
-    """A field of features, and of optional features of a sample or a ray."""
+    """A field of features, and of optional further features per sample or per ray."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -120,7 +120,7 @@ def holding(value: Any) -> nn.Module:
 
 @dataclasses.dataclass
 class Compared(nn.Module):
-    """A module without a hash, since instances are equal by their fields."""
+    """An unhashable module: it compares instances by their fields."""
 
     width: int = 2
 

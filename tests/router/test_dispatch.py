@@ -1,4 +1,4 @@
-"""The choice between the ways of a call: it is measured, reported, and leaves no trace."""
+"""The choice of a call's evaluation path: it is based on measurements, is reported, and has no side effects."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_the_fastest_is_taken_and_said(monkeypatch: pytest.MonkeyPatch, fastest:
     others = [f"{name} 4 ms" for name in ("fused", "grouped", "cell by cell") if name != fastest]
     assert router.explain() == f"forward: {fastest}: 1 ms for 200 samples, {', '.join(others)}"
     assert calls == [["fused", "grouped", "cell by cell"]]
-    router(uniform((2000,)))  # measured again, since it is larger by more than a factor of four
+    router(uniform((2000,)))  # measured again: over four times as many samples
     router(uniform((2,)))
     with torch.no_grad():
         router(x)
@@ -49,9 +49,9 @@ def test_the_fastest_is_taken_and_said(monkeypatch: pytest.MonkeyPatch, fastest:
 @pytest.mark.parametrize(
     ("fused", "taken"),
     [
-        ([17.6, 0.8], "fused"),  # one noisy look
+        ([17.6, 0.8], "fused"),  # one noisy measurement
         ([17.6, 17.6, 0.8], "fused"),
-        ([2.9], "fused"),  # slower, but not clearly
+        ([2.9], "fused"),  # slower, but not by much
         ([17.6, 17.6, 17.6], "grouped"),
     ],
 )
@@ -138,7 +138,7 @@ def test_measuring_leaves_no_trace(requires_grad: bool) -> None:
 
 
 class Half(nn.Module):
-    """A module that runs grouped unless a sample lies outside."""
+    """A module that can run grouped only if no coordinate exceeds 1."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -160,7 +160,7 @@ def test_batches_that_cannot_be_grouped_are_tried_by_doubling() -> None:
     tries[0] = 0
     for _ in range(64):
         torch.testing.assert_close(router(far), masked_loop(router, router.diagram.locate(far), [far])[0][0])
-    assert 64 * cells < tries[0] <= 64 * 2 * cells + 10  # calls of the loop, of the expected values, few others
+    assert 64 * cells < tries[0] <= 64 * 2 * cells + 10  # two loops (router, expected) and few others
     for _ in range(80):
         router(near)
     tries[0] = 0

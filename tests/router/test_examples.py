@@ -1,4 +1,4 @@
-"""The scripts of examples/ run as they are, and the training loop gains its cells by three lines."""
+"""The scripts of examples/ run unchanged, and three lines add cells to the training loop."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_there_is_a_script_for_each_codebase() -> None:
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_script(path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each script itself compares its field before and after routing."""
+    """Runs the script, which compares its field before and after routing."""
     run(path, monkeypatch)
     assert re.search(r"\d+ (cells|modules in one router)", capsys.readouterr().out)
 

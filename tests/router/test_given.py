@@ -1,4 +1,4 @@
-"""Fields that declare their program: changes are followed, and a field without a program still equals a loop."""
+"""Fields that declare their program: routers follow changes, and equal a loop also for fields without a program."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def make(field: nn.Module | None = None, **options: Any) -> VoronoiRouter:
 
 
 def loop(router: VoronoiRouter, *args: Tensor) -> tuple[Tensor, ...]:
-    """Returns the results of the cells' modules, each on its own samples."""
+    """Returns the results of the cells' modules; each evaluates the samples of its cell."""
     cells = router.assign(args[0])
     parts = [router.cell(cell)(*(x[cells == cell] for x in args)) for cell in range(K)]
     parts = [part if isinstance(part, tuple) else (part,) for part in parts]

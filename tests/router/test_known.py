@@ -1,4 +1,4 @@
-"""Calls with a known program: later calls of the same kind run in two operations, with the same bits."""
+"""Calls with a cached program: later calls of the same kind run in two operations, with the same bits."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Call = Callable[[VoronoiRouter], Any]
 
 
 class Named(nn.Module):
-    """A field with results in a dict and a list, from positions and a direction."""
+    """A field that takes positions and directions, and returns a dict with a list."""
 
     def __init__(self, columns: int = 6) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ def outcome(router: VoronoiRouter, call: Call, *leaves: Tensor) -> list[Tensor]:
 
 @pytest.fixture
 def ordinary(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Tensor]]:
-    """Returns a function that calls a router without any known program."""
+    """Returns a function that calls a router without cached programs."""
 
     def run(router: VoronoiRouter, call: Call, *leaves: Tensor) -> list[Tensor]:
         with monkeypatch.context() as patch:
@@ -71,7 +71,7 @@ def ordinary(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Tensor]]:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Collects the methods of calls without a known program."""
+    """Collects the methods of calls without a cached program."""
     results: list[str] = []
     route = VoronoiRouter._route_as_it_is
 
@@ -79,7 +79,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         results.append(method)
         return route(self, method, *args, **kwargs)
 
-    for name in ("_route_as_it_is", "_route_uncompiled"):  # the second one once torch's compiler is imported
+    for name in ("_route_as_it_is", "_route_uncompiled"):  # the second applies once torch's compiler is imported
         monkeypatch.setattr(VoronoiRouter, name, noted)
     return results
 
@@ -182,7 +182,7 @@ def test_what_few_samples_have_shown_is_looked_at_again_with_more(monkeypatch: p
 
 
 class Given(nn.Module):
-    """A field of a vector that all samples share, or of one vector per ray."""
+    """A field that takes one vector for all samples, or one vector per ray."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -260,7 +260,7 @@ def test_frozen_cells(ordinary: Callable[..., list[Tensor]], calls: list[str]) -
     assert torch.equal(actual[0], expected[0])
     for own, other in zip(actual[1:], expected[1:], strict=True):
         assert torch.equal(own, other) and not own[[0, 2]].any() and own[[1, 3]].any()
-    x = rows(64).requires_grad_()  # with gradients to x, the backward pass leaves frozen cells out
+    x = rows(64).requires_grad_()  # if x has gradients, the backward pass skips frozen cells
     for _ in range(2):
         actual = outcome(router, lambda r: r(x), x)
     assert not actual[-1][torch.isin(router.assign(x), torch.tensor([0, 2]))].any()
@@ -279,7 +279,7 @@ def test_methods_share_the_cells_that_were_drawn(calls: list[str]) -> None:
 
 
 def doubled(module: nn.Module) -> nn.Module:
-    """Returns a copy with other parameters."""
+    """Returns a copy of the module with doubled parameters."""
     copied = copy.deepcopy(module)
     with torch.no_grad():
         for parameter in copied.parameters():

@@ -35,7 +35,7 @@ def routed(module: nn.Module, way: str = "fused", cells: Any = K, **options: Any
 
 
 def drawn(generator: torch.Generator, *shape: int, dtype: torch.dtype = torch.int64) -> Tensor:
-    """Draws labels; the last network gets no sample."""
+    """Draws labels, of all networks except the last."""
     return torch.randint(K - 1, shape, generator=generator, dtype=dtype)
 
 
@@ -48,7 +48,7 @@ def gradients(results: list[Tensor], wanted: list[Tensor]) -> list[Tensor]:
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
 def test_every_way_equals_the_loop_with_gradients(way: str, dtype: torch.dtype, generator: torch.Generator) -> None:
     router = routed(Sine(), way)
-    for n in (40, 23, 1):  # the first call of a kind, a known call, few samples
+    for n in (40, 23, 1):  # a first call, a call with a cached program, a single sample
         x, cells = torch.rand(n, 3, generator=generator, requires_grad=True), drawn(generator, n, dtype=dtype)
         expected, modules = masked_loop(router, cells, [x])
         actual = tensors(router(x, cells=cells))

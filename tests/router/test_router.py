@@ -1,4 +1,4 @@
-"""VoronoiRouter: equal to a loop over cells, inheritance of parameters and moments, state across subdivisions."""
+"""VoronoiRouter equals a loop over cells; subdivisions inherit parameters and moments, and keep state."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def samples(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def trained(field: NeRF, generator: torch.Generator) -> tuple[VoronoiRouter, torch.optim.Optimizer]:
-    """Returns a router of three cells after a few steps of Adam in two parameter groups."""
+    """Returns a router of three cells after a few steps of Adam, and the optimiser, which has two parameter groups."""
     router = VoronoiRouter(field, torch.randn(3, 3, generator=generator))
     heads = [p for name, p in router.named_parameters() if "colour" in name]
     rest = [p for name, p in router.named_parameters() if "colour" not in name]
@@ -48,7 +48,7 @@ def trained(field: NeRF, generator: torch.Generator) -> tuple[VoronoiRouter, tor
 def test_results_from_before_a_split_that_are_still_held_do_not_disturb(
     field: NeRF, generator: torch.Generator
 ) -> None:
-    """Parameters stay the same objects, with another shape; an earlier graph remembers the old shape."""
+    """A split changes the shapes of the same parameter objects; a graph from before the split needs the old shapes."""
     router, _ = trained(field, generator)
     positions, directions = samples(200, generator)
     held = router(positions, directions)
@@ -91,7 +91,7 @@ def test_copies_and_the_wrapped_field_are_independent(field: NeRF, generator: to
 
 @pytest.mark.parametrize("kind", ["one", "flat", "nested", "many"])
 def test_every_kind_of_diagram_equals_the_loop(kind: str, field: NeRF, generator: torch.Generator) -> None:
-    cells = {"one": 1, "many": 300}.get(kind, 4)  # with many centres, a diagram looks cells up by itself
+    cells = {"one": 1, "many": 300}.get(kind, 4)  # for many centres, the diagram uses its index
     diagram = VoronoiDiagram(torch.randn(cells, 3, generator=generator))
     if kind == "nested":
         diagram, _ = diagram.refine({1: torch.randn(3, 3, generator=generator)})

@@ -1,4 +1,4 @@
-"""Edge cases of routing: module hooks, fields that do more than their table, odd arguments, threads, failures."""
+"""Edge cases of routing: module hooks, fields that do more than their table, unusual arguments, threads, failures."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_hooks_and_weight_norm_of_a_field_with_a_table() -> None:
 
 @pytest.mark.parametrize("rule", ["function", "slice", "at the call"])
 def test_coords_of_a_field_with_a_table(rule: str) -> None:
-    """The coords of the rule decide the cell, not the position itself."""
+    """The ``coords`` rule decides the cell, not the position itself."""
     module = NeRF(width=16, depth=2, position_encoding="integrated") if rule == "slice" else NeRF(width=16, depth=2)
     x = samples()[:, :3]
     if rule == "slice":
@@ -208,7 +208,7 @@ def test_networks_traced_in_two_threads_leave_custom_functions_as_they_were() ->
 
 
 def test_centres_go_where_the_module_is(device: torch.device) -> None:
-    """Centres come from the CPU, also the first centre of a coarse stage, which needs no look-up."""
+    """Centres move from the CPU to the module's device, even the single centre of a coarse stage, without look-ups."""
     router, x = VoronoiRouter(network().to(device), torch.zeros(1, 3), coords="first3"), samples().to(device)
     router.generator = torch.Generator(device).manual_seed(3)
     coarse = router(x)

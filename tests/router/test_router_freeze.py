@@ -1,4 +1,4 @@
-"""Frozen cells have no gradient, no optimiser step and no backward time; the other cells keep the same bits."""
+"""Frozen cells have no gradient and no optimiser step, and cost no backward time; other cells keep the same bits."""
 
 import copy
 import pickle

@@ -1,4 +1,4 @@
-"""Functions that become steps of a fused network, and functions that run between its parts."""
+"""Functions that become steps of a fused network, and functions that run between parts of the network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ K = 4
 
 
 def written(make: Callable[[Any], Tensor]) -> Callable[[Any, Tensor], Tensor]:
-    """Returns a step that makes a tensor and writes into it."""
+    """Returns a step that makes a tensor and writes into this tensor."""
 
     def step(net: Any, h: Tensor) -> Tensor:
         result = make(h)
@@ -71,7 +71,7 @@ STEPS: dict[str, Callable[[Any, Tensor], Tensor]] = {
 
 
 class Around(nn.Module):
-    """Linear layers around a step."""
+    """A module with a step between linear layers."""
 
     def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ class Around(nn.Module):
 
 
 def both(make: Callable[[], nn.Module], x: Tensor, *args: Any, **options: Any) -> tuple[Any, Any, VoronoiRouter]:
-    """Returns (result, result of a loop over masks, router), with a separate module in each cell."""
+    """Returns (router result, result of a loop over masks, router); each cell is a separate module."""
     modules = [randomised(make()) for _ in range(K)]
     centres = torch.rand(K, 3, generator=torch.Generator().manual_seed(3)) * 2 - 1
     options = {"coords": "first3", "fuse": True, "way": "fused", **options}
@@ -102,7 +102,7 @@ ONCE = ("a norm of zeros",)  # its second derivative is NaN in PyTorch
 
 
 def derivatives(y: Tensor, x: Tensor, router: VoronoiRouter, twice: bool = True) -> list[Tensor]:
-    """Returns the first derivatives by x and parameters, and the derivatives of a penalty on the gradient."""
+    """Returns derivatives of ``y`` and, if ``twice``, of a penalty on its gradient, by x and the parameters."""
     weights = torch.linspace(0.5, 1.5, y.numel()).view_as(y)
     wanted = [x, *router.parameters()]
     first = torch.autograd.grad((y * weights).sum(), wanted, create_graph=twice, retain_graph=True, allow_unused=True)
@@ -113,7 +113,7 @@ def derivatives(y: Tensor, x: Tensor, router: VoronoiRouter, twice: bool = True)
 
 @pytest.mark.parametrize("name", STEPS)
 def test_a_step_of_the_program(name: str) -> None:
-    """Values, first and second derivatives equal the loop, and nothing runs between the fused steps."""
+    """Values, first and second derivatives equal the loop's, and the whole network runs fused."""
     torch.manual_seed(0)
     x = uniform((90,)).requires_grad_()
     actual, expected, router = both(lambda: Around(STEPS[name]), x)
@@ -125,7 +125,7 @@ def test_a_step_of_the_program(name: str) -> None:
 
 
 class Parts(nn.Module):
-    """Layers, and a ``forward`` that returns parts of their output."""
+    """Layers, and a ``forward`` that splits results of layers."""
 
     def __init__(self, forward: Callable[[Any, Tensor], Any]) -> None:
         super().__init__()
@@ -190,7 +190,7 @@ PARTS_BETWEEN: dict[str, Callable[[Any, Tensor], Any]] = {
     ],
 )
 def test_parts_of_what_is_split(forward: Callable[[Any, Tensor], Any], between: bool) -> None:
-    """Values, their structure and gradients equal the loop, whatever is split and wherever its parts go."""
+    """Values, their structure and gradients equal the loop's, for all splits and uses of the parts."""
     torch.manual_seed(0)
     centres = torch.rand(K, 3) * 2 - 1
     router = VoronoiRouter(Parts(forward), centres, coords="first3", fuse=True, way="fused")
@@ -215,7 +215,7 @@ def test_parts_of_what_is_split(forward: Callable[[Any, Tensor], Any], between: 
 
 
 class FourierKAN(nn.Module):
-    """A KAN of sines and cosines: parameters in products and sums, and no layer."""
+    """A KAN of sines and cosines, with parameters only in products and sums, without layers."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -231,7 +231,7 @@ class FourierKAN(nn.Module):
 
 
 class Convolved(nn.Module):
-    """Convolutions of one place, along samples or features, and a convolution that covers all places of a sample."""
+    """Convolutions with kernel size 1 along samples or features, and one whose kernel covers all features."""
 
     def __init__(self, form: str) -> None:
         super().__init__()
@@ -251,7 +251,7 @@ class Convolved(nn.Module):
 
 
 class Recurrent(nn.Module):
-    """A GRU cell, from its first state, zeros, and from a later state."""
+    """A GRU cell applied twice: to the initial zero state and to the next state."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -262,7 +262,7 @@ class Recurrent(nn.Module):
 
 
 class Masked(nn.Module):
-    """A network that writes numbers where a mask of entries, or a mask of samples, is true."""
+    """A network that writes numbers by a mask of entries and by a mask of samples."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -276,7 +276,7 @@ class Masked(nn.Module):
 
 
 class Shaped(Masked):
-    """A network with shapes from tensors: a size as a tensor, and a size as a number."""
+    """A network that computes sizes with tensors, and passes one size as a tensor and one as a number."""
 
     def forward(self, x: Tensor) -> Tensor:
         y = self.a(x.reshape(torch.prod(torch.tensor(x.shape[:-1])), -1))
@@ -328,7 +328,7 @@ def by_sum(net: Any, h: Tensor) -> Tensor:
 
 
 class Slope(Around):
-    """NeuS: the gradient of the first output, by ``torch.autograd.grad`` inside of ``forward``."""
+    """The gradient of the first output by ``torch.autograd.grad`` inside ``forward``, as in NeuS."""
 
     def forward(self, x: Tensor) -> Tensor:
         with torch.enable_grad():
@@ -340,7 +340,7 @@ class Slope(Around):
 
 
 class Field(Slope):
-    """nerfstudio's SDFField: the gradient by positions that ``forward`` computes and makes require a gradient."""
+    """The gradient with respect to positions that ``forward`` computes, as in nerfstudio's SDFField."""
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x * 0.5 + 0.1)
@@ -357,7 +357,7 @@ BETWEEN: dict[str, tuple[Callable[[], nn.Module], str]] = {
 
 @pytest.mark.parametrize("name", BETWEEN)
 def test_what_runs_between_the_runs(name: str) -> None:
-    """Values and derivatives equal the loop where PyTorch computes a part, also under no_grad."""
+    """Values and derivatives equal the loop's if PyTorch computes one part, also under no_grad."""
     torch.manual_seed(0)
     make, says = BETWEEN[name]
     x = uniform((90,)).requires_grad_()
@@ -373,7 +373,7 @@ def test_what_runs_between_the_runs(name: str) -> None:
 
 
 class Timed(nn.Module):
-    """torch-ngp's D-NeRF: a time that all samples share goes through its own layer."""
+    """torch-ngp's D-NeRF: layers encode a time that all samples share."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -410,7 +410,7 @@ def test_a_path_that_an_argument_chooses_is_refused() -> None:
 
 
 class Product(torch.autograd.Function):
-    """faster-KAN: a custom function of samples and parameters, with its own backward."""
+    """A custom autograd function of samples and parameters, as in faster-KAN."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, grid: Tensor) -> Tensor:

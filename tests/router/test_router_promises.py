@@ -1,4 +1,4 @@
-"""Promises of a user about a module (`fuse`, `share`, `layout`, `register`), and the router's report (`explain`)."""
+"""Options by which users make promises about a module (`fuse`, `share`, `layout`, `register`), and `explain`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def equal_to_loop(router: VoronoiRouter, x: Tensor) -> None:
 
 
 class Rough(nn.Module):
-    """Sines of large angles without SIREN's initialisation, whose results are lost in float32 rounding."""
+    """Sines of large angles without SIREN's initialisation; float32 rounding makes the results meaningless."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ def test_rounding_is_no_reason_for_a_loop(fuse: bool) -> None:
 
 
 class Forward(nn.Module):
-    """Linear layers around a step."""
+    """A module with a step between linear layers."""
 
     def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
         super().__init__()
@@ -141,7 +141,7 @@ def test_shared_parameters_are_one_copy() -> None:
 
 
 class Squeezes(nn.Module):
-    """A field with a camera number for each sample, squeezed as in old code."""
+    """A field that squeezes a camera number per sample, as in old code."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -152,7 +152,7 @@ class Squeezes(nn.Module):
 
 
 class Flattens(Squeezes):
-    """A field that returns a flat row for each sample, for arguments of any shape."""
+    """A field that returns flat rows, one for each sample, for arguments of any shape."""
 
     def forward(self, x: Tensor, cam: Tensor) -> Tensor:
         return self.fc(torch.cat([x, self.table(cam[..., 0])], -1)).reshape(-1, 3)
@@ -253,7 +253,7 @@ def test_a_rule_of_ones_own_may_be_wrong(generator: torch.Generator) -> None:
 @pytest.mark.filterwarnings("ignore:VoronoiRouter")
 @pytest.mark.parametrize("case", LISTED[:2], ids=str)
 def test_resuming_after_a_split_in_the_order_of_nerf_pytorch(case: Any) -> None:
-    """A resumed run loads the optimiser's state before the network's, here after a split into 4 cells."""
+    """A resumed run loads the optimiser's state and then the network's; here the saved run was split into 4 cells."""
     module, (args, kwargs) = randomised(case.make()), case.arguments(case.lead)
     points = case.positions(*args, **kwargs).reshape(-1, 3)
 
@@ -319,7 +319,7 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
 
 @pytest.mark.parametrize("width", [37, 74, 259, 1147])
 def test_widths_that_are_numbers_of_samples_of_a_trace(width):
-    """1147 is a multiple of the first two numbers of samples of a trace."""
+    """All widths are multiples of 37; 1147 is a multiple of the first two numbers of samples of a trace."""
     torch.manual_seed(0)
     field = nn.Sequential(nn.Linear(3, width), nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, 4))
     router = VoronoiRouter(field, torch.rand(3, 3), coords="first3", fuse=True, way="fused")

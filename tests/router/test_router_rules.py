@@ -1,4 +1,4 @@
-"""Steps of real fields in which all cells run at once, against a loop over masks."""
+"""Modules from published fields that run for all cells at once, against a loop over masks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from voronerf import VoronoiRouter
 
 
 class FiLM(nn.Module):
-    """pi-GAN: a network maps a code, here a parameter, to frequencies and shifts of a layer."""
+    """pi-GAN: a network maps a code (a parameter here) to frequencies and phases of the layers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class FiLM(nn.Module):
 
 
 class Added(nn.Module):
-    """Layers written by ``addmm``."""
+    """Layers written as ``addmm``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Added(nn.Module):
 
 
 class TensorVM(nn.Module):
-    """nerfstudio's TensoRF: three planes and three lines stacked in one parameter each."""
+    """nerfstudio's TensoRF: one parameter stacks three planes, another stacks three lines."""
 
     def __init__(self, padding: str = "zeros", align: bool = True) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class TensorVM(nn.Module):
 
 
 class BARF(nn.Module):
-    """Coarse to fine: a weight for each frequency, from a parameter that is read through ``.data``."""
+    """Coarse-to-fine weights of frequencies, computed from a parameter that is read through ``.data``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class BARF(nn.Module):
 
 
 class Gabor(nn.Module):
-    """WIRE: complex layers behind a real layer."""
+    """WIRE: complex layers after a real layer."""
 
     def __init__(self, bias: bool = True) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class Gabor(nn.Module):
 
 
 class Spectrum(Gabor):
-    """The same layers with complex results."""
+    """The layers of :class:`Gabor` with complex results."""
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.exp(1j * self.layers[0](self.first(x).cfloat())) @ self.out.weight.T
@@ -126,7 +126,7 @@ def real(tensor: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("fuse", [True, False])
 def test_complex_layers_stay_complex_under_autocast(fuse: bool) -> None:
-    """Autocast leaves complex layers alone; it rounds real layers before them, and fused layers at their ends."""
+    """Autocast does not change complex layers; it rounds real layers before them, and results of fused layers."""
     generator = torch.Generator().manual_seed(3)
     centres = torch.rand(5, 3, generator=generator) * 2 - 1
     torch.manual_seed(0)
@@ -142,7 +142,7 @@ def test_complex_layers_stay_complex_under_autocast(fuse: bool) -> None:
     torch.testing.assert_close(torch.autograd.grad(actual.sum(), x)[0].norm(), slope.norm(), rtol=0.1, atol=0.1)
 
 
-@pytest.mark.parametrize("n", [60, 6000])  # look-ups of few samples take another path
+@pytest.mark.parametrize("n", [60, 6000])  # look-ups of few samples use another algorithm
 @pytest.mark.parametrize("name", MODULES)
 def test_results_and_gradients_are_those_of_the_loop(name: str, n: int) -> None:
     generator = torch.Generator().manual_seed(3)
@@ -172,7 +172,7 @@ def test_results_and_gradients_are_those_of_the_loop(name: str, n: int) -> None:
 
 
 class Normed(nn.Module):
-    """Layer norms in six spellings, with weights and without; one is left out of some calls."""
+    """Layer norms in six spellings, with and without weights; if ``on`` is False, none runs."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -24,9 +24,9 @@ X = uniform((90,))
 
 
 class Scheduled(nn.Module):
-    """A module that reads numbers of many kinds besides its arguments; ``use`` says which."""
+    """A module that may read numbers of many kinds besides its arguments; ``use`` is a function that reads some."""
 
-    progress = 0.25  # an attribute of the class, until it is set
+    progress = 0.25  # an attribute of the class until an instance sets it
 
     def __init__(self, use: Callable[..., Tensor]) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ def routed(use: Callable[..., Tensor], **options: Any) -> VoronoiRouter:
 
 
 def check(router: VoronoiRouter, *args: Any) -> None:
-    """Checks that values and parameter gradients equal the loop over cells, in the current state of the module."""
+    """Checks that values and parameter gradients equal the loop over cells for the module's current state."""
     actual = router(X, *args)
     (expected,), modules = masked_loop(router, router.assign(X), [X, *args])
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
@@ -92,13 +92,13 @@ NUMBERS: dict[str, tuple[Callable[..., Tensor], list[Any]]] = {
 @pytest.mark.filterwarnings("ignore:VoronoiRouter.*no longer fused")
 @pytest.mark.parametrize("name", NUMBERS)
 def test_a_number_that_changes_becomes_an_input(name: str, traces: list[Any]) -> None:
-    """A few traces serve all values, or the module runs grouped in the end; each value is followed."""
+    """All values give correct results: a few traces serve all values, or the module runs grouped in the end."""
     use, values = NUMBERS[name]
     router = routed(use)
     for value in values:
         check(router, value)
     assert "fused" in router.explain()
-    if name not in ("a slope", "a limit"):  # arguments that have to be Python numbers
+    if name not in ("a slope", "a limit"):  # the arguments of these functions must be Python numbers
         assert len(traces) <= 4 and traces[-1]
     count = len(traces)
     for value in values:
@@ -210,7 +210,7 @@ def test_parameters_of_other_shapes_are_refused_or_followed(way: Any) -> None:
     check(router)
     weight, bias = router.module.b.weight.data, router.module.b.bias.data
     router.module.b.weight.data, router.module.b.bias.data = weight[:, :1], bias[:, :1]
-    check(router)  # one output for each cell
+    check(router)  # each cell has one output
     router.module.b.weight.data = weight[:1, :1]
     with pytest.raises(ValueError, match=r"must be \[4, \.\.\.\], one for each cell, but 'b.weight' is \[1, 1, 8\]"):
         router(X)

@@ -1,4 +1,4 @@
-"""Tables and planes of the cells: one look-up for all cells, with the gradients of a separate module for each cell."""
+"""Tables and planes of cells: one look-up for all cells gives the same gradients as separate modules."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def _router(module: nn.Module, k: int) -> VoronoiRouter:
 
 
 def _loop(router: VoronoiRouter, x: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Returns the results, and the parameters of the cells' modules, one after the other for each name."""
+    """Returns the results, and the parameters of the cells' modules: for each name, one parameter per cell."""
     (result,), modules = masked_loop(router, router.assign(x), [x])
     return result, [p for name, _ in router.module.named_parameters() for p in (m.get_parameter(name) for m in modules)]
 
 
 def _gradients(out: Tensor, parameters: list[Tensor], k: int, weights: Tensor) -> list[Tensor]:
-    """Returns gradients [k, ...], stacked over the modules of a loop; k is 0 for a router."""
+    """Returns gradients [k, ...]: stacks the gradients of k modules, or keeps a router's gradients (k = 0)."""
     result = torch.autograd.grad(out, parameters, weights, retain_graph=True, materialize_grads=True, allow_unused=True)
     return list(result) if k == 0 else [torch.stack(result[i : i + k]) for i in range(0, len(result), k)]
 
@@ -39,7 +39,7 @@ def test_indices_outside_of_a_table_are_refused() -> None:
 
 
 def test_pieces_cut_large_cells_and_join_small_ones() -> None:
-    """A wide network runs in pieces of 1,024 rows: several for a large cell, and one for several small cells."""
+    """A wide network runs in pieces of 1,024 rows: a large cell is cut into several, small cells share one."""
     torch.manual_seed(3)
     router = _router(nn.Sequential(nn.Linear(3, 1100), nn.ReLU(), nn.Linear(1100, 2)), 40)
     x = torch.cat([torch.rand(2500, 3) * 0.1, torch.rand(1500, 3) * 2 - 1])[torch.randperm(4000)]

@@ -1,4 +1,4 @@
-"""A router's module never changes in a call: other threads save, copy and call it meanwhile."""
+"""A router's module never changes during a call, so other threads can save, copy and call it meanwhile."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ CENTRES = torch.rand(5, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
 
 
 class Field(nn.Module):
-    """A field slow enough for another thread to intervene; ``Bilinear`` has no rule, so it runs cell by cell."""
+    """A field that lets other threads run in ``forward``. ``Bilinear`` has no rule and runs cell by cell."""
 
     def __init__(self, last: nn.Module) -> None:
         super().__init__()
         self.net, self.last = nn.Sequential(nn.Linear(3, 16), nn.ReLU(), nn.Linear(16, 3)), last
 
     def forward(self, x: Tensor) -> Tensor:
-        time.sleep(0)  # releases the interpreter lock
+        time.sleep(0)  # releases the GIL
         h = self.net(x)
         time.sleep(0)
         return self.last(h, h) if isinstance(self.last, nn.Bilinear) else self.last(h)
@@ -98,7 +98,7 @@ def test_reading_beside_calls(last: nn.Module, way: str) -> None:
 
 
 class Itself(nn.Linear):
-    """A layer that acts on itself in ``forward``."""
+    """A layer whose ``forward`` changes the layer itself by ``act``."""
 
     def __init__(self, act: Callable[[Any], Any]) -> None:
         super().__init__(3, 2)
@@ -161,7 +161,7 @@ def test_attributes_are_of_one_run() -> None:
 
 
 class Caches(nn.Linear):
-    """A layer that caches a function of its weight, as if the weight never changed."""
+    """A layer that caches a function of its weight and ignores later changes of the weight."""
 
     made: Any = None
 
@@ -183,7 +183,7 @@ def test_what_is_made_of_one_cells_parameters_is_not_for_another(k: int) -> None
 
 
 class Helper:
-    """An object that is no module, but holds one."""
+    """An object that holds a module, but is not a module."""
 
     def __init__(self, layer: nn.Module) -> None:
         self.layer = layer
@@ -193,7 +193,7 @@ class Helper:
 
 
 class Indirect(nn.Module):
-    """A module with layers behind lists, dicts, objects, methods, partials and a child that knows its parent."""
+    """A module that reaches layers by lists, dicts, objects, methods, partials and a child's link to its parent."""
 
     def __init__(self) -> None:
         super().__init__()

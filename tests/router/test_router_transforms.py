@@ -1,4 +1,4 @@
-"""VoronoiRouter within checkpoints, function transforms, tracers and compilers."""
+"""Tests of VoronoiRouter inside checkpoints, function transforms, tracers and compilers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def generator() -> torch.Generator:
 
 
 class Looked(nn.Module):
-    """A table for each cell, looked up twice, and layers."""
+    """A field with a table, looked up twice for each sample, and layers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -175,7 +175,7 @@ def test_func_grad_of_several_methods(generator: torch.Generator) -> None:
     own = x.clone().requires_grad_()
     (router.density(own)["sigma"].sum() + router(own).sum()).backward()
     torch.testing.assert_close(result, own.grad)
-    assert router.density(x)["sigma"].shape == (100,)  # the router keeps nothing of the transform
+    assert router.density(x)["sigma"].shape == (100,)  # the router keeps no state of the transform
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -1,4 +1,4 @@
-"""Common mistakes around a VoronoiRouter, and its messages about them."""
+"""Common mistakes in the use of VoronoiRouter, and the messages about these mistakes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def router_of(module: nn.Module, generator: torch.Generator, k: int = 8, **optio
 
 
 class Field(nn.Module):
-    """A shared encoder, a table, a normalised layer and a buffer."""
+    """A field with an encoder, a table, a layer with weight norm, and a buffer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -108,7 +108,7 @@ def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Gen
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for _ in range(64):  # gradients may be accumulated; the first call finds none
+        for _ in range(64):  # no warning yet, since gradients may be accumulated
             step()
     with pytest.warns(
         UserWarning, match=r"no optimizer has changed the parameters.*construct it from router.parameters\(\)"
@@ -117,12 +117,12 @@ def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Gen
     assert told[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for _ in range(65):  # the warning comes once
+        for _ in range(65):  # no second warning
             step()
 
 
 def test_a_fused_optimiser_with_the_state_of_other_cells_is_stopped(generator: torch.Generator) -> None:
-    """A step would write past the end of the old state."""
+    """A fused step would write beyond the end of the old state."""
     router, x = router_of(net(), generator, k=1), torch.rand(20, 3, generator=generator)
     old, other = torch.optim.Adam(router.parameters(), fused=True), torch.optim.Adam(net().parameters(), fused=True)
     router(x).sum().backward()
@@ -150,7 +150,7 @@ def test_optimisers_that_train_something_are_not_told(generator: torch.Generator
         both = torch.optim.Adam([*fields[1].parameters(), *routers[1].parameters()])
         routers[1](x).sum().backward()
         both.step()
-        fields[2](x).sum().backward()  # the plain module is trained as well
+        fields[2](x).sum().backward()  # trains the plain module of the third router
         torch.optim.SGD(fields[2].parameters(), 0.1).step()
 
 
@@ -207,7 +207,7 @@ def test_attributes_and_methods_of_the_module_are_pointed_to(generator: torch.Ge
 
 
 class MadeInside(nn.Module):
-    """A module that makes a layer in every call, and keeps it as a child or uses it once."""
+    """A module that makes a layer in every call; if ``kept``, it stores the layer as a child."""
 
     def __init__(self, kept: bool) -> None:
         super().__init__()
@@ -228,11 +228,11 @@ def test_layers_that_are_made_inside_of_forward(kept: bool, fuse: bool, generato
         router(torch.rand(100, 3, generator=generator))
 
 
-# Parameters past their names ------------------------------------------------------------------------------------------
+# Parameters under other names -----------------------------------------------------------------------------------------
 
 
 class Scaled(nn.Module):
-    """A layer and a parameter, besides the attribute that a test adds."""
+    """A module with a layer and a parameter; tests add an attribute."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -319,7 +319,7 @@ def test_centres_in_other_units_are_told_once(generator: torch.Generator) -> Non
         router = VoronoiRouter(net(), 100 * torch.rand(8, 3, generator=generator), coords="first3", **options)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            router(x[:100])  # too few samples to tell
+            router(x[:100])  # too few samples for a warning
         with pytest.warns(UserWarning, match=r"2,000 of 2,000 samples are in one of 8.*from_points\(positions, 8\)"):
             router(x)
         with warnings.catch_warnings():

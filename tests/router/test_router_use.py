@@ -1,4 +1,4 @@
-"""VoronoiRouter in a training loop: arguments, methods, optimisers, copies, wrappers, errors."""
+"""Tests of VoronoiRouter in a training loop: arguments, methods, optimisers, copies, wrappers, errors."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_methods_share_an_assignment(generator: torch.Generator, monkeypatch: py
     torch.testing.assert_close(router.density(x)["sigma"], sigma)
     assert len(drawn) == 1
     torch.testing.assert_close(sigma, masked_loop(router, drawn[0], [x, d])[0][1])
-    router.density(x)  # a second step with the same batch draws new cells
+    router.density(x)  # a second ``density`` call with this batch draws new cells
     x.add_(1)
     router(x, d)
     assert len(drawn) == 3
@@ -94,7 +94,7 @@ OPTIMIZERS: dict[str, Callable[[Any], torch.optim.Optimizer]] = {
 
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_children_step_as_their_parent_would(generator: torch.Generator, name: str) -> None:
-    """After a split that changes no assignment, both routers step alike, at the rates of the schedule."""
+    """After a split that moves no sample to another cell, optimiser steps are the same as without the split."""
     x = uniform(generator, 200, 3)
     router = router_of(Sine(), generator, k=2)
     router.module.b.requires_grad_(False)
@@ -114,7 +114,7 @@ def test_children_step_as_their_parent_would(generator: torch.Generator, name: s
     other = OPTIMIZERS[name]([{"params": [p]} for p in plain.parameters() if p.requires_grad])
     for a, b in zip(trained, (g["params"][0] for g in other.param_groups), strict=True):
         other.state[b] = copy.deepcopy(optimizer.state[a])
-    # The new centre is far away: its cell has no samples, and the others keep theirs.
+    # The new centre is far away: its cell has no samples, and the other cells keep their samples.
     finer, parents = router.diagram.refine({0: torch.cat([router.diagram.centres[:1], torch.full((1, 3), 90.0)])})
     router.subdivide(finer, parents, optimizer=optimizer)
     schedule.step()
@@ -160,7 +160,7 @@ def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
     with pytest.raises(ValueError, match="a number of children needs points, and no parents"):
         router.subdivide(4)
     other = router_of(Sine(), generator, k=1)
-    other.subdivide(4, points=x)  # all points weigh the same
+    other.subdivide(4, points=x)  # all points have equal weight
     assert other.num_cells == 4
     with pytest.raises(TypeError, match="must be a VoronoiDiagram or a number of children, got float"):
         router.subdivide(2.0)  # type: ignore[arg-type]
@@ -202,7 +202,7 @@ def test_autocast(generator: torch.Generator, make: type[nn.Module]) -> None:
 
 
 class Fast(nn.Module):
-    """SIREN: sines of thirty times a layer, which amplify rounding."""
+    """A SIREN network: the factor 30 inside its sines amplifies rounding."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -247,7 +247,7 @@ def test_fused_under_autocast_is_as_near_to_float64_as_the_loop(make: type[nn.Mo
 
 
 def test_inference_mode(generator: torch.Generator) -> None:
-    """A router that is made, called and fed in inference mode trains after it."""
+    """A router constructed and called in inference mode, with inputs made there, can be trained afterwards."""
     for options in ({"fuse": True, "way": "fused"}, {"way": "grouped"}, {"way": "loop"}):
         with torch.inference_mode():
             router, x = router_of(Heads(), generator, **options), uniform(generator, 50, 3)
@@ -259,7 +259,7 @@ def test_inference_mode(generator: torch.Generator) -> None:
 
 
 class Labelled(Tensor):
-    """A tensor with column names, as in PINA; results of functions have this class, but no names."""
+    """A tensor with column names, as in PINA; results of functions are of this class, but have no names."""
 
     @staticmethod
     def of(x: Tensor, labels: list[str]) -> Labelled:
@@ -281,7 +281,7 @@ class Labelled(Tensor):
 
 
 class Named(nn.Module):
-    """A module that uses column names in one of several ways."""
+    """A module that uses column names always, if there are some, for results, or never."""
 
     def __init__(self, use: str) -> None:
         super().__init__()
@@ -346,7 +346,7 @@ def test_modules_that_need_a_subclass_of_tensors_are_told(generator: torch.Gener
 
 
 class Unsliced(Tensor):
-    """A subclass of tensors whose slices lack the column names."""
+    """A tensor subclass whose slices lack the column names."""
 
     def column(self, name: str) -> Tensor:
         return self.as_subclass(Tensor)[..., self._labels.index(name)]
@@ -446,7 +446,7 @@ def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
 
 
 def test_an_average_of_weights_is_split_with_its_router(generator: torch.Generator) -> None:
-    """``AveragedModel`` holds a copy of the router, with its own diagram, as in the page of recipes."""
+    """``AveragedModel`` holds a copy of the router with its own diagram; the recipe in the docs splits both."""
     router, x = router_of(SkipNet(), generator), uniform(generator, 40, 15)
     router(x)
     average = torch.optim.swa_utils.AveragedModel(router, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.5))
@@ -461,7 +461,7 @@ def test_an_average_of_weights_is_split_with_its_router(generator: torch.Generat
 
 
 class Decides(nn.Module):
-    """A module that decides by a condition on any sample, directly or inverted."""
+    """A module that branches on whether any sample meets a condition, or on its negation."""
 
     def __init__(self, inverted: bool) -> None:
         super().__init__()

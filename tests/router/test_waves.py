@@ -1,4 +1,4 @@
-"""Sines and cosines of octaves, as codebases write them, become an encoding and give the same numbers."""
+"""Frequency encodings, as codebases write them, become an encoding step that gives the same numbers."""
 
 import math
 
@@ -29,7 +29,7 @@ def of_shifted(x):  # nerfstudio
     return torch.sin(torch.cat([angles, angles + math.pi / 2], -1))
 
 
-def with_a_start(x):  # BARF's, with weights
+def with_a_start(x):  # BARF: weighted octaves
     weights = torch.tensor([1.0, 1.0, 0.5, 0.0])
     parts = [w * f(2.0**i * 3.0 * x) for i, w in enumerate(weights.tolist()) for f in (torch.sin, torch.cos)]
     return torch.cat([x, *parts], -1)
@@ -97,7 +97,7 @@ def test_numbers_that_are_learnt_are_left():
     angles = b.binary("mul", x, Columns(PARAMETER, scale, 0, 3))
     program = b.program([b.apply("sine", angles, 1.0), b.apply("sine", angles, 1.0, math.pi / 2)])
     programs = [with_encodings(program, constants) for constants in ({}, {scale: [3.0, 3.0, 3.0]})]
-    assert [step.numbers for step in programs[0].steps if step.op == "encode"] == [(1, 0, 0, 0)]  # of the product
+    assert [step.numbers for step in programs[0].steps if step.op == "encode"] == [(1, 0, 0, 0)]  # x * scale
     assert programs[0].steps[1].name == "mul" and [step.name for step in programs[1].steps] == [
         "",
         "affine",

@@ -41,7 +41,7 @@ def new_store():
 def start_ranks(function, arguments, folder, restarts=0, store=None):
     """Starts a process for each rank, which calls a function with the rank's arguments in ``arguments``.
 
-    The ranks print to files in ``folder``. ``store`` is the store of earlier starts, which torchrun keeps.
+    The ranks print to files in ``folder``. ``store`` stands for torchrun's store, which outlives restarts.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["voronerf.app.cli", "voronerf.app.train.loop"])

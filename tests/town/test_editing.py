@@ -28,7 +28,7 @@ SMALL = ("log2_entries=10", "levels=4")
 
 @pytest.fixture(autouse=True, scope="module")
 def coarse_grids():
-    """Makes the grids coarse that are built for runs without a grid, which saves time."""
+    """Coarsens the occupancy grids that are built for runs without one, to save time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(importlib.import_module("voronerf.app.train.build"), "PICTURE_RESOLUTION", 24)
         patch.setattr(editing, "PICTURE_RESOLUTION", 24)
@@ -157,7 +157,7 @@ def test_a_region_is_cut_exactly(opened, tmp_path) -> None:
     for cut, where in ((kept, inside), (rest, ~inside)):
         density, occupied = cut.router(*inputs)[1], cut.router.assign(points) >= 0
         assert not density[~where].any()
-        # Evaluates the same rows only: rounding depends on the number of rows.
+        # Only the occupied rows are evaluated, since rounding depends on the number of rows.
         wanted = run.router(points[occupied], inputs[1], inputs[2][occupied])[1]
         assert occupied.any() and torch.equal(density[occupied], wanted)
     assert (kept.scene.box[1] - kept.scene.box[0]).max() <= 0.8 + 2 * 2.36 / 16
@@ -327,7 +327,7 @@ def test_runs_are_aligned_by_shared_images(scene) -> None:
 
 @pytest.mark.parametrize("degrees", [(10, 20, 30), (200, 20, 30), (10, 200, 30), (10, 20, 200)])
 def test_cameras_of_one_height_are_aligned_without_a_mirror(scene, degrees) -> None:
-    """Coplanar cameras are aligned by a rotation, although a mirroring would fit them as well."""
+    """Coplanar cameras are aligned by a rotation, although a reflection would fit them as well."""
     frame = Similarity.of((1, 2, 3), degrees, 1.7)
     flat = with_cameras(scene, lambda cameras: placed(cameras, cameras.origins * torch.tensor([1.0, 1, 0])))
     moved = with_cameras(flat, lambda cameras: editing.moved_cameras(cameras, frame))

@@ -105,7 +105,7 @@ def test_a_gap_that_another_rank_may_fill_ends_a_run():
 
 @pytest.mark.parametrize("backend", ["native", "reference"])
 def test_runs_of_a_ray_that_begin_alike_keep_their_order(backend):
-    """The first of two opaque runs of a ray hides the second if both have the same start depth."""
+    """If two opaque runs of a ray have the same start depth, the first one hides the second."""
     reason = backends.why_not("compose_runs", backend, torch.device("cpu"))
     if reason is not None:
         pytest.skip(reason)

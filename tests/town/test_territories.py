@@ -1,4 +1,4 @@
-"""Tests of territories: their places and regions, the routing of rays, and the loss of rays across territories."""
+"""Tests of territories: their places and regions, the routing of rays, and the loss of rays that cross territories."""
 
 import math
 from dataclasses import replace
@@ -95,7 +95,7 @@ def test_which_territories_a_ray_meets():
 
 
 def members(count):
-    """Returns territories in a line by number, each with its own networks."""
+    """Returns {number: territory} for a line of territories, each with its own networks."""
     result = {}
     for number in range(count):
         torch.manual_seed(number)
@@ -180,7 +180,7 @@ def test_gradients_are_those_of_the_loss():
 
 
 def test_colours_are_those_of_all_territories_in_turn():
-    """Rays through two territories of constant fog have the colours of the formula, whichever territory owns them."""
+    """Rays through constant fog in two territories have the formula's colours, whichever territory owns the rays."""
     territories, densities = members(2), (0.3, 0.7)
     colours = torch.tensor([[0.9, 0.1, 0.2], [0.2, 0.8, 0.4]])
     fill(territories, densities, colours)

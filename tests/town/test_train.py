@@ -85,7 +85,7 @@ def whole(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def resumed(tmp_path_factory):
-    """The folder of a run with two checkpoints, which two ranks have stopped and resumed."""
+    """The folder of a run of two ranks, which was stopped and resumed, and has two checkpoints."""
     folder = tmp_path_factory.mktemp("resumed")
     assert on_ranks(is_asked_to_stop, command(folder / "run"), 12, folder=folder)[0] == [130, 130]
     assert on_ranks(main, command(folder / "run", "--resume"), folder=folder)[0] == [0, 0]
@@ -122,7 +122,7 @@ def test_a_run_continues_on_another_number_of_ranks_that_need_not_name_its_terri
 
 @pytest.mark.slow
 def test_a_rank_that_is_killed(tmp_path, whole):
-    """The other rank reports it; after a restart as by torchrun, the run equals an undisturbed one bit for bit."""
+    """The other rank reports the killed rank; after a restart as by torchrun, the run equals `whole` bit for bit."""
     args = command(tmp_path / "run", "--checkpoint-every", "1e-6")
     codes, texts = on_ranks(dies, args, 19, folder=tmp_path)
     assert codes == [1, -signal.SIGKILL] and len(complaints(texts)) == 1
@@ -140,7 +140,7 @@ def test_a_rank_that_is_killed_before_the_others_meet_it(tmp_path):
 
 @pytest.mark.parametrize("harm", ["changed", slow("cut short"), slow("missing")])
 def test_a_damaged_part(tmp_path, whole, resumed, harm):
-    """All ranks take the previous checkpoint and name the damaged file."""
+    """All ranks load the previous checkpoint, and name the damaged file."""
     shutil.copytree(resumed, tmp_path / "run")
     part = network_files(tmp_path / "run")[1]
     data = bytearray(part.read_bytes())
@@ -183,7 +183,7 @@ def test_a_full_disk(tmp_path):
     ],
 )
 def test_settings_that_territories_do_not_support(tmp_path, more, said):
-    """One rank reports it at every start, whatever an earlier start has left in torchrun's store."""
+    """Exactly one rank reports the error at every start, also if torchrun's store has entries of an earlier start."""
     store = new_store()
     for restarts in range(1 + (more[0] == "--sampling")):
         args = command(tmp_path / "run", *more)
@@ -259,7 +259,7 @@ def test_photographs_have_a_robust_loss(tmp_path):
     for robust in (0.0, 0.05):
         town = build_some(tmp_path / str(robust), 1)
         for state in town.states.values():
-            assert state.ray_loss.robust == 0  # computed pictures
+            assert state.ray_loss.robust == 0  # the pictures are computed, not photographs
             state.ray_loss.robust = robust
         train.train(town)
         losses.append([state.loss for state in town.states.values()])
@@ -284,7 +284,7 @@ def test_one_territory_is_an_ordinary_training(tmp_path):
 
 
 def test_one_territory_of_photographs_is_an_ordinary_training(tmp_path):
-    """A single territory trains as without territories, bit for bit, with sparse points and unseen rays."""
+    """A single territory equals a training without territories, bit for bit, with sparse points and unseen rays."""
     computed, points = builtin_scene(16, train_views=9, test_views=1), SparseDepth(torch.arange(60), torch.ones(60))
     views = replace(computed.train, images=computed.train.images[..., :3].contiguous(), sparse_depth=points)
     scene = replace(computed, train=views, box=None, background=None, kind="unbounded")

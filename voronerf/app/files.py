@@ -16,7 +16,7 @@ from typing import Any
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Writes a file atomically: after a crash, and for any reader, it has either the old or the new content.
+    """Writes a file atomically: at any time, and after a crash, it has either the old or the new content.
 
     Raises:
         OSError: When the disk is full or the folder cannot be written; the error names the file, and the old content
@@ -56,7 +56,8 @@ def locked(folder: Path, busy: Callable[[], None]) -> Iterator[None]:
 
     Args:
         folder: An existing folder.
-        busy: Function that is called if another process holds the lock; unless it raises an error, the lock is awaited.
+        busy: Function that is called if another process holds the lock. Unless this function raises an error, the lock
+            is awaited.
     """
     if sys.platform == "win32":
         yield
@@ -78,7 +79,7 @@ def locked(folder: Path, busy: Callable[[], None]) -> Iterator[None]:
 
 
 def leads_outside(path: Path, folder: Path) -> bool:
-    """Returns whether a path leaves a folder, by its text (``..``, another root) or through a link."""
+    """Returns whether a path leads out of a folder, by its text (``..``, another root) or through a link."""
     return any(not Path(full(path)).is_relative_to(full(folder)) for full in (os.path.abspath, os.path.realpath))
 
 

@@ -198,8 +198,9 @@ def open_run(
     Args:
         path: The run directory.
         scene: The scene, if it is loaded already.
-        data: Scene folder; None for the folder of the training. Since a run may be another person's, this folder must
-            lie in the run directory, the working directory or ``VORONERF_DATA``, unless the user has named it before.
+        data: Scene folder; None for the folder of the training. Since a run may be another person's, the folder of the
+            training must lie in the run directory, the working directory or ``VORONERF_DATA``, unless the user has
+            named it before.
         downscale: Downscale factor of the images; None for the factor of the training.
         allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray of each pass; None for the numbers of the training.
@@ -210,8 +211,8 @@ def open_run(
 
     Raises:
         CheckpointError: If there is no usable checkpoint.
-        ConfigError: For an unusable argument, occupancy for a run that cannot use a grid, a scene folder that must be
-            given, or a subfolder of the run that is a link out of it.
+        ConfigError: If an argument is unusable, the run cannot use a grid for ``occupancy``, the scene folder must be
+            given, or a subfolder of the run is a link out of the run.
         SceneError: If the scene cannot be read.
 
     Examples:

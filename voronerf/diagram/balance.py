@@ -168,7 +168,7 @@ def balance(
 
 
 def first_centres(samples: Tensor, masses: Tensor, k: int, centres: str, generator: torch.Generator | None) -> Tensor:
-    """Draws initial centres, float32 [k, d], from CPU samples float32 [m, d]; masses [m] weight centroidal ones."""
+    """Draws initial centres, float32 [k, d], from CPU samples float32 [m, d], by masses [m] if they are centroidal."""
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)
     if k > distinct.shape[0]:
         raise ValueError(f"balance: k must be at most the number of distinct points, {distinct.shape[0]}, got {k}")
@@ -245,10 +245,10 @@ def uniform_centres(box: Tensor, k: int) -> Tensor:
 def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
     """Moves centres to the centroids of their Voronoi cells, so that cells are compact.
 
-    Lloyd's iteration lowers the energy E = sum_j m_j min_i |x_j - v_i|^2 of samples x_j of mass m_j: samples go to the
-    nearest centre, and centres to the centroids of their samples (Du, Faber and Gunzburger 1999, section 5; with
-    masses, section 2). A centre without mass in its cell moves to the sample x_j that contributes most to the energy,
-    unless this contribution is 0.
+    Lloyd's iteration lowers the energy E = sum_j m_j min_i |x_j - v_i|^2 of samples x_j of mass m_j: each step assigns
+    samples to the nearest centre and moves centres to the centroids of their samples (Du, Faber and Gunzburger 1999,
+    section 5; with masses, section 2). A centre without mass in its cell moves to the sample x_j that contributes most
+    to the energy, unless this contribution is 0.
     """
     k = centres.shape[0]
     precise, energy = samples.double(), float("inf")

@@ -22,9 +22,9 @@ def draw_cell(
 ) -> Tensor:
     """Draws a leaf for every point at random, by its distances to the centres, level by level.
 
-    On each level, it draws the first centre at which the cumulative probability reaches 1 - u, where u is the point's
-    uniform number for the level. A point that is not finite, or whose squared distances overflow, goes to the first
-    centre on every level.
+    On each level, the function draws the first centre at which the cumulative probability reaches 1 - u, where u is the
+    point's uniform number for the level. A point that is not finite, or whose squared distances overflow, goes to the
+    first centre on every level.
 
     Args:
         points: float32 or float64 [n, d].
@@ -54,8 +54,9 @@ def draw_cell(
             nearest = distance.masked_fill(elsewhere, torch.inf).amin(1, keepdim=True)
             # Centres at a distance of infinity or NaN get mass 0.
             mass = ((nearest - distance) / temperature).exp().masked_fill(elsewhere, 0).nan_to_num(0.0)
-            # A device sums as a tree, with different rounding for each sum. A sum may be below the previous sum, and
-            # the last sum above the sum at the last centre with mass. So only centres with mass are candidates.
+            # A GPU computes cumulative sums as a tree, and rounds each one differently. A sum may be below the previous
+            # sum, and the last sum above the sum at the last centre with mass. So only centres with mass are
+            # candidates.
             sums = mass.cumsum(1).masked_fill(mass == 0, 0)
             total = sums.amax(1, keepdim=True)
             drawn = (sums >= wanted[:, level, None] * total).to(torch.uint8).argmax(1)

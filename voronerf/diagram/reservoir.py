@@ -73,9 +73,9 @@ class SampleReservoir:
 
         Args:
             points: floating [..., d], scene units.
-            importance: floating [...]; any scale, since only ratios count. With ``error``, the weights w, each of which
-                is multiplied by the error of its ray.
-            error: floating [r], the error E of each ray; None for 1.
+            importance: floating [...]; any scale, since only ratios count. If ``error`` is given, these are the weights
+                w, and each is multiplied by the error of its sample's ray.
+            error: floating [r], the error E of each ray; None counts as 1.
             ray_index: int32 [m], the ray of each of m samples; required with ``error``.
             backend: the backend of the op.
 

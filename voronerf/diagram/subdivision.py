@@ -65,8 +65,8 @@ def split_diagram(
         min_samples: the number of distinct samples that a cell needs to be split.
         centres: "centroidal", "balanced", "random" or "uniform", see `balance`. Uniform centres may lie outside of
             their cell and have no samples. "random" and "uniform" are ablations of the paper.
-        generator: the CPU generator for all random draws; None for torch's global generator. Cells use it in ascending
-            order.
+        generator: the CPU generator for all random draws; None for torch's global generator. Draws are made cell by
+            cell, in ascending order.
         backend: the backend of the cell queries, see `voronerf.ops._core.backends`.
         steps: the number of steps of `balance`.
 

@@ -41,7 +41,8 @@ class VoronoiDiagram(nn.Module):
     Attributes:
         centres: float32 [m, d], the centres of all diagrams, diagram after diagram; diagram 0 is the root.
         child_offsets: int32 [g + 1]; diagram j owns rows `child_offsets[j] : child_offsets[j + 1]` of `centres`.
-        child: int32 [m]; if c >= 0, diagram c refines the centre; if c < 0, the centre is leaf number `-c - 1`.
+        child: int32 [m], an entry c for each centre; if c >= 0, diagram c refines the centre; if c < 0, the centre is
+            leaf number `-c - 1`.
         depth: the number of levels; 1 for a flat diagram.
         num_cells: the number of leaves.
 
@@ -287,7 +288,7 @@ class VoronoiDiagram(nn.Module):
             points: floating [..., d]; compared in float32.
             temperature: the temperature in scene units, >= 0.
             generator: a generator on any device; its numbers are moved to the device of `points`. None for torch's
-                global one.
+                global generator.
             backend: see `voronerf.ops._core.backends`.
 
         Returns:
@@ -431,7 +432,7 @@ class VoronoiDiagram(nn.Module):
 
 
 def _is_unchanged(seen: Tensor, centres: Tensor) -> bool:
-    """Returns whether centres are as an index has seen them; compares values or, on a GPU, addresses."""
+    """Returns whether centres are unchanged since an index was made; compares values or, on a GPU, addresses."""
     if seen.device != centres.device or seen.shape != centres.shape:
         return False
     native = backends.compiled()

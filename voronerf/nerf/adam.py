@@ -19,7 +19,7 @@ from voronerf.ops.adam import Guard, Rule, adam, average
 from voronerf.router import VoronoiRouter
 from voronerf.router.optimizers import trained_parts
 
-#: The largest averaging window as a fraction of the steps done; weights move far in the first steps.
+#: The largest averaging window as a fraction of the steps done: short windows at first, when weights change fast.
 WINDOW = 1 / 30
 #: The weight decay of tables, which removes unread entries such as early noise in empty space. With more than
 #: `DECAY_VIEWS` views, the decay is divided by views / `DECAY_VIEWS`, since a point is then sampled less often.
@@ -36,15 +36,15 @@ class Adam(torch.optim.Adam):
     state has the same keys as in torch. One op updates all parameters, which must be float32 and contiguous: for
     networks of this size, torch's own step takes longer to prepare than to compute.
 
-    The state also holds averages of the weights over the last steps (``average``), for pictures and scores. They reduce
-    noise: each cell gets few samples of a batch, so its weights fluctuate.
+    The state also holds averages of the weights over the last steps (``average``), for pictures and scores. Averages
+    reduce noise: each cell gets few samples of a batch, so its weights fluctuate.
 
     Args:
         params: Parameters or groups of them, as ``torch.optim.Adam`` takes them.
         lr: The learning rate.
-        betas: Decay rates of the first and second moments. After a split each cell gets fewer samples and other
-            gradients than its parent; with torch's 0.999 the parent's moments would set the cell's step sizes for a
-            thousand steps. The default gains 0.7 dB after 800 steps of Lego at 100 x 100.
+        betas: Decay rates of the first and second moments. After a split, each cell gets fewer samples and other
+            gradients than its parent. With torch's 0.999, the moments of the parent would determine the step sizes of
+            the cell for a thousand steps. The default gains 0.7 dB after 800 steps of Lego at 100 x 100.
         eps: The constant that is added to the root of the second moment.
         average: Decay per step of the averaged weights, smaller in the first steps; 0 for no averages.
         backend: The backend of the ops.
@@ -114,7 +114,7 @@ class Adam(torch.optim.Adam):
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Clears the gradients like ``torch.optim.Adam``.
 
-        Unlike torch, it makes no profiler record, which would take as long as evaluating a small layer.
+        Unlike torch's method, it makes no profiler record, since a record takes as long as evaluating a small layer.
         """
         if not set_to_none:
             inspect.unwrap(torch.optim.Adam.zero_grad)(self, False)
@@ -153,7 +153,8 @@ class Adam(torch.optim.Adam):
     def after_step(self, step: int) -> None:
         """Applies weight decay and updates the averages of the weights after each `GROUP` of steps.
 
-        Weights change little within a group, and a large table takes time to read.
+        Once per group suffices, since weights change little within a group; reading a large table in each step would
+        take time.
 
         The decay is decoupled from the gradients (Loshchilov and Hutter 2019): weights are multiplied by 1 - lr * RATE
         for each step. Parameters without a gradient and frozen cells do not decay. The decay of an average per step is
@@ -202,7 +203,7 @@ class Adam(torch.optim.Adam):
 
     @contextmanager
     def averaged(self) -> Iterator[None]:
-        """Replaces the weights by their averages within the context; weights without an average stay."""
+        """Replaces the weights by their averages within the context; weights without an average do not change."""
         parameters = [p for group in self.param_groups for p in group["params"] if _AVERAGE in self.state.get(p, {})]
         weights = [parameter.data for parameter in parameters]
         for parameter in parameters:
@@ -215,7 +216,7 @@ class Adam(torch.optim.Adam):
 
     @torch.no_grad()
     def update(self, guard: Guard | None = None, loss: Tensor | None = None) -> None:
-        """Updates the parameters like :meth:`step`, but skips hooks, since they take as long as a small layer.
+        """Updates the parameters like :meth:`step`, but without torch's hooks, which take as long as a small layer.
 
         Args:
             guard: NaN guard, which may skip the step, see :func:`voronerf.ops.adam`; None for no guard.

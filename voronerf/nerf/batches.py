@@ -57,7 +57,7 @@ class RaySource(Protocol):
 
 @replayed
 class RayBatches:
-    """A source of random rays through pixels of pictures; all its rays meet the box of the scene.
+    """A source of random rays through pixels of pictures; all these rays meet the box of the scene.
 
     The networks learn nothing from a ray that misses the box, since its pixel shows the background. Masked pixels are
     not drawn either. All other pixels are equally likely.
@@ -70,17 +70,16 @@ class RayBatches:
         box: [2, 3], the box of the scene; None for no box.
         background: [3], the colour behind the scene; None for black.
         random_background: Whether to draw a background colour for each ray, for images with alpha and for photographs
-            without a background. A translucent surface then never has the right colour, so surfaces become opaque.
-        masks: bool [c, h, w], False for pixels that are not drawn; None for no masks.
+            without a background. A translucent surface then never has the right colour, so surfaces learn to be opaque.
+        masks: bool [c, h, w], False for pixels that are never drawn; None for no masks.
         sparse: The pixels that show points of a sparse model (int64 [s], flat indices over all images), and the
             distances of the points (float32 [s]). The fraction `SPARSE` of the rays is drawn from these pixels. None
             for no sparse model.
         unseen: The largest offset of an unseen ray's origin from its camera, along each axis; 0 for no unseen rays. A
-            batch ends with `UNSEEN` triples of neighbouring unseen rays for each of its other rays. Not allowed with a
-            box.
+            batch of n other rays ends with n * `UNSEEN` triples of neighbouring unseen rays. Must be 0 with a box.
         views: int64, the indices of the pictures to draw from; None for all.
         cones: Whether the rays have radii.
-        fetch: Function for images on disk; it gets the pixels int64 [r] of a batch before they are read.
+        fetch: Function that is called with the pixels, int64 [r], of a batch before they are read; for images on disk.
         device: The device of the batches; None for the device of the images.
         backend: The backend of the ops.
 

@@ -33,9 +33,9 @@ __all__ = [
     "turntable_cameras",
 ]
 
-#: Cameras count as standing around an object up to this median of `axis_misses`: 24 degrees, which is inside the
-#: pictures of most lenses. The median is 0.06 to 0.13 for captures around an object, 0.22 for captures aimed 12 degrees
-#: off, and below 0.4 for 1 % of random walks.
+#: Cameras count as standing around an object if the median of their `axis_misses` is at most this value. It corresponds
+#: to 24 degrees, an angle inside the pictures of most lenses. The median is 0.06 to 0.13 for captures around an object,
+#: 0.22 for captures aimed 12 degrees off, and below 0.4 for 1 % of random walks.
 AROUND = 0.4
 
 
@@ -268,7 +268,7 @@ class Cameras:
     def downscaled(self, factor: int) -> Cameras:
         """Returns the cameras of the images averaged over blocks of `factor` x `factor` pixels.
 
-        Incomplete blocks at the right and at the bottom are dropped, so that focal lengths and the principal point are
+        Incomplete blocks at the right and at the bottom are dropped. So focal lengths and the principal point are
         divided by exactly `factor`.
 
         Raises:
@@ -431,17 +431,17 @@ def axis_misses(cameras: Cameras, point: Tensor) -> Tensor:
 def shared_focus(cameras: Cameras) -> Tensor | None:
     """Returns the `focus_point` [3] of cameras that stand around an object, or None for other cameras.
 
-    If a person walks and looks around, the focus point lies ahead of most cameras by chance, but few cameras look at
-    it.
+    For cameras of a person who walks and looks around, the focus point lies ahead of most cameras by chance, but few
+    cameras look at it.
     """
     focus = focus_point(cameras)
     return focus if focus is not None and float(axis_misses(cameras, focus).median()) < AROUND else None
 
 
 def look_at(origins: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """Returns the poses [c, 4, 4] of cameras at `origins` [c, 3] that look at `target` [3], with `up` [3] upwards.
+    """Returns the poses [c, 4, 4] of cameras at `origins` [c, 3] that look at `target` [3]; `up` [3] points upwards.
 
-    A camera that looks along `up` uses another axis instead.
+    For a camera that looks along `up`, another axis replaces `up`.
     """
     back = torch.nn.functional.normalize(origins - target, dim=-1)
     along = torch.cross(up.expand_as(back), back, dim=-1)
@@ -500,7 +500,7 @@ def orbit_cameras(
 
 
 def turntable_cameras(cameras: Cameras, count: int) -> Cameras:
-    """Returns an orbit around the focus of cameras, at their mean distance, elevation and focal length.
+    """Returns an orbit around the cameras' focus, with the cameras' mean distance, elevation and focal length.
 
     The pictures have the size of the first camera's picture.
 

@@ -18,7 +18,7 @@ class Contraction:
     """The map ``c + R f((x - c) / R)`` with ``f(x) = x`` up to length 1 and ``(2 - 1 / |x|) x / |x|`` beyond.
 
     Attributes:
-        centre: [3], c, best on the device of the points: otherwise each call copies it.
+        centre: [3], c, preferably on the device of the points, since each call copies it otherwise.
         radius: R > 0, in world units.
 
     Raises:
@@ -59,7 +59,7 @@ class Contraction:
         return centre + self.radius * offset * torch.where(length > 1, far, 1)
 
     def stretch(self, points: Tensor) -> Tensor:
-        """Returns [...], the world length of a unit of contracted length at points [..., 3]; at most 1,000,000.
+        """Returns [...], world length per contracted length at contracted points [..., 3]; at most 1,000,000.
 
         Lengths are along rays from the centre.
         """
@@ -145,7 +145,7 @@ class Perspective:
         return torch.cat((across, depth), dim=-1) @ self.axes.to(points) + self.centre.to(points)
 
     def stretch(self, points: Tensor) -> Tensor:
-        """Returns [...], the world depth of a unit of contracted depth at points [..., 3]; at most 2,000,000 near."""
+        """Returns [...], world depth per contracted depth at contracted points [..., 3]; at most 2,000,000 near."""
         return 2 * self.near / (1 - points[..., 2]).clamp_min(1e-3).square()
 
     @property

@@ -40,11 +40,11 @@ class RayLoss:
     Args:
         renderer: The networks and the sampler.
         terms: Further terms of the loss: a :class:`Term`, such as :class:`SparseDepth` or :class:`Surface`, or a
-            function of :class:`Seen` rays and their :class:`Batch` that returns a scalar, which torch differentiates.
-            Its gradients go only to the networks. A term gets all rays; the last ``3 * batch.unseen`` have no target
-            colour.
+            function of :class:`Seen` rays and their :class:`Batch` that returns a scalar. Torch differentiates this
+            function, with gradients for the networks alone. A term gets all rays; the last ``3 * batch.unseen`` have no
+            target colour.
         robust: The scale of errors above which the loss is linear instead of squared; see `voronerf.ops.render_loss`.
-            Differences between pictures, such as exposure, then cause less fog. 0 for the squared error.
+            With a robust loss, differences between pictures, such as exposure, cause less fog. 0 for the squared error.
 
     Examples:
         >>> import torch
@@ -81,7 +81,7 @@ class RayLoss:
         Args:
             batch: The rays.
             generator: Random generator of the samples.
-            backward: Whether to add the gradients to ``grad`` of the parameters at once, which is faster than
+            backward: Whether this call itself adds the gradients to ``grad`` of the parameters, which is faster than
                 ``loss.backward()``; the returned loss then has no gradient.
 
         Raises:
@@ -224,7 +224,7 @@ class RayLoss:
         return run_backward(loss, defer)
 
     def explain(self) -> str:
-        """Describes how a step is computed, and what keeps it from being faster, in a few lines."""
+        """Describes in a few lines how a step is computed, and what prevents a faster way."""
         renderer = self.renderer
         lines = [f"samples: {renderer.sampler.explain()}"]
         if (obstacle := self.why_not_fused()) is not None:

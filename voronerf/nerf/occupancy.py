@@ -4,7 +4,7 @@ x, y, z voxels along the axes of the grid, q voxels to update, r rays, s strata 
 With a contraction, the densities that a grid stores are per unit of contracted space, so a far and a near voxel that
 absorb the same light have the same density.
 Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (voxels keep the largest recent density,
-which decays). This project adds updates from the samples of a batch, and empties hidden voxels.
+which decays). This project adds updates from the samples of a batch, and marks hidden voxels as empty.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
 OPACITY = 0.02
 #: A voxel of contracted space is empty if the whole voxel has less than this opacity.
 CONTRACTED_OPACITY = 0.1
-#: The number of consecutive empty samples that empty a new voxel. 8 samples take about thirty steps; in this time the
-#: field learns something about most voxels. In contracted space fewer are better: occupied voxels in front of the
-#: cameras keep fog that explains one view and spoils the others.
+#: The number of consecutive samples of negligible density after which a new voxel counts as empty. 8 samples take about
+#: thirty steps; in this time the field learns something about most voxels. In contracted space fewer samples are
+#: better: occupied voxels in front of the cameras keep fog that explains one view and spoils the others.
 PATIENCE, CONTRACTED_PATIENCE = 8, 4
 #: The factor by which each sample of a training batch reduces the stored density of its voxel.
 DECAY = 0.8
@@ -59,7 +59,7 @@ class OccupancyGrid:
         density: float32 [x, y, z], the stored density of each voxel.
         occupied: bool [x, y, z], density >= threshold.
         threshold: The minimum density of an occupied voxel, in the unit of `density`.
-        contraction: The contraction of the space of the box, or None.
+        contraction: The contraction that maps world space to the space of the box, or None.
 
     Examples:
         >>> import torch
@@ -90,9 +90,10 @@ class OccupancyGrid:
             box: [2, 3], the lowest and the highest corner.
             resolution: The number of voxels along each axis, one number for all axes or three numbers.
             threshold: The minimum density of an occupied voxel, in the unit of `density`, > 0 and finite.
-            remembered: The density of a new voxel, in thresholds, >= 1. A larger density takes more empty samples to
-                empty the voxel.
-            contraction: The contraction of the space of box and positions, or None. Rays stay in world coordinates.
+            remembered: The density of a new voxel, in thresholds, >= 1. With a larger density, the voxel counts as
+                empty only after more samples of negligible density.
+            contraction: The contraction that maps world space to the space of the box and of positions, or None. Rays
+                are in world coordinates.
             device: The device of the grid; None for the device of the box.
         """
         shape = (resolution,) * 3 if isinstance(resolution, int) else tuple(resolution)
@@ -158,7 +159,7 @@ class OccupancyGrid:
 
     @property
     def share(self) -> float:
-        """The fraction of occupied voxels, 0..1. The host waits for the device."""
+        """The fraction of occupied voxels, 0..1. Reading it makes the host wait for the device."""
         return float(self.occupied.float().mean())
 
     def points(self, voxels: Tensor, uniforms: Tensor | None = None) -> Tensor:
@@ -173,7 +174,8 @@ class OccupancyGrid:
         """
         shape = torch.tensor(self.occupied.shape, dtype=torch.float32, device=self.box.device)
         _, y, z = self.occupied.shape
-        # Computed in float64, since torch divides integers slowly, and axis by axis, since rows of three are slow.
+        # Computed in float64, since torch divides integers slowly, and axis by axis, since operations on [q, 3] are
+        # slow.
         voxels = voxels.double()
         line = (voxels / z).floor()
         plane = (line / y).floor()
@@ -245,9 +247,9 @@ class OccupancyGrid:
     ) -> None:
         """Updates voxels, in place, from samples that were already rendered.
 
-        If at most the fraction `HIDDEN` of the ray's light reaches a sample, its density counts as 0. The inside of an
-        opaque object thus becomes empty, which changes no picture. The voxel of a surface is emptied too if few rays
-        through it see the surface, until `update` evaluates it again.
+        If at most the fraction `HIDDEN` of the ray's light reaches a sample, its density counts as 0. So voxels inside
+        an opaque object become empty, which changes no picture. A voxel with a surface becomes empty too if few rays
+        through the voxel see the surface; `update` can restore it.
 
         Args:
             positions: float32 [m, 3] in the box; a position outside counts for the nearest voxel at the border.
@@ -268,10 +270,11 @@ class OccupancyGrid:
 
     @torch.no_grad()
     def fill_holes(self, field: Field, *, generator: torch.Generator | None = None) -> None:
-        """Fills holes in surfaces: occupies empty voxels in which a field is dense and many neighbours are occupied.
+        """Fills holes in surfaces: marks empty voxels with a dense field and many occupied neighbours as occupied.
 
-        Call it after the training, since filled voxels would cost samples in every step. Where no ray samples the
-        field, it can be dense by chance, so voxels without enough occupied neighbours, or with thin points, stay empty.
+        Call it after the training, since filled voxels would cost samples in every step. The field can be dense by
+        chance where no ray samples it. So a voxel with few occupied neighbours, or with a point of low density, stays
+        empty.
 
         Args:
             field: The trained field, which is called without gradients.
@@ -293,7 +296,7 @@ class OccupancyGrid:
         self.occupied.view(-1)[holes] = True
 
     def drop_specks(self) -> None:
-        """Empties isolated groups of one or two occupied voxels, which look like dust in pictures."""
+        """Marks isolated groups of one or two occupied voxels as empty; they look like dust in pictures."""
         neighbours = (self._neighbours() * self.occupied)[None]
         most = torch.nn.functional.max_pool3d(neighbours, 3, 1, 1)[0]
         specks = self.occupied & (most <= 2)
@@ -319,7 +322,7 @@ class OccupancyGrid:
         return march_rays(*arguments, contraction=self._numbers, **rule)
 
     def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaysSeen:
-        """Renders rays from networks in occupied voxels; for the options see `voronerf.ops.render_opaque`."""
+        """Renders rays by evaluating networks in occupied voxels; for the options see `voronerf.ops.render_opaque`."""
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return render_opaque(*arguments, contraction=self._numbers, **rule)
 
@@ -349,7 +352,7 @@ class OccupancyGrid:
         contraction: Contraction | Perspective | None = None,
         device: torch.device | str = "cpu",
     ) -> OccupancyGrid:
-        """Returns a grid from its `state_dict`, and from its contraction, which the state does not hold.
+        """Returns a grid from its `state_dict` and its contraction, which is not part of the state.
 
         Raises:
             ValueError: An entry is missing or has a wrong shape.

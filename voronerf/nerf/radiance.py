@@ -25,8 +25,8 @@ class Networks(NamedTuple):
     Attributes:
         program: The program from positions [n, 3], or Gaussians [n, 6], and, if used, directions [r, 3] of the rays, to
             one output [n, 4] of colour and density.
-        density_scale: The factor on the softplus of the density, if the output is before the sigmoid of the colour and
-            the softplus of the density; None if the output is after all activations.
+        density_scale: The factor on the density's softplus, if the program ends before the sigmoid of the colour and
+            the softplus of the density; None if the program includes all activations.
         density: The program from positions to the activated density [n, 1]; None if it uses directions.
     """
 
@@ -75,7 +75,7 @@ def radiance_of(field: Field, samples: tuple[Tensor, Tensor] | None = None, *, i
     Args:
         field: A router, or a router in a `DirectionPerSample`.
         samples: Positions [n, 3] or Gaussians [n, 6], and directions [n, 3], with which an untraced module is traced;
-            None for no trace.
+            None to trace nothing.
         inputs: The number of columns of positions or Gaussians.
     """
     router = router_of(field)
@@ -90,7 +90,7 @@ def radiance_of(field: Field, samples: tuple[Tensor, Tensor] | None = None, *, i
 
 
 def router_of(field: Field) -> VoronoiRouter | None:
-    """Returns the router of a field: the field itself, or its network in a `DirectionPerSample`; None if none."""
+    """Returns the router of a field: the field itself, or its network in a `DirectionPerSample`; else None."""
     inner = field.network if isinstance(field, DirectionPerSample) else field
     return inner if isinstance(inner, VoronoiRouter) else None
 

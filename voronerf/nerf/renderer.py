@@ -27,8 +27,8 @@ class RenderedImage(NamedTuple):
         colour: [h, w, 3], the background included.
         opacity: [h, w], 0..1.
         depth: [h, w], as in `Rendered`.
-        heaviest: [h, w, 3], the position of the sample with the largest weight, whose cell the pixel shows. For a ray
-            without samples (opacity 0) it is the far end.
+        heaviest: [h, w, 3], the position of the sample with the largest weight; pictures of cells show the cell of this
+            sample. For a ray without samples (opacity 0), the far end of the ray.
 
     Examples:
         >>> import torch
@@ -88,7 +88,7 @@ class Renderer:
 
     @property
     def occupancy(self) -> OccupancyGrid | None:
-        """The occupancy grid of the sampler; None if it skips no space."""
+        """The occupancy grid of the sampler; None if the sampler skips no space."""
         return self.sampler.grid
 
     @property
@@ -190,7 +190,7 @@ class Renderer:
             background: [3], the colour behind the scene; None is black.
             heaviest: Whether to find the samples with the largest weights; else `heaviest` of the result is undefined.
             chunk: The number of rays rendered at a time, which bounds the memory. Default 4,096; 131,072 with a grid,
-                since its rays have few samples.
+                since rays then have few samples.
         """
         if chunk is None:
             chunk = 4096 if self.occupancy is None else 131_072
@@ -242,7 +242,7 @@ def render_rays(
         far: End of the integral, [r] or one for all. A ray with far == near gets the background.
         samples: s, the number of strata with one sample each; or a sampler, such as `Occupancy`.
         background: [3] or [r, 3], the colour behind the scene; None is black.
-        jitter: Whether samples are at random positions in their strata, else in the middles.
+        jitter: Whether samples are at random positions in their strata instead of the middles.
         generator: Random generator of the jitter.
 
     Examples:

@@ -39,7 +39,7 @@ from voronerf.ops.resample import resample
 
 #: The weight of the first pass in the loss if one network serves two passes (mip-NeRF, section 3.2).
 COARSE_SHARE = 0.1
-#: The divisor of the number of strata while an occupancy grid settles.
+#: The number of strata is divided by this while an occupancy grid settles.
 SETTLING_PART = 4
 #: The number of first steps in which the grid of a contracted sphere learns nothing; for other grids, `WARMUP_STEPS`.
 #: An untrained field is thin everywhere: the grid would take it for empty, and emptied voxels learn no more. The more
@@ -71,7 +71,7 @@ RenderPass = Callable[[str, Samples], Rendered]
 
 @replayed
 class Sampler:
-    """A rule that chooses the sample points of rays, and may learn from the steps of a training.
+    """A rule that chooses the sample points of rays; it may learn from the steps of a training.
 
     A subclass defines :meth:`sample`. A subclass with several passes also defines :meth:`draw` and
     :meth:`loss_before`. A subclass that learns defines :meth:`step_pre_backward` and :meth:`step_post_backward`. A
@@ -296,9 +296,9 @@ class Occupancy(Sampler):
 
     Args:
         grid: The occupancy grid, in contracted space if there is a contraction. It can be replaced at any time.
-        samples: s, strata of a ray.
-        picture_samples: Strata of a ray of a picture; None for `PICTURE_SAMPLES` times ``samples``. Since rays of a
-            picture end at the first surface, additional strata cost little.
+        samples: s, the number of strata per ray.
+        picture_samples: The number of strata per ray in pictures; None for `PICTURE_SAMPLES` times ``samples``. Since
+            rays of a picture end at the first surface, additional strata cost little.
         space: The coordinates in which rays are sampled and the field is evaluated.
         empty: bool [v], voxels that stay empty in a training; None for none.
         backend: The backend of the ops.
@@ -354,7 +354,7 @@ class Occupancy(Sampler):
 
     @property
     def strata(self) -> int:
-        """The strata of a ray in a training step: `samples`, or a fraction of this number while the grid settles."""
+        """The number of strata per ray in a training step: `samples`, or a fraction of it while the grid settles."""
         return max(1, self.samples // SETTLING_PART) if self.settling else self.samples
 
     def explain(self) -> str:
@@ -442,7 +442,7 @@ class Occupancy(Sampler):
             self.grid.revisit(field, fixed_count(count), seed, fixed=self.empty, backend=self.backend)
 
     def asks_at(self, step: int) -> bool:
-        """Returns True before each `GROUP` of steps after settling; see :meth:`Sampler.asks_at`."""
+        """Returns True before each `GROUP` of steps once the grid has settled; see :meth:`Sampler.asks_at`."""
         return step >= self.settling_steps and step % schedule.GROUP == 0
 
     def steps_alike(self, step: int) -> int:
@@ -458,7 +458,7 @@ class Occupancy(Sampler):
             self.grid.observe(*values, decay=DECAY, fixed=self.empty, backend=self.backend)
 
     def finish(self, field: Field, seed: int) -> None:
-        """Removes specks from the grid of a box, and fills holes in surfaces of a contracted sphere.
+        """Removes specks from a grid of a box; fills holes in surfaces in a grid of a contracted sphere.
 
         See `OccupancyGrid.drop_specks` and `OccupancyGrid.fill_holes`. Other grids gain nothing from either method.
 
@@ -509,7 +509,7 @@ class Occupancy(Sampler):
             seed: int32 [1], the seed of random samples; None for the middles of the strata.
             start: int32 [r], the first stratum of each ray; None for 0.
             most: The maximum number of samples per ray; None for no limit.
-            picture: Whether rays have ``picture_samples`` strata instead of ``strata``.
+            picture: Whether each ray has ``picture_samples`` strata instead of ``strata``.
         """
         samples = self.picture_samples if picture else self.strata
         options: dict[str, Any] = {"seed": seed, "start": start, "most": most, "backend": self.backend}
@@ -523,11 +523,11 @@ class Occupancy(Sampler):
 
 @replayed
 class Hierarchical(Stratified):
-    """A sampler with two passes; the first pass gives the weights that the second draws from.
+    """A sampler with two passes; the second pass draws its samples by the weights of the first pass.
 
-    Source: NeRF, section 5.2; mip-NeRF, section 3.2. For points, a network "coarse" renders the first pass, and the
-    second pass evaluates the points of both. For cones, "field" is evaluated twice, the second time in new intervals,
-    and the loss of the first pass counts a tenth.
+    Source: NeRF, section 5.2; mip-NeRF, section 3.2. For points, the network "coarse" renders the first pass, and
+    "field" renders the points of both passes. For cones, "field" renders both passes, the second one in new intervals,
+    and the loss of the first pass is multiplied by 0.1.
 
     Args:
         samples: s, the number of samples per ray in the first pass.
@@ -557,7 +557,7 @@ class Hierarchical(Stratified):
 
     @staticmethod
     def networks(cones: bool) -> tuple[str, ...]:
-        """Returns the names of the networks; a field of cones serves both passes."""
+        """Returns the names of the networks; with cones, one network renders both passes."""
         return ("field",) if cones else ("field", "coarse")
 
     def draw(

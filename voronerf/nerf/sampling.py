@@ -28,7 +28,7 @@ def stratified_depths(
             have to wait for the device. A ray with near == 0 gets finite depths, all 0 except for the far end.
         far: [r], the end of each ray, >= near.
         samples: s, >= 1.
-        jitter: Whether each sample is uniformly random in its stratum; else it is in the middle (for "disparity", the
+        jitter: Whether each sample is uniformly random in its stratum, instead of in the middle (for "disparity", the
             middle in disparity).
         spacing: "linear" for strata of equal length, or "disparity" for equal steps of 1 / distance, which are dense
             near the camera and suit scenes with a far background.
@@ -83,8 +83,8 @@ def stratified_edges(
         near: [r], the start of each ray, as for `stratified_depths`.
         far: [r], the end of each ray.
         samples: s, >= 1.
-        jitter: Whether each inner edge is uniformly random between the middles of its two strata; else the edges are
-            evenly spaced.
+        jitter: Whether each inner edge is uniformly random between the middles of its two strata, instead of evenly
+            spaced.
         spacing: "linear" or "disparity".
         generator: Random generator of the jitter, on any device.
 
@@ -120,9 +120,9 @@ def strata_uniforms(
 
 
 def blurred_weights(weights: Tensor) -> Tensor:
-    """Returns weights [r, s] to draw from: maximum of two neighbours, blurred, plus a constant (mip-NeRF, equation 18).
+    """Returns weights [r, s] to draw from: blurred maxima of two neighbours, plus a constant (mip-NeRF, equation 18).
 
-    The result is an upper bound of the weights and wider on both sides, so a second pass also samples beside a surface.
+    The results are upper bounds of the weights, with wider peaks, so that a second pass also samples beside a surface.
     """
     wide = torch.nn.functional.pad(weights[:, None, :], (1, 1), mode="replicate")[:, 0]
     largest = torch.maximum(wide[:, :-1], wide[:, 1:])

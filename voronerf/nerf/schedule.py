@@ -31,8 +31,8 @@ def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0, b
         lr: The highest rate.
         fraction: The completed fraction of the training, 0..1.
         step: The number of steps done.
-        hold: The fraction of the training after which the rate falls; it reaches ``lr * FINAL`` at the end.
-        began: The step at which the training was restarted; 0 for never.
+        hold: The fraction of the training after which the rate falls; at the end, the rate is ``lr * FINAL``.
+        began: The step at which the training was restarted; 0 if it was not restarted.
     """
     warmup = max((step - began) / WARMUP_STEPS, 0.0 if began else fraction / WARMUP)
     factor = 0.01 + 0.99 * warmup if warmup < 1 else 1.0
@@ -47,7 +47,7 @@ def next_rays(now: int, taken: int, *, rays: int, samples: int, growth: float, c
         now: The number of rays of the last step.
         taken: The number of samples of the last step in occupied space.
         rays: The number of rays of the first step, which is the minimum.
-        samples: Strata of a ray of the last step.
+        samples: The number of strata per ray in the last step.
         growth: The maximum number of rays, as a multiple of ``rays``.
         contracted: Whether space is contracted.
     """

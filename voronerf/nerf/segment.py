@@ -104,7 +104,7 @@ class Stage(NamedTuple):
         function: Function from results of earlier stages to new results by name, or to None.
         reads: The names of the results that the function takes.
         python: Whether the function is called in each step; else it may be replayed.
-        lazy: Whether the function of a stage in Python gets recorded results, and itself takes their current rows.
+        lazy: Whether a function in Python gets the whole recorded tensors, and itself selects their current rows.
     """
 
     name: str
@@ -146,8 +146,9 @@ class Segment:
     Attributes:
         recording: The recorded calls; None if there is no recording.
         replayed: Whether the last call was replayed.
-        obstacle: The reason why the last recording cannot be replayed; "" for none.
-        eager_calls: The number of upcoming calls that run eagerly: the back-off after recordings without a replay.
+        obstacle: The reason why the last recording cannot be replayed; "" if it can.
+        eager_calls: The number of upcoming calls that run eagerly, as a back-off after recordings that could not be
+            replayed.
 
     Examples:
         >>> import torch
@@ -180,7 +181,7 @@ class Segment:
             arguments: Results of other segments (`SegmentResult`), which are read in place; row counts; or tensors in
                 tuples, dictionaries and dataclasses, which are copied. The numbers of rows may change from call to
                 call.
-            times: The number of replays in a row; without a replay the function is called once.
+            times: The number of replays in a row; if there is no recording, the function is called once.
         """
         tensors, key = _flatten(arguments)
         self._numbers = [each for each in arguments if type(each) is int]

@@ -59,9 +59,9 @@ def plan_splits(
     Args:
         cells: The number of children of a split, for each level.
         times: The time of each level, as ``PlannedSplit.at``; with ``max_cells`` the times of the first and the last
-            split. None for a single split at 0.2, or several splits evenly spaced from 0.15 to 0.5.
+            split. By default, a single split is at 0.2, and several splits are evenly spaced from 0.15 to 0.5.
         max_cells: The number of cells to reach by splitting the worst cell into ``cells[-1]`` at evenly spaced times
-            after the first split; the last split may have fewer children. None for no such splits.
+            after the first split; the last split may make fewer children. None for no such splits.
     """
     levels = len(cells) if max_cells is None else 2
     if times is None:
@@ -90,7 +90,7 @@ class SplitDone(NamedTuple):
     """The result of a split.
 
     Attributes:
-        split: The refined diagram, parents and balances; if there are no balances, no cell held enough samples.
+        split: The refined diagram, parents and balances. There are no balances if no cell held enough samples.
         points: [m, 3], the samples from which the new cells were computed.
         importance: [m], the importance of each sample.
     """
@@ -102,7 +102,7 @@ class SplitDone(NamedTuple):
 
 @replayed
 class Strategy:
-    """The base class of rules for splitting cells in a training; it never splits a cell.
+    """The base class of rules for splitting cells in a training; this class itself never splits a cell.
 
     Before each step the loop checks :meth:`is_due`. A loop that can postpone the split also checks :meth:`has_samples`.
     If a split is due, the loop calls :meth:`step_pre_backward`, the only hook that may change networks and optimiser.
@@ -188,7 +188,7 @@ class SplitStrategy(Strategy):
         routers: The routers by name, which are all split in the same way; "field" holds the diagram.
         plan: The splits to make.
         centres: The method that places the new centres, see `split_diagram`.
-        inherit: Whether new cells start as copies of their parent, else from random parameters.
+        inherit: Whether new cells start as copies of their parent instead of from random parameters.
         min_samples: A cell with fewer kept samples is not split further.
         reservoir: The number of samples to keep.
         batches: The number of latest batches from which samples are kept.
@@ -240,7 +240,7 @@ class SplitStrategy(Strategy):
 
     @property
     def planned(self) -> PlannedSplit | None:
-        """The next split; None after the last split, when no more samples are kept."""
+        """The next split; None after the last split, since samples are then no longer kept."""
         return self.plan[self.splits] if self.splits < len(self.plan) else None
 
     @property

@@ -65,7 +65,7 @@ class StepOutput:
 
     @property
     def samples(self) -> int:
-        """The number of samples of all rays; the host waits for the device."""
+        """The number of samples of all rays; reading it makes the host wait for the device."""
         rows, weights = self._output.samples.rows, self._output.weights
         if self._recording is not None:
             weights = self._recording.now(weights)
@@ -145,7 +145,7 @@ class TrainingStep:
         self.forget()
 
     def run_within(self, context: Callable[[], AbstractContextManager[None]]) -> None:
-        """Sets the context manager of the steps and stages that are not replayed.
+        """Sets the context manager in which steps and stages run if they are not replayed.
 
         Args:
             context: Function that returns a new context manager for each step or stage.
@@ -195,10 +195,10 @@ class TrainingStep:
         Args:
             rays: The number of rays of each step.
             steps: The number of steps, at least 1.
-            at: The number of steps done before, or None if the loop calls the hooks itself. If set, the step also calls
-                the sampler's ``step_pre_backward``, as often as ``steps_alike`` demands or, with user hooks, before
-                each step. It calls the optimiser's ``after_step`` after each multiple of `GROUP` steps. Both hooks are
-                recorded.
+            at: The number of steps done before, or None if the loop calls the hooks itself. With a number, the step
+                also calls the sampler's ``step_pre_backward``, as often as ``steps_alike`` demands or, with user hooks,
+                before each step. It calls the optimiser's ``after_step`` after each multiple of `GROUP` steps. Both
+                hooks are recorded.
 
         Returns:
             The result of the last step.
@@ -229,7 +229,7 @@ class TrainingStep:
     # Segments of a step that an outer loop runs, with host code in between --------------------------------------------
 
     def begin(self, at: int) -> None:
-        """Begins a step of segments that an outer loop runs, with host code in between.
+        """Begins a step whose segments are run by an outer loop, with host code in between.
 
         Calls the sampler's ``step_pre_backward``. The loop then calls :meth:`do` for each segment, and :meth:`end`.
 

@@ -27,7 +27,8 @@ class LossAlongRays(NamedTuple):
     Attributes:
         loss: [], the loss, to which terms add.
         gradient: [m, 4], the gradient with respect to ``raw``, to which terms add.
-        raw: [m, 4], the outputs of the networks: colour and density, before their activations or ``activated``.
+        raw: [m, 4], the outputs of the networks: colour and density, before their activations or, with the rule
+            ``activated``, after them.
         rule: The option that tells `voronerf.ops.render_loss` how to read ``raw``: ``density_scale`` or ``activated``.
         colour: [r, 3], the colours of the rays, background included.
         weights: [m], contributions of the samples to their rays.
@@ -73,8 +74,9 @@ class LossAlongRays(NamedTuple):
 class Term(Protocol):
     """A term of :class:`RayLoss` that computes its own gradient.
 
-    Each step calls it once, after the networks and the error of the colours, before the backward pass. Terms are called
-    in their order. A class that is `replayed` is recorded with the step; any other class is called in Python.
+    Each step calls it once, after the evaluation of the networks and the colour loss, and before the backward pass.
+    Terms are called in their order. A class that is `replayed` is recorded with the step; any other class is called in
+    Python.
 
     Examples:
         >>> import torch
@@ -185,7 +187,7 @@ class Surface:
 
 
 class Seen:
-    """The rendered rays for a term in torch. All attributes have gradients except ``samples``.
+    """The rendered rays, for a term that torch differentiates. All attributes except ``samples`` have gradients.
 
     The tensors belong to the step: they are valid until the next step, and must not be written to.
 

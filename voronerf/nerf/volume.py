@@ -31,8 +31,8 @@ class Samples(NamedTuple):
         depths: [m], the distances of the samples.
         deltas: [m], the lengths of the intervals that the samples stand for.
         edges: [r, s + 1], the ends of these intervals if all rays have s samples; else None.
-        rows: int32 [1] on the device, the number of samples that belong to rays, if the host does not know it; None if
-            all samples belong to rays.
+        rows: int32 [1] on the device, the number of leading samples that belong to rays, if the host does not know this
+            number; None if all samples belong to rays.
 
     Examples:
         >>> import torch
@@ -57,14 +57,14 @@ class Samples(NamedTuple):
         return self.inputs if self.inputs.shape[1] == 3 else self.inputs[:, :3]
 
     def counted(self) -> Samples:
-        """Returns only the rows that belong to rays; the host waits for their number."""
+        """Returns only the samples that belong to rays; the host waits for the number of these samples."""
         if self.rows is None:
             return self
         count = int(self.rows)
         return self._selected(lambda values: values[:count], self.ray_offsets)
 
     def part(self, rows: Tensor) -> Samples:
-        """Returns the samples that the mask `rows`, bool [m], selects; all rays stay."""
+        """Returns the samples that the mask `rows`, bool [m], selects; rays without samples stay in the batch."""
         counts = torch.nn.functional.pad(rows.cumsum(0, dtype=torch.int32), (1, 0))
         chosen = rows.nonzero()[:, 0]
         return self._selected(lambda values: values.index_select(0, chosen), counts.index_select(0, self.ray_offsets))
@@ -89,8 +89,8 @@ class Space:
         spacing: Spacing of the strata of a ray, "linear" or "disparity".
         cones: Whether the field is evaluated on Gaussians [m, 6] of cone frustums instead of points [m, 3].
         full_gradient: The distance below which the gradients of samples are scaled by (distance / full_gradient)^2;
-            None for no scaling. A camera samples the space close in front of it most densely. Without the scaling,
-            floaters would form there, each seen by one view only.
+            None for no scaling. Rays of a camera lie most densely close in front of it. Without scaling, floaters that
+            only one view sees would form close to the cameras.
 
     Examples:
         >>> from voronerf.nerf import Space, Stratified
@@ -156,7 +156,7 @@ class RayColours(NamedTuple):
         colour: [r, 3], the background included.
         opacity: [r], 0..1.
         depth: [r], as in `Rendered`.
-        heaviest: [r, 3], the position of the heaviest sample of each ray, or its far end if it has no samples.
+        heaviest: [r, 3], the position of the heaviest sample of each ray; the far end of a ray without samples.
 
     Examples:
         >>> import torch
@@ -241,7 +241,7 @@ class RenderOutput(NamedTuple):
 def evaluate_field(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tensor, Tensor]:
     """Returns colours [m, 3] and densities [m] of samples, in the dtype of the depths even under autocast.
 
-    Near the camera, the gradients of the results are scaled, see `Space.full_gradient`.
+    The gradients of samples near the camera are scaled, see `Space.full_gradient`.
     """
     outputs = field(samples.inputs, rays.directions, samples.ray_index)
     rgb, density = (values.to(samples.depths.dtype) for values in outputs)

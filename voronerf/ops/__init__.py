@@ -104,7 +104,7 @@ __all__ = [
 
 
 class _Package(ModuleType):
-    """The package of an op. The function of the same name hides it here, so its submodules are copied to the function.
+    """The package of an op. The function of the same name hides it here, so the function gets its submodules too.
 
     ``import voronerf.ops.adam.reference as reference`` looks up ``reference`` in the function ``voronerf.ops.adam``.
     """

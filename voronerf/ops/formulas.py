@@ -192,16 +192,16 @@ class Composed(NamedTuple):
 
     @property
     def front(self) -> Tensor:
-        """Returns [q], the light that arrives at each run."""
+        """Returns the transmittance in front of each run, [q]."""
         return torch.exp(-self.before)
 
     def behind(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
-        """Returns [q], the part of the loss due to light from behind each run, to first order.
+        """Returns the part of the loss that is due to light from behind each run, [q], to first order.
 
         Args:
             colour: [q, c], the colours of the runs.
             ray: int64 [q], the rays of the runs.
-            slopes: [r, c], the loss gradient of each ray's colour, background included.
+            slopes: [r, c], the gradient of the loss with respect to each ray's colour, background included.
             background: [r, c], the colours behind the rays.
         """
         table = slopes.new_zeros(len(slopes), self.width)

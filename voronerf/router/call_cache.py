@@ -54,7 +54,7 @@ class CachedCall:
     """The cached form of all calls of one kind, made from the first call and its plan.
 
     Attributes:
-        unchanged: A guard that tells whether the module has not changed since the first call.
+        unchanged: A guard that holds while the module is the same as in the first call.
     """
 
     unchanged: Any

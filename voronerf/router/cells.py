@@ -23,7 +23,7 @@ _OP = "VoronoiRouter"
 
 
 def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
-    """Returns a deep copy, even of a module that keeps results of its last call, which ``deepcopy`` refuses."""
+    """Returns a deep copy. Unlike ``deepcopy``, it accepts a module that keeps results of its last call."""
     memo = {} if memo is None else memo
     detach_results(module, memo)
     initial = dict(memo)
@@ -54,7 +54,7 @@ def _named(name: str, part: nn.Module) -> str:
 
 
 def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
-    """Adds to the memo of ``copy.deepcopy`` detached copies of the results that a module keeps."""
+    """Adds detached copies of the results that a module keeps to the memo of ``copy.deepcopy``."""
     for part in module.modules():
         for value in vars(part).values():
             if isinstance(value, Tensor) and not value.is_leaf:
@@ -79,7 +79,7 @@ def check_module(module: nn.Module) -> None:
 
 
 def _check_reach(module: nn.Module) -> None:
-    """Raises TypeError if code accesses parameters other than by name; cells replace them by name."""
+    """Raises TypeError if code accesses parameters other than by name, since calls replace parameters by name."""
     owner = {address: name for name, p in module.named_parameters() if (address := _address(p))}
     objects = {id(p): f"parameter `{name}`" for name, p in module.named_parameters()}
     objects |= {id(part): f"part `{name}`" if name else "module" for name, part in module.named_modules()}

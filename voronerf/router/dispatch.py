@@ -42,7 +42,7 @@ _PLANS = 256  # maximum number of kinds of calls with plans
 _TRACES = 8  # maximum number of traces for a kind of call; a module that changes more often runs grouped
 _TURNS, _SECONDS = 8, 0.08  # maximum number of timings of each way, time in seconds after which none begins
 _BEHIND = 1.5  # a loop that is slower than the fastest way by this factor is not timed again
-_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # losses that rule out the fused way, seconds between them, time ratio of a loss
+_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # lost timings that end the fused way, seconds between them, time ratio of a loss
 _EQUAL = 1.02  # times within this factor of the least count as equal; the plan's first such way is chosen
 _OF_DTYPES = re.compile("same dtype|expected scalar type|Input type")  # PyTorch's messages about dtypes
 _LIBRARY_FOLDERS = tuple(
@@ -162,7 +162,7 @@ class Dispatch:
 
     @staticmethod
     def _note_parts(guard: Any, module: nn.Module) -> None:
-        """Makes a guard check that a module has the same parameters and submodules."""
+        """Adds a module's parameters and submodules to the objects that a guard checks."""
         for part, name, _ in owned_parameters(module):
             guard.kind(part._parameters, name)
         for part in parts_of(module).values():

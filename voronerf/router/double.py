@@ -68,7 +68,7 @@ class Double:
             self._registries.append((twin, registry, set(registry)))
 
     def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any], mode: Any = None) -> Any:
-        """Runs a call with ``rows`` as arguments and with ``values``, found by parameter id, as parameters.
+        """Runs a call with ``rows`` as its arguments, and with ``values``, by parameter id, as its parameters.
 
         The ``mode`` is active only while the method runs.
 
@@ -118,7 +118,7 @@ class Double:
             part._buffers = {name: None if b is None else b.clone() for name, b in part._buffers.items()}
 
     def end(self) -> None:
-        """Removes the parameters, so that code fails if the backward pass runs it again."""
+        """Removes the parameters, so that the module's code fails if the backward pass runs it again."""
         for registry, _, _ in self._places:
             registry.clear()
 

@@ -45,7 +45,7 @@ class ParameterEntries:
         self._numbers = numbers.clone()  # a copy, because an inference tensor cannot be saved for a backward pass
 
     def constants(self) -> list[float] | None:
-        """Returns the entries as numbers if the source is a constant, or None."""
+        """Returns the entries as numbers if the source is a constant, else None."""
         values: list[float] | None = None
         if isinstance(self.of, Tensor):
             values = self.of.detach().flatten().cpu()[self._numbers].tolist()
@@ -79,7 +79,7 @@ class Segment:
 
 
 class WholeProgram(NamedTuple):
-    """A call as one program, the numbers of its arguments, and the shape and dtype of each result per sample."""
+    """A call as one program, the indices of the arguments it reads, and each result's shape and dtype per sample."""
 
     program: Program
     reads: tuple[int, ...]
@@ -89,8 +89,8 @@ class WholeProgram(NamedTuple):
 class Fused:
     """A call of the routed module as runs of programs with PyTorch functions between them.
 
-    The call is traced on rows of its arguments, for ``rows_for`` samples. Raises :class:`Unfusable` if nothing can be
-    fused, or if a step cannot be repeated for other samples.
+    The call is traced on rows of its arguments, for as many samples as ``rows_for`` returns. Raises :class:`Unfusable`
+    if nothing can be fused, or if a step cannot be repeated for other samples.
 
     Attributes:
         inputs: The numbers and buffers that are looked up in each call.
@@ -111,7 +111,7 @@ class Fused:
         self._differentiates = any(node.target is torch.autograd.grad for node in trace.graph.nodes)
         self._lowering = Lowering(trace.rows)
         self._entries: dict[fx.Node, Entries] = {}  # entries of each value that steps compute or move
-        self._ready: dict[fx.Node, int] = {}  # the first run that can read each value of PyTorch
+        self._ready: dict[fx.Node, int] = {}  # the first run that can read each value from PyTorch
         self._reasons: dict[fx.Node, str] = {}
         for node in trace.graph.nodes:
             self._add(node)
@@ -148,7 +148,7 @@ class Fused:
     # Cutting ----------------------------------------------------------------------------------------------------------
 
     def _add(self, node: fx.Node) -> None:
-        """Decides whether steps compute a node, or PyTorch does between runs."""
+        """Decides whether a node is computed by steps, or by PyTorch between runs."""
         if node.meta["on"] != SAMPLES or node.op == "placeholder" or isinstance(node.meta.get("value"), int):
             self._ready[node] = 0
             return
@@ -291,7 +291,7 @@ class Fused:
     # Running ----------------------------------------------------------------------------------------------------------
 
     def run(self, call: Call, grouping: Grouping) -> Results:
-        """Returns the method's results, unsorted if no function between runs needs rows sorted by cell."""
+        """Returns the method's results. The rows are sorted by cell only if a function between runs needs it."""
         sort = self._sorted or grouping.rows is not None or not call.layout.n
         call = self._with_inputs(call, grouping.device)
         rows, shared = call.arranged(grouping if sort else None), call.shared()
@@ -314,7 +314,7 @@ class Fused:
 
     @functools.cached_property
     def whole_program(self) -> WholeProgram | str:
-        """The call as one program on its unchanged arguments, or the reason why it is not one."""
+        """The call as one program on its unchanged arguments, or the reason why there is none."""
         if self.name != "fused":
             return self.why
         (run,) = self._runs.values()

@@ -21,7 +21,7 @@ SHARED = "_voronerf_shared"
 
 
 class Grouping:
-    """Entries of n samples in k cells, sorted by cell.
+    """n entries, each a sample in one of k cells, sorted by cell.
 
     Args:
         cells: The cell of each entry, int32 [n]; None for a single cell.
@@ -47,7 +47,7 @@ class Grouping:
             self._order, self.offsets = ops.cell_sort(cells, k, backend=backend)
 
     def anew(self) -> Grouping:
-        """Returns a grouping of the same entries, sorted again."""
+        """Returns a new grouping of the same entries, without cached results."""
         return Grouping(self.cells, self.n, self.k, self.device, self.backend, self.rows)
 
     @functools.cached_property

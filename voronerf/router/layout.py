@@ -238,7 +238,7 @@ class Call:
         return (self.module if self.method == "forward" else getattr(self.module, self.method))(*args, **kwargs)
 
     def changed(self, change: Callable[[Tensor, str], Tensor]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        """Applies ``change`` (of a tensor and its kind) to every tensor that has rows; returns the arguments."""
+        """Applies ``change`` (of a tensor and its kind) to every tensor that has rows; returns the new arguments."""
 
         def changed(name: str, value: Any, nested: bool) -> Any:
             if not isinstance(value, Tensor):
@@ -280,7 +280,7 @@ class Call:
         return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)
 
     def part(self, most: int) -> tuple[Call, Tensor] | None:
-        """Returns a call on at most ``most`` samples, and their numbers, int64 [m]; None if no selection is needed.
+        """Returns a call on at most ``most`` samples, and their numbers, int64 [m]; None if the call is no larger.
 
         The samples are evenly spaced along the longest leading dimension, so that many rays stay complete.
         """
@@ -395,7 +395,7 @@ def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
 
 
 def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: int = 3) -> Tensor:
-    """Returns the positions of a call's samples, [..., d]; ``rule`` is the ``coords`` rule or their tensor."""
+    """Returns the positions of a call's samples, [..., d]; ``rule`` is the ``coords`` rule or the positions."""
     if rule is None:
         raise ValueError(
             f"{_OP}: coords must name the positions among the module's arguments: pass "

@@ -220,8 +220,8 @@ class Lowering:
 
     Attributes:
         rows: The number of samples of the trace.
-        levels: The number of the run that computes each value.
-        sources: The node of the trace whose rows each input reads.
+        levels: For each value, the number of the run that computes it.
+        sources: For each input, the node of the trace whose rows it reads.
         columns: (value, column in the value), by the number of the column in codes.
         parameters: The source of each parameter of the program: a node or tensor, and the numbers of its entries.
     """
@@ -309,7 +309,7 @@ class Lowering:
         return parts[0][0] if len(parts) == 1 else self.builder.move(len(numbers), parts)
 
     def parameter(self, entries: Entries, matrix: bool = False) -> int:
-        """Returns the number of the program's parameter with these entries, [w] or [o, i]."""
+        """Returns the index of the program's parameter with these entries, [w] or [o, i]."""
         shape = tuple(entries.codes.shape) if matrix else (entries.codes.numel(),)
         key = (id(entries.of), shape, bytes(entries.codes.contiguous().numpy()))
         if key not in self._parameter_numbers:
@@ -318,7 +318,7 @@ class Lowering:
         return self._parameter_numbers[key]
 
     def vector(self, entries: Entries, codes: Tensor) -> Columns:
-        """Returns the entries ``codes`` [w] of a parameter as an operand."""
+        """Returns an operand of the parameter's entries with these codes, [w]."""
         low, width = int(codes.min()), len(codes)
         if bool((codes == low).all()):
             one = Entries(codes[:1], entries.of)

@@ -26,8 +26,8 @@ class CallPlan:
         open: Whether another batch may run grouped although the first did not.
         few: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another plan.
         chosen: The number of the fastest way and the reason, by the size of a batch and the number of cells.
-        lost: The timings that the fused way has lost, by the same key: their count, the time of the next timing, and an
-            explanation.
+        lost: The lost timings of the fused way, by the key of ``chosen``: their count, the time of the next timing, and
+            an explanation.
         constants: The arguments of the traced call that are not tensors, by name; only for the fused way.
         watch: The values of the module that the trace has read.
         skip: The number of calls that run cell by cell before another way is tried again.
@@ -80,5 +80,5 @@ class CallPlan:
 
 
 def measured_samples(ways: list[Way]) -> int:
-    """Returns the sample limit of a timing: higher for fused runs, since tensors between runs outgrow the cache."""
+    """Returns the sample limit of a timing. It is higher for fused runs, as tensors between runs outgrow the cache."""
     return SLICE * 8 if any(way.name == "fused in runs" for way in ways) else SLICE

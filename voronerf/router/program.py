@@ -38,7 +38,7 @@ class CellProgram(NamedTuple):
 
     Attributes:
         program: The program. Its outputs are the tensors that the call returns, in their order, [n, w] each.
-        reads: The number of the call's argument that each input of the program reads.
+        reads: For each input of the program, the index of the call's argument that it reads.
         shapes: The shape, for one sample, of each tensor that the call returns.
         parameters: The parameters [k, ...], or [...] if all cells share them: the module's own parameters or views of
             them. For a traced module, they may also be computed from the module's parameters.
@@ -69,7 +69,7 @@ def layered_program(
         layers: The layer table, which reads positions and possibly directions.
         linears: The linear layers, in the table's order.
         activate: A function from the table's outputs [n, out] to the results of ``forward``, sample by sample.
-        features: The feature table of its hash grid, or None.
+        features: The feature table of the hash grid of ``layers``, or None.
 
     Examples:
         >>> import torch

@@ -496,8 +496,8 @@ class VoronoiRouter(nn.Module):
             strict: See ``nn.Module``.
             assign: See ``nn.Module``; if True, parameters are new objects.
             optimizer: The optimiser that holds this router's parameters. If the number of cells changes, the
-                optimiser's state is reset; restore it afterwards with ``optimizer.load_state_dict``. An optimiser with
-                state of the old cells that was not passed raises at its next step.
+                optimiser's state is reset; restore it afterwards with ``optimizer.load_state_dict``. If an optimiser
+                that holds state of the old cells is not passed, it raises at its next step.
 
         Returns:
             Missing and unexpected keys.

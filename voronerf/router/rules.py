@@ -154,7 +154,7 @@ def convolution(
     dilation: Any = 1,
     groups: int = 1,
 ) -> Any:
-    """Convolves rows [n * m, i, ...] with kernels of one place; inputs [i, ...] or [1, i, ...] have n elsewhere."""
+    """Convolves rows [n * m, i, ...] with kernels of one place; in [i, ...] and [1, i, ...], a later dimension is n."""
     places, channel = weight.dim() - 2, input.dim() - weight.dim() + 1
     if not run.is_rows(input) or set(weight.shape[2:]) != {1} or groups != 1:
         return NotImplemented

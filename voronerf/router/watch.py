@@ -31,7 +31,7 @@ _MISSING: Any = object()
 
 @dataclass(frozen=True)
 class Inputs:
-    """Attributes and arguments that a fused call reads in each call."""
+    """Attributes and arguments whose values are looked up in each fused call."""
 
     sources: frozenset[Source] = frozenset()
     dtype: torch.dtype = torch.float64  # dtype of numbers as tensors, one of NUMBERS

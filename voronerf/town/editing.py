@@ -34,7 +34,7 @@ from voronerf.town.run import TOWN, is_town, open_parts, write_parts
 
 #: The maximum number of voxels of a joined grid; a grid that would have more gets larger voxels.
 MOST_VOXELS = 1 << 22
-#: The minimum size of a run as a fraction of the joined scene: the strata of a ray would step over a smaller run.
+#: The minimum size of a run as a fraction of the joined scene: a smaller run would lie between two samples of a ray.
 SMALLEST = 1e-4
 
 
@@ -108,7 +108,7 @@ def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Simila
 
 
 def cut(run: Path | str, kept: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Source:
-    """Writes a new run with only a solid or some cells of a run; networks of all other cells are left out.
+    """Writes a new run with only the contents of a solid, or only some cells, of a run; leaves out all other networks.
 
     Args:
         run: The run directory, which is not changed.
@@ -152,7 +152,7 @@ def place(
 
     Args:
         run: The run directory of the scene, which is not changed.
-        thing: The run directory of the object, which was cut out or was trained on a white background.
+        thing: The run directory of the object; the object must be cut out or trained on a white background.
         at: The position of the bottom centre of the object's box.
         out: A new directory.
         degrees: The rotations about the axes x, y, z, in this order.
@@ -230,7 +230,7 @@ def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Sc
 
 
 def _join_scenes(sources: Sequence[Source], frames: Sequence[Similarity]) -> Scene:
-    """Joins the views and the boxes of all sources; the same scene in the same place counts once."""
+    """Joins the views and the boxes of all sources; a scene that occurs twice in the same place counts once."""
     first, box, views = sources[0].scene, sources[0].scene.box, []
     seen: set[tuple[str, str]] = set()
     if box is not None:
@@ -344,9 +344,9 @@ def _empty_grid(box: Tensor, shape: Sequence[int], threshold: float) -> Occupanc
 
 
 def cut_source(source: Source, kept: Solid | Tensor) -> Source:
-    """Returns a source with only a solid or some cells; networks of all other cells are left out.
+    """Returns a source with only the contents of a solid, or only some cells; leaves out all other networks.
 
-    A contraction is the identity inside of its sphere, so a cut inside of the sphere needs no contraction.
+    A contraction is the identity inside its sphere, so a source cut inside the sphere needs no contraction.
 
     Args:
         source: The source, of any kind.
@@ -427,7 +427,7 @@ def _inside_ball(solid: Solid, contraction: Contraction) -> bool:
     return farthest <= contraction.radius * (1 + 1e-4)
 
 
-#: Sample points in a voxel; a part covers the voxel if it covers one of them.
+#: Sample points in a voxel; a part covers the voxel if it covers one of these points.
 _LATTICE = torch.tensor([*itertools.product((0.5, 1e-3, 1 - 1e-3), repeat=3)])
 
 

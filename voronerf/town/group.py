@@ -28,7 +28,7 @@ from voronerf.app.scenes import Scene
 PATIENCE = 50
 #: Settings that may differ between ranks.
 MAY_DIFFER = ("data", "device", "lpips")
-#: The (first, second) territory of a part of a message: sender and receiver, or for answers receiver and sender.
+#: The (first, second) territory of a part of a message: (sender, receiver), but (receiver, sender) for an answer.
 Key = tuple[int, int]
 
 
@@ -152,7 +152,7 @@ class Group:
         return dict(sorted(zip(keys, incoming.split([int(counts[key]) for key in keys]), strict=True)))
 
     def check_equal(self, texts: dict[str, str]) -> None:
-        """Raises ValueError unless all ranks have the same ``texts`` by the same names."""
+        """Raises ValueError unless ``texts``, by name, are the same on all ranks."""
         first, *others = self.gather(texts)
         for name, value in first.items():
             for rank, other in enumerate(others, 1):

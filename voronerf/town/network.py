@@ -1,4 +1,4 @@
-"""The stored networks of cells; the first use makes a router from them."""
+"""The stored networks of cells; a router is made from them on first use."""
 
 from __future__ import annotations
 

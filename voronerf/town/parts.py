@@ -1,7 +1,7 @@
 """Parts: routers that are placed in one scene, each in a frame of its own, and evaluated as one field.
 
 n samples, r rays, k cells of all parts, l leaves of the diagram of one part. Positions, lengths and densities are in
-scene units unless the text names a part's frame; a similarity maps a part's frame to the scene.
+scene units, or in a part's frame if the text says so; a similarity maps a part's frame to the scene.
 
 A part covers a point if the point lies in its region and its leaf has a network. If several parts of a layer cover a
 point, the part with the nearest centre is evaluated, in the cell of its own diagram. Layers are superposed: their
@@ -35,7 +35,7 @@ class Part(nn.Module):
     Args:
         networks: The stored routers; router i has the networks of the leaves with ``owner == i``, in ascending order.
         diagram: A diagram with l leaves; None for the diagram of the only router.
-        owner: int [l], the network of each leaf, -1 for none; None for the only network.
+        owner: int [l], the network of each leaf, -1 for none; None if all leaves have the only network.
         frame: The similarity from the part's frame to the scene.
         contraction: The contraction of the part's space, or None.
         region: Solids in the part's frame; the part covers their intersection.
@@ -213,13 +213,13 @@ class Parts(nn.Module):
         return [claim for claim in joined if len(claim.rows)]
 
     def _claim(self, index: int, positions: Tensor, rows: Tensor) -> Claim:
-        """Returns the claim of a part on the positions of ``rows`` that it covers."""
+        """Returns a part's claim: the positions, among those with the numbers ``rows``, that the part covers."""
         local = self[index].frame.inverse.points(positions[rows])
         leaf, covered = self[index].find(local, self.backend)
         return Claim(index, rows[covered], local[covered], leaf[covered])
 
     def assign(self, positions: Tensor) -> Tensor:
-        """Returns the cell of each position [n, 3], int32 [n], in the uppermost layer that covers it; -1 for none."""
+        """Returns the cell of each position [n, 3], int32 [n], in the uppermost layer that covers it, or -1."""
         cells = torch.full((len(positions),), -1, dtype=torch.int32, device=positions.device)
         for layer in range(len(self.layers)):
             for claim in self.claims(layer, positions):

@@ -51,7 +51,7 @@ class Territory:
 
 
 class Evaluated(NamedTuple):
-    """The outputs of a territory's networks for its samples, with the autograd tape and the sums of the runs."""
+    """The outputs of a territory's networks for its samples, with the autograd tape and the sums of the sample runs."""
 
     samples: OwnSamples
     tape: Tape
@@ -71,7 +71,7 @@ class Pass:
 
     Attributes:
         sums: [q, 6], the partial sum of each run of samples.
-        learnt: The segment that has set the gradients of the parameters, as a list; empty without samples.
+        learnt: A list with the segment that has set the gradients of the parameters; empty without samples.
 
     Args:
         name: The prefix of the segment names.
@@ -173,7 +173,7 @@ class Crossing(StepOutput):
         self._sums = sums
 
     def whole(self) -> StepOutput:
-        """Returns the output of the same rays through all territories, with one sample per ray."""
+        """Returns the output for the rays through all territories together, with one sample per ray."""
         batch, sums = self.batch, self._sums[along_rays(self._sums[:, 5].long(), self._sums[:, 4])]
         composed = compose(sums[:, :3], sums[:, 3], sums[:, 5].long(), len(batch.rays))
         behind = torch.zeros_like(batch.target) if batch.background is None else batch.background

@@ -58,7 +58,7 @@ def stored_territories(run: Path) -> int | None:
 
 
 def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGrid | None) -> None:
-    """Writes one file per network, also for a network that several parts share, then the run's checkpoint."""
+    """Writes one file for each network, even if several parts share it, and then the run's checkpoint."""
     folder, names = checkpoint_path(run).parent, dict[int, str]()
     for network in (network for part in parts for network in part.networks):
         if id(network) not in names:
@@ -149,7 +149,7 @@ def open_run(
 
     Args:
         path: The run directory.
-        scene: The scene if it is already loaded, with the images of the first run or without images.
+        scene: The scene, with the images of the first run or without images; None to load it.
         data: The scene folder of the first run; None for the folder of its training.
         downscale: The factor by which images are reduced; None for the factor of the training.
         allow_outside: Also read images that lie outside of the scene folder.

@@ -58,7 +58,7 @@ class Territories:
         return (self.train == number).nonzero()[:, 0]
 
     def scene(self, whole: Scene, number: int) -> Scene:
-        """Returns a territory's scene without images, for its settings: the box, and the cameras of its views."""
+        """Returns the scene of a territory, from which its settings follow: the box, and its cameras without images."""
         rows = self.views(number)
         names = tuple(whole.train.names[row] for row in rows.tolist())
         train = replace(whole.train, cameras=whole.train.cameras[rows], names=names, images=whole.train.images[:0])
@@ -113,9 +113,9 @@ class Place:
 def cut_space(scene: Scene, count: int, contraction: Contraction | Perspective | None) -> Territories:
     """Cuts the space of a scene into territories whose numbers of training views differ by at most one.
 
-    The place of a view is the mean of the middles of its rays in the scene; a middle is at most half a territory's
-    width beyond the near end of its ray. The views are halved recursively by their places, along the longest side of
-    the places' box. The centre of a territory is the mean of its views' places.
+    The middle of a ray is halfway between its ends in the scene, but at most half a territory's width beyond the near
+    end. The place of a view is the mean of the middles of its rays. The views are halved recursively by their places,
+    along the longest side of the places' box. The centre of a territory is the mean of its views' places.
     """
     views = len(scene.train)
     if count > views:
@@ -182,7 +182,7 @@ def _boxes(centres: Tensor, box: Tensor) -> Tensor:
     """Returns a box around each territory, [T, 2, 3], within the box of the scene.
 
     Three sides of a territory meet in each corner. The candidates are the sides of the scene and the bisectors to the
-    nearest centres; leaving out the other bisectors can only make a box larger.
+    nearest centres. The other bisectors are left out, which can only make a box larger.
     """
     sides = torch.cat((torch.eye(3), -torch.eye(3))).double()
     limits = torch.cat((box[1], -box[0])).double()

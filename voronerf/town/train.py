@@ -1,4 +1,4 @@
-"""Training in territories: regions of space with networks, grid, optimiser and views of their own; rays cross borders.
+"""Training in territories: regions of space with networks, grid, optimiser and views of their own. Rays cross borders.
 
 The territories are distributed over the ranks. The results of a territory do not depend on its rank, so that one
 process trains the same run as several, bit for bit. T territories.
@@ -109,7 +109,7 @@ class Town:
 
 
 def grid_of(state: State) -> OccupancyGrid:
-    """Returns the occupancy grid of a territory; `check_territories` rejects settings without a grid."""
+    """Returns the occupancy grid of a territory, which always has one, see `check_territories`."""
     assert state.sampler.grid is not None
     return state.sampler.grid
 
@@ -274,7 +274,7 @@ def train(
 
 
 def save(town: Town) -> None:
-    """Writes the checkpoints of all territories, then the index that names them; the old index is valid until then."""
+    """Writes the checkpoints of all territories, then the index of their names; until then, the old index is valid."""
     group, count, folder = town.group, len(town.owner), checkpoint_path(town.out).parent
     token = f"{town.first.step}-{group.gather(secrets.token_hex(4))[0]}"
     names = [f"networks-{token}-{number}.safetensors" for number in range(count)]

@@ -6,7 +6,7 @@ from voronerf.app.cli import main
 
 @pytest.fixture(autouse=True, scope="session")
 def own_cache(tmp_path_factory):
-    """Gives the tests a cache folder of their own, so that no path of a test enters the user's cache."""
+    """Gives the tests their own cache folder, so that no test's path gets into the user's cache."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("VORONERF_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield

@@ -126,7 +126,7 @@ def test_exports_of_a_run(run, tmp_path, capsys, fails, monkeypatch):
     pytest.importorskip("skimage", reason="scikit-image is not installed")
     pytest.importorskip("fast_simplification", reason="fast-simplification is not installed")
     files = [tmp_path / name for name in ("mesh.glb", "cells.glb")]
-    monkeypatch.setattr(space, "SOLID", 0.01)  # since a run of a few steps has low densities
+    monkeypatch.setattr(space, "SOLID", 0.01)  # a run of a few steps has low densities
     succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--resolution 8 --faces 50")
     assert all(file.stat().st_size for file in files)
     output = capsys.readouterr().out
@@ -155,7 +155,7 @@ def test_info_names_every_backend(capsys):
 def test_resume_needs_no_setting_again(run, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
-    # Longer twice, then from a number of steps to a time budget, and back.
+    # The run is extended twice, then changed from a number of steps to a time budget, and back.
     for options, steps, budget in (
         (f"--out {copy} --steps 20", 20, None),
         (f"--out={copy} --steps 22", 22, None),
@@ -169,7 +169,7 @@ def test_resume_needs_no_setting_again(run, tmp_path):
 
 
 def test_defaults_follow_the_speed_of_the_machine_that_began(tmp_path, monkeypatch):
-    """Defaults stay when a machine of another speed resumes the run."""
+    """Defaults stay the same when a machine of another speed resumes the run."""
     out, tiny = tmp_path / "run", TINY.replace("--steps 16", "").replace("--samples 8", "").replace("--depth 2", "")
     monkeypatch.setattr("voronerf.app.cli.train.machine_speed", lambda: 1024.0)
     succeeds("train --data builtin --budget 0.2 --out", out, tiny)

@@ -28,7 +28,7 @@ def test_what_goes_on_beside_a_training_has_a_bar_with_its_name():
     assert shown == [(5, "scores", "0 of 2"), (6, "scores", "1 of 2")]
     parts = display.track([5, 6], "scores")
     next(iter(parts))
-    parts.close()  # as a stopped training does
+    parts.close()  # as when a training is stopped
     assert [task.description for task in display.progress.tasks] == ["run"]
 
 

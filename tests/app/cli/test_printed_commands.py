@@ -32,7 +32,7 @@ PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "SECURITY"
 PROGRAMS = ("voronerf", "torchrun", "python", "make", "pip", "ns-train", "tensorboard")
 #: Programs of other projects.
 FOREIGN = ("tensorboard", "ns-train")
-#: Option values that make a command short.
+#: Option values that make a command quick.
 SHORT = {"--budget": "0.1", "--frames": "2", "--resolution": "8", "--count": "20"}
 ADDED = {
     "train": ("--budget",),
@@ -40,7 +40,7 @@ ADDED = {
     "render": ("--frames",),
     "export": ("--resolution", "--count"),
 }
-#: Replacements of placeholders and of large scenes.
+#: Replacements for placeholders and for large scenes.
 STAND_INS = {
     "DIR": "scene",
     "DATA": "scene",
@@ -175,7 +175,7 @@ def test_printed_commands_run(page, small_run, tmp_path, monkeypatch, capsys):
     """The commands of a page run in order in one folder, which starts as a copy of the small run's folder."""
     pytest.importorskip("trimesh", reason="trimesh is not installed")
     viser = pytest.importorskip("voronerf.app.viewer", reason="viser is not installed")
-    monkeypatch.setattr(viser.Viewer, "serve", lambda viewer: None)  # it would serve until Ctrl-C
+    monkeypatch.setattr(viser.Viewer, "serve", lambda viewer: None)  # the viewer would serve until Ctrl-C
     monkeypatch.chdir(tmp_path)
     shutil.copytree(small_run, tmp_path, dirs_exist_ok=True)
     for number, command in enumerate(MESSAGES if page == "messages" else COLLECTED[page]):

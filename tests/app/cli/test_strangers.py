@@ -1,4 +1,4 @@
-"""Tests of untrusted runs: a run is refused before it costs memory or time, or leads to files outside its folder."""
+"""Tests that untrusted runs are refused before they cost memory or time, or lead to files outside their folders."""
 
 import json
 import os
@@ -113,7 +113,7 @@ def flat_average(run, checkpoint):
     checkpoint.tensors["optimizer.0.average"] = checkpoint.tensors["optimizer.0.average"].flatten()
 
 
-#: Changes of a run, and the messages that refuse it.
+#: Changes to a run, and the error messages that they cause.
 OVERSIZED = {
     "width": (
         settings(width=18_000),

@@ -1,4 +1,4 @@
-"""Tests of mistyped commands (one line with a suggestion), grouped help, and the words that are no command."""
+"""Tests of mistyped commands (one line with a suggestion), grouped help, and words that are not commands."""
 
 import os
 import re

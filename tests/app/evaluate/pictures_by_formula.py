@@ -1,9 +1,9 @@
-"""Pairs of images computed from formulas, and their scores by other programs.
+"""Pairs of images computed from formulas, and the scores that other programs give them.
 
-PSNR and SSIM are by scikit-image 0.26.0 (Gaussian window, sigma 1.5, population covariance, data range 1). LPIPS is by
-the lpips package 0.1.4 (net "alex", version 0.1, in float64) on torch 2.13.0. torchmetrics 1.9.0 agrees: PSNR to
-2e-6 dB (it divides in float32), LPIPS to the last bit of float32. Its SSIM agrees to 1e-15 without the border, which it
-pads by reflection; its own mean includes the border and is 0.9032 for 100 x 100.
+PSNR and SSIM are from scikit-image 0.26.0 (Gaussian window, sigma 1.5, population covariance, data range 1). LPIPS is
+from the lpips package 0.1.4 (net "alex", version 0.1, in float64) on torch 2.13.0. torchmetrics 1.9.0 agrees: PSNR to
+2e-6 dB (it divides in float32), LPIPS to the last bit of float32. The SSIM of torchmetrics agrees to 1e-15 away from
+the border, which it pads by reflection; its mean includes the border and is 0.9032 for 100 x 100.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Tests of LPIPS against a slow float64 version and against the lpips package, and of finding its weights."""
+"""Tests of LPIPS against a slow float64 version and the lpips package, and of the search for its weights."""
 
 import importlib.machinery
 import math
@@ -39,7 +39,7 @@ def weights():
 
 
 def patches(x, size, stride, padding):
-    """Returns the patches of an image [c, h, w] that a convolution reads, [rows, columns, c, size, size]."""
+    """Returns the patches that a convolution reads from an image [c, h, w], as [rows, columns, c, size, size]."""
     x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
     rows, columns = ((extent - size) // stride + 1 for extent in x.shape[1:])
     views = [
@@ -50,7 +50,7 @@ def patches(x, size, stride, padding):
 
 
 def slow_lpips(image, truth, weights):
-    """Computes LPIPS by equation 1 of the paper, pixel by pixel."""
+    """Computes LPIPS pixel by pixel, with equation 1 of the paper."""
     maps = [np.moveaxis(2 * p.astype(np.float64) - 1, -1, 0) for p in (image, truth)]
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
     maps = [(p - shift[:, None, None]) / scale[:, None, None] for p in maps]

@@ -1,4 +1,4 @@
-"""Tests of PSNR and SSIM against slow loops by their definitions, against scipy, and against other programs' scores."""
+"""Tests of PSNR and SSIM against slow loops that follow their definitions, scipy, and scores of other programs."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""Tests of exported points, meshes and cells, loaded again; the fields of the runs are formulas."""
+"""Tests of exported points, meshes and cells, which are loaded again; the runs' fields are formulas."""
 
 import itertools
 import json
@@ -35,7 +35,7 @@ RED, BLUE = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9])
 
 
 def shell(positions, directions, ray_index):
-    """Computes colour and density of a hollow ball, red above and blue below, with a speck beside it."""
+    """Computes colours and densities of a hollow ball (red above, blue below) and of a speck beside it."""
     apart = (positions.norm(dim=-1) - (RADIUS - 0.1)).abs() < 0.1
     speck = (positions - torch.tensor([0.9, 0.9, 0.6])).norm(dim=-1) < 0.04
     return torch.where(positions[:, 2:] > 0, RED, BLUE), 300.0 * (apart | speck)
@@ -118,7 +118,7 @@ def test_a_mesh_is_the_outer_surface_alone(run, tmp_path, suffix):
 
 
 def test_steps_of_pixels_and_samples_are_smoothed(run, tmp_path, monkeypatch):
-    def slope(mesh):  # the angles of its triangles to the ball's surface, in degrees
+    def slope(mesh):  # mean angle between triangles and the ball, in degrees
         along = (mesh.face_normals * mesh.triangles_center).sum(-1) / np.linalg.norm(mesh.triangles_center, axis=-1)
         return np.degrees(np.arccos(along.clip(-1, 1))).mean()
 
@@ -139,7 +139,7 @@ def test_the_surface_of_an_object_on_a_plain_background_lies_before_its_distance
         mesh = export_mesh(seen, tmp_path / "mesh.ply", resolution=48, box=None if plain else BOX)
         radii.append(np.linalg.norm(mesh.triangles_center, axis=-1).mean())
     moved = (radii[1] - radii[0]) / (0.01 * float((BOX[1] - BOX[0]).max()))
-    assert 0.1 < moved < 1 if plain else moved == 0  # distances are along rays, which are oblique
+    assert 0.1 < moved < 1 if plain else moved == 0  # distances are measured along oblique rays
 
 
 @pytest.mark.parametrize("to_files", [False, True])
@@ -234,7 +234,7 @@ def test_a_mesh_is_what_the_cameras_look_at_and_not_what_lies_around(run, tmp_pa
     assert 30 < share < 95 and np.abs(np.abs(corners) - 1.2 * RADIUS).max() < 0.3  # no camera sees the ball from below
     assert not said[0].startswith("0%") and len(said) == 1
     export_mesh(run, tmp_path / "boxed.ply", resolution=16, say=said.append)
-    assert len(said) == 1  # a scene's box holds the whole scene: no note
+    assert len(said) == 1  # no note, since the scene's box holds the whole scene
 
 
 def test_points_have_colours_and_normals(run, tmp_path):

@@ -33,7 +33,7 @@ SMALL = ("log2_entries=10", "levels=2")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the built-in scene in 10 x 10 pixels, in the format of nerfstudio's parser for Blender scenes."""
+    """A folder with the built-in scene at 10 x 10 pixels, in the format of nerfstudio's parser for Blender scenes."""
     path = tmp_path_factory.mktemp("scene")
     scene = load_scene("builtin", downscale=10)
     for split, views in (("train", scene.train), ("val", scene.test), ("test", scene.test)):
@@ -102,7 +102,7 @@ def test_it_trains_splits_evaluates_and_resumes(folder: Path, tmp_path: Path) ->
     shown = [each.eval().get_outputs_for_camera(rays) for each in (model, resumed)]
     assert all(torch.equal(shown[0][name], shown[1][name]) for name in ("rgb", "depth", "accumulation", "cells"))
     again.train()
-    assert resumed.num_cells == 4  # the cell was split
+    assert resumed.num_cells == 4  # the cell had been split already
 
 
 def test_a_training_that_ends_before_the_split_makes_it_when_it_is_resumed(folder: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Tests of rendered photographs: holes are filled with the colours beside them."""
+"""Tests of rendering photographed scenes: holes are filled with neighbouring colours."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_picture_of_nothing_is_black():
 
 
 def test_photographs_alone_are_filled():
-    """A hole is filled only without a background colour, outside the viewer (fill=False) and without a box."""
+    """Holes are filled if the scene has no background colour and no box, except in the viewer (fill=False)."""
 
     def wall(positions, directions, ray_index):
         inside = (positions[:, 2] < 0) & (positions[:, :2].norm(dim=-1) > 0.3)

@@ -40,7 +40,7 @@ def scaled(matrix, factor):
 
 
 def nerfstudio_rays(kind, pose, width, height, fov):
-    """Computes the world directions [h, w, 3] of a path's frame by the formulas of nerfstudio's `Cameras`."""
+    """Computes the world ray directions [h, w, 3] of a path's frame with the formulas of nerfstudio's `Cameras`."""
     focal = height / 2 / math.tan(math.radians(fov) / 2)
     fx, fy = (width / 2, height) if kind == "equirectangular" else (focal, focal)
     y, x = torch.meshgrid(*(torch.arange(side, dtype=torch.float64) + 0.5 for side in (height, width)), indexing="ij")
@@ -110,7 +110,7 @@ def test_the_rate_of_a_file(tmp_path, changes, fps):
     [
         (LEVEL, True),
         (ROWS, True),
-        (json.dumps([float(x) for x in columns(LEVEL)]), True),  # by nerfstudio's viewer before 1.0, and by add-ons
+        (json.dumps([float(x) for x in columns(LEVEL)]), True),  # from nerfstudio's viewer before 1.0, or add-ons
         (json.dumps(LEVEL), False),
         ("[1, 2", False),
         ("7", False),
@@ -233,13 +233,13 @@ def test_smooth_paths_pass_their_keyframes_evenly(closed):
     turns = frames.poses[:, :3, :3]
     torch.testing.assert_close(turns @ turns.mT, torch.eye(3).expand(count, 3, 3), atol=1e-5, rtol=0)
     moves = (frames.poses.roll(-1, 0) - frames.poses).flatten(1).norm(dim=-1)[: count - (not closed)]
-    assert moves.max() < 2 * moves.min()  # no jump, nor from the last frame to the first
+    assert moves.max() < 2 * moves.min()  # no jump, not even from the last frame to the first
     assert smooth_path(keyframes[:1], 3).poses.sub(keyframes.poses[0]).abs().max() < 1e-5
     refuses("keyframes and count must be at least 1, got 6 and 0", smooth_path, keyframes, 0)
 
 
 def ring(degrees, radius=3.0, climb=20.0):
-    """Returns cameras at these angles in degrees around (1, 0, 0), alternating between two heights."""
+    """Returns cameras around (1, 0, 0) at the angles in degrees, at two alternating heights."""
     angles = torch.tensor(degrees, dtype=torch.float32).deg2rad()
     target = torch.tensor([1.0, 0, 0])
     climbs = torch.where(torch.arange(len(angles)) % 2 == 0, climb, climb + 30).deg2rad()
@@ -285,7 +285,7 @@ def test_a_path_of_cameras_that_look_outwards_goes_through_them_in_order():
 
 
 def test_a_path_of_people_who_walk_and_look_around_is_theirs():
-    """The path follows the cameras, although the point closest to their axes lies ahead of most by chance."""
+    """The path follows the cameras, although the point closest to their axes lies ahead of most cameras by chance."""
     torch.manual_seed(0)
     along = torch.linspace(-2, 2, 12)
     origins = torch.stack((along, 0.3 * torch.rand(12), torch.full((12,), 1.5)), 1)

@@ -62,7 +62,7 @@ def rewrite(folder, change, name="transforms", **options):
 
 
 def write_images(folder, sizes, **save):
-    """Writes JPEG images of (width, height) sizes, where image i has grey value i."""
+    """Writes JPEG images with the sizes (width, height); image i has grey value i."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for index, (width, height) in enumerate(sizes):
         Image.fromarray(np.full((height, width, 3), index, np.uint8)).save(folder / f"images/{index:02d}.jpg", **save)
@@ -124,7 +124,7 @@ def write_colmap(folder, poses, sizes, points, *, binary=True, lenses=None):
 
 
 def write_llff(folder, poses, size, focal, bounds):
-    """Writes LLFF's file of the axes (down, right, backwards), position, height, width, focal length and bounds."""
+    """Writes LLFF's poses_bounds.npy: axes (down, right, backwards), position, height, width, focal length, bounds."""
     poses = np.asarray(poses, np.float64)
     lens = np.broadcast_to(np.array([size[1], size[0], focal]), (len(poses), 3))
     matrix = np.stack((-poses[:, :3, 1], poses[:, :3, 0], poses[:, :3, 2], poses[:, :3, 3], lens), axis=-1)

@@ -171,7 +171,7 @@ def test_box_is_carved_by_masks_of_a_lens(scene, k1):
     cameras = replace(straight, distortion=lenses)
     masks = scene.train.images[..., 3]
     bent = torch.zeros_like(masks)
-    for index in range(len(cameras)):  # looks up the straight mask along each ray
+    for index in range(len(cameras)):  # looks up each ray in the mask without a lens
         rays = cameras.image_rays(index)
         column, row = straight.project(rays.origins + rays.directions, index)[0].floor().long().unbind(-1)
         seen = (column >= 0) & (column < 40) & (row >= 0) & (row < 40)
@@ -186,7 +186,7 @@ def test_box_is_carved_by_masks_of_a_lens(scene, k1):
 @pytest.mark.parametrize("cut", [False, True])
 def test_what_a_picture_does_not_show_may_be_an_object_that_it_cuts(scene, cut):
     lenses = torch.zeros(len(scene.train.cameras), 8)
-    lenses[:, 0] = 0.8  # a camera without the lens sees a wider area
+    lenses[:, 0] = 0.8  # without this lens a camera sees a wider area
     visible = np.zeros((40, 40), dtype=bool)
     visible[18:22, 18:] = cut
     visible[18:22, 18:22] = True

@@ -25,7 +25,7 @@ def test_other_cameras_see_the_same_city(scene):
 
 
 def test_rays_meet_the_first_of_all_solids(monkeypatch):
-    """Culled solids give the same hits, bit for bit, as testing every ray with every solid, for views and shadows."""
+    """With culling, the rays of views and shadows have the same hits, bit for bit, as without culling."""
     caster, cameras = Caster(city((2, 2)), LIGHT), city_cameras(9, (2, 2), 2, 0)
     indices, tested, first = np.arange(len(caster.solids)), [], caster.first
 

@@ -14,7 +14,7 @@ from voronerf.app.scenes import SceneError, load_scene
 
 
 def write_models(folder, counts, pictures="images"):
-    """Writes COLMAP models; `counts` maps each model's place in the folder to its number of leading images."""
+    """Writes COLMAP models; `counts` maps a model's subfolder to its number of images (the first ones)."""
     for place, count in counts.items():
         write_colmap(folder / "made", POSES[:count], [SIZE] * count, POINTS, binary=place.endswith(("0", "2")))
         shutil.copytree(folder / "made/sparse/0", folder / place, dirs_exist_ok=True)
@@ -51,7 +51,7 @@ def test_of_several_models_the_largest_is_read_or_the_one_that_is_named(tmp_path
 
 
 def test_the_folder_of_undistorted_images_is_a_scene(tmp_path):
-    """The output of COLMAP's image_undistorter loads, also from within the scene's folder."""
+    """The output of COLMAP's image_undistorter loads; `data` may also be one of its subfolders."""
     write_models(tmp_path, {"dense/sparse": COUNT}, "dense/images")
     for folder in (tmp_path, tmp_path / "dense", tmp_path / "dense/sparse"):
         assert len(load_scene(folder).train) == 7
@@ -119,7 +119,7 @@ def test_images_are_found_by_their_names_or_else_by_their_order(tmp_path, name, 
 
 @pytest.mark.parametrize(("name", "file"), [("{}.jpg", "image_{:03d}.png"), ("IMG_{:03d}.JPG", "{}.png")])
 def test_an_order_of_which_there_are_two_is_none(tmp_path, name, file):
-    """Files do not match by order if numeric and alphabetic order differ: "10" sorts before "9" as text."""
+    """Files are not matched by order if their numeric and alphabetic orders differ: "10" sorts before "9" as text."""
     write_named(tmp_path, lambda index: name.format(index + 5), lambda index: file.format(index + 5))
     refuses("none of its 9 images exists", load_scene, tmp_path, error=SceneError)
 
@@ -195,7 +195,7 @@ def test_images_that_may_be_others_are_not_taken(tmp_path, caplog):
 
 
 def test_a_file_is_that_of_one_name_alone(tmp_path, caplog):
-    """3.png does not replace a missing 3.jpg if the model also lists 3.png, or if two listed names match it."""
+    """3.png replaces a missing 3.jpg only if the model does not list 3.png and no other listed name matches it."""
     for lost in ("3.jpg", "3"):
         write_named(tmp_path / lost, lambda index, lost=lost: lost if index == 4 else f"{index}.png", "{}.png".format)
         scene = load_scene(tmp_path / lost, normalise=False)
@@ -211,7 +211,7 @@ def test_a_file_is_that_of_one_name_alone(tmp_path, caplog):
 
 
 def test_names_of_files_elsewhere_are_those_in_the_folder(tmp_path):
-    """A name in another folder means the file of that name in this folder, unless outside files are allowed."""
+    """For a listed path outside the scene, the scene's file of this name is read, unless outside files are allowed."""
     elsewhere = tmp_path / "elsewhere"
     write_named(tmp_path / "scene", lambda index: f"{elsewhere}/{index}.png", "{}.png".format)
     elsewhere.mkdir()

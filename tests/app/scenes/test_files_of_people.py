@@ -1,4 +1,4 @@
-"""Regression tests on captures and camera paths of other programs: each file is read correctly, or refused with one
+"""Regression tests on captures and camera paths from other programs: each file is read correctly, or refused with one
 line that says what to do."""
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def test_models_of_another_size_than_their_pictures():
     folder = case("images_smaller_than_model")
     small, large = load_scene(folder), load_scene(folder / "big")
     assert size_of(small) == (504, 378) and size_of(large) == (400, 300)
-    for scene in (small, large):  # the focal length is the model's, scaled
+    for scene in (small, large):  # the focal length is scaled from the model's
         model = read_model(folder / ("big" if scene is large else "") / "sparse/0").images[0].camera
         across = size_of(scene)[0] / model.width
         assert float(scene.train.cameras.intrinsics[0, 0]) == pytest.approx(model.lens.intrinsics[0] * across)

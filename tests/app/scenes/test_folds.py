@@ -30,7 +30,7 @@ LENS = colmap_lens("SIMPLE_RADIAL", (FOCAL, WIDTH / 2, HEIGHT / 2, 0.05))
 
 
 def images(turned=()):
-    """Returns images on a circle; the cameras of the `turned` indices are on its opposite side."""
+    """Returns images of cameras on a circle; the cameras with `turned` indices are moved to the opposite side."""
     poses = orbit_cameras(COUNT, radius=4.0, elevation=20.0, width=WIDTH, height=HEIGHT, focal=FOCAL).poses.double()
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
     result = []
@@ -43,7 +43,7 @@ def images(turned=()):
 
 
 def matches():
-    """Returns matches of 200 points that all images see: neighbours share 200, other pairs the 40 close together."""
+    """Returns matches of 200 points: neighbours match all points, other pairs only the 40 points close together."""
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
     points[:40] *= 0.2
     features = {}
@@ -86,7 +86,7 @@ def test_pairs_that_match_over_much_of_both_images_are_wide():
 
 
 def test_an_image_without_strong_pairs_keeps_its_best_pairs():
-    pairs = {  # number of matches, and their extent as a share of the image
+    pairs = {  # number of matches, and the fraction of the image that they span
         ("a", "b"): (200, 0.5),
         ("a", "c"): (100, 0.5),
         ("b", "d"): (49, 0.5),  # wide, but few matches
@@ -107,7 +107,7 @@ def test_a_model_contradicts_the_pairs_that_a_fold_tears_apart():
     strong = strong_pairs(data, wide_pairs(data, spreads(data)))
     assert contradicted_pairs(data, strong, images()) == (0, COUNT)
     folded = images(turned=range(3, 9))
-    assert contradicted_pairs(data, strong, folded) == (2, COUNT)  # at both ends of the turned arc
+    assert contradicted_pairs(data, strong, folded) == (2, COUNT)  # one pair at each end of the moved arc
     assert contradicted_pairs(data, strong, folded[:6]) == (1, 5)
     assert contradicted_pairs(data, strong, []) == (0, 0)
     assert [is_folded(*counts) for counts in ((2, 12), (3, 12), (3, 300), (4, 300), (0, 0))] == [0, 1, 0, 1, 0]

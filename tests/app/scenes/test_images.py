@@ -69,7 +69,7 @@ def test_a_jpeg_with_a_second_picture_is_read_like_one_without(tmp_path, tag, mo
     with Image.open(two) as file:
         assert file.format == "MPO"
     assert read_header(one) == read_header(two) and read_header(two).turns == {1: 0, 3: 2, 6: 3, 8: 1}[tag]
-    for factor in (1, 2, 3, 8):  # by 8, an area average would differ
+    for factor in (1, 2, 3, 8):  # for factor 8, an area average would differ
         assert np.array_equal(read_image(one, factor), read_image(two, factor))
 
 

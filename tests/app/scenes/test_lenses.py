@@ -1,4 +1,4 @@
-"""Tests of the rays of every COLMAP camera model against pixels by pycolmap 4.2.
+"""Tests of the rays of every COLMAP camera model against pixels from pycolmap 4.2.
 
 OpenCV 5.0 (`projectPoints`, `fisheye.projectPoints`) gives the same pixels to 1e-13 for all models except FOV and
 THIN_PRISM_FISHEYE, which it lacks.
@@ -39,7 +39,7 @@ def test_rays_go_where_colmap_and_opencv_see_the_points(model):
 
 
 def test_each_image_of_a_folder_has_its_own_model(tmp_path):
-    """Each image has its own camera model and size: a tenth or a twentieth of its lens's size."""
+    """Each image has its own camera model, and a tenth or a twentieth of the size in its COLMAP camera."""
     names = [name for name, _ in MODELS.values()]
     poses = orbit_cameras(len(names), radius=4, elevation=20, width=1, height=1, focal=1).poses
     write_images(tmp_path, [(64, 48) if index % 3 else (32, 24) for index in range(len(names))])
@@ -82,7 +82,7 @@ def test_pictures_all_around(tmp_path):
 @pytest.mark.parametrize("height", [32, 40])
 @pytest.mark.parametrize("binary", [True, False])
 def test_pictures_all_around_of_a_model(tmp_path, binary, height):
-    """Equirectangular COLMAP cameras load: their two parameters are the size, and depths are distances."""
+    """Equirectangular COLMAP cameras load: their two parameters are the image size, and point depths are distances."""
     poses = orbit_cameras(9, radius=4, elevation=20, width=1, height=1, focal=1).poses
     points = torch.nn.functional.normalize(torch.randn(60, 3, generator=torch.Generator().manual_seed(0)), dim=-1) * 20
     lens = ("EQUIRECTANGULAR", (64.0, float(height)))

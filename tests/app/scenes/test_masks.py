@@ -1,4 +1,4 @@
-"""Tests of the pixels that count: masks, alpha, and the image circle of a lens."""
+"""Tests of the masks of valid pixels: from mask files, from alpha, and from the image circle of a lens."""
 
 from dataclasses import replace
 
@@ -177,7 +177,7 @@ def test_corners_without_a_ray_are_masked(tmp_path, focal, lens, limit):
     directions = torch.nn.functional.normalize(torch.randn(5000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     pixels, depth = cameras.project(cameras.origins[0] + 3 * directions, 0)
     seen = ((pixels >= 0) & (pixels < 20)).all(-1) & ((depth > 0) | (cameras.models is not None))
-    inner = torch.nn.functional.max_pool2d((~mask).float()[None], 3, 1, 1)[0] == 0  # leaves the steep border out
+    inner = torch.nn.functional.max_pool2d((~mask).float()[None], 3, 1, 1)[0] == 0  # leaves out the steep border
     seen[seen.clone()] &= inner[tuple(pixels[seen].long().flip(-1).T)]
     back = cameras.rays(0, *pixels[seen].unbind(-1)).directions
     assert seen.sum() > 100 and float((back - directions[seen]).norm(dim=-1).max()) < 1e-3

@@ -78,7 +78,7 @@ def test_the_scene_is_normalised_by_a_similarity_that_it_keeps(tmp_path):
 
 
 def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
-    """A quarter of the rays ends at points of the sparse model, for reduced images of two sizes."""
+    """A quarter of the drawn rays ends at points of the sparse model, for reduced images of two sizes."""
     write_both(tmp_path, [(48, 40) if index % 2 else (32, 56) for index in range(COUNT)])
     scene = load_scene(tmp_path, downscale=4)
     points = torch.from_numpy(POINTS) @ scene.transform[:3, :3].T + scene.transform[:3, 3]
@@ -88,10 +88,10 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     assert config.occupancy and config.samples == (384,)
     assert resolve(TrainConfig(budget=15), scene).samples == (128,)
     states = [build(config, state) for state in (scene, replace(scene, background="white"))]
-    assert [state.ray_loss.robust for state in states] == [ROBUST, 0.0]  # for photographs only
+    assert [state.ray_loss.robust for state in states] == [ROBUST, 0.0]  # robust for photographs only
     batch = make_batches(config, scene).draw(400, torch.Generator().manual_seed(0))
     assert len(batch.rays) == 400 and len(batch.sparse_depths) == 100
-    assert batch.background.shape == (400, 3) and batch.background.unique().numel() > 1000  # one drawn per ray
+    assert batch.background.shape == (400, 3) and batch.background.unique().numel() > 1000  # a random colour per ray
     rays = batch.rays[:100]
     depths = batch.sparse_depths
     apart = torch.cdist(rays.origins + depths[:, None] * rays.directions, points.float()).amin(1)
@@ -110,7 +110,7 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
 
 
 def test_space_before_the_rays_of_cameras_stays_empty(tmp_path):
-    """Only space between a camera and the near distance stays empty, not space behind the camera or beyond."""
+    """Only the space between a camera and its near distance stays empty, not the space behind or beyond."""
     write_both(tmp_path)
     scene = load_scene(tmp_path)
     state = build(TrainConfig(steps=20, rays=32, samples=(16,), cells=(), field_options=("log2_entries=10",)), scene)
@@ -128,7 +128,7 @@ def test_space_before_the_rays_of_cameras_stays_empty(tmp_path):
 
 
 def test_rays_from_elsewhere_end_the_sooner_the_more_points_there_are(tmp_path):
-    """Unseen rays are used around an object with few sparse points, and end the sooner the more points there are."""
+    """Rays from unseen views are drawn around an object with few sparse points; with more points they stop earlier."""
     write_both(tmp_path)
     scene = load_scene(tmp_path)  # each pixel is a tile
     pixels = torch.arange(len(scene.train) * 120)
@@ -148,7 +148,7 @@ def test_rays_from_elsewhere_end_the_sooner_the_more_points_there_are(tmp_path):
 
     train(build(config, few), [Note()])
     assert set(shares) == {(True, BESIDE), (False, 0.0)}
-    states = [build(replace(config, steps=40), few) for _ in range(2)]  # half the steps end within a group
+    states = [build(replace(config, steps=40), few) for _ in range(2)]  # unseen rays stop within a group of steps
     for state, callbacks in zip(states, ([Note()], [])):
         train(state, callbacks)
     assert torch.equal(*(state.router.module.features for state in states))
@@ -204,7 +204,7 @@ def test_people_who_walk_and_look_around_are_inside_out():
 @pytest.mark.parametrize("turn", [2.0, math.pi, 2 * math.pi])
 @pytest.mark.parametrize("climb", [0.2, 1.5])
 def test_cameras_around_something_are_unbounded(turn, climb, middle, noise):
-    """Cameras on an arc or a dome are "unbounded", also if their aim is noisy or beside the middle."""
+    """Cameras on an arc or a dome are "unbounded", also if their aim is noisy or off-centre."""
     generator = torch.Generator().manual_seed(0)
     origins = on_a_sphere(60, turn, climb, generator)
     targets = torch.tensor((-middle, 0.0, 0.0)) + noise * torch.randn(60, 3, generator=generator)
@@ -224,7 +224,7 @@ def outward(extent):
     ids=["far", "a walk", "on the spot"],
 )
 def test_the_sphere_of_a_walk_goes_through_its_farthest_camera(extent, length):
-    """The unit sphere reaches the farthest camera, unless cameras only turn or see less far; near is before points."""
+    """The unit sphere reaches the farthest camera, but its radius stays within the depths of the points."""
     bounds = torch.tensor((0.5, 20.0), dtype=torch.float64).repeat(24, 1)
     frame = find_frame(outward(extent), "inside-out", bounds)
     assert 1 / frame.scale == pytest.approx(length)
@@ -287,7 +287,7 @@ def test_images_of_different_sizes_train_and_are_scored_as_they_are(tmp_path):
 
 @pytest.mark.parametrize("lens", [{"latlong": True}, {"latlong": 1, "fl_x": None}, {"camera_model": "EQUIRECTANGULAR"}])
 def test_pictures_all_around_of_instant_ngp(tmp_path, lens):
-    """instant-ngp's `latlong` has the same rays as nerfstudio's EQUIRECTANGULAR: the middle looks ahead."""
+    """instant-ngp's `latlong` has the same rays as nerfstudio's EQUIRECTANGULAR: the image's middle looks ahead."""
     write_capture(tmp_path, orbit_cameras(9, radius=2, elevation=5, width=16, height=8, focal=10), **lens)
     cameras = load_scene(tmp_path, normalise=False).train.cameras
     assert cameras.models.tolist() == [3] * 7
@@ -301,13 +301,13 @@ def test_pictures_all_around_of_instant_ngp(tmp_path, lens):
         ({}, (60, 45), 480, 360),
         ({"cx": 230.0, "cy": 185.5}, (160, 120), 480, 360),
         ({"k1": 0.05, "p1": 0.003}, (126, 94), 504.0, 376.0),
-        ({"k1": 0.05}, (61, 45), 487, 365),  # 1/8 of the lens's size, rounded
+        ({"k1": 0.05}, (61, 45), 487, 365),  # 1/8 of the lens's size is rounded
         ({"is_fisheye": True, "k1": 0.01, "fisheye_crop_radius": 170}, (60, 45), 480, 360),
         ({"fl_y": 420.0}, (960, 720), 480, 360),  # larger than the lens's size
     ],
 )
 def test_pictures_smaller_than_their_lens_says(tmp_path, lens, size, w, h):
-    """Images smaller than their lens's size show points at the scaled pixels."""
+    """Images of another size than their lens states show points at scaled pixels."""
     rig = orbit_cameras(9, radius=2, elevation=5, width=size[0], height=size[1], focal=10)
     for folder, stated in (("small", {"w": w, "h": h}), ("full", {})):
         write_capture(tmp_path / folder, rig, fl_x=0.9 * w, **lens, **stated)
@@ -361,7 +361,7 @@ def test_a_picture_that_is_listed_twice_counts_once(tmp_path):
 @pytest.mark.parametrize("tag", [3, 6, 8])
 @pytest.mark.parametrize("lens", [("OPENCV", (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02)), ("THIN_PRISM_FISHEYE", None)])
 def test_an_orientation_tag_turns_pixels_and_cameras_alike(tmp_path, tag, lens):
-    """A turned pixel keeps the ray, colour, mask and depth of the stored image, which COLMAP has used."""
+    """A rotated pixel keeps its ray, colour, mask and depth from the stored image, which COLMAP has used."""
     lens = lens if lens[1] else (lens[0], (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02, 0.01, 0.002, 0.04, 0.03))
     poses, generator = POSES.numpy(), np.random.default_rng(1)
     exif, turns = Image.Exif(), {3: 2, 6: -1, 8: 1}[tag]
@@ -392,7 +392,7 @@ def test_an_orientation_tag_turns_pixels_and_cameras_alike(tmp_path, tag, lens):
 
 @pytest.mark.parametrize("format", ["colmap", "llff", "transforms"])
 def test_up_is_that_of_the_pictures_which_people_see(tmp_path, format):
-    """Up follows the orientation tag: a camera held upright stores its images, which COLMAP uses, on their side."""
+    """Up follows the orientation tag: the stored images of an upright camera, which COLMAP uses, lie on their side."""
     exif, on_side = Image.Exif(), POSES.clone()
     exif[0x0112] = 6
     on_side[:, :3, 0], on_side[:, :3, 1] = -POSES[:, :3, 1], POSES[:, :3, 0]
@@ -433,7 +433,7 @@ def test_which_folder_of_images_and_by_how_much_they_are_reduced(tmp_path, monke
         ((3966, 2974), (504, 378), None, (504, 378)),
         ((3966, 2974), (504, 378), 2, (252, 189)),
         ((400, 300), (1600, 1200), None, (400, 300)),
-        ((400, 267), (1600, 1066), None, (400, 266)),  # an original of 1602 x 1067, say
+        ((400, 267), (1600, 1066), None, (400, 266)),  # e.g. from an original of 1602 x 1067
         ((4031, 3023), (1008, 756), None, (504, 378)),
     ],
 )
@@ -477,7 +477,7 @@ def test_a_forward_facing_scene_fills_the_cube_of_its_contraction(tmp_path):
 
 
 def test_a_folder_trains_is_scored_and_opened_again(tmp_path):
-    """A folder with two image sizes and a mask trains, is scored and opens again."""
+    """A run on a folder with two image sizes and a mask is trained, scored and opened again."""
     rig = orbit_cameras(9, radius=2, elevation=5, width=12, height=14, focal=12)
     write_capture(tmp_path / "scene", rig)
     mask = np.full((14, 12), 255, np.uint8)

@@ -144,7 +144,7 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
 def write_database(path, scales, matches=()):
     """Writes a COLMAP database of images 0.png, 1.png, ...; returns its path.
 
-    Every image has features of the `scales`; `matches` maps pairs of images to their numbers of matches.
+    Every image has one feature for each of the `scales`; `matches` maps pairs of images to their numbers of matches.
     """
     with pycolmap.Database.open(path) as opened:
         camera = opened.write_camera(pycolmap.Camera(model="SIMPLE_RADIAL", width=9, height=9, params=[9, 4, 4, 0]))
@@ -221,11 +221,11 @@ def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, mon
         "global mapping by 0 pairs of 0: 10 of 10 images, points off by 0.50 pixels",
     ]
     others = {"incremental": None, "incremental_again": None}
-    called, _, best = find_best(**{"global": folded, "global_again": circle(4)}, **others)  # too few
+    called, _, best = find_best(**{"global": folded, "global_again": circle(4)}, **others)  # too few images
     assert called == ["global", "global_again", "incremental"] and best.folder.name == "global"
     called, _, best = find_best(**{"global": folded, "global_again": (circle(10), 3)}, **others)
     assert called == ["global", "global_again", "incremental", "incremental_again"] and best.contradicted == 3
-    called, *_ = find_best(**{"global": (circle(10), 2)})  # two pairs may be wrong matches
+    called, *_ = find_best(**{"global": (circle(10), 2)})  # two pairs may be false matches
     assert called == ["global"]
     lost = circle(10) * torch.tensor([1.0] * 9 + [90.0])[:, None]  # other cameras may be wrong too
     called, _, best = find_best(**{"global": lost, "incremental": circle(9)})
@@ -245,7 +245,7 @@ def test_cameras_far_from_all_others_count_as_missing():
     assert not lost_cameras(origins[:2]).any() and not lost_cameras(origins[:1]).any()
     origins[7] *= 9
     assert lost_cameras(origins).nonzero().flatten().tolist() == [7]
-    assert camera_faults(origins) == []  # one lost camera is no fault
+    assert camera_faults(origins) == []  # a single lost camera is not a fault
     origins[20:32] *= 30 + torch.arange(12)[:, None] ** 2
     assert lost_cameras(origins).nonzero().flatten().tolist() == [7, *range(20, 32)]
     together = circle(40) + 5000 * torch.arange(40)[:, None].ge(38)
@@ -398,7 +398,7 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a process of its own")
 @pytest.mark.parametrize(("count", "reason"), [(2, "must have at least 3 images, got 2"), (3, "COLMAP finds no model")])
 def test_a_process_that_is_killed_in_its_first_moments_goes_on(tmp_path, monkeypatch, count, reason):
-    """A process killed before any change of a folder, at its start or its clean-up, can run again."""
+    """`process` can run again after it was killed before a change to a folder, at its start or in its clean-up."""
     models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
     write_images(tmp_path, [(12, 10)] * count)
     for moment in range(1, 40):
@@ -497,7 +497,7 @@ def picture(number, size=(32, 20), mode="RGB"):
 def gathered(tmp_path, monkeypatch, files):
     """Processes files and returns (names of the copied images, messages).
 
-    `files` maps a file name to its content: the number of a picture, an image, or bytes.
+    `files` maps a file name to its content: a picture number, an image, or bytes.
     """
     models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
     folder, out, said = tmp_path / "in", tmp_path / "out", []
@@ -613,7 +613,7 @@ def test_converted_images_are_upright_and_keep_their_lens(tmp_path, name, option
         assert image.format == ("JPEG" if kept.endswith("jpg") else "PNG")
         assert exif[0x0110] == "a camera" and 0x0112 not in exif
     upright = np.asarray(quarters().transpose(Image.Transpose.ROTATE_270)).astype(int)
-    inside = np.s_[[8, 24], [[5], [15]]]  # a pixel of each quarter
+    inside = np.s_[[8, 24], [[5], [15]]]  # a pixel in each quarter
     assert shown.shape == (32, 20, 3) and np.abs(shown[inside] - upright[inside]).max() < 12
     camera = pycolmap.infer_camera_from_image(copy)
     assert camera.has_prior_focal_length == ("exif" in options)

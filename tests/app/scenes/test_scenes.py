@@ -47,7 +47,7 @@ def test_blender_without_alpha_has_no_box(tmp_path):
 
 
 def test_a_capture_that_others_split(tmp_path):
-    """Split files by torch-ngp's scripts load: Blender's format with a principal point and distortion."""
+    """Scenes split by torch-ngp's scripts can be loaded: Blender's format with a principal point and distortion."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     rig = orbit_cameras(9, radius=2, elevation=5, width=12, height=10, focal=4)
     lens = {"camera_angle_x": 0.9, "fl_x": 20.0, "fl_y": 21.0, "cx": 5.0, "cy": 5.5, "k1": 0.02, "w": 12.6, "h": 10}
@@ -70,7 +70,7 @@ def test_a_capture_that_others_split(tmp_path):
 
 
 def test_files_from_elsewhere(tmp_path):
-    """Windows separators, a byte order mark, repeated stems and upper-case suffixes load."""
+    """A scene may have Windows separators, a byte order mark, repeated stems and upper-case suffixes."""
     original = builtin_scene(16, train_views=4, test_views=1)
     write_blender(tmp_path, original, 0.6911112)
 
@@ -183,7 +183,7 @@ def test_capture(tmp_path, caplog):
 
 @pytest.mark.parametrize("rig", ["outward", "parallel", "one place"])
 def test_rays_of_a_capture_without_a_common_focus_are_finite(tmp_path, rig):
-    """All rays are finite, also for a camera at the origin, from which near is measured."""
+    """All rays are finite, even for a camera at the origin; the near distance is measured from the origin."""
     poses = orbit_cameras(9, radius=2, elevation=0, width=4, height=4, focal=4).poses
     if rig == "outward":
         poses[:, :3, [0, 2]] *= -1

@@ -1,4 +1,4 @@
-"""Tests of image stores on disk: pixels and batches as in memory, resumed builds, and stores of other images."""
+"""Tests of image stores on disk: equal to images in memory, resumed builds, and stores of other images."""
 
 import errno
 import fcntl

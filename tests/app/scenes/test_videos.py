@@ -1,4 +1,4 @@
-"""Tests of extracting frames from videos by phones, browsers and other programs."""
+"""Tests of extracting frames from the videos of phones, browsers and other programs."""
 
 import struct
 import subprocess
@@ -64,7 +64,7 @@ H264, SILENT = ("-c:v", "libx264", "-bf", "2"), ("-f", "lavfi", "-i", "anullsrc=
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("a.webm", ("-c:v", "libvpx", "-f", "webm", "-live", "1")),  # without a duration, as by MediaRecorder
+        ("a.webm", ("-c:v", "libvpx", "-f", "webm", "-live", "1")),  # without a duration, as MediaRecorder writes it
         ("a.webm", ("-c:v", "libvpx-vp9", "-b:v", "100k")),
         ("a.mkv", (*H264, "-vf", "setpts='PTS*(1+floor(N/10))'", "-fps_mode", "vfr")),  # variable frame rate
         ("a.mov", SILENT),  # sound longer than the video
@@ -109,7 +109,7 @@ def test_times_that_go_back_do_not_matter(tmp_path):
 
 
 def test_frames_of_two_sizes_are_counted_on(tmp_path):
-    """All frames get the size of the first one: browsers change the size when the network is slow."""
+    """All frames get the first frame's size; browsers change the frame size when the network is slow."""
     large, small = (write_clip(tmp_path / f"{name}.ts", 20, *options) for name, options in TWO_SIZES.items())
     (tmp_path / "both.ts").write_bytes(large.read_bytes() + small.read_bytes())
     gather._take_frames(tmp_path / "both.ts", tmp_path / "frames", 10, print)

@@ -1,4 +1,4 @@
-"""Tests of checkpoint files: exact, atomic, and refused with the file's name when broken."""
+"""Tests of checkpoint files: they are exact and atomic, and an error names a broken file."""
 
 import errno
 import os

@@ -136,7 +136,7 @@ def test_defaults_of_the_architectures(scene):
     ("peak", "speed"), [(0.01, 1), (0.7, 1), (1.4, 1), (1.5, 2), (2.8, 2), (2.9, 4), (8, 8), (90, 64)]
 )
 def test_a_faster_machine_is_so_by_a_power_of_two(monkeypatch, peak, speed):
-    """The speed is a power of two; slow or busy machines count as the reference machine."""
+    """The speed is a power of two; slow or busy machines get the reference machine's speed."""
     monkeypatch.setattr("voronerf.ops._core.native.measure_peak", lambda kind: peak * PEAK)
     assert machine_speed() == speed
     monkeypatch.setattr("voronerf.ops._core.native.missing", lambda device: "not built")

@@ -146,7 +146,7 @@ def test_every_kind_of_field_is_trained_split_resumed_and_scored(tmp_path: Path,
     whole, resumed = (load_checkpoint(checkpoint_path(tmp_path / run)).tensors for run in ("whole", "part"))
     assert whole.keys() == resumed.keys() and all(torch.equal(whole[key], resumed[key]) for key in whole)
     changed = [key for key in whole if key.startswith("router.module.") and not torch.equal(*whole[key][:2])]
-    assert changed  # cells differ since the split
+    assert changed  # the cells have changed since the split
 
     run = open_run(tmp_path / "whole", scene=scene)
     assert isinstance(run.router.module, KINDS[name][0])
@@ -167,7 +167,7 @@ def test_steps_of_what_is_one_program_do_not_depend_on_threads(scene: Scene) -> 
     assert not states["fourier"].thread_deterministic
 
     def four_steps() -> list[Tensor]:
-        # 521 x 67 elements: PyTorch splits 32,768 and more among threads, here into odd parts.
+        # PyTorch splits tensors of 32,768 or more elements among threads; 521 x 67 elements give uneven parts.
         config = replace(small(Path("run"), field="fourier"), steps=4, rays=521, samples=(67,), split_at=(0.5,))
         state = steps_of(build(config, scene), 4)
         return [tensor for _, tensor in sorted(snapshot(state).tensors.items())]

@@ -100,7 +100,7 @@ def test_a_loaded_run_renders_the_same(tmp_path, scene):
         assert evaluate(opened.renderer, scene, views=2) == evaluate(state.renderer, scene, views=2)
     coarser = open_run(tmp_path, scene=scene, samples=(3, 2), backend="reference").renderer
     assert (coarser.sampler.samples, coarser.sampler.fine_samples, coarser.backend) == (3, 2, "reference")
-    # a checkpoint of another configuration or architecture
+    # Checkpoints of another configuration or architecture are refused.
     checkpoint = load_checkpoint(checkpoint_path(tmp_path))
     with pytest.raises(CheckpointError, match=r"a checkpoint of another configuration: --width 8 -> 16; --lr"):
         load(build(replace(config, width=16, lr=1e-4), scene), checkpoint)
@@ -235,7 +235,7 @@ def test_turns_leave_checkpoints(tmp_path, scene):
     checkpoints = Checkpoints(tmp_path, every=0.05)
     while state.seconds < 0.15:
         assert state.seconds >= 0.05 or not checkpoint_path(tmp_path).exists()
-        train(state, [checkpoints], until=state.seconds + 1e-4, clock=lambda: 0.01 * next(ticks))  # one step
+        train(state, [checkpoints], until=state.seconds + 1e-4, clock=lambda: 0.01 * next(ticks))  # takes one step
     checkpoints.writer.wait()
     assert checkpoint_path(tmp_path).exists()
 

@@ -1,4 +1,4 @@
-"""Tests of evaluations during training: their share of the budget, warnings about poor scores, and bad steps."""
+"""Tests of evaluations during training: the time they take, warnings about poor scores, and invalid steps."""
 
 import json
 import math
@@ -23,7 +23,7 @@ def weights(state):
 
 
 class Clock:
-    """A simulated clock: a step, which reads it twice, takes 1 s; a view takes `view_seconds` scaled by its pixels."""
+    """A simulated clock: a step reads it twice and takes 1 s; a view takes `view_seconds` scaled by its pixels."""
 
     def __init__(self, monkeypatch, view_seconds):
         self.now, self.read, self.views, pixels = 0.0, 0, [], SIDE**2

@@ -1,4 +1,4 @@
-"""Tests of the first steps: the grid does not become empty, and a start that learns nothing is redrawn."""
+"""Tests of the first steps: the grid does not become empty, and training restarts if it learns nothing."""
 
 import itertools
 from dataclasses import replace

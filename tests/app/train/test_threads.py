@@ -24,7 +24,7 @@ VARIANTS = {
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_steps_do_not_depend_on_threads(scene, variant):
     def four_steps():
-        # 521 x 67 elements: PyTorch splits 32,768 and more among threads, here into odd parts.
+        # PyTorch splits tensors of 32,768 or more elements among threads; 521 x 67 elements give uneven parts.
         few = {"steps": 4, "rays": 521, "samples": (67,), "depth": 1, "split_at": (2,)}
         state = steps_of(build(small(**{**few, **VARIANTS[variant]}), scene), 4)
         return [tensor for _, tensor in sorted(snapshot(state).tensors.items())]
@@ -49,7 +49,7 @@ def test_what_a_sampler_of_the_users_gives_is_checked_in_every_step(scene, monke
 
 
 def test_torch_on_one_thread():
-    """PyTorch runs on one thread within the context, also when nested; the ops keep their threads."""
+    """PyTorch runs on one thread within the context, which may be nested; voronerf's ops keep their threads."""
     before = torch.get_num_threads()
     with backends.torch_on_one_thread():
         with backends.torch_on_one_thread():

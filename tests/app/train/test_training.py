@@ -62,7 +62,7 @@ def test_training_learns_and_the_reference_learns_the_same(scene):
 
 
 def test_the_middle_of_a_view_is_that_of_the_whole_view(scene):
-    """The middle of a view is rendered bit for bit as in the whole view, with its truth and mask."""
+    """The middle of a view has the same score as the same pixels of the whole view, with their truth and mask."""
     state = started(scene, 4)
     count, cameras = len(scene.test), scene.test.cameras
     distortion = torch.zeros(count, 8)
@@ -81,7 +81,7 @@ def test_the_middle_of_a_view_is_that_of_the_whole_view(scene):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_no_collapse_to_white(scene, seed):
-    """The opacity does not collapse to 0, where every ray is white and has no gradient."""
+    """The opacity does not collapse to 0; every ray would then be white and have no gradient."""
     state = started(scene, 100, steps=100, seed=seed, rays=256, samples=(24,), width=32, cells=())
     image = render_camera(state.renderer, scene, scene.test.cameras, 0)
     alpha = scene.test.images[0][..., 3].float() / 255
@@ -108,7 +108,7 @@ def test_nested_levels_and_cells_too_small(scene, monkeypatch):
     ("settings", "at", "cells"),
     [
         ({"split_at": (7,)}, [0, 7], [1, 4]),
-        # The worst cell is split first, into 4, 4 and then the remaining 3.
+        # The worst cells are split first: two into 4 cells each, and a third into the remaining 3.
         (
             {"cells": (3, 4), "max_cells": 11, "split_at": (0.2, 0.8), "steps": 50},
             [0, 10, 20, 30, 40],
@@ -179,9 +179,9 @@ def test_parameters_decide_the_width(scene, field):
 
 
 def test_octaves_follow_the_pixels(scene):
-    """A 100 x 100 image has 8 octaves, and half the pixel size adds one: 10 at 400 x 400, as in the paper.
+    """A 100 x 100 image needs 8 octaves, and halving the pixel size adds one: 10 at 400 x 400, as in the paper.
 
-    Cones have two more: the last octave keeps a visible amplitude at the middle of the scene, the next one none.
+    Cones need two more: in the middle of the scene the last octave has a visible amplitude, a further one has none.
     """
     some = scene.train.cameras
     for size, octaves in ((50, 7), (100, 8), (200, 9), (400, 10)):
@@ -288,7 +288,7 @@ def test_results_do_not_depend_on_how_many_steps_are_made_at_once(scene, monkeyp
 
 
 def test_a_step_takes_more_rays_where_space_is_empty(scene, monkeypatch):
-    """Steps take up to eight times as many rays while space becomes empty."""
+    """A step draws more rays as space becomes empty, up to eight times as many."""
     monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 1)
     state = build(small(field="hashgrid", depth=1, occupancy=True, steps=12, cells=()), scene)
     rays, voxels = [], state.sampler.grid.occupied.numel()
@@ -346,7 +346,7 @@ def test_the_reference_calls_nothing_compiled(scene, monkeypatch, occupancy):
 
     class Counted:
         def __getattr__(self, name):
-            calls.extend({name} - {"Unchanged"})  # computes nothing
+            calls.extend({name} - {"Unchanged"})  # `Unchanged` computes nothing
             return getattr(real, name)
 
     for backend in ("reference", "warp", "native"):

@@ -1,4 +1,4 @@
-"""Tests of every field with every sampling: single, with all kinds of cells, resumed, and learning."""
+"""Tests of every field with every sampling: with one cell, with all kinds of cells, resumed runs, and learning."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ from voronerf.app.train.build import count_parameters
 
 HIERARCHICAL = {"sampling": "hierarchical", "samples": (10, 6)}
 CONTRACTION, KILO, CONES = {"contraction": "sphere"}, {"field": "kilonerf"}, {"field": "mipnerf"}
-#: Variants in an order in which every second one covers all fields and samplings.
+#: Training variants; the 1st, 3rd, 5th and 7th together have every field and every sampling.
 VARIANTS = {
     "kilonerf": KILO,
     "mipnerf": CONES,
@@ -71,7 +71,7 @@ def test_variants_learn(tmp_path, variant, floor):
 
 
 def test_a_worst_cell_without_samples_is_split_when_it_has_them(scene):
-    """A split that is due before the worst cell has enough samples waits for them."""
+    """If the worst cell has too few samples when a split is due, the split waits for more samples."""
     state = build(small(cells=(2,), max_cells=4, split_at=(4, 6)), scene)
     state.strategy.min_samples = 60
     stages = steps_of(state, 24).stages

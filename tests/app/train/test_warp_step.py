@@ -1,6 +1,6 @@
-"""Tests without a GPU that a default step on Warp reads nothing on the host: its tensors are on the meta device.
+"""Tests, without a GPU, that a default step on Warp reads no tensor on the host: all tensors are on the meta device.
 
-Meta tensors have no values, so reading one raises. Checks whether a tensor is on the CPU fail, as on a GPU.
+Reading a meta tensor raises, since it has no values. A check for CPU tensors is false, as it is on a GPU.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.warp
 
 
 def on_meta(tensor: Tensor, memo: dict[int, object]) -> Tensor:
-    """Copies a tensor to the meta device, once per tensor (the memo of `deepcopy`)."""
+    """Copies a tensor to the meta device, once per tensor; ``memo`` is the memo of `deepcopy`."""
     if id(tensor) not in memo:
         copied = torch.empty_strided(tensor.shape, tensor.stride(), dtype=tensor.dtype, device="meta")
         of_parameter = isinstance(tensor, torch.nn.Parameter)
@@ -41,7 +41,7 @@ def test_a_default_step_reads_nothing_on_the_host(scene, monkeypatch):
     for name in vars(before.optimizer).keys() - vars(state.optimizer).keys():  # not copied by deepcopy
         setattr(state.optimizer, name, copy.deepcopy(getattr(before.optimizer, name), memo))
 
-    # PyTorch and Warp do not support the device here; ``random_`` would need a generator on it.
+    # Replaces calls that do not support the meta device; ``random_`` would need a generator on it.
     empty = torch.empty(1, dtype=torch.int32, device="meta")
     for module in (batches, samplers):
         monkeypatch.setattr(module, "draw_seed", lambda device, generator: empty)

@@ -14,7 +14,7 @@ HIERARCHICAL = {"sampling": "hierarchical", "samples": (12, 6)}
 
 
 def small(out=None, **settings):
-    """Returns the settings of 24 steps; by default the cell is split into four after 12 steps."""
+    """Returns settings for 24 steps; by default the cell is split into four after 12 steps."""
     if not {"cells", "split_at"} & settings.keys():
         settings["split_at"] = (0.5,)
     return TrainConfig(out=out, **{**SMALL, **settings})

@@ -1,4 +1,4 @@
-"""Fixtures: a run of nested cells on a scene of 24 x 24 pixels, and its viewers."""
+"""Fixtures: a run with nested cells on a scene of 24 x 24 pixels, and viewers of this run."""
 
 from __future__ import annotations
 

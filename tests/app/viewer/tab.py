@@ -27,7 +27,7 @@ def resolved(value, buffers):
 
 
 class Tab:
-    """A client of a viewer, which renders while :meth:`until` waits.
+    """A client of a viewer; the viewer renders while :meth:`until` waits.
 
     Args:
         viewer: The viewer that serves the tab.

@@ -78,7 +78,7 @@ def test_panes(run, scene, tab) -> None:
         pictures[pane] = tab.rest()
     assert apart(pictures["opacity"], image.opacity[..., None].expand(128, 128, 3)) < 1.5
     solid, near = image.opacity.numpy() > 0.95, torch.nn.functional.max_pool2d(image.opacity[None], 17, 1, 8)[0]
-    empty = near.numpy() < 0.01  # beyond the ringing of the JPEG's 8 x 8 blocks
+    empty = near.numpy() < 0.01  # outside the ringing of the JPEG's 8 x 8 blocks
     assert empty.any() and pictures["depth"][empty].min() > 240 and pictures["depth"][solid].mean() < 200
     # A pixel of the cells pane has the hue of its leaf cell.
     hues = palette(run.diagram.num_cells).numpy().astype(float)
@@ -112,7 +112,7 @@ def test_a_narrow_canvas_opens_at_all_of_the_first_view(viewer, scene, tab) -> N
         assert abs(across - wide) < 0.1
         phone.until(lambda: abs(phone.gui["Field of view"]["value"] - fov) <= 0.5)
         again = Tab(viewer, replace(scene.test.cameras, intrinsics=scene.test.cameras.intrinsics * 2), number=2)
-        again.rest()  # as a browser that reconnects
+        again.rest()  # like a browser that reconnects
         assert abs(viewer.clients[2].handle.camera.fov - 2 * np.arctan(np.tan(viewer.clients[0].fov / 2) / 2)) < 1e-3
         again.close()
 
@@ -144,7 +144,7 @@ def test_the_line_about_the_picture(viewer, scene, tab) -> None:
         tab.look(scene.test.cameras, number % 2)
         viewer.render_next()
         tab.read()
-        lines.append(said())  # a slow machine draws the sharp picture in between
+        lines.append(said())  # a slow machine may draw the sharp picture in between
     assert re.search(r"rendering (9[6-9]|1..) x \S+ pixels, \d+ frames a second", " ".join(lines))
     assert min(len(picture) for picture in tab.pictures) >= 96
 
@@ -175,7 +175,7 @@ def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
     before = run.diagram.locate(image.heaviest) == leaf
 
     def shares():
-        """Returns the shares of the cell's pixels and of the other solid pixels that are still visible."""
+        """Returns the fractions of the cell's pixels and of the other solid pixels that are still visible."""
         solid = (image.opacity > 0.95).numpy()
         now = tab.rest().min(-1) < 235
         mine = before.numpy() & solid
@@ -251,7 +251,7 @@ def test_keyframes_become_a_path_that_render_takes(run, scene, tab) -> None:
         tab.set("Keyframes", "add")
         tab.until(lambda index=index: f"{index + 1} keyframe" in str(tab.gui["No keyframes."]))
     assert {"/keyframes/0", "/keyframes/1", "/keyframes/line"} <= set(tab.nodes)
-    assert tab.nodes["/keyframes/0"]["thickness_units"] == "screen"  # else lines cover large scenes
+    assert tab.nodes["/keyframes/0"]["thickness_units"] == "screen"  # otherwise lines cover large scenes
     tab.set("Seconds", 1.0)
     pictures = len(tab.pictures)
     tab.set("Preview", True)
@@ -293,7 +293,7 @@ def test_a_tab_may_close_at_any_time(run, scene, capfd) -> None:
         while viewer.server.get_clients():
             time.sleep(0.01)
         viewer._draw_coarse(client)  # as if drawing had begun before the tab closed
-        socket.create_connection(("127.0.0.1", viewer.port)).close()  # browsers open spare ones
+        socket.create_connection(("127.0.0.1", viewer.port)).close()  # browsers open spare connections
         with closing(Tab(viewer, scene.test.cameras, number=1)) as other:
             other.until(lambda: other.pictures)
     assert not warned and capfd.readouterr().err == ""
@@ -405,7 +405,7 @@ def test_bad_addresses(run, address, message) -> None:
 @pytest.mark.parametrize(
     ("host", "asked", "origin", "status"),
     [
-        ("127.0.0.1", "127.0.0.1:{}", None, 101),  # a program, no browser
+        ("127.0.0.1", "127.0.0.1:{}", None, 101),  # a program that is not a browser
         ("127.0.0.1", "127.0.0.1:{}", "http://127.0.0.1:{}", 101),
         ("127.0.0.1", "localhost:9", "http://localhost:9", 101),  # an SSH tunnel
         ("127.0.0.1", "127.0.0.1:{}", "https://example.org", 403),

@@ -10,7 +10,7 @@ from voronerf.app.run import Run
 
 @pytest.fixture(scope="session")
 def runs():
-    """A function that returns the random run of a kind, made once."""
+    """A function that returns the random run of a kind; it makes each run only once."""
     cache: dict[str, Run] = {}
 
     def run(kind: str) -> Run:

@@ -1,4 +1,4 @@
-"""Runs of random networks, one for every kind that a page can draw, on views of the built-in scene."""
+"""Defines runs with random networks on views of the built-in scene, one for each kind of field that a page can draw."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 AXES = torch.tensor([[1.0, 0, 0], [0.0, 0, 1], [0.0, 1, 0]])  # right, up, forward
 SPHERE = Contraction(torch.tensor([0.1, 0.0, -0.1]), 0.7)
 PERSPECTIVE = Perspective(torch.tensor([0.0, -3.0, 0.2]), AXES, 1.0, (0.8, 0.7))
-#: (field, router options, contraction, spacing of the strata) by kind.
+#: The (field, router options, contraction, spacing of the strata) of each kind.
 KINDS = {
     "hash grid": (lambda: HashGridField(width=16, log2_entries=12, box=BOX), {"share": ["features"]}, None, "linear"),
     "a table for each cell": (
@@ -55,7 +55,7 @@ KINDS = {
 
 
 class Rotated(torch.nn.Module):
-    """A foreign field with its own activations, which is traced."""
+    """A custom field with its own activations; the router traces it."""
 
     def __init__(self):
         super().__init__()
@@ -113,7 +113,7 @@ def random_run(kind: str) -> Run:
     first = VoronoiDiagram(torch.rand(3, 3, generator=seeded()) - 0.5)
     router = VoronoiRouter(field, first.centres, **options)
     points = torch.rand(500, 3, generator=seeded()) * 1.6 - 0.8
-    optimizer = Adam(router.parameters(), lr=0.1)  # otherwise all objects are searched for one
+    optimizer = Adam(router.parameters(), lr=0.1)  # otherwise all live objects are searched
     router.subdivide(3, points=points, weights=torch.ones(500), optimizer=optimizer)
     assert router.diagram.depth == 2 and router.num_cells > 4
     with torch.no_grad():

@@ -29,7 +29,7 @@ HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)> {{scri
 
 
 class Page(HTMLParser):
-    """A parser of a page's elements and of its scripts' texts by id."""
+    """A parser that collects a page's elements, and the texts of its scripts by id."""
 
     def __init__(self, text):
         super().__init__()
@@ -202,7 +202,7 @@ def test_the_shader_is_that_of_the_field(runs):
 
 @pytest.mark.parametrize(("size", "factor"), [(0.1, 1.0), (0.6, None), (1.5, 2.0)])
 def test_the_turntable_shows_all_of_an_object(size, factor):
-    """Cameras that cut it see wider, by a factor of two at the most."""
+    """If an object does not fit into the pictures, the focal lengths are reduced, by a factor of two at most."""
     cameras = orbit_cameras(5, radius=3.0, elevation=20.0, width=60, height=40, focal=70.0)
     points = (torch.rand(500, 3) - 0.5) * 2 * size
     wide = wide_enough(cameras, points)

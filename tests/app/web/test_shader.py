@@ -17,7 +17,7 @@ from voronerf.app.web import pack
 #: The image size in pixels, and two strips of rows that are drawn one after the other.
 WIDTH, HEIGHT, STRIPS = 12, 9, ((0, 5), (5, 9))
 LENS = torch.tensor([[13.0, 14.0, 5.0, 5.5]])
-#: C++ code that draws the pixel x, y.
+#: C++ code that draws pixel (x, y).
 DRAW = "draw(vec3u(x, y, 0));"
 SHOW = "static_cast<vec4f*>(bound[4])[y * width + x] = show(vec4f(x + 0.5f, y + 0.5f, 0, 1));"
 CONTRACTED = ("ahead", "a sphere")
@@ -26,7 +26,7 @@ CONTRACT = "vec4f& place = static_cast<vec4f*>(bound[7])[x]; place = vec4f(contr
 
 @pytest.fixture(scope="module")
 def shaders(runs, tmp_path_factory):
-    """A function that runs a shader by its name: a kind of run, "contract" and a kind, or "screen"."""
+    """A function that runs a shader by its name: KIND, "contract KIND" or "screen", where KIND is a kind of run."""
     texts = {kind: pack(runs(kind)).shader for kind in KINDS}
     parts = {kind: (text, DRAW) for kind, text in texts.items()}
     parts |= {f"contract {kind}": (texts[kind], CONTRACT) for kind in CONTRACTED}

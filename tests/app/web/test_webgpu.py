@@ -1,4 +1,4 @@
-"""Tests in a real browser, whose WebGPU runs on the CPU, that pages draw the pictures that `Run.render` renders."""
+"""Tests that pages draw the pictures of `Run.render`, in a real browser whose WebGPU runs on the CPU."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from voronerf.app.web import export_web
 pytestmark = pytest.mark.slow
 pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 
-#: The window size in pixels, small since the CPU draws it.
+#: The window size in pixels; it is small since the CPU draws.
 WINDOW = 32, 32
 PICTURE = """
 const [camera, done] = arguments;
@@ -49,7 +49,7 @@ def resize(browser, width, height, **phone):
 
 @contextlib.contextmanager
 def resized(browser, width, height, **phone):
-    """Resizes the window within the context."""
+    """Resizes the window, and restores its size at the end of the context."""
     resize(browser, width, height, **phone)
     try:
         yield
@@ -137,7 +137,7 @@ def test_the_lens_and_the_size_are_those_that_are_asked_for(page, runs):
 
 @pytest.fixture
 def tall(browser):
-    """A window so high that the page's header does not cover its middle."""
+    """A window so high that the page's header does not cover the middle of the window."""
     with resized(browser, 64, 112):
         yield
 

@@ -1,4 +1,4 @@
-"""Runs a page's shaders on the CPU without a browser: WGSL is translated to C++ line by line, with wgsl.h's types."""
+"""Runs a page's shaders on the CPU without a browser: translates WGSL to C++ line by line, with types of wgsl.h."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 
 def declared(members: str, end: str) -> str:
-    """Translates a struct's members or a function's parameters to C++: types before names."""
+    """Translates a struct's members or a function's parameters to C++, where types precede names."""
     pairs = [member.strip().split(": ") for member in members.split(",") if member.strip()]
     return "".join(f"{kind} {name}{end}" for name, kind in pairs).removesuffix(",")
 
@@ -70,10 +70,11 @@ def translated(text: str) -> str:
 
 
 def compiled(folder: Path, shaders: dict[str, tuple[str, str]]) -> Callable[..., None]:
-    """Compiles shaders; ``shaders`` maps a name to (WGSL text, C++ code that handles the pixel x, y).
+    """Compiles shaders; ``shaders`` maps a name to (WGSL text, C++ code that handles pixel (x, y)).
 
     Returns:
-        A function that runs a shader; it takes the shader's name, width, height, and the buffers in binding order.
+        A function that runs a shader; it takes the shader's name, the picture's width and height, and the buffers in
+        binding order.
     """
     compiler = shlex.split(os.environ.get("CXX", "g++"))
     if shutil.which(compiler[0]) is None:

@@ -22,7 +22,7 @@ FIGURES = (
     *(("cells", "cells", 0), ("parameters", "parameters", 0), ("steps", "steps", 0), ("seconds", "training [s]", 0)),
     *(("rays_per_second", "rays/s", 0), ("psnr", "PSNR [dB]", 2), ("ssim", "SSIM", 4), ("lpips", "LPIPS", 4)),
 )
-#: Scores of test views, and the mark for scores of view centres alone.
+#: Scores of test views, and the mark of scores that belong to the centres of views alone.
 SCORES, PARTLY = ("psnr", "ssim", "lpips"), "*"
 #: Settings about the location and outputs of a run, which are not compared.
 PLACES = ("out", "resume", "allow_outside", "panels", "tensorboard")

@@ -27,7 +27,7 @@ from voronerf.app.train.state import State
 from voronerf.nerf.schedule import GROUP
 
 LONGEST_LINE = 900
-#: Width of a bar; width of the live line of a training without its name and text.
+#: Width of a bar, and width of a training's live line without its name and text.
 BAR = 24
 BESIDE = BAR + len(" 100 %    0:00:00 ")
 
@@ -113,8 +113,8 @@ def fitting(parts: Sequence[tuple[int, str]], room: int) -> str:
 class TrainingDisplay(Callback):
     """A callback that shows step, stage, rays/s, loss, PSNR and the remaining time in a live line.
 
-    The line shows inside the context manager ``progress``. Without a terminal, the display prints a line when none was
-    printed for `EVERY` seconds.
+    The line shows inside the context manager ``progress``. Without a terminal, the display prints a line if it has
+    printed none for `EVERY` seconds.
 
     Args:
         label: Name of the run.
@@ -141,7 +141,7 @@ class TrainingDisplay(Callback):
         self.told = time.monotonic()
 
     def following(self, scores: Scores) -> TrainingDisplay:
-        """Makes the display show the PSNR of the last of these scores; returns the display."""
+        """Makes the display show the PSNR of the last evaluation in ``scores``; returns the display."""
         self.scores = scores
         return self
 

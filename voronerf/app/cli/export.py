@@ -46,8 +46,8 @@ def export(
         crop: The exported box, x y z of the lowest and of the highest corner, or "saved" for the viewer's crop. Default
             the scene's box. For a scene without a box, the mesh covers the region that the cameras look at; points and
             cells cover the box around the sphere of the contraction.
-        coordinates: Coordinates of points, meshes and cells: of the scene as it is rendered, or of its files, which
-            are in metres if the capture is.
+        coordinates: Coordinates of points, meshes and cells: of the rendered scene, or of the scene's files (in metres
+            if the capture is).
         opening: The settings with which the run is opened.
     """
     check_counts(count=count)

@@ -115,7 +115,7 @@ def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 @RULES.primitive_rule
 def values(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Tells tyro how to parse numbers, lists of numbers, choices and optional values; errors name rule and value."""
+    """Tells tyro how to parse numbers, lists of numbers, choices and optional values; errors tell rule and value."""
     kind, origin, parts = info.type, get_origin(info.type), get_args(info.type)
     if kind in NUMBERS:
         return _spec(1, kind.__name__.upper(), NUMBERS[kind], lambda words: kind(words[0]))

@@ -42,7 +42,7 @@ def process(
         matching: The pairs of images that are compared: all pairs (exhaustive), neighbours by name (sequential), or
             images that share their largest features (auto).
         camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
-        mapper: COLMAP's mapper; auto is global, and incremental too if that model has faults or loses cameras. A
+        mapper: COLMAP's mapper; auto is global, and also incremental if the global model has faults or loses cameras. A
             model that contradicts pairs of images is made again without the doubtful pairs.
         max_features: Greatest number of features of an image.
         size: Pixels along the longer side to which images are reduced for the search of features.

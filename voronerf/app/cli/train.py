@@ -99,7 +99,7 @@ def train(
         view: Show the training in a browser, and its result until Ctrl-C.
         host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
         port: Port that --view listens at; 0 is any free port.
-        explain: Only print how a training step is computed, and why not in a faster way.
+        explain: Only print how a training step is computed, and what prevents a faster way.
     """
     present_device(config.device)  # fails before the scene is read
     if panels is not None and panels < 0:
@@ -297,8 +297,8 @@ def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callab
     check_stored_paths(
         folder, data=None if is_given("data") else stored.data, lpips=None if is_given("lpips") else stored.lpips
     )
-    # --steps on the command line replaces a stored budget, and --budget stored steps. The placeholder set here is
-    # overwritten by the option.
+    # On the command line, --steps replaces a stored budget, and --budget replaces stored steps. The placeholder set
+    # here is overwritten by the option.
     length = {name for name in ("budget", "steps") if is_given(name)}
     if length == {"steps"} and stored.budget is not None:
         stored = replace(stored, budget=None, steps=2**53 - 1)

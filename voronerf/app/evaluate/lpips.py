@@ -119,8 +119,8 @@ def find_lpips(
         The metric or None, and a line with the source of the weights or the reason why there are none.
 
     Raises:
-        LpipsError: the first file or folder of weights cannot be used, or the images are too small and `setting` names
-            weights.
+        LpipsError: the first weights that exist cannot be used, or the images are too small for the weights of
+            `setting`.
 
     Examples:
         >>> from pathlib import Path

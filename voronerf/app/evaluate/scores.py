@@ -113,7 +113,7 @@ def _middle_of(cameras: Cameras, view: int, factor: int) -> tuple[Cameras, slice
 
 
 def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
-    """Averages the scores over the views, as the literature's tables do.
+    """Averages the scores over the views, like the tables in the literature.
 
     "psnr_of_mean_error" is the PSNR of the mean squared error over all views, as in the paper's curves; it is never
     above the mean of the PSNRs. "lpips" is None unless every view has one.

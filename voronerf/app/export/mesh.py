@@ -3,9 +3,9 @@
 The training views are rendered, which gives each pixel the distance of its surface. These distances are fused into a
 truncated signed distance function: the distance from the surface along the rays, averaged over the views (Curless and
 Levoy 1996), then smoothed a little. The mesh is its zero level; for an object on a plain background, the level is
-shifted by `BEFORE`. The average removes surfaces that one view shows and other views look through. A node of the grid
-has a value if a view sees it, or if it lies shortly behind a surface. Only blocks of nodes near a shown surface are
-filled.
+shifted by `BEFORE`. The average removes a surface that only one view shows, if other views look through it. A node of
+the grid has a value if a view sees it, or if it lies shortly behind a surface. Only blocks of nodes near a visible
+surface are filled.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def export_mesh(
         ConfigError: The resolution does not fit into memory, `faces` is below 4, or the views show no surface in the
             box.
         ImportError: trimesh, scikit-image, scipy or fast-simplification is missing.
-        ValueError: Another suffix.
+        ValueError: The suffix is none of these.
         OSError: The file cannot be written.
 
     Examples:
@@ -117,8 +117,8 @@ def export_mesh(
 def looked_at(views: list[SurfaceView]) -> Tensor | None:
     """Returns the box [2, 3] of the region that the cameras look at, or None if there is none.
 
-    The box is around the surface points that half of the views have in their pictures and that are nearer to the
-    cameras' focus than half of the cameras.
+    The box is around the surface points that lie in the pictures of at least half of the views, and that are nearer to
+    the cameras' focus than half of the cameras are.
     """
     cameras = Cameras.joined([view.camera for view in views])
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])
@@ -140,7 +140,7 @@ def looked_at(views: list[SurfaceView]) -> Tensor | None:
 
 
 def _left_out(views: list[SurfaceView], box: Tensor) -> str:
-    """Returns a line about the fraction of surfaces outside of a box."""
+    """Returns a line about the fraction of the surfaces that lies outside of a box."""
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])
     points = points[points.isfinite().all(-1)]
     inside = ((points >= box[0]) & (points <= box[1])).all(-1)

@@ -111,7 +111,7 @@ def views_of(run: Run, cameras: Cameras, track: Track = in_silence) -> list[Surf
 
 
 def spread_around(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Finds the principal axes of each point's nearest neighbours.
+    """Finds the principal axes of the nearest neighbours of each point.
 
     Returns:
         [n, 3, 3], the axes in columns, the axis of least spread first; and [n, count], the distances of the neighbours.

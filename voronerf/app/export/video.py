@@ -97,7 +97,7 @@ def _colours(run: Run, cameras: Cameras, numbers: Iterable[int]) -> Iterator[Ten
 
 
 def _depths(run: Run, cameras: Cameras, numbers: Iterable[int]) -> Iterator[Tensor]:
-    """Yields pictures of depth, or of disparity if rays are sampled in disparity, on one scale for all frames."""
+    """Yields pictures of depth (of disparity if rays are sampled in disparity), on one scale for all frames."""
 
     def measured(number: int) -> tuple[Tensor, Tensor]:
         image = run.render(cameras, number, heaviest=False)

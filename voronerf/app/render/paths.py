@@ -74,8 +74,8 @@ def read_camera_path(file: Path | str) -> CameraPath:
 
     Positions are in the coordinates of the rendered scene. The scale of a pose, as in exports of scaled objects, is
     ignored, and so are crops, times and transitions of the file. The default angle of view is the file's `default_fov`.
-    If `fps` is missing, the rate follows from the file's `seconds`, and is 24 frames a second if these are missing too.
-    Invalid keyframes are left out.
+    If `fps` is missing, the rate follows from the file's `seconds`; if `seconds` is missing too, the rate is 24 frames
+    a second. Invalid keyframes are left out.
 
     Raises:
         ValueError: the file is no camera path, is too large, or its cameras are not perspective, fisheye or
@@ -238,7 +238,7 @@ def like_most(cameras: Cameras) -> Cameras:
 
 
 def resized(cameras: Cameras, size: tuple[int, int]) -> Cameras:
-    """Resizes cameras to another (width, height); the new pictures reach no farther than the old ones on any side."""
+    """Resizes cameras to another (width, height); the new pictures show nothing beyond the old ones on any side."""
     scale = max(size[0] / cameras.width, size[1] / cameras.height)
     intrinsics = scale * cameras.intrinsics
     intrinsics[:, 2] += (size[0] - scale * cameras.width) / 2

@@ -74,7 +74,7 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
 
 
 def _test_frames(folder: Path, train_frames: Sequence[ListedImage], reading: Reading) -> list[ListedImage]:
-    """Returns the test images of the first file that has any; leaves out training images, with a warning."""
+    """Returns the test images of the first file that has test images; leaves out training images, with a warning."""
     training = {frame.path.resolve() for frame in train_frames}
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():

@@ -52,7 +52,7 @@ PLACES = {
 }
 #: The largest size of a file in bytes.
 MOST_BYTES = 2**31
-#: The minimum number of images that see a point; with fewer images, its position is too uncertain.
+#: The minimum number of images that see a point; if fewer images see it, its position is too uncertain.
 LEAST_SEEN = 3
 #: The first invalid point number: COLMAP writes 2^64 - 1 for an observation without a point.
 NO_POINT = 2**63
@@ -112,7 +112,7 @@ def find_models(folder: Path) -> Models | None:
 
 
 def _scene_around(folder: Path) -> tuple[Path, str]:
-    """Returns (scene folder, path of the images in it), given the scene folder or a model folder inside it."""
+    """Returns (scene folder, path of the images in it); ``folder`` is the scene folder or a model folder inside it."""
     models = folder.parent if folder.name.isdecimal() else folder
     if not image_folders(folder):
         for place, images in PLACES.items():
@@ -404,7 +404,7 @@ def points_seen(image: ColmapImage, model: ColmapModel) -> Array:
 
 
 def depth_bounds(image: ColmapImage, points: Array) -> tuple[float, float] | None:
-    """Returns the depths between which an image's points [s, 3] lie, without outliers; None for too few points."""
+    """Returns the least and the largest depth of an image's points [s, 3] without outliers; None for too few points."""
     offsets = points - image.pose[:3, 3]
     panorama = image.camera.lens.model == EQUIRECTANGULAR  # without an optical axis, distances replace depths
     depth = np.linalg.norm(offsets, axis=1) if panorama else -offsets @ image.pose[:3, 2]

@@ -29,7 +29,8 @@ class ImageFolder(NamedTuple):
 
     Attributes:
         path: the folder.
-        full: the folder of the same images in full size; None if ``path`` has full size, or if this folder is missing.
+        full: the folder of the same images in full size; None if ``path`` holds images in full size, or if there is no
+            such folder.
         masks: the folder of their masks, or None.
         factor: the remaining downscale factor; None to choose it by the size of the images.
         notes: lines for the user.

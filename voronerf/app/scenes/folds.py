@@ -1,7 +1,7 @@
 """Checks for images that mislead a mapper: a static background, and an object that looks alike from two sides.
 
-Behind an object on a turntable, the background has most features, and its features show a static camera. A model is
-folded if it places the images of two sides of an object on one side.
+If an object turns in front of a static background, most features lie on the background and show a static camera. A
+model is folded if it places the images of two sides of an object on one side.
 
 False matches between two sides lie on the object alone, which fills a small part of the images. Matches of neighbouring
 images spread over a large part; such pairs of images are called wide. Wide pairs are trusted, and a model that
@@ -57,7 +57,7 @@ class Matches(NamedTuple):
 
 
 def spreads(matches: Matches) -> dict[Pair, float]:
-    """Returns for each pair the smaller ratio, of two images, of the area of the matches' box to the features' box."""
+    """Returns for each pair the area of the matches' box over the area of all features' box, in the worse image."""
     boxes = {name: max(_box(places), TINY) for name, places in matches.features.items()}
     return {
         pair: min(_box(matches.features[name][indices]) / boxes[name] for name, indices in zip(pair, rows.T))
@@ -97,7 +97,7 @@ def strong_pairs(matches: Matches, wide: Iterable[Pair]) -> list[Pair]:
 
 
 def trusted_pairs(matches: Matches, spread: dict[Pair, float]) -> set[Pair]:
-    """Returns the wide pairs and, for an image without strong pairs, its best other pairs, by matches x spread."""
+    """Returns the wide pairs and, for each image without strong pairs, its best other pairs by matches x spread."""
     wide = set(wide_pairs(matches, spread))
     covered = {name for pair in strong_pairs(matches, wide) for name in pair}
     others = [pair for pair, rows in matches.pairs.items() if pair not in wide and len(rows) >= WIDE_MATCHES]
@@ -107,7 +107,7 @@ def trusted_pairs(matches: Matches, spread: dict[Pair, float]) -> set[Pair]:
 
 
 def contradicted_pairs(matches: Matches, strong: Iterable[Pair], images: Sequence[ColmapImage]) -> tuple[int, int]:
-    """Returns (number of strong pairs that a model's cameras contradict, number of strong pairs of its images)."""
+    """Returns (number of strong pairs that a model's cameras contradict, number of all strong pairs of its images)."""
     by_name = {image.name: image for image in images}
     placed = [pair for pair in strong if by_name.keys() >= set(pair)]
     rays = {name: _rays(by_name[name], matches.features[name]) for name in {name for pair in placed for name in pair}}

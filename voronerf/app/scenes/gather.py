@@ -51,7 +51,7 @@ def gather(
         masks: the folder for the masks, which is made only if there are masks.
         frames: the number of frames to extract from a video.
         say: called with a line for the user, such as about files that are left out.
-        progress: called with the name "images", the number of copied images, and the number of all.
+        progress: called with the name "images", the number of copied images, and the number of all images.
     """
     folder, files = _list_images(source, say) if source.is_dir() else (source, [])
     progress("images", 0, len(files))

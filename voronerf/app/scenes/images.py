@@ -144,7 +144,7 @@ def read_images(
     most_channels: int = 4,
     upright: bool = False,
 ) -> Decoded:
-    """Decodes images; beside the result, memory holds only one image, or several small images.
+    """Decodes images; in addition to the result, the memory holds only one image, or several small images.
 
     Args:
         paths: at least one file.
@@ -219,7 +219,7 @@ def read_masks(
     Args:
         masks: the mask file of each image, or None if the whole image counts.
         paths: the image files.
-        images: the decoded images, which have the size of their masks or a smaller one. Each mask is rotated like its
+        images: the decoded images, which have the size of their masks or a smaller size. Each mask is rotated like its
             image. If the images are stored on disk, the masks are stored there too.
         factor: downscale factor.
         name: the name of the scene.
@@ -266,7 +266,7 @@ def read_masks(
 
 
 def drawn(mask: Image.Image, size: Sequence[int], turns: int) -> NDArray[np.bool_]:
-    """Returns which pixels of a mask are neither black nor transparent, bool [h, w], oriented like the stored image.
+    """Returns bool [h, w], oriented like the stored image: whether a mask's pixel is neither black nor transparent.
 
     A mask may have been drawn on the upright image. Since JPEG blurs borders, pixels of a JPEG mask that are darker
     than grey count as black.

@@ -133,7 +133,7 @@ def photograph_scene(
         reading: the options for reading the folder.
         factor: the remaining downscale factor of the files.
         notes: the loader's lines for the user.
-        transform: float64 [4, 4], transform from the original coordinates to the coordinates of the poses.
+        transform: float64 [4, 4], the transform from the original coordinates to the coordinates of the poses.
     """
     views, held_out, repeats = _listed_once(views, held_out)
     places = torch.stack([view.pose[:3, 3] for view in views])
@@ -274,7 +274,7 @@ def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
 
 
 def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:
-    """Returns the pixels, inside image and mask, in which a split's views see their points; None if there are none."""
+    """Returns pixels (inside image and mask) and distances of the points that a split's views see; None if none."""
     pixels, distances = [], []
     for index, view in enumerate(views):
         if view.points is None:
@@ -332,8 +332,9 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
     The cameras' common focus, or else their mean position, becomes the origin. Their mean up direction becomes z, and
     for a forward-facing scene their mean viewing direction becomes y. The farthest camera is at distance 1.
 
-    With bounds, the unit of a forward-facing scene is the smallest near bound. The unit of an inside-out scene is
-    limited to the range from the median near bound to the median far bound, since its cameras may share one place.
+    With bounds, two kinds of scenes differ. In a forward-facing scene, the smallest least depth becomes 1. In an
+    inside-out scene, whose cameras may share one place, the camera distance that becomes 1 is first clamped to the
+    range from the median least depth to the median largest depth.
 
     Args:
         poses: float64 [c, 4, 4].
@@ -395,7 +396,7 @@ def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Per
 
 
 def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
-    """Returns a rotation [3, 3] of `up` to z and of `forward` to y; ignores a direction that is None or nearly zero."""
+    """Returns a rotation [3, 3] that maps `up` to z and `forward` to y; ignores None and directions near zero."""
     if forward is not None and forward.norm() > 0.1:
         y = torch.nn.functional.normalize(forward, dim=0)
         x = torch.linalg.cross(y, up)

@@ -79,8 +79,8 @@ SEQUENTIAL = 10
 #: Fractions of the images that have a camera: below the first, a model is refused; below the second, other mappers are
 #: tried.
 LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
-#: A camera is lost if it sees fewer points than this; only points in at least three images count. COLMAP requires the
-#: same number of matches between two images.
+#: A camera is lost if it sees fewer points than this. Only points that at least three images see count. COLMAP requires
+#: the same number of matches between two images.
 LEAST_HELD = 15
 #: The largest mean reprojection error of a sound model: in pixels, and as a fraction of the longer side, whichever is
 #: larger. With a phone's images of 4,032 pixels, fields are as good at an error of 2.04 as at 1.39.
@@ -137,7 +137,7 @@ class Model:
 
     @property
     def folded(self) -> bool:
-        """Returns whether an object that looks alike from several sides has misled the mapper."""
+        """Returns whether the model is folded: an object that looks alike from several sides has misled the mapper."""
         return is_folded(self.contradicted, self.strong)
 
 
@@ -263,7 +263,7 @@ def process(
 
 
 def _begin(out: Path, settings: Settings) -> Path:
-    """Returns the folder of the stages: a new one, or the folder of a stopped process with the same settings."""
+    """Returns the folder of the stages: a new folder, or the folder of a stopped process with the same settings."""
     work = out / "colmap"
     record = work / "settings.json"
     if record.is_file():
@@ -311,7 +311,7 @@ class Stages:
     progress: Progress  # see :func:`process`
 
     def in_parts(self, name: str, items: Sequence[Item], size: int, work: Callable[[Sequence[Item]], None]) -> None:
-        """Runs a stage in parts, for progress and interruption; COLMAP skips the items that are finished."""
+        """Runs a stage in parts, between which it reports progress and can be stopped; COLMAP skips finished items."""
         for first in range(0, len(items), size):
             self.progress(name, first, len(items))
             with _named_errors(name):
@@ -506,7 +506,7 @@ def _best(models: Sequence[Model], count: int) -> Model:
 
 
 def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Sequence[Pair]) -> Model | None:
-    """Runs the mapper with which ``name`` begins; returns its largest model, or None if it finds no model."""
+    """Runs the mapper whose name is the start of ``name``; returns its largest model, or None if it finds no model."""
     colmap, folder = stages.colmap, stages.work / name
     mapper, _, again = name.partition("_")
     if not folder.is_dir():

@@ -93,7 +93,7 @@ class Scene:
         near: distance along a ray at which the scene begins.
         far: distance along a ray at which the scene ends.
         box: float32 [2, 3], lowest and highest corner of an axis-aligned box around the scene, or None if unknown.
-        background: "white" behind transparent pixels; None for an opaque capture without a background.
+        background: the colour behind transparent pixels, "white"; None for opaque images.
         kind: one of `KINDS`.
         contraction: the contraction that makes the space of a scene without a box finite; None for the sphere around
             the origin and all cameras.

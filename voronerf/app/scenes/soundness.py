@@ -14,15 +14,15 @@ from voronerf.app.scenes.lenses import Lens
 from voronerf.nerf.lenses import EQUIRECTANGULAR
 
 #: A camera is lost if the distance to its nearest neighbour exceeds `LOST` times the median of these distances, and
-#: exceeds the fraction `EXTENT` of all distances between two cameras. The first condition alone would reject all
+#: is larger than the fraction `EXTENT` of the distances between two cameras. The first condition alone would reject all
 #: cameras outside a burst of images. The second condition works for bursts of up to 57 % of the cameras, and for up to
 #: 42 % of lost cameras.
 LOST, EXTENT = 8.0, 1 / 3
-#: Cameras that are lost together are each other's neighbours. So a camera is also lost if its distance to the median
+#: Two lost cameras may be each other's nearest neighbours. So a camera is also lost if its distance to the median
 #: position exceeds `APART` times the quantile `MOST` of these distances.
 APART, MOST = 10.0, 0.8
-#: The check for a collapse ignores lost cameras up to this fraction of all cameras, and a single one always. If more
-#: are lost, these may be the only cameras outside a collapse.
+#: The check for a collapse ignores lost cameras if they are at most this fraction of all cameras, or a single camera.
+#: More lost cameras may be the only cameras outside a collapse.
 FEW = 0.1
 #: The maximum number of cameras whose pairwise distances are measured.
 MOST_CAMERAS = 1000

@@ -69,8 +69,8 @@ def read_transforms(
 ) -> tuple[dict[str, Any], list[ListedImage]]:
     """Reads a transforms file and finds its images.
 
-    Listed images that are missing are left out, with a warning of their number. It is an error if all are missing,
-    unless ``all_may_miss`` is set.
+    Listed images that are missing are left out, with a warning that tells their number. It is an error if all images
+    are missing, unless ``all_may_miss`` is set.
 
     Returns:
         (the file's entries, the frames with an existing image, in the file's order).
@@ -265,7 +265,7 @@ def _plain(name: str) -> str:
 
 
 def has_lens(frames: Sequence[ListedImage]) -> bool:
-    """Returns whether any frame has lens entries, as captures do; Blender's files have the field of view alone."""
+    """Returns whether any frame has lens entries, as in captures; Blender's files have only the field of view."""
     flags = ("latlong", "fisheye_crop_radius", *OTHER_RAYS)
     return any(
         any(frame.values.get(key) is not None for key in LENS) or any(frame.values.get(key) for key in flags)

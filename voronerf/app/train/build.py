@@ -249,7 +249,7 @@ def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) ->
 
 
 def as_field(router: VoronoiRouter) -> Field:
-    """Adapts a router to the renderer, which gives one direction per ray; some networks need one per sample."""
+    """Adapts a router to the renderer, which gives one direction per ray; some networks need a direction per sample."""
     takes_rays = "ray_index" in inspect.signature(router.module.forward).parameters
     return router if takes_rays else DirectionPerSample(router)
 

@@ -46,7 +46,7 @@ FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views", "part")
 PATIENCE = 10
 #: Drop of the PSNR from its best value, in dB, that counts as a collapse.
 COLLAPSE = 5.0
-#: From this step on, in the second half of a run, its PSNR is compared with the PSNR of a single colour.
+#: From this step on, but only in the second half of a run, the PSNR is compared with the PSNR of a single colour.
 SETTLED = 100
 
 
@@ -147,7 +147,7 @@ class Scores(Callback):
     """Scores test views at regular intervals and at the end, into ``metrics.jsonl``, and writes ``summary.json``.
 
     With ``config.budget`` and without ``config.eval_views``, the time of evaluations is limited. Intermediate
-    evaluations take at most a twentieth of the elapsed time, and score fewer views, or none, if necessary. All
+    evaluations take at most a twentieth of the elapsed time; if necessary, they score fewer views or none. All
     evaluations together take at most a tenth of the budget. If there is too little time for a view at the end, only the
     middles of some views are scored.
 
@@ -246,7 +246,7 @@ class Scores(Callback):
             state.count_evaluation(self.clock() - started, min(self.view_seconds * all_views, SHARE / 2 * budget))
 
     def affordable(self, budget: float | None, most: int) -> int:
-        """Returns how many views, 1 to ``most``, fit into a tenth of a budget (seconds), given the last view's time."""
+        """Returns how many views, 1 to ``most``, fit into a tenth of a budget (seconds), by the last view's time."""
         return most if budget is None else max(1, min(most, int(SHARE * budget / max(self.view_seconds, 1e-9))))
 
     def _seconds_of(self, lpips: Lpips, state: State) -> float:

@@ -60,7 +60,10 @@ def checkpoint_paths(run: Path) -> list[Path]:
 
 
 def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
-    """Writes the last checkpoint, renames older ones to ``last-1``, ... and keeps ``keep``, or all on failure."""
+    """Writes a checkpoint as the last one, renames older ones to ``last-1``, ..., and deletes all but ``keep``.
+
+    If the new checkpoint cannot be written, the older ones stay unchanged.
+    """
     last = checkpoint_path(run)
     written = last.with_name("new.safetensors")
     save_checkpoint(written, checkpoint)
@@ -177,7 +180,8 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
 
     Args:
         path: The file.
-        keep: Function of a tensor's name that returns whether to read and verify it. Other tensors must exist, too.
+        keep: Function from a tensor's name to whether the tensor is read and verified. The other tensors must exist,
+            too.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint")

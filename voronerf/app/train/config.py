@@ -109,18 +109,18 @@ class CellSettings:
     cells: tuple[int, ...] = (16,)
     """Cells per level: `16` is 16 cells, `16 16` splits each of the 16 cells into 16, no number is one network."""
     split_at: tuple[float, ...] | None = None
-    """Time of the split of each level: below 1 a fraction of the run, from 1 on a number of steps; default: 0.2, or
+    """Time of the split of each level: below 1 a fraction of the run, otherwise a number of steps; default: 0.2, or
     evenly spaced from 0.15 to 0.5. With --max-cells, the times of the first and of the last split."""
     max_cells: int | None = None
-    """Final number of cells when, below the first level, each split divides only the cell with the largest accumulated
+    """Final number of cells, if each split after the first one divides only the cell with the largest accumulated
     error. The first number of --cells is for the first split, the last number for each later split."""
     centres: Literal["balanced", "random", "uniform", "centroidal"] = "centroidal"
     """Centres of the new cells: balanced by importance (as published), random samples, a uniform grid, or centroids of
     the cells (centroidal), which makes cells compact."""
     init: Literal["inherit", "random"] = "inherit"
-    """New cells start from the parameters of their parent, or from random ones."""
+    """Initial parameters of new cells: copies of their parent's parameters, or random parameters."""
     assignment: Literal["nearest", "stochastic"] = "nearest"
-    """Cell of a sample: the nearest one, or, in training, a random one by the distances to the centres."""
+    """Cell of a sample: the nearest cell, or, in training, a random cell, drawn by the distances to the centres."""
 
 
 @dataclass(frozen=True)
@@ -143,9 +143,9 @@ class SamplingSettings:
     """Factor of a loss on light that does not come from the points of a sparse model (Deng et al. 2022,
     "Depth-supervised NeRF"); default 0.0015 for COLMAP's models, and 0, which is off, without points."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
-    """Input space of the networks: unchanged; with all points outside a sphere mapped into a shell of twice its radius;
-    or normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for fields
-    without a grid, otherwise ndc for forward-facing cameras and sphere for other cameras."""
+    """Input space of the networks: unchanged (none); all points outside a sphere mapped into a shell up to twice its
+    radius (sphere); or normalised device coordinates, for forward-facing scenes (ndc). auto is none for a scene with a
+    box and for fields without a grid, otherwise ndc for forward-facing cameras and sphere for other cameras."""
     occupancy: bool = True
     """Skip samples in empty space, in training and in pictures. This works for points in a single pass, in a scene with
     a box or with a contraction; it is off otherwise."""

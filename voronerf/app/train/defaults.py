@@ -43,9 +43,9 @@ PEAK = 5.1e11
 def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfig:
     """Returns the settings with every default filled in, except ``width`` and ``lr`` if ``parameters`` determines them.
 
-    The defaults are for contraction, occupancy, sparse depth, rays, samples per ray, and the options of the field.
+    Contraction, occupancy, sparse depth, rays, samples per ray, and the options of the field have such defaults.
     ``speed`` is the speed of this machine relative to the one on which the defaults were measured. It has no effect if
-    the length of the training is a number of steps, since the same seed should give the same networks everywhere.
+    the length of the training is a number of steps, since the same seed should give the same networks on every machine.
     """
     kind, boxed = config.field_type, scene.box is not None
     contraction, sparse_depth, rays, samples = config.contraction, config.sparse_depth, config.rays, config.samples

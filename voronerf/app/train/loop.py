@@ -21,7 +21,7 @@ ANSWER = 0.3
 
 
 class TrainingError(RuntimeError):
-    """A training cannot continue; the message gives the reason, and the state of the last checkpoint."""
+    """A training cannot continue; the message gives the reason and the state of the last checkpoint."""
 
 
 class Callback:
@@ -124,7 +124,7 @@ def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool =
 
 
 def count(state: State, steps: int, output: StepOutput) -> None:
-    """Counts steps, and reads the output of the last step, on a GPU only every `READ_EVERY` steps."""
+    """Counts steps, and reads the output of the last step; on a GPU, reads it only every `READ_EVERY` steps."""
     state.count_steps(steps, output.rays)
     if state.device.type == "cpu" or state.step % READ_EVERY == 0:
         state.read_output(output)

@@ -64,7 +64,8 @@ def load(state: State, checkpoint: Checkpoint) -> None:
 
     Args:
         state: The new state, from :func:`voronerf.app.train.build`.
-        checkpoint: A checkpoint of a training with the same settings, except those that may differ.
+        checkpoint: A checkpoint of a training with the same settings, except for `RESUMABLE` settings, which may
+            differ.
 
     Raises:
         CheckpointError: If the checkpoint has another configuration, or its contents are incomplete or do not fit.

@@ -49,7 +49,7 @@ def is_outside(run: Path, path: str | Path) -> bool:
 
 
 def remember_choice(path: str | Path) -> None:
-    """Remembers that the user of this machine has named a path, so that settings of runs may name it, too."""
+    """Remembers that the user of this machine has named a path; settings of runs may then name the path, too."""
     with contextlib.suppress(OSError):  # on failure, the user must name it again
         _marker_of(path).touch()
 

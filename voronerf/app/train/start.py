@@ -56,7 +56,7 @@ def judge_start(state: State, last: StepOutput) -> None:
 
 
 def steps_to_judgement(state: State) -> int:
-    """Returns the number of steps until :func:`judge_start` judges; `GROUP` if it will not."""
+    """Returns the number of steps until :func:`judge_start` judges the start; `GROUP` if it will not judge it."""
     remaining = judged_at(state) - state.step
     return remaining if remaining > 0 else GROUP
 

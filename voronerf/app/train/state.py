@@ -76,7 +76,7 @@ class State:
         unseen_share: The fraction of the training in which batches have unseen rays.
         rays_done: The number of rays of all finished steps.
         loss: The loss of the last step that the host has read.
-        skipped_in_a_row: The number of steps that the guard has skipped since the last step that it has not skipped.
+        skipped_in_a_row: The number of consecutive steps, up to the last one, that the guard has skipped.
         stages: The periods of training: the first one, one after each split, and one for each restart of the coarse
             stage.
         stopped: Whether a stop of the training is requested.

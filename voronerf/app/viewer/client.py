@@ -31,11 +31,12 @@ if TYPE_CHECKING:
 SHARP, FULL, LARGEST = 512, 1536, 2048
 #: Greatest number of training views that are drawn, and pixels along the longer side of their pictures.
 MOST_VIEWS, THUMBNAIL = 200, 96
-#: Range of the vertical angle of view in degrees.
+#: The smallest and the largest vertical angle of view in degrees.
 NARROWEST, WIDEST = 5, 120
 NO_CELL = "Click or tap a cell."
 MOUSE = "Drag: turn. Right drag or two fingers: move. Scroll or pinch: zoom. Click or tap: name the cell."
-#: Seconds without a movement after which the frame rate is measured anew; seconds between updates of its display.
+#: Seconds without a movement after which the frame rate is measured anew, and seconds between updates of the shown
+#: rate.
 PAUSE, SAY = 0.5, 0.25
 OWN_GPU = "[Draw it in this browser](/scene.html) with WebGPU: movements then need no pictures from the server."
 #: Padding of the curve in pixels: top, right, bottom, left. Without it the labels are cut off.
@@ -51,7 +52,7 @@ class Client:
     """A browser that is connected to the viewer.
 
     Attributes:
-        camera: Returns the browser's camera, for a number of pixels along the longer side.
+        camera: Function from a number of pixels along the picture's longer side to the browser's camera.
         aspect: Width over height of the canvas.
         fov: The vertical angle of view in radians.
         look: The choices in the panel.
@@ -127,7 +128,7 @@ class Client:
             self._open(angle_of_view(self.viewer.subject.scene.test.cameras, 0, self.aspect))
 
     def _look_around(self) -> bool:
-        """Reads the browser's camera; returns False and keeps the old one if canvas or numbers are invalid."""
+        """Reads the browser's camera; if canvas or numbers are invalid, keeps the old camera and returns False."""
         now = self.handle.camera
         numbers = (*now.wxyz, *now.position, now.fov)
         is_shown = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)

@@ -119,7 +119,7 @@ class Keyframes:
 
 
 def same_size(cameras: list[Cameras]) -> Cameras:
-    """Resizes cameras to the size of the last one, in even numbers for a video; keeps vertical angles of view."""
+    """Resizes cameras to the last camera's size, made even for a video; keeps vertical angles of view."""
     width, height = (max(2, side // 2 * 2) for side in (cameras[-1].width, cameras[-1].height))
     focal = torch.stack([camera.intrinsics[0, 1] * (height / camera.height) for camera in cameras])
     middle = torch.tensor((width / 2, height / 2)).repeat(len(cameras), 1)

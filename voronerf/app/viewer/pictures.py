@@ -1,4 +1,4 @@
-"""The pictures of a viewer: colour, depth, opacity and cells of a camera, hidden cells, the cell behind a pixel.
+"""The pictures of a viewer: colour, depth, opacity and cells, without hidden cells; and the cell that a pixel shows.
 
 h x w pixels, k cells. Pictures are uint8 [h, w, 3].
 """
@@ -110,7 +110,7 @@ def groups_of(diagram: VoronoiDiagram, level: int) -> Tensor:
 
 
 def space_from(scene: Scene, camera: Cameras) -> Scene:
-    """Returns the scene with near and far for a camera at any place, also inside the scene's box."""
+    """Returns the scene with other near and far bounds, for a camera at any place, also inside the scene's box."""
     if scene.box is None:
         return scene
     diagonal = float((scene.box[1] - scene.box[0]).norm())

@@ -252,7 +252,7 @@ def _views(run: Run) -> dict[str, Any]:
 
 
 def _tour(places: NDArray[np.float32]) -> list[int]:
-    """Orders places [c, 3] into a tour from the first; the nearest remaining place is always next."""
+    """Orders places [c, 3] into a tour from the first place; the next place is always the nearest remaining one."""
     remaining, order = np.arange(1, len(places)), [0]
     while len(remaining):
         nearest = int(np.square(places[remaining] - places[order[-1]]).sum(1).argmin())

@@ -283,7 +283,7 @@ ENCODINGS: dict[str, Callable[[str, int], list[str]]] = {"frequency": _frequency
 
 
 def _whole(columns: Columns, steps: dict[int, Step], name: str) -> tuple[list[str], str]:
-    """Returns WGSL lines that make an array of exactly these columns, and its name."""
+    """Returns WGSL lines that make an array of exactly these columns, and the name of the array."""
     if columns.of != VALUE:
         raise CannotDraw("its networks use parameters that are neither weights nor biases")
     if not columns.spread and columns.start == 0 and columns.width == steps[columns.index].width:

@@ -80,7 +80,7 @@ class FieldType:
 
     @property
     def router_options(self) -> Mapping[str, Any]:
-        """Further arguments of the router around the field."""
+        """Further arguments of the router that holds the field."""
         return cast("Mapping[str, Any]", self._declared("router_options", {}))
 
     @property
@@ -90,7 +90,7 @@ class FieldType:
 
     @property
     def ray_growth(self) -> float:
-        """The maximum rays of a training step as a multiple of the first step's rays, if empty space is skipped."""
+        """The maximum number of rays of a step if empty space is skipped, as a multiple of the first step's rays."""
         return float(self._declared("ray_growth", 1.0))
 
     @property

@@ -15,5 +15,5 @@ class _Active(threading.local):
 
 
 active = _Active()
-"""The active :class:`voronerf.ops._core.recording.Recording` or None, and the function that makes the numbers that vary
-between replays of a recording (CPU) or a capture (GPU)."""
+"""The active :class:`voronerf.ops._core.recording.Recording` or None, and the function with which a recording (CPU) or
+capture (GPU) makes a number that varies between replays."""

@@ -46,7 +46,7 @@ class Implementation:
 
     devices: tuple[str, ...] = ()  # device types; empty for any
     dtypes: tuple[torch.dtype, ...] = ()  # supported dtypes of the op's first tensor; empty for any
-    file: str | None = None  # the op whose module has the function; None if both have one name
+    file: str | None = None  # the op whose module has the function; None for the op itself
     function: str | None = None  # the function's name; None if it is the op's name
     plain: bool = False  # whether the backend uses the reference, because the op needs no kernel
 
@@ -145,7 +145,7 @@ def resolve_composed(op: str, *, backend: str, device: torch.device, dtype: torc
 
 
 def function(op: str, name: str, backend: str, composed: bool) -> Callable[..., Any]:
-    """Returns the implementation ``name``, chosen for ``backend``; see `resolve_composed` for ``composed``."""
+    """Returns an op's implementation ``name``, the choice for ``backend``; see `resolve_composed` for ``composed``."""
     run = _FUNCTIONS[op, name]
     passed = composed and (_TABLE[op, name].plain or (name == "reference" and backend == "auto"))
     return functools.partial(run, backend=backend) if passed else run
@@ -199,7 +199,7 @@ def missing(backend: str, device: torch.device) -> str | None:
 
 
 def automatic(device: torch.device) -> str:
-    """Returns the choice of "auto" on a device, with the obstacles to other backends: "warp (native: no GPU code)"."""
+    """Returns the choice of "auto" on a device, and what rules out other backends: "warp (native: no GPU code)"."""
     reasons: list[str] = []
     for name in ORDER[device.type]:
         reason = missing(name, device)
@@ -292,7 +292,7 @@ def torch_on_one_thread() -> Iterator[None]:
 
 
 def table() -> list[Row]:
-    """Returns a row for every op and backend: its devices here, its dtypes, and why it cannot run."""
+    """Returns the `Row` of every pair of op and backend."""
     rows = []
     for op in ops():
         for backend in BACKENDS:

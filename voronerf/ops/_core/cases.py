@@ -1,4 +1,4 @@
-"""The case of an op: it makes valid arguments of the op, and lists arguments that the op must refuse.
+"""The test case of an op: it makes valid arguments of the op, and lists arguments that the op must refuse.
 
 Each op has a case, ``voronerf/ops/<op>/case.py``. The case parametrises the tests of every op, the random calls of the
 attack and the sanitizers, the runs on the emulated and on a real GPU, and the benchmark. n is the number of
@@ -30,7 +30,8 @@ class Draw:
 
     Args:
         seed: the seed of the numbers and choices.
-        free: whether options and strides are random; otherwise first options are chosen and tensors are contiguous.
+        free: whether options and strides are random; otherwise the first option is always chosen, and tensors are
+            contiguous.
         pinned: fixed choices, by name.
     """
 
@@ -115,8 +116,8 @@ class Case:
         traced: whether torch can trace the op on every backend.
         on_devices: the pinned choices of additional calls on GPUs.
         device_rows: n of a call under a sanitizer; more than a thread block if a kernel has one thread for each row.
-        hostile: the arguments for which no values cause an access out of bounds: "indices"; "numbers" for indices and
-            floating-point numbers; "" for none.
+        hostile: the arguments that, with any values, cannot cause an access out of bounds: "indices"; "numbers" for
+            indices and floating-point numbers; "" for none.
     """
 
     make: Callable[[Draw, int], Arguments]
@@ -134,7 +135,7 @@ class Case:
 
 
 def cases() -> dict[str, Case]:
-    """Returns the case of every op, by name. The case module of a folder with several ops has ``CASES`` by name."""
+    """Returns the case of every op, by name. The case module of a folder with several ops has a dict ``CASES``."""
     cases_by_op = {}
     for op in backends.ops():
         module = importlib.import_module(f"voronerf.ops.{backends.folder(op)}.case")

@@ -28,7 +28,7 @@ from voronerf.ops._core import backends
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INDEX = (torch.int32,)
 LIKE_FIRST: tuple[torch.dtype, ...] = ()
-"""A placeholder for `Checked`: the dtype of the first floating-point tensor."""
+"""A placeholder in `Checked.tensor` for the dtype of the first floating-point tensor."""
 MAX_COUNT = 2**31 - 1
 """The largest number of rows in one call, because index tensors are int32."""
 MAX_GROUPS = 2**27
@@ -200,7 +200,7 @@ class Row(NamedTuple):
         dtypes: the allowed dtypes.
         shape: the numbers and letters of the shape; "1|k" is 1 or the letter.
         like: the name of a tensor with the same dtype, if the error should name it; else "".
-        empty: the error's rule if the tensor has no rows; "" if it may be empty.
+        empty: the rule that the error states if the tensor has no rows; "" if the tensor may be empty.
     """
 
     name: str
@@ -372,7 +372,7 @@ def check_positive(op: str, name: str, value: float) -> None:
 
 
 def check_interval(op: str, name: str, value: float, low: float, high: float, rule: str) -> None:
-    """Runs `check_number`, and raises ValueError for a value outside the interval ``rule``: "[0, 1)" or "0 to 1"."""
+    """Runs `check_number`, and raises ValueError for a value outside an interval; ``rule`` is "[0, 1)" or "0 to 1"."""
     check_number(op, name, value)
     if not (low <= value < high or (value == high and not rule.endswith(")"))):
         raise ValueError(f"{op}: {name} must lie in {rule}, got {value}")
@@ -418,7 +418,7 @@ def physical_memory() -> int:
 
 
 def available_memory() -> int:
-    """Returns the bytes that this process can still allocate: free memory, or what its container's limit leaves."""
+    """Returns the bytes that this process can still allocate, given the free memory and its container's limit."""
     free = physical_memory()
     with contextlib.suppress(OSError, ValueError):
         match = re.search(r"^MemAvailable: +(\d+) kB$", Path("/proc/meminfo").read_text(), re.MULTILINE)

@@ -289,9 +289,10 @@ class Op:
 class _Differentiable(torch.autograd.Function):
     """An op with gradients for PyTorch's autograd and ``torch.func``.
 
-    Under ``torch.func`` it takes the custom op's arguments with flattened lists, the lengths of the lists, the op, and
-    None. Elsewhere the lengths are None, the op's own arguments replace the last None (``torch.func`` would replace
-    their tensors), and an op with lists passes the result of `Op._tensors_of` in place of the flattened arguments.
+    Its arguments under ``torch.func`` are the custom op's arguments with flattened lists, the lengths of the lists, the
+    op, and None. Elsewhere the lengths are None, and the op's own arguments take the place of the last None
+    (``torch.func`` would replace their tensors). An op with lists then passes the result of `Op._tensors_of` instead of
+    the flattened arguments.
     """
 
     @staticmethod

@@ -20,8 +20,8 @@ the schema of custom ops, the allocation of their results (also used as the fake
 A tensor's annotation has dtypes and a shape. The dtypes are ``floating``, a list of names (``float32|float64``),
 ``same`` for the dtype of the first floating-point tensor, or ``wide`` for this dtype promoted to at least float32. An
 entry of a shape is a number, a letter, a letter plus one, or the name of an integer argument. ``[3] or [r, 3]`` allows
-either shape; their numbers of dimensions differ. ``[m] if ray_offsets else [r, s]`` is [m] if the argument
-``ray_offsets`` is not None. The shape of a result may also have letters that are functions of the arguments
+either shape; the two shapes must differ in the number of dimensions. ``[m] if ray_offsets else [r, s]`` is [m] if the
+argument ``ray_offsets`` is not None. The shape of a result may also have letters that are functions of the arguments
 (``sizes``).
 
 An int's annotation is a range (``1..4``, ``0..``), a float's is ``positive`` or an interval (``[0, 1)``, ``0 to 1``), a
@@ -156,7 +156,7 @@ class Source(NamedTuple):
     """The origin of a parameter of a compiled function, or of a member of its structs.
 
     Attributes:
-        get: returns the parameter, from the arguments of an op and the memory for its results.
+        get: a function that returns the parameter, given the arguments of an op and the memory for its results.
         plan: the description from which the compiled module gets the parameter without ``get``.
     """
 
@@ -407,7 +407,7 @@ class Declaration:
         Args:
             name: the name of the custom op; by default the op's name.
             options: the options of `voronerf.ops._core.custom_op`. If only the kernels know the number of rows of the
-                results, also ``fake``; ``fill(arguments)`` then returns the results.
+                results, pass ``fake`` too; ``fill(arguments)`` then returns the results.
         """
         memory, fake = self.allocate, options.pop("fake", None)
         if fake is not None:
@@ -552,8 +552,8 @@ class Declaration:
             function: the name of the compiled function.
             parameters: the parameters of the function except the machine. Each is the name of an argument, a result or
                 a letter, a `Source` (`inputs`, `outputs`), a `Memory`, a function of the arguments, or a constant.
-            on_cuda: a function (arguments, results, machine) that fills the results on a GPU, if the compiled function
-                has other parameters on a GPU.
+            on_cuda: a function (arguments, results, machine) that fills the results on a GPU; None if the compiled
+                function has the same parameters on a GPU.
             fault: a function that raises the error; it is called with the arguments if the compiled function returns
                 False.
             options: the options of `custom_op`.

@@ -43,10 +43,10 @@ _ask = getattr(torch._C, "_will_engine_execute_node", None)
 
 
 def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:
-    """Returns the tensors by which a double backward differentiates, and whether its results are differentiated again.
+    """Returns the variables of a double backward, and whether its results are differentiated again.
 
-    If so, the tensors are aliases within the caller's graph. If one tensor was computed from another, that graph
-    differentiates the path between them. Call this function before ``torch.enable_grad``.
+    If so, the variables are aliases of the tensors within the caller's graph. If one tensor was computed from another,
+    that graph differentiates the path between them. Call this function before ``torch.enable_grad``.
     """
     graph = torch.is_grad_enabled()
     leaves = [
@@ -171,7 +171,7 @@ def _saved(ctx: Any, op: Op) -> list[Any]:
 
 
 def run_backward(loss: Tensor, defer: bool) -> Tensor:
-    """Returns the loss, detached after its backward pass; with ``defer`` the backward pass is left to the caller."""
+    """Runs the backward pass of a loss and returns the loss, detached; with ``defer`` only returns the loss."""
     if defer:
         return loss
     loss.backward()

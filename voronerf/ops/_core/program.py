@@ -24,8 +24,8 @@ The steps:
 The derivatives of an encoding e(x), which may have a table T, are closed under differentiation:
 
     F_m(x; h_1 .. h_m)        the m-th derivative of e at x along h_1, ..., h_m, with as many columns as e(x)
-    G_m(x, g; h_1 .. h_m-1)   the gradient to x of <g, F_m-1(x; h_1 .. h_m-1)>, with as many columns as x
-    T_m(x, g; h_1 .. h_m)     the gradient to the table of <g, F_m(x; h_1 .. h_m)>, which a scatter sums
+    G_m(x, g; h_1 .. h_m-1)   the gradient with respect to x of <g, F_m-1(x; h_1 .. h_m-1)>, with as many columns as x
+    T_m(x, g; h_1 .. h_m)     the gradient with respect to the table of <g, F_m(x; h_1 .. h_m)>, which a scatter sums
 """
 
 from __future__ import annotations
@@ -476,7 +476,7 @@ class Builder:
     def function(
         self, name: str, x: Columns, a: float = 0.0, b: float = 0.0, order: int = 0, times: Columns | None = None
     ) -> Columns | None:
-        """Adds a step with the derivative of a function, times a value; returns None if the derivative is 0."""
+        """Adds a step with a derivative of a function, multiplied by ``times``; returns None if the derivative is 0."""
         if order > FUNCTIONS[name].orders or (name == "power" and a == int(a) and 0 <= a < order):
             return None
         if order == 1 and times is not None and name in ("copy", "affine"):
@@ -539,14 +539,14 @@ class Builder:
     def encode_backward(
         self, name: str, x: Columns, g: Columns, size: int, parameter: int = 0, along: Sequence[Columns] = ()
     ) -> Columns:
-        """Adds a step with the gradient G_m+1 of ``<g, F_m(x; along)>`` to x; :meth:`encode` explains the arguments."""
+        """Adds a step with G_m+1, the gradient of ``<g, F_m(x; along)>`` with respect to x; see :meth:`encode`."""
         operands = [self.rows(each) for each in (x, g, *along)]
         if not along:
             operands.append(self.encode(name, x, size, parameter))
         return self.emit("encode", x.width, operands, (size, parameter, len(along) + 1, 1), name)
 
     def rows(self, columns: Columns) -> Columns:
-        """Returns the columns as a value; copies the columns of a parameter and a broadcast column."""
+        """Returns the columns as columns of a value; a step copies columns of a parameter, or a broadcast column."""
         return self.apply("copy", columns) if columns.of == PARAMETER or columns.spread else columns
 
     def add_outer(self, index: int, g: Columns, x: Columns, start: int) -> None:
@@ -601,7 +601,7 @@ class _Arriving:
             self.parts.setdefault(columns.index, []).append((g, columns.start))
 
     def take_full(self, value: int) -> Columns | None:
-        """Removes and returns one gradient of all columns of a value, which a linear step can take as its addend."""
+        """Removes and returns one gradient that covers all columns of a value, as the addend of a linear step."""
         parts = self.parts.get(value, [])
         for i, (g, start) in enumerate(parts):
             if start == 0 and g.width == self.widths[value] and g.of == VALUE and not g.spread:

@@ -131,7 +131,7 @@ class Recording(TorchDispatchMode):
         return len(self._calls)
 
     def hold(self, tensor: Tensor) -> None:
-        """Refuses replays after the caller has replaced the memory of a tensor that the recording allocated."""
+        """Watches a tensor that the recording allocated: if the caller replaces its memory, replays are refused."""
         self._calls.hold_tensor(tensor)
 
     def count(self, source: Callable[[], int]) -> int:
@@ -142,7 +142,7 @@ class Recording(TorchDispatchMode):
         return RowCount.of(count)
 
     def computed(self, memory: Tensor) -> int:
-        """Returns the number of rows in ``memory``, int64 [1], which a call has computed."""
+        """Returns the number of rows that a call has written into ``memory``, int64 [1]."""
         with _disable_current_modes():
             if memory.dtype is not torch.int64:  # a number on a GPU: calls on a GPU are not recorded
                 self._refuse("a number of rows is not int64")
@@ -164,7 +164,7 @@ class Recording(TorchDispatchMode):
         return number
 
     def take(self, tensor: Tensor) -> Tensor:
-        """Copies an input of the runs into the recording's memory and returns the memory, whose rows may vary."""
+        """Copies an input of the runs into memory of the recording, and returns this memory; its rows may vary."""
         place = len(self._taken)
         self._taken.append(tensor)  # replaced by the input of each run
         shape = tensor.shape
@@ -178,7 +178,7 @@ class Recording(TorchDispatchMode):
         return memory
 
     def new_rows(self, like: Tensor, shape: Sequence[int], dtype: torch.dtype | None) -> Tensor:
-        """Allocates memory whose number of rows is a `RowCount`, large enough for the largest number."""
+        """Allocates memory for a `RowCount` of rows, large enough for the largest number of rows."""
         rows, *columns = shape
         assert isinstance(rows, RowCount)
         with _disable_current_modes():
@@ -235,7 +235,7 @@ class Recording(TorchDispatchMode):
         return completed
 
     def _run(self, threads: int, times: int, drawn: int, places: Sequence[int], size: int) -> int:
-        """Runs the calls and torch operations in order; ``size``: the bytes of one array of random integers."""
+        """Runs the calls and torch operations in order; ``size`` is the bytes of one array of random integers."""
         calls, every = self._calls, len(self._calls)
         if not self._computed:
             completed: int = calls.replay(threads, times, 0, every, drawn, places, size)
@@ -278,7 +278,7 @@ class Recording(TorchDispatchMode):
         return held.value
 
     def counted_now(self, recorded: Any) -> Any:
-        """Returns :meth:`now` for use in another recording: numbers of rows stay `RowCount`."""
+        """Returns the result of :meth:`now` for another recording, in which numbers of rows stay `RowCount`."""
         if isinstance(recorded, RowCount):
             return RowCount.of(recorded.count, recorded.more)
         return self._tensor_now(recorded) if isinstance(recorded, Tensor) else mapped(self.counted_now, recorded)

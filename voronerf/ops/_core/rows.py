@@ -56,7 +56,7 @@ class RowCount(int):
 
     @classmethod
     def of(cls, count: Count, more: int = 0) -> RowCount:
-        """Returns the number of a count in this run, plus ``more``."""
+        """Makes the `RowCount` of a count plus ``more``; as an int, it is the number in this run."""
         rows = cls(count.now + more)
         rows.count, rows.more, rows.address, rows.most = count, more, count.memory.data_ptr(), count.most
         return rows

@@ -51,8 +51,9 @@ def adam(
         square  <- b2 square + (1 - b2) g^2
         p       <- p - rate / (1 - b1^s) mean / (sqrt(square) / sqrt(1 - b2^s) + epsilon)
 
-    With ``every=False`` in its rule, an entry whose gradient is 0 keeps its value and both moments, as in hash grids of
-    tiny-cuda-nn. If an entry gets its first gradient late, its first step is (1 - b1) / sqrt(1 - b2) times the rate.
+    If a parameter's rule has ``every=False``, entries whose gradient is 0 keep their values and both moments, as in
+    hash grids of tiny-cuda-nn. If an entry gets its first gradient late, its first step is (1 - b1) / sqrt(1 - b2)
+    times the rate.
 
     Args:
         rules: One rule for each parameter.
@@ -108,7 +109,7 @@ def average(
     Args:
         averages: float32, any shapes, contiguous.
         parameters: float32, the shapes of the averages, contiguous; None for zero. Not differentiable.
-        share: the fraction of the difference to move by, 0 to 1; or float32 [].
+        share: the fraction of the difference to move by: a number from 0 to 1, or float32 [].
         backend: "auto", "reference", "native" or "warp".
 
     Raises:

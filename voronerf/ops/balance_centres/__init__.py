@@ -44,7 +44,7 @@ def balance_centres(
         neighbours: the size of N(i), >= 1.
 
     Returns:
-        (centres float32 [k, 3], weights float64 [k], the mass in each cell of the returned centres).
+        Centres float32 [k, 3]; weights float64 [k], the mass in each cell of the returned centres.
 
     Examples:
         >>> import torch

@@ -46,8 +46,8 @@ def composite(
     float32 precision.
 
     Returns:
-        Composite(colour [r, c], opacity [r], depth [r], weights like sigma). ``depth`` is the sum of weight times depth
-        and is not divided by the opacity.
+        Composite(colour [r, c], opacity [r], depth [r], weights in the shape of sigma). ``depth`` is the sum of weight
+        times depth and is not divided by the opacity.
 
     Raises:
         ValueError: the offsets decrease or exceed m (checked on the CPU only).

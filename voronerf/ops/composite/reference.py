@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 _OPAQUE = 1e30
-"""The finite substitute for infinite density: opaque over any length except 0, where the product is 0, not NaN."""
+"""The finite value for infinite density: every sample is opaque, but at length 0 the product is 0, not NaN."""
 
 
 class Composite(NamedTuple):
@@ -18,7 +18,7 @@ class Composite(NamedTuple):
         colour: [r, c], background included.
         opacity: [r], the sum of the weights.
         depth: [r], the sum of weight times depth, not divided by the opacity.
-        weights: like sigma, the contribution of each sample.
+        weights: the shape of sigma, the weight of each sample in its ray's colour.
 
     Examples:
         >>> import torch
@@ -88,7 +88,7 @@ def composite(
 
 
 def saveable(value: Any) -> Any:
-    """Returns the value, or a copy of an inference tensor, because autograd cannot save inference tensors."""
+    """Returns the value, or its copy if it is an inference tensor, which autograd cannot save."""
     return value.clone() if isinstance(value, Tensor) and value.is_inference() else value
 
 

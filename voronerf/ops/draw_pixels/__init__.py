@@ -69,7 +69,7 @@ def draw_pixels(
     Args:
         seed: the seed of the hashes.
         count: the number of pixels to draw, b, 1 to 2**27.
-        below: the number of pixels to draw from, 1 to 2**48; with ``runs``, their total.
+        below: the number of pixels to draw from, 1 to 2**48; with ``runs``, it equals ``runs.total``.
         runs: the pixels to draw from; None for 0 to ``below`` - 1.
         known: pixels of known distance, from which the first pixels of the batch are drawn; None for none.
 

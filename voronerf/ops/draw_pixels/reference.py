@@ -26,7 +26,8 @@ class Runs(_Runs):
     Attributes:
         ends: int64 [n], the inclusive cumulative sum of the lengths of the runs.
         shift: int64 [n], pixel minus place in each run.
-        first: int32, the first run that ends after place 0, 2^bits, 2 * 2^bits and so on, up to ``total``.
+        first: int32, for each of the places 0, 2^bits, 2 * 2^bits and so on up to ``total``, the first run that ends
+            after it.
         bits: the binary logarithm of the step between the places of ``first``; 2^bits is about the length of a run.
         total: the number of pixels in all runs.
 
@@ -68,7 +69,7 @@ class Runs(_Runs):
 
 
 def _first_runs(ends: Tensor, bits: int, total: int) -> Tensor:
-    """Returns int32, the first run that ends after place 0, 2^bits, 2 * 2^bits and so on."""
+    """Returns int32, for each of the places 0, 2^bits, 2 * 2^bits and so on, the first run that ends after it."""
     places = torch.arange(0, total, 1 << bits, device=ends.device)
     return torch.searchsorted(ends, places, right=True).int()
 

@@ -1,4 +1,4 @@
-"""Networks with an autograd tape: the caller computes the loss gradient of their outputs. n samples."""
+"""Networks with an autograd tape: the caller computes a loss and the gradient of their outputs. n samples."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _NEEDED = ("program", "inputs", "parameters")
 
 
 def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> Tape:
-    """Evaluates networks and returns a tape, whose ``backward`` takes the gradient of a loss to the outputs.
+    """Evaluates networks and returns a tape; its ``backward`` takes a loss and the gradient of the outputs.
 
-    ``tape.backward(loss, gradient)`` equals the backward pass of a loss on ``routed_program(**network)``, for a loss
-    whose gradient the caller computes. Only first derivatives exist.
+    ``tape.backward(loss, gradient)`` equals the backward pass of a loss on ``routed_program(**network)``; the caller
+    computes ``gradient``. Only first derivatives exist.
 
     Args:
         network: the arguments of `routed_program` by name, except ``backend``: ``program``, with one output, ``inputs``

@@ -44,13 +44,13 @@ def grouped_linear(
     Args:
         x: the samples, sorted by cell, n < 2**31, i >= 1.
         offsets: ascending; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells (before
-            ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
+            ``offsets[0]`` or from ``offsets[k]`` on) give 0. Cells may be empty.
         weight: the weights of each cell, o >= 1.
         bias: the biases of each cell, or None.
         activation: "none", "relu", "softplus", "sigmoid" or "sine".
 
     Returns:
-        [n, o] in the dtype of x (of autocast, if it is enabled).
+        [n, o] in the dtype of x (or of autocast, if it is enabled).
 
     Raises:
         ValueError: offsets decrease or exceed n (checked on the CPU only).

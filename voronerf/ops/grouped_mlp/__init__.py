@@ -40,7 +40,7 @@ def grouped_mlp(
             encoded. p >= 1 if a layer reads positions, and q >= 1 if a layer reads directions. For the integrated
             encoding p = 6: mean and diagonal variance.
         offsets: int32 [k + 1], ascending; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
-            (before ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
+            (before ``offsets[0]`` or from ``offsets[k]`` on) give 0. Cells may be empty.
         weights: one [k, o, i] for each layer, all of one dtype; i is ``layers.input_width``.
         biases: one [k, o] or None for each layer.
         layers: the layer table.
@@ -52,7 +52,7 @@ def grouped_mlp(
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        [n, layers.out_features] in the dtype of the weights (of autocast, if it is enabled).
+        [n, layers.out_features] in the dtype of the weights (or of autocast, if it is enabled).
 
     Raises:
         ValueError: offsets decrease or exceed n, or a direction_index is outside 0 to r - 1 (checked on the CPU only).

@@ -51,10 +51,10 @@ def grouped_program(
             that are not a chain of layers, run in PyTorch.
 
     Returns:
-        [n, w] for each output of the program, or [r, w], the sum over the rows of each ray, for the outputs in
-        ``program.by_ray``; then [k, ...] for each sum over the rows of a cell, or [1, e, f] for the gradient of a table
-        that all cells share. The results have the dtype of the parameters (of autocast, if it is enabled), or without
-        parameters the dtype of the first input. Rows outside all cells add nothing to sums.
+        The outputs of the program: [n, w] each, or [r, w] for the outputs in ``program.by_ray``, which are summed over
+        the rows of each ray. Then the sums over the rows of a cell: [k, ...] each, or [1, e, f] for the gradient of a
+        table that all cells share. The results have the dtype of the parameters (or of autocast, if it is enabled);
+        without parameters, the dtype of the first input. Rows outside all cells add nothing to sums.
 
     Raises:
         ValueError: offsets decrease or exceed n, an order is outside 0 to n - 1, or a ray_index is outside 0 to r - 1

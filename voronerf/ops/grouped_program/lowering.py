@@ -210,11 +210,11 @@ class _Lowering:
         return _padded(max(widths))
 
     def pairs_of(self, width: int) -> int:
-        """Returns the floats in a row of pairs; in the layout "parts" the rounding remainders double the number."""
+        """Returns the number of floats in a row of pairs; in the layout "parts" the rounding remainders double it."""
         return _padded(width, 2 * _GRANULE) // 2 * (2 if self.parts else 1)
 
     def padded_outputs(self, width: int) -> int:
-        """Returns the padded floats in a row of packed weights, one float for each output."""
+        """Returns the number of floats, with padding, in a row of packed weights that has one float per output."""
         return _padded(width, 2 * _GRANULE if self.cuda else _GRANULE)
 
     # Records ----------------------------------------------------------------------------------------------------------
@@ -306,7 +306,7 @@ class _Lowering:
             self.slots.give(self.pairs_of(location.width), location.pairs)
 
     def make(self, step: Step, dying: set[int], entrywise: Iterable[Columns] = (), stride: int = 0) -> _Value:
-        """Allocates the value of a step: in a new slot, or in the slot of an elementwise operand at its last use."""
+        """Allocates a step's value: in a new slot, or in the slot of an elementwise operand that is not read later."""
         value = _Value(step.width, stride or _padded(step.width))
         self.values[step.out] = value
         if step.op not in ("input", "encode"):
@@ -344,7 +344,7 @@ class _Lowering:
         return alone and step.width <= self.compiled.most_held
 
     def _multipliers(self, step: Step) -> list[Step]:
-        """Returns the steps after a linear step on CUDA that can read its packed values from registers."""
+        """Returns the later steps that can read a linear step's packed values from registers, on CUDA."""
         steps = list[Step]()
         # A scattered value does not stay in registers, because the warp scatters it in between.
         scattered = any(reader.op == "scatter" for reader, _ in self.readers.get(step.out, []))
@@ -646,7 +646,7 @@ def _adds(step: Step, to: Step) -> bool:
 
 
 def _delayed(steps: list[Step]) -> list[Step]:
-    """Returns the steps; moves each product directly before the step that adds to it, if no other step reads it."""
+    """Moves each product directly before the step that adds to it, if no other step reads it; returns the steps."""
     uses = [c.index for step in steps for c in step.operands if c.of == VALUE]
     result = list(steps)
     for step in reversed(steps):

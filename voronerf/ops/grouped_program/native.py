@@ -382,7 +382,7 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
 
 
 def _saved_gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """Returns the gradients to the inputs, then to the parameters; None for an unwanted gradient."""
+    """Returns the gradients of the inputs, then of the parameters; None for an unwanted gradient."""
     count, saved = ctx.count + ctx.parameters, ctx.saved_tensors
     wanted = needed_gradients(ctx, saved[:count])
     gradients: list[Tensor | None] = [None] * count
@@ -398,7 +398,7 @@ def _saved_gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> list[Tensor
 def run_gradient(
     rows: Rows, options: RunOptions, arriving: Sequence[Tensor | None], wanted: Sequence[bool]
 ) -> list[Tensor]:
-    """Returns the gradients to the wanted inputs and parameters.
+    """Returns the gradients of the wanted inputs and parameters.
 
     Args:
         rows: the tensors of the program, with the kept features.
@@ -430,7 +430,7 @@ class _Gradient(NamedTuple):
 
     Attributes:
         options: the options of the gradient's program.
-        outputs: the number of its results that are gradients to inputs.
+        outputs: the number of its results that are gradients of inputs.
         keeps: whether it can use the features that the program kept.
     """
 

@@ -236,7 +236,7 @@ def cells_of(offsets: Tensor, rows: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def recording() -> Iterator[None]:
-    """Enables autograd within a custom op; otherwise it records nothing there, and gradients would be 0.
+    """Enables autograd within a custom op, where it usually records nothing, so that gradients would be 0.
 
     PyTorch has no public function for this.
     """

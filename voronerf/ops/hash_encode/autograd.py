@@ -32,7 +32,7 @@ class Hashed(NamedTuple):
 
 
 class HashedGradient(NamedTuple):
-    """The arguments of the backward pass: the gradient to the features, and flags for the wanted gradients."""
+    """The arguments of the backward pass: the gradient of the features, and flags for the wanted gradients."""
 
     gradient: Tensor
     arguments: Hashed
@@ -40,7 +40,7 @@ class HashedGradient(NamedTuple):
     to_table: bool
 
     def results(self: HashedGradient) -> list[Tensor]:
-        """Allocates the gradients to positions and table, in float32, empty if they are not wanted."""
+        """Allocates the gradients of positions and table, in float32; empty if they are not wanted."""
         positions, table = self.arguments.positions, self.arguments.table
         shapes = positions.shape if self.to_positions else 0, table.shape if self.to_table else 0
         return [positions.new_empty(shape) for shape in shapes]
@@ -53,8 +53,8 @@ class HashDerivatives:
     """Registers the derivatives of the hash encoding, from a backend's two ops.
 
     ``encode`` takes the fields of `Hashed` and returns the features or, with a direction, their derivatives along it.
-    ``backward`` takes the fields of `HashedGradient` and returns the gradients to positions and table. The derivative
-    of ``backward`` needs only these two ops: with the gradient g to the features and the cotangents p and t of the two
+    ``backward`` takes the fields of `HashedGradient` and returns the gradients of positions and table. The derivative
+    of ``backward`` needs only these two ops: with the gradient g of the features and the cotangents p and t of the two
     results, it is the gradient of ``g * encode(t as the table) + g * encode(along p)``.
     """
 
@@ -69,7 +69,7 @@ class HashDerivatives:
         ctx.save_for_backward(*tensors)
 
     def encode(self, ctx: Any, gradient: Tensor) -> Hashed:
-        """Returns the gradients to positions, table and direction."""
+        """Returns the gradients of positions, table and direction."""
         arguments = Hashed._make([*ctx.saved_tensors, ctx.grid])
         to_positions, to_table, to_direction, _ = needed_gradients(ctx, arguments[:4])
         gradients = _NONE
@@ -91,7 +91,7 @@ class HashDerivatives:
         ctx.save_for_backward(gradient, *tensors)
 
     def backward(self, ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
-        """Returns the gradients to the incoming gradient, positions, table and direction."""
+        """Returns the gradients of the incoming gradient, positions, table and direction."""
         saved = gradient, *tensors = ctx.saved_tensors
         arguments = Hashed._make([*tensors, ctx.grid])
         p, t = (part if want else None for part, want in zip(cotangents, (ctx.to_positions, ctx.to_table)))
@@ -111,7 +111,7 @@ class HashDerivatives:
             term = arguments._replace(table=features, direction=along)
             if to_gradient:
                 add(0, self._encode(*term))
-            # The first term does not read the table, so only the second has a gradient to the table.
+            # The first term does not read the table, so only the second contributes to the table's gradient.
             of_table = to_table and along is not None
             if to_positions or of_table:
                 parts = self._backward(gradient, term, to_positions, of_table)

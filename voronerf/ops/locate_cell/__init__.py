@@ -52,7 +52,7 @@ def locate_cell(
     Args:
         points: n < 2**31. float16 and bfloat16 are compared in float32.
         centres: finite, m >= 1; every diagram has at least one centre.
-        child_offsets: the first row of each diagram, and m; g >= 1.
+        child_offsets: the first row of each diagram, followed by m; g >= 1.
         child: if ``child[c] >= 0``, diagram ``child[c]`` refines centre c; if ``child[c] < 0``, centre c is leaf
             ``-child[c] - 1``.
         depth: the number of levels of the tree, 1 for a flat diagram.

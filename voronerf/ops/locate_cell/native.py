@@ -27,7 +27,7 @@ def find(
     caller: str,
     rows: Tensor | None = None,
 ) -> None:
-    """Fills ``leaves``, int32 [n]; on CUDA, the rows from ``rows`` on get -1.
+    """Fills ``leaves``, int32 [n]; on CUDA, all rows from number ``rows`` (int32 [1]) on get -1.
 
     Points and centres have one dtype. ``tree`` is child_offsets, child and depth; ``caller`` is the op's name for error
     messages.

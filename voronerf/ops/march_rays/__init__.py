@@ -58,9 +58,10 @@ def march_rays(
     To stop at opaque surfaces, march in pieces: limit each call to ``most`` samples per ray, and pass its ``stop`` as
     ``start`` to the next call.
 
-    The number of samples depends on values on the device. Without ``capacity`` the host waits for it. With ``capacity``
-    the result has that many rows: rows beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays that do not fit
-    are cut off at their ``stop``. This form can be captured in a CUDA graph and compiled. Not differentiable.
+    The number of samples depends on values on the device. Without ``capacity`` the host waits for this number. With
+    ``capacity`` the result has that many rows: rows beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays that
+    do not fit are cut off at their ``stop``. This form can be captured in a CUDA graph and compiled. Not
+    differentiable.
 
     Args:
         origins: the origins of the rays.

@@ -46,7 +46,7 @@ class March(NamedTuple):
 
 
 def memory(near: Tensor, offsets: Tensor, rows: Any) -> March:
-    """Allocates a result of ``rows`` samples; the ray offsets are given."""
+    """Allocates a result of ``rows`` samples, with ``offsets`` as its ray offsets."""
     index, stop = (new_empty(near, count, dtype=torch.int32) for count in (rows, rows_of(near)))
     return March(offsets, index, new_empty(near, rows), new_empty(near, rows), new_empty(near, rows, 3), stop)
 

@@ -39,7 +39,7 @@ nearest_centre = declared("nearest_centre").compiled_op(
 def find(
     cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None, index: Tensor | None = None
 ) -> None:
-    """Fills ``cells``, int32 [n], for points and centres of one dtype; on CUDA, the rows from ``rows`` on get -1."""
+    """Fills ``cells``, int32 [n], for points and centres of one dtype; on CUDA, rows from number ``rows`` on get -1."""
     compiled, machine = native.compiled, native.machine(points)
     n, (k, d), words = rows_of(points), centres.shape, 0 if index is None else len(index)
     if isinstance(machine, compiled.Cuda):

@@ -3,7 +3,7 @@
 Each rank evaluates the samples in its own cells and sums them over runs (`own_samples`, `run_sums`). A run is a piece
 of a ray without samples of other ranks in between. The process with the runs of all ranks composes the rays and returns
 to each run the totals of its ray (`compose_runs`), from which each rank computes its gradients (`run_gradients`).
-Together they equal `render_loss` (Li et al. 2024, NeRF-XL). Nothing is differentiable.
+Together the operations equal `render_loss` (Li et al. 2024, NeRF-XL). Nothing is differentiable.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def own_samples(
 ) -> OwnSamples:
     """Selects the samples in this rank's own cells, and finds their runs.
 
-    Other ranks may hold samples that this rank does not know. A run therefore also ends between two samples of
-    different cells that are at least one stratum apart, since an unknown sample may lie there. Within one convex cell
-    none can; with ``bent`` rays the run ends there too.
+    Other ranks may hold samples that this rank does not know. A run therefore also ends between two samples that are in
+    different cells and at least one stratum apart, since an unknown sample may lie between them. Between two samples of
+    one convex cell none can, unless rays are ``bent``: then the run ends there too.
 
     Args:
         positions: the positions of all samples that this rank knows, ray after ray, near to far.

@@ -53,7 +53,7 @@ def compose_runs(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
 
 @_GRADIENTS.custom_op("run_gradients_native", devices=("cpu",))
 def run_gradients(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
-    """Fills the gradient [m, 4] to the outputs, and weights [m]; see ``voronerf.ops.run_gradients``."""
+    """Fills the gradient [m, 4] of the outputs, and weights [m]; see ``voronerf.ops.run_gradients``."""
     gradient, weights = results
     importance = new_empty(weights, arguments.m)
     native.compiled.run_gradients(_outputs(arguments), arguments.answers, gradient, weights, importance, native.cpu())

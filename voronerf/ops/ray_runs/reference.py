@@ -136,7 +136,7 @@ def compose_runs(
 def run_gradients(
     raw: Tensor, samples: OwnSamples, answers: Tensor, density_scale: float, hidden: float
 ) -> tuple[Tensor, Tensor]:
-    """Returns the gradient [m, 4] to the outputs, and weights [m]; see ``voronerf.ops.run_gradients``."""
+    """Returns the gradient [m, 4] of the outputs, and weights [m]; see ``voronerf.ops.run_gradients``."""
     samples, answers = OwnSamples._make(map(saveable, samples)), saveable(answers)
     raw = saveable(raw.detach()).requires_grad_()
     colour, density = activate(raw, density_scale)

@@ -61,9 +61,9 @@ def render_loss(
         hidden: the transmittance, in [0, 1), up to which a sample counts as hidden. Hidden samples have no gradient,
             but they contribute to the gradients of the samples in front of them.
         robust: the scale s of errors beyond which the loss is linear, in [0, 1); 0 for the squared error.
-        triples: the number of triples of `unseen_rays`, at most r / 3. These are the last ``3 triples`` rays. They have
-            no target: their errors and the gradients of their samples are 0, but the loss is divided by the number of
-            all rays.
+        triples: the number of triples of `unseen_rays`, at most r / 3. Their rays are the last ``3 triples`` rays,
+            which have no target: their errors and the gradients of their samples are 0, but the loss is divided by the
+            number of all rays.
 
     ``deltas``, ``target``, ``background`` and the results are float32, or float64 if ``raw`` is. The loss has
     derivatives of every order in ``raw``. Nothing else has gradients.
@@ -72,8 +72,8 @@ def render_loss(
         RenderLoss(loss [], colour [r, 3], weights [m], density [m], error [r]).
 
     Raises:
-        ValueError: ``density_scale`` with ``activated``, or neither; more triples than a third of the rays; offsets
-            that decrease or exceed m (checked on the CPU only).
+        ValueError: both or neither of ``density_scale`` and ``activated``; more triples than a third of the rays;
+            offsets that decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch
@@ -113,7 +113,7 @@ def render_loss_gradient(
     triples: Annotated[int, "0.."] = 0,
     backend: str = "auto",
 ) -> tuple[RenderLoss, Annotated[Tensor, "same [m, 4]"]]:
-    """Returns the result of `render_loss`, and the gradient of its loss to ``raw`` for `forward_with_tape`.
+    """Returns the result of `render_loss`, and the loss's gradient with respect to ``raw`` for `forward_with_tape`.
 
     Not differentiable.
 

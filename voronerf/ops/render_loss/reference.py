@@ -71,7 +71,7 @@ def render_loss(
 
 
 def robust_error(error: Tensor, robust: float) -> Tensor:
-    """Returns the robust errors [r] for squared errors [r] of rays; these stay unchanged if ``robust`` is 0."""
+    """Returns the robust errors [r] of rays from their squared errors [r], or the squared errors if ``robust`` is 0."""
     return 2 * robust * error / ((error + robust**2).sqrt() + robust) if robust else error
 
 
@@ -93,7 +93,7 @@ def scaled(op: str, arguments: Any) -> Any:
 @torch.inference_mode(False)
 @torch.enable_grad()
 def render_loss_gradient(raw: Tensor, *others: Any) -> tuple[Tensor, ...]:
-    """Returns the result of `render_loss`, and the gradient of its loss to ``raw``."""
+    """Returns the result of `render_loss`, and the gradient of the loss with respect to ``raw``."""
     raw = saveable(raw.detach()).requires_grad_()
     result = render_loss(raw, *(saveable(value) for value in others))
     return result.loss.detach(), *result[1:], torch.autograd.grad(result.loss, raw)[0]

@@ -96,7 +96,7 @@ def render_opaque(
         RaysSeen(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]).
 
     Raises:
-        ValueError: ``density_scale`` with ``activated``, or neither.
+        ValueError: both or neither of ``density_scale`` and ``activated``.
 
     Examples:
         >>> import torch

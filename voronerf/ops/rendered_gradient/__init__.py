@@ -1,4 +1,4 @@
-"""Gradients to the networks' outputs, from gradients to rendered values. r rays, m samples of all rays (packed)."""
+"""Gradients of the networks' outputs, from gradients of rendered values. r rays, m samples of all rays (packed)."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ def rendered_gradient(
     activated: bool = False,
     backend: str = "auto",
 ) -> None:
-    """Computes the gradient of a loss to ``raw`` from its gradients to the rendered values; adds it to ``gradient``.
+    """Computes a loss's gradient of ``raw`` from its gradients of rendered values, and adds it to ``gradient``.
 
     `composite` renders the samples, with weights w and transmittance T, to the colour
     ``sum w_i c_i + (1 - sum w_i) background``, the opacity ``sum w_i`` and the depth ``sum w_i d_i``, which is not
-    divided by the opacity. Let v_i be the loss gradient of w_i, through all of these and through the weights,
-    ``of_weights_i + of_opacity + of_depth d_i + of_colour (c_i - background)``. Then the gradient to the density of a
-    sample is ``of_density_i + delta_i (T_{i+1} v_i - sum over j > i of w_j v_j)``, and the gradient to the colour is
-    ``of_rgb_i + w_i of_colour`` (Max 1995; Mildenhall et al. 2020, equation 3). The chain rule through the activations
-    gives the gradient to ``raw``. Not differentiable.
+    divided by the opacity. Let v_i be the derivative of the loss with respect to w_i, through these three values and
+    the weights themselves, ``of_weights_i + of_opacity + of_depth d_i + of_colour (c_i - background)``. Then the
+    gradient of the density of a sample is ``of_density_i + delta_i (T_{i+1} v_i - sum over j > i of w_j v_j)``, and the
+    gradient of its colour is ``of_rgb_i + w_i of_colour`` (Max 1995; Mildenhall et al. 2020, equation 3). The chain
+    rule through the activations gives the gradient of ``raw``. Not differentiable.
 
     Args:
-        gradient: the gradient to the networks' outputs, contiguous, updated in place.
+        gradient: the gradient of the loss with respect to the networks' outputs, contiguous, updated in place.
         raw: colour and density, before their activations unless ``activated``, as for `render_loss`.
         density: the densities of the samples, as `render_loss` returns them for ``raw``.
         depths: the distances of the samples along the rays.
@@ -64,20 +64,21 @@ def rendered_gradient(
         ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none. Samples outside all
             rays have no gradient.
         background: a colour with weight 1 - opacity; None is black.
-        of_colour: the loss gradient of the colours of the rays. None counts as zero, here and for the arguments below.
-        of_opacity: the loss gradient of the opacities.
-        of_depth: the loss gradient of the depths.
-        of_weights: the loss gradient of the weights of the samples.
-        of_rgb: the loss gradient of the colours of the samples.
-        of_density: the loss gradient of the densities of the samples.
+        of_colour: the gradient of the loss with respect to the colours of the rays. None counts as zero, here and for
+            the arguments below.
+        of_opacity: the gradient with respect to the opacities.
+        of_depth: the gradient with respect to the depths.
+        of_weights: the gradient with respect to the weights of the samples.
+        of_rgb: the gradient with respect to the colours of the samples.
+        of_density: the gradient with respect to the densities of the samples.
         hidden: the transmittance up to which a sample counts as hidden. Hidden samples have no gradient; 0 hides no
             sample.
         density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.
         activated: whether ``raw`` and ``gradient`` refer to the colour and the density themselves.
 
     Raises:
-        ValueError: a gradient that is not contiguous; ``density_scale`` with ``activated``, or neither; offsets that
-            decrease or exceed m (checked on the CPU only).
+        ValueError: a gradient that is not contiguous; both or neither of ``density_scale`` and ``activated``; offsets
+            that decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Gradients to the networks' outputs, from gradients to rendered values. r rays, m samples of all rays (packed)."""
+"""Gradients of the networks' outputs, from gradients of rendered values. r rays, m samples of all rays (packed)."""
 
 from __future__ import annotations
 

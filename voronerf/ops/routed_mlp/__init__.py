@@ -71,8 +71,8 @@ def routed_mlp(
             operations, each with its own choice of backend.
 
     Returns:
-        The output [n, layers.out_features] in the dtype of the weights (of autocast, if it is enabled), and cells int32
-        [n].
+        The output [n, layers.out_features] in the dtype of the weights (or of autocast, if it is enabled), and cells
+        int32 [n].
 
     Raises:
         ValueError: the tables are not a tree, a cell is outside 0 to k - 1, or a direction_index is outside 0 to r - 1

@@ -60,11 +60,11 @@ def routed_program(
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        [n, w] for each output, in the dtype of ``grouped_program``; and cells int32 [n].
+        [n, w] for each output, in the dtype that ``grouped_program`` would return; and cells int32 [n].
 
     Raises:
-        ValueError: the program has sums, or a first input with rows of rays; or ``grouped_program`` or ``routed_mlp``
-            would refuse the arguments.
+        ValueError: the program has sums, or its first input has one row for each ray; or ``grouped_program`` or
+            ``routed_mlp`` would refuse the arguments.
 
     Examples:
         >>> import torch

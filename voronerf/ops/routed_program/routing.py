@@ -26,7 +26,7 @@ _ROWS_OF_A_TREE = {**_ROWS, "centres": Row("centres", FLOATING, ("m", 3))}
 
 
 class Routing(NamedTuple):
-    """The arguments of `routed_mlp` that determine the cells, the frozen cells and the number of samples that count."""
+    """The arguments of `routed_mlp` for the cells of samples, the frozen cells and the number of samples that count."""
 
     centres: Tensor | None = None
     child_offsets: Tensor | None = None
@@ -39,7 +39,7 @@ class Routing(NamedTuple):
     centre_index: Tensor | None = None
 
     def to_check(self, op: str) -> Others:
-        """Checks the combination of arguments, and returns the rules of the tensors and the tensors."""
+        """Checks the combination of arguments; returns the rules for the tensors, and the tensors."""
         if self.centres is None:
             for name, tensor in (("child_offsets", self.child_offsets), ("child", self.child)):
                 if tensor is not None:

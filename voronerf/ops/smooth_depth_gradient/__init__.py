@@ -47,17 +47,18 @@ def smooth_depth_gradient(
     The last rays are the triples of `unseen_rays`: ray ``r - 3 triples + i`` lies between rays ``r - 2 triples + i``
     and ``r - triples + i``. The disparity D of a ray is the sum of its weights divided by their depths; the remaining
     transmittance counts as a weight at depth ``far``. Along a line of an image, the disparity of a plane is linear. The
-    loss is ``factor`` times the mean over the triples of the robust error of ``log((D' + D'') / 2 D)``, where D belongs
-    to the middle ray. The robust error is as in `render_loss`, with scale 0.05, so that edges of surfaces count less.
-    (Distances along rays differ from depths by the cosine of the angle between rays: by 0.5 % for 0.1 radians.) The
-    gradient goes to the last column of ``gradient``. The derivative of D by the density of a sample is
-    ``delta (T / depth - S)``, where T is the transmittance behind the sample and S the disparity of everything behind
-    the sample. The loss favours smooth surfaces over fog that only fits single views (after Niemeyer et al. 2022,
-    "RegNeRF", section 4.1, whose loss favours equal depths of neighbours). Not differentiable.
+    loss is ``factor`` times the mean over the triples of the robust error of ``log((D' + D'') / 2 D)``, where D is the
+    disparity of the middle ray and D', D'' are its neighbours' disparities. The robust error is as in `render_loss`,
+    with scale 0.05, so that edges of surfaces count less. (Distances along rays differ from depths by the cosine of the
+    angle between rays: by 0.5 % for 0.1 radians.) The gradient goes to the last column of ``gradient``. The derivative
+    of D with respect to the density of a sample is ``delta (T / depth - S)``, where T is the transmittance behind the
+    sample and S the disparity of everything behind the sample. The loss favours smooth surfaces over fog that only fits
+    single views (after Niemeyer et al. 2022, "RegNeRF", section 4.1, whose loss favours equal depths of neighbours).
+    Not differentiable.
 
     Args:
         loss: the loss, updated in place.
-        gradient: the gradient to the networks' outputs, contiguous, updated in place.
+        gradient: the gradient of the loss with respect to the networks' outputs, contiguous, updated in place.
         density: the densities of the samples.
         depths: the distances of the samples along the rays, > 0.
         deltas: the lengths of the samples' ray segments.
@@ -72,8 +73,8 @@ def smooth_depth_gradient(
         activated: whether the gradient is with respect to the density itself.
 
     Raises:
-        ValueError: tensors that are not contiguous; more triples than a third of the rays; ``density_scale`` with
-            ``activated``, or neither; offsets that decrease or exceed m (checked on the CPU only).
+        ValueError: tensors that are not contiguous; more triples than a third of the rays; both or neither of
+            ``density_scale`` and ``activated``; offsets that decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""A loss, and its gradient, for depths of neighbouring unseen rays that do not lie on a plane. r rays, m samples."""
+"""A loss on depths of neighbouring unseen rays that do not lie on a plane, and its gradient. r rays, m samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A loss on rays that end at known points (sparse depth), with its gradient. r rays, s with points, m samples."""
+"""A loss on rays that end at known points (sparse depth) and its gradient. r rays, s of them with points, m samples."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def sparse_depth_gradient(
     A sample is near the point if its distance from the point is at most 0.03 times the distance of the point, plus the
     sample's length. The loss of a ray is ``-log`` of the sum of the weights of these samples, clamped to at least
     0.001. It is the likelihood of Deng et al. 2022, "Depth-supervised NeRF", with a box in place of their Gaussian. Fog
-    in front of the point reduces this sum. The derivative of the sum by the density of a sample is
+    in front of the point reduces this sum. The derivative of the sum with respect to the density of a sample is
     ``delta (T near - S)``, where T is the transmittance behind the sample, S the part of the sum that is due to samples
     behind it, and ``near`` is 1 if the sample is near the point, otherwise 0. The mean of the s losses times ``factor``
     is added to ``loss``, and its gradient to the last column of ``gradient``. If the weight of a sample near the point
@@ -56,7 +56,7 @@ def sparse_depth_gradient(
 
     Args:
         loss: the loss, updated in place.
-        gradient: the gradient to the networks' outputs, contiguous, updated in place.
+        gradient: the gradient of the loss with respect to the networks' outputs, contiguous, updated in place.
         density: the densities of the samples.
         depths: the distances of the samples along the rays.
         deltas: the lengths of the samples' ray segments.
@@ -68,8 +68,8 @@ def sparse_depth_gradient(
         activated: whether the gradient is with respect to the density itself.
 
     Raises:
-        ValueError: a gradient that is not contiguous; more distances than rays; ``density_scale`` with ``activated``,
-            or neither; offsets that decrease or exceed m (checked on the CPU only).
+        ValueError: a gradient that is not contiguous; more distances than rays; both or neither of ``density_scale``
+            and ``activated``; offsets that decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch

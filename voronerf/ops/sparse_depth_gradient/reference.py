@@ -1,4 +1,4 @@
-"""A loss on rays whose light does not come from a known point, with its gradient. r rays, s with points, m samples."""
+"""A loss on rays that end at known points, and its gradient. r rays, s of them with points, m samples."""
 
 from __future__ import annotations
 

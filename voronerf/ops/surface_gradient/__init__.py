@@ -60,7 +60,7 @@ def surface_gradient(
 
     Args:
         loss: the loss, updated in place.
-        gradient: the gradient to the networks' outputs, contiguous, updated in place.
+        gradient: the gradient of the loss with respect to the networks' outputs, contiguous, updated in place.
         density: the densities of the samples.
         depths: the distances of the samples along the rays, > 0 and ascending.
         deltas: the lengths of the samples' ray segments.
@@ -76,8 +76,8 @@ def surface_gradient(
         activated: whether the gradient is with respect to the density itself.
 
     Raises:
-        ValueError: a gradient that is not contiguous; ``density_scale`` with ``activated``, or neither; offsets that
-            decrease or exceed m (checked on the CPU only).
+        ValueError: a gradient that is not contiguous; both or neither of ``density_scale`` and ``activated``; offsets
+            that decrease or exceed m (checked on the CPU only).
 
     Examples:
         >>> import torch

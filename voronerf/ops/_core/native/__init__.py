@@ -96,12 +96,12 @@ def know_torch(module: Any) -> None:
 know_torch(compiled)
 
 signature, Rules, alike, adam_step = compiled.signature, compiled.Rules, compiled.alike, compiled.adam_step
-"""The functions that check arguments and make calls (csrc/bindings/signature.h), even if tests replace `compiled`."""
+"""The functions that check arguments and make calls (csrc/bindings/signature.h); kept when tests replace `compiled`."""
 
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
 LEAST_GAIN = 1.25
-"""The least speed-up at which networks use bfloat16 instead of float32 products; rounding and pairing take time."""
+"""The least speed-up at which networks use bfloat16 instead of float32 products, as rounding and pairing cost time."""
 _bfloat16_gain = compiled.bfloat16_gain()
 
 
@@ -283,8 +283,9 @@ def measure_peak(kind: str, *, isa: str | None = None, threads: int | None = Non
     """Measures the machine's peak throughput, the reference of benchmarks; takes 0.1 to 0.2 s.
 
     Args:
-        kind: "float32" (multiply-adds) or "bfloat16" (dot products), of operands in registers, in floating-point
-            operations a second; or "copy", of memory larger than the caches, in bytes read and written a second.
+        kind: "float32" (multiply-adds) or "bfloat16" (dot products) for operands in registers, measured in
+            floating-point operations a second; or "copy" for memory larger than the caches, measured in bytes read and
+            written a second.
         isa: the instruction set, one of ``ISAS``; by default the one in use.
         threads: the number of threads; by default torch's number.
 
