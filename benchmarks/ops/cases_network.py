@@ -19,7 +19,7 @@ TOLERANCE = {(FULL, FORWARD): 1e-4, (FULL, BACKWARD): 0.02, (HALF, FORWARD): 0.0
 bfloat16 by half of the largest gradient. Missing gradients have an error of 1."""
 BOTH = ("native", "reference")
 
-# (network, n, k, dtype, direction). The first row of a small network, dtype and direction also runs the reference.
+# (network, n, k, dtype, direction). For each small network, dtype and direction, the first row also runs the reference.
 MLP_ROWS: tuple[tuple[str, int, int, torch.dtype, str], ...] = (
     *[("w64d4", n, 16, FULL, FORWARD) for n in (BASE, 1 << 10, 1 << 14, 1 << 20)],
     *[("mlp32", BASE, k, FULL, FORWARD) for k in (256, 1, 16, 64, 512, 4096)],

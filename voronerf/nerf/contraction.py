@@ -150,7 +150,7 @@ class Perspective:
 
     @property
     def numbers(self) -> Tensor:
-        """The tensor [5, 3] for `voronerf.ops.march_rays`: the centre, the axes, and a row of near and slopes."""
+        """The tensor [5, 3] for `voronerf.ops.march_rays`: centre, three axes, and (near distance, slopes)."""
         last = self.centre.new_tensor([[self.near, *self.slopes]])
         return torch.cat((self.centre[None], self.axes.to(self.centre), last))
 

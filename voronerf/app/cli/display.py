@@ -162,7 +162,7 @@ class TrainingDisplay(Callback):
             self.on_event("  ".join((f"{state.fraction:5.0%}", *(text for _, text in parts))))
 
     def track(self, parts: Sequence[Any], name: str) -> Iterable[Any]:
-        """Yields the parts of a task during the training, with a bar below its live line."""
+        """Yields the parts of a task during a training, with a progress bar below the training's status line."""
         task = self.progress.add_task(name, total=len(parts), text="")
         try:
             for number, part in enumerate(with_lines(parts, name)):

@@ -225,7 +225,7 @@ Others = tuple[Sequence[Row], Sequence[Any]]
 def check_rows(
     op: str, make: Callable[..., Rows], tensors: list[Any], *arguments: Any, smooth: bool = True
 ) -> dict[str, int]:
-    """Checks tensors against a table of rows, whose length depends on the network.
+    """Checks each tensor against one row of a table; the number of rows depends on the network.
 
     The compiled module reads the rows once and then checks all tensors of the network. If a tensor breaks a rule,
     Python repeats the check and raises the error.
@@ -272,7 +272,10 @@ def check_rows(
 
 @functools.lru_cache(maxsize=4096)
 def _compiled(make: Callable[..., Rows], *arguments: Any) -> tuple[list[str], Callable[[list[Any]], Any]]:
-    """Returns the letters of the rows, and a compiled check: tensors -> the letters' numbers, or None if it fails."""
+    """Returns the letters of the rows, and a compiled function.
+
+    The function returns the sizes of the letters for tensors, or None if a tensor breaks a rule.
+    """
     rows = make(*arguments)
     letters = _letters(rows)
     native = backends.compiled()

@@ -100,7 +100,7 @@ def read_count(memory: Tensor) -> int:
 
 
 def fixed_count(rows: int) -> int:
-    """Returns a number of rows that is the same in each run."""
+    """Returns ``rows`` as a row count that is the same in every replay."""
     return rows if active.recording is None else active.recording.count(lambda: rows)
 
 

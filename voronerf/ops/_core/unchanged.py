@@ -8,7 +8,7 @@ from voronerf.ops._core import backends
 
 
 class Never:
-    """The guard without the compiled module: it never holds, so every call checks its dependencies again."""
+    """A guard for use without the compiled module; `holds` is always False, so every call checks its dependencies."""
 
     def holds(self) -> bool:
         """Returns whether all noted objects are unchanged."""

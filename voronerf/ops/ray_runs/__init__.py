@@ -162,7 +162,7 @@ def run_gradients(
     hidden: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> tuple[Annotated[Tensor, "same [m, 4]"], Annotated[Tensor, "same [m]"]]:
-    """Returns the gradient of the loss with respect to the networks' outputs, from the answers to the runs.
+    """Returns the gradient of the loss with respect to the networks' outputs, from the result of `compose_runs`.
 
     Args:
         raw: colour and density before their activations, as in `run_sums`.

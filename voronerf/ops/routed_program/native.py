@@ -138,7 +138,7 @@ class _Samples(NamedTuple):
 
 
 def _memory(arguments: _Samples) -> tuple[Tensor, Tensor, Tensor]:
-    """Allocates cells (empty if they are arguments), the order (empty if there is one cell) and offsets."""
+    """Allocates cells (an empty tensor if the caller passes cells), order (empty for one cell) and offsets."""
     n, alone = rows_of(arguments.positions), arguments.cells is None and arguments.centres is None
     cells = new_empty(arguments.positions, n if arguments.cells is None else 0, dtype=torch.int32)
     order = new_empty(cells, 0 if alone else n)

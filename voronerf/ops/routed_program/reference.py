@@ -57,7 +57,7 @@ def find_cells(op: str, routing: Routing, k: int, backend: str) -> Tensor | None
 
 
 def mask_rows(outputs: Sequence[Tensor], cells: Tensor, rows: Tensor | None) -> tuple[list[Tensor], Tensor]:
-    """Sets outputs to 0 and cells to -1 (no cell) from row ``rows`` (int32 [1]) on; None changes nothing."""
+    """Keeps the first ``rows`` rows (int32 [1]; None keeps all); later rows get outputs 0 and cell -1 (no cell)."""
     if rows is None:
         return list(outputs), cells
     beyond = torch.arange(cells.shape[0], device=cells.device) >= rows
