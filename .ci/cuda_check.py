@@ -4,11 +4,13 @@ It uses the rules of setup.py and the build folder, so a build for the same arch
 architecture is compiled to PTX as well.
 
 For every kernel it prints registers, spills, shared memory and the warps that fit a multiprocessor's registers, and
-compares them with the table .ci/cuda_resources.json. A spill that is not in the table is a failure. With the table's
-version of nvcc, more registers, more shared memory and fewer warps are failures too, and so is a network layer that has
-more instructions or is not found (machine_code.py, if cuobjdump is installed). sm_80 is an A100, sm_89 an RTX 4090,
-sm_90 an H200. The check also fails if a kernel's resources are not reported for every architecture, or if there is no
-kernel. Kernels of the toolkit (CUB) are only counted: their names change with its version.
+compares them with the table .ci/cuda_resources.json. More spilled bytes than in the table are a failure, and so is any
+spill of a kernel that is not in the table. If nvcc has the version recorded in the table, more registers, more shared
+memory and fewer warps are failures too. If cuobjdump and nvdisasm are installed as well, it is a failure if a network
+layer has more instructions than in the table, or if machine_code.py does not find a layer that the table has. The check
+also fails if a kernel's resources are not reported for every architecture, or if there is no kernel. Kernels of the
+toolkit (CUB) are only counted: their names change with the toolkit's version. In the output, sm_80 is an A100, sm_89 an
+RTX 4090, sm_90 an H200.
 
 ``--update`` writes the named architectures to the table and removes kernels that no longer exist. The last line of the
 output is one sentence: what was compiled, and whether it passed.
@@ -100,7 +102,7 @@ def main(architectures: list[str]) -> int:
     version = nvcc_version(nvcc)
     spilling = sum(row["spilled_bytes"] > 0 for rows in kernels.values() for row in rows.values())
     targets = f"{', '.join(f'sm_{arch}' for arch in architectures)} and PTX of {architectures[-1]}"
-    # A file that failed to compile lacks architectures anyway.
+    # Kernels of files that failed to compile are skipped, because the failure itself is reported.
     broken = {Path(name).stem for name in failed}
     compiled = {kernel: found for kernel, found in kernels.items() if kernel.split(":")[0] not in broken}
     lacking = [
@@ -133,7 +135,10 @@ Kernels = dict[str, dict[str, dict[str, int]]]
 
 
 def regressions(version: str, kernels: Kernels) -> list[str]:
-    """Returns a line for each value worse than in the table; kernels and architectures that it lacks must not spill."""
+    """Returns a line for each value that is worse than in the table.
+
+    A kernel or architecture that is not in the table gets a line only if it spills.
+    """
     kept = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": "", "kernels": {}}
     compared = ("spilled_bytes", *(("registers", "shared_bytes", "layer") if kept["nvcc"] == version else ()))
     counted = any("layer" in row for rows in kernels.values() for row in rows.values())
@@ -154,7 +159,10 @@ def regressions(version: str, kernels: Kernels) -> list[str]:
 
 
 def merged(version: str, kernels: Kernels) -> Kernels:
-    """Returns the new rows and, if nvcc has the same version, these kernels' table rows of other architectures."""
+    """Returns the table with the new rows.
+
+    If the table records the same version of nvcc, the compiled kernels keep their rows of other architectures.
+    """
     table = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": ""}
     kept = table["kernels"] if table["nvcc"] == version else {}
     return {
@@ -184,7 +192,7 @@ def as_text(version: str, kernels: Kernels) -> str:
 
 
 def unpack(rows: dict[str, list[int]]) -> dict[str, dict[str, int]]:
-    """Returns a kernel's rows in the table, by architecture."""
+    """Returns a kernel's values by architecture and column name, from its rows in the table."""
     return {architecture: dict(zip(COLUMNS, row)) for architecture, row in rows.items()}
 
 

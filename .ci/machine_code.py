@@ -1,4 +1,6 @@
-"""Counts the instructions of a network layer, the shortest loop through its products, in machine code without a GPU.
+"""Counts the machine instructions of a network layer, without a GPU.
+
+A layer is found as the shortest loop through the block with the most multiply instructions.
 
 ``layers(object, "90")`` reads an object file with cuobjdump, from the toolkit or the package nvidia-cuda-cuobjdump.
 """
@@ -14,7 +16,7 @@ from collections import Counter
 from pathlib import Path
 
 PRODUCTS = {"HMMA": 32, "FFMA": 128}
-"""The multiply instructions, for a warp's matrices or for its floats, and the minimum number in a layer's block."""
+"""The multiply instructions (HMMA for matrices, FFMA for floats), each with the minimum number in a layer's block."""
 LINE = re.compile(r"^\s+/\*([0-9a-f]{4,})\*/\s+(.*?);")
 BRANCH = re.compile(r"^(?P<when>@!?U?P\d+ )?(?P<what>[A-Z][A-Z0-9]*)(?P<kind>\S*)(?P<rest>.*)$")
 
@@ -31,7 +33,10 @@ def tools() -> str | None:
 
 
 def layers(compiled: Path, architecture: str, path: str) -> dict[str, Counter[str]]:
-    """Returns, for the mangled name of each kernel with products, the instruction counts of a layer by kind."""
+    """Returns, by mangled kernel name, the number of instructions of each kind in one layer of the kernel.
+
+    Kernels without enough multiply instructions are left out. ``path`` is the PATH that `tools` returns.
+    """
     command = [shutil.which("cuobjdump", path=path) or "cuobjdump", "-arch", f"sm_{architecture}", "-sass", compiled]
     said = subprocess.run(command, capture_output=True, text=True, check=True, env={"PATH": path}).stdout
     kernels = dict[str, Code]()
@@ -44,10 +49,10 @@ def layers(compiled: Path, architecture: str, path: str) -> dict[str, Counter[st
 
 
 def layer(code: Code) -> Counter[str]:
-    """Counts, by kind, the instructions of the shortest cycle through the basic block with the most products.
+    """Counts, by kind, the instructions of the shortest cycle through the block with the most multiply instructions.
 
-    In a chain of layers this cycle is one layer and the code between layers. A block that is itself a loop over a
-    product counts once. The result is empty if no block has enough products.
+    In a chain of layers this cycle is one layer and the code between layers. A basic block that loops to itself counts
+    once. The result is empty if no block has enough multiply instructions.
     """
     blocks, ways = _blocks(code)
     kinds = [Counter(kind(text) for _, text in block) for block in blocks]

@@ -1,10 +1,11 @@
-"""Times small calls of ops, and routers beside a single network, in turns on one thread.
+"""Times small calls of ops, and routers compared with a single network, in turns on one thread.
 
     python benchmarks/calls.py --json benchmarks/results/calls.json
 
-Ops: the public call beside its compiled function. Routers: 16 cells with ``fuse=True``, beside one ``nn.Sequential``
-and beside routing by hand (argmin, argsort, one padded ``baddbmm`` per layer, scatter). Networks on sorted rows:
-``grouped_mlp`` beside a padded ``baddbmm``. Times are median wall times in microseconds.
+Ops: the public Python function and, for ``nearest_centre``, the C++ function that it calls. Routers: 16 cells with
+``fuse=True``, compared with one ``nn.Sequential`` and with routing by hand (argmin, argsort, one padded ``baddbmm`` per
+layer, scatter). Networks on sorted rows: ``grouped_mlp``, compared with a padded ``baddbmm``. Times are median wall
+times in microseconds.
 """
 
 from __future__ import annotations

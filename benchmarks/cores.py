@@ -4,14 +4,16 @@
 
 It takes three minutes on two idle cores. DATA holds the scenes lego and bonsai. `voronerf train` sets the two
 environment variables itself (docs/kernels.md). The measured trainings run the same steps, in turns: on one thread and
-on all cores; replayed (voronerf/nerf/step.py) and eager; and beside a second training in another process. The first
-quarter of the turns, which contains the split, and the end of a training are not counted.
+on all cores; replayed (voronerf/nerf/step.py) and eager; and at the same time as a second training in another process.
+The first quarter of the turns is not counted, because the split into cells happens there. The last steps of a training
+are not counted, either.
 
 The model starts from the processor time of one thread. Calls of the compiled module are traced in separate steps of
-each turn (csrc/common/trace.h). Each chunk of items of a parallel region is assigned to the first free one of 2, 8, 16
-or 32 threads. All time outside parallel regions is serial: Python, torch's operations, and the compiled module's code
-around its regions. The modelled step time is the serial time, plus the fixed cost of each region, plus the time of
-the busiest thread or the time to move the step's bytes through memory, whichever is longer.
+each turn (csrc/common/trace.h). For teams of 2, 8, 16 and 32 threads, the model assigns each chunk of items of a
+parallel region to the thread that becomes idle first. All time outside parallel regions is serial: Python, torch's
+operations, and the compiled module's code around its regions. The modelled step time is the serial time, plus the fixed
+cost of each region, plus the time of the busiest thread or the time to move the step's bytes through memory, whichever
+is longer.
 """
 
 from __future__ import annotations
@@ -44,11 +46,13 @@ TURN = GROUP, 2 * GROUP, 4 * GROUP
 """The numbers of steps after which, in each turn, the trace (if any) begins, the timing begins, and the turn ends. The
 first steps are not counted, because `train` takes milliseconds to start."""
 LINE, SAMPLE_BYTES, ENTRY_BYTES, TAUGHT_BYTES = 16, 450, 8, 24
-"""Parameters in a cache line, and the bytes that a step moves: per sample (positions to gradients), per parameter (its
-gradient, twice), and per parameter of a cache line with a gradient (the value and two moments, read and written)."""
+"""LINE is the number of parameters in a cache line. The others are bytes that a step moves: SAMPLE_BYTES per sample
+(all arrays from its position to its gradients), ENTRY_BYTES per parameter (its gradient, written and read), and
+TAUGHT_BYTES per parameter in a cache line that has a nonzero gradient (the value and two moments, read and written)."""
 CALLS, SERIAL_US, TRIALS = 100, 40, 5
-"""Parallel regions in a recording, microseconds of serial work before each region, and the number of measurements,
-of which the fastest counts."""
+"""The number of parallel regions in the measured recording (a sequence of compiled calls that is replayed without
+Python), the microseconds of serial work before each region, and the number of measurements, of which the fastest
+counts."""
 
 
 class Case(NamedTuple):
@@ -126,7 +130,7 @@ class Other(Callback):
 
 
 class Training(Callback):
-    """A training that runs in turns, in one of the ways."""
+    """A training that runs in turns, in one of the compared ways (`Way`)."""
 
     group = GROUP
 
@@ -181,9 +185,16 @@ def load(case: Case, downscale: int | None = None) -> Any:
 
 
 def parts(seconds: float, calls: list[Any]) -> dict[str, list[float]]:
-    """Returns seconds, seconds in parallel regions, number of regions, and modelled seconds on each of TEAMS.
+    """Returns the processor time of each compiled function, and of "Python and torch".
 
-    The keys are the compiled functions, and "Python and torch"."""
+    Args:
+        seconds: The processor seconds of some steps or of a picture.
+        calls: The trace of the compiled calls in this time.
+
+    Returns:
+        For each name: total seconds, seconds in parallel regions, number of regions, and modelled total seconds on each
+        team of TEAMS.
+    """
     table: dict[str, list[float]] = defaultdict(lambda: [0.0] * (3 + len(TEAMS)))
     for name, whole, regions, inside, shared in calls:
         added = whole, inside, regions, *(whole - inside + columns for columns in shared)
@@ -194,10 +205,16 @@ def parts(seconds: float, calls: list[Any]) -> dict[str, list[float]]:
 
 
 def model(groups: list[dict[str, list[float]]], moved: float, region_us: float) -> dict[str, Any]:
-    """Returns the row of the model: speed-ups, and microseconds a step of each part.
+    """Returns the modelled speed-ups, and the microseconds of each part of a step (or of a picture).
 
-    A part's time is the median over the groups of steps. For Python and torch, and for parts that most groups lack, it
-    is the mean."""
+    A part's time is its median over the groups. For "Python and torch", and for parts that occur in less than half of
+    the groups, it is the mean.
+
+    Args:
+        groups: The result of :func:`parts` for each measured group of steps, divided by the number of steps.
+        moved: The bytes that a step moves through memory.
+        region_us: The microseconds that a parallel region costs.
+    """
     table = {}
     for name in dict.fromkeys(name for each in groups for name in each):
         rows = [each.get(name, [0.0] * (3 + len(TEAMS))) for each in groups]
@@ -222,8 +239,9 @@ def model(groups: list[dict[str, list[float]]], moved: float, region_us: float) 
 def region(cores: int) -> dict[str, Any]:
     """Measures the cost in microseconds of an empty parallel region that follows serial work.
 
-    There are two costs: a thread team is woken for each region, or a recording's team waits between regions. If a
-    recording of calls on several threads is replayed on one thread, it has no team, and each call wakes its own."""
+    Calls whose regions run on all cores are recorded, and replayed in two ways. A replay on all cores keeps one team of
+    threads, which waits between the regions. A replay on one thread keeps no team, so each region wakes its own team.
+    The time of the same calls with serial regions is subtracted from both times."""
     points, cells, share = torch.rand(2048, 3), torch.empty(2048, dtype=torch.int32), torch.tensor(0.5)
     pair = [torch.zeros(1), torch.zeros(1)], [torch.zeros(1), torch.zeros(1)]
 
@@ -232,8 +250,8 @@ def region(cores: int) -> dict[str, Any]:
         with threads(count), Recording() as recording:
             n, machine = recording.count(lambda: len(points)), native.cpu()
             for _ in range(CALLS):
-                native.compiled.nearest_centre(points, centres, None, cells, n, k, 3, 0, machine)  # one region
-                native.compiled.average(*pair, share, [1, 1], machine)  # two regions
+                native.compiled.nearest_centre(points, centres, None, cells, n, k, 3, 0, machine)  # one chunk: serial
+                native.compiled.average(*pair, share, [1, 1], machine)  # a region of two chunks
         if recording.obstacle is not None:
             raise RuntimeError(recording.obstacle)
         return recording
@@ -255,7 +273,7 @@ def region(cores: int) -> dict[str, Any]:
 
 
 def measure(name: str, case: Case, cores: int, region_us: float) -> list[dict[str, Any]]:
-    """Returns the row of a training and, if the case has a picture, the row of rendering it."""
+    """Returns the row of a training and, if ``case.picture`` is set, the row of rendering a view."""
     scene, other = load(case), Other(case)
     trainings = {way: Training(case, scene, how) for way, how in ways(cores).items()}
     turns = (case.settings["steps"] - 1) // TURN[-1]

@@ -2,13 +2,14 @@
 
     python benchmarks/edges.py RUN
 
-- half: the fraction of half-covered pixels within 8 pixels of a silhouette. A silhouette is where the disparity changes
-  by a tenth from pixel to pixel. The disparity is the inverse of the median depth of the light, median-filtered over
-  5 x 5 pixels. The coverage of a pixel is its light from nearer than the geometric mean of the nearest and farthest
-  depth around the pixel. A pixel with a coverage of 0.1 to 0.9 is half covered.
-- rough: the root mean square distance of disparities from a fitted plane in patches of 9 x 9 pixels, in percent of the
-  mean disparity. It is averaged over plain patches: away from silhouettes, and with a standard deviation of grey
-  values below 0.015.
+- half: the fraction of half-covered pixels among the pixels within 8 pixels of a silhouette. At a silhouette, the
+  disparity changes by more than a tenth from pixel to pixel. This disparity is the inverse of the depth at which a ray
+  has half of its opacity, median-filtered over 5 x 5 pixels. The coverage of a pixel is the sum of the rendering
+  weights of its samples in front of the geometric mean of the nearest and farthest depths around the pixel. A pixel
+  with a coverage of 0.1 to 0.9 is half covered.
+- rough: the root mean square distance of disparities (here the inverse mean depths) from a fitted plane in patches of
+  9 x 9 pixels, in percent of the mean disparity. It is averaged over plain patches, which are away from silhouettes and
+  have a standard deviation of grey values below 0.015.
 - holes: the percentage of pixels with an opacity below one half.
 """
 
@@ -32,7 +33,15 @@ BESIDE, CHANGE, CLEAR, PATCH, STRIDE, PLAIN, CHUNK = 8, 1.1, 0.1, 9, 5, 0.015, 1
 
 
 class Looked(NamedTuple):
-    """A rendered view: opacity, mean depth and median depth of the light [h, w], and its samples in chunks of rays."""
+    """A rendered view and its samples.
+
+    Attributes:
+        opacity: The opacity of each ray [h, w].
+        mean: The mean depth of each ray's samples, weighted by the rendering weights [h, w].
+        half: The depth at which each ray has half of its opacity [h, w].
+        samples: A tuple for each chunk of rays: the ray (counted within the chunk), depth and rendering weight of each
+            sample, and the number of rays.
+    """
 
     opacity: Tensor
     mean: Tensor
@@ -40,7 +49,7 @@ class Looked(NamedTuple):
     samples: list[tuple[Tensor, Tensor, Tensor, int]]
 
     def before(self, depth: Tensor) -> Tensor:
-        """Returns the light [h, w] that comes from nearer than the depths [h, w]."""
+        """Returns the sum [h, w] of the rendering weights of the samples in front of the depths [h, w]."""
         parts, begin, ends = [], 0, depth.reshape(-1)
         for ray, depths, weights, rays in self.samples:
             near = torch.where(depths < ends[begin : begin + rays][ray], weights, 0)

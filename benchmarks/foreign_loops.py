@@ -1,7 +1,8 @@
-"""Trains fields of other codebases in their own training loops: unchanged, routed, and as a loop over masks.
+"""Trains fields of other codebases in their own training loops: unchanged, narrower, routed, or in a loop over masks.
 
-Clones of EmilienDupont/coin, Lilac-Lee/Neural_Scene_Flow_Prior and yenchenlin/nerf-pytorch lie in one folder, scenes
-in VORONERF_DATA. A loop ends after --seconds of processor time; mocks replace its missing imports.
+Clones of EmilienDupont/coin, Lilac-Lee/Neural_Scene_Flow_Prior and yenchenlin/nerf-pytorch must be in one folder,
+and the scenes in VORONERF_DATA. A loop ends after --seconds of processor time. Mocks replace packages that the clones
+import (`ABSENT`).
 
     python benchmarks/foreign_loops.py coin routed CLONES --json FILE [--seconds 60] [--seed 0]
 """
@@ -60,13 +61,18 @@ class Masks(nn.Module):
 
 
 class Run:
-    """One training: replaces the field, and ends the loop when the time is over."""
+    """One training, which replaces the field of the codebase and ends the training loop when the time is over."""
 
     def __init__(self, way: str, seconds: float, clones: Path) -> None:
         self.way, self.seconds, self.clones, self.steps = way, seconds, clones, -1
 
     def field(self, make: Callable[[bool], nn.Module], points: Tensor) -> nn.Module:
-        """Returns the original field, ``make(True)``, or narrow fields in the cells of its samples [..., d]."""
+        """Returns the field to train, and counts its calls as steps.
+
+        The way "plain" trains the original field ``make(True)``, and "narrow" trains a narrower field ``make(False)``.
+        The ways "routed" and "masks" train one narrower field per cell, in a router or in a loop over masks. The cells'
+        centres are computed from the samples ``points`` [..., d].
+        """
         net = make(self.way == "plain")
         if self.way in ("masks", "routed"):
             diagram = VoronoiDiagram.from_points(points, CELLS, generator=torch.Generator().manual_seed(0))
@@ -104,7 +110,7 @@ def nearest(x: Tensor, y: Tensor, **_: Any) -> Any:
 
 
 def flow(run: Run) -> dict[str, float]:
-    """Trains Neural Scene Flow Prior, width 128 or 64, between two halves of bonsai's points, one half deformed."""
+    """Trains Neural Scene Flow Prior, width 128 or 64: flow from half of bonsai's points to the deformed other half."""
     torch.Tensor.cuda = lambda self, *_, **__: self
     sys.modules["pytorch3d.ops.knn"].knn_points = nearest
     sys.modules["pytorch3d.structures.pointclouds"].Pointclouds = type(None)

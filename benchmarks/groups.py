@@ -59,7 +59,7 @@ class Siren(nn.Module):
 
 
 def ways(k: int) -> dict[str, tuple[list[nn.Parameter], Run]]:
-    """Returns for each method its parameters of the same k networks, and a function [k, rows, 2] -> [k, rows, 3]."""
+    """Returns {method: (parameters, function [k, rows, 2] -> [k, rows, 3])}; all methods have the same k networks."""
     modules = [Siren() for _ in range(k)]
     router = VoronoiRouter.from_modules(modules, fuse=True, way="fused")
     labels = torch.arange(k)[:, None]

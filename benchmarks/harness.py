@@ -37,9 +37,10 @@ MOST = 200
 DISTURBED_PEAK = 0.9
 """A measured peak below this fraction of the best one counts as disturbed and is replaced by the best one."""
 SLOW = 2
-"""If a single call takes longer than this many limits, its contender gets one timing instead of ``FEWEST``."""
+"""If a single call takes longer than this multiple of its contender's time limit, the contender gets one timing instead
+of ``FEWEST``."""
 TOO_SLOW = 5
-"""If the warm-up of a contender takes longer than this many limits, the contender is not called again."""
+"""If a contender's warm-up takes longer than this multiple of its time limit, the contender is not called again."""
 BATCH_SECONDS = 5e-3
 """Calls shorter than this are timed in batches. An untimed call precedes each batch, because the previous contender
 left its code and data in the caches, and its threads spinning."""
@@ -152,14 +153,15 @@ def measure(
 ) -> dict[str, Timing]:
     """Times contenders in turns. The caller must have run call 0 of each contender.
 
-    A contender stops when its timings add up to its limit, but not before ``FEWEST`` timings. If a
-    single call takes more than ``SLOW`` limits, it is the only timing, and counts as capped.
+    A contender stops when its timings add up to its limit, but not before ``FEWEST`` timings. If a single call takes
+    longer than ``SLOW`` times the limit, it is the only timing, and the result is capped.
 
     Args:
         contenders: The functions to run, by name, in the order of their turns.
-        limits: Seconds for each contender.
+        limits: The time limit of each contender in seconds.
         stopwatch: A function of (contender, first call, number of calls) that returns seconds; a :class:`Stopwatch`.
-        warm: Seconds of call 0, if known; above ``TOO_SLOW`` limits, they are the contender's only timing.
+        warm: The seconds of call 0 by contender, if known. If they exceed ``TOO_SLOW`` times the limit, they become the
+            contender's only timing.
 
     Returns:
         A timing for each contender.

@@ -2,9 +2,9 @@
 
     python benchmarks/many_cells.py --data builtin-city:8x8 --cells 1 16 65536 --seconds 60 --json FILE
 
-All trainings have the same field, rays and learning rate. The coarse stage trains one network for a fifth of the time.
-Its samples then place the centres (`VoronoiDiagram.from_points`), and the networks of all cells begin as copies of the
-coarse network. The placement counts as training time.
+All trainings have the same field, rays and learning rate. A coarse stage first trains one network for a fifth of the
+time. The centres are then computed from its samples (`VoronoiDiagram.from_points`), and the networks of all cells begin
+as copies of the coarse network. Computing the centres counts as training time.
 """
 
 from __future__ import annotations

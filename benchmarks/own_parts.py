@@ -1,4 +1,4 @@
-"""Measures the cost of extending a training step: the examples of docs/extend.md beside the default step.
+"""Measures the cost of extending a training step: the examples of docs/extend.md, compared with the default step.
 
     OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=1000 python benchmarks/own_parts.py --data DATA --json FILE
 
@@ -39,7 +39,10 @@ def examples() -> dict[str, Any]:
 
 
 def add_term(name: str, *arguments: float) -> Callable[[State, dict[str, Any]], None]:
-    """Returns a change that adds a term to the loss; ``arguments`` construct it, if it is a class."""
+    """Returns a function that adds the example ``name`` to a training's loss terms.
+
+    An example that is a class is constructed with ``arguments``.
+    """
 
     def change(state: State, own: dict[str, Any]) -> None:
         term = own[name](*arguments) if arguments else own[name]
@@ -49,7 +52,10 @@ def add_term(name: str, *arguments: float) -> Callable[[State, dict[str, Any]], 
 
 
 def set_strategy(name: str) -> Callable[[State, dict[str, Any]], None]:
-    """Returns a change that replaces the split strategy after the splits."""
+    """Returns a function that replaces a training's split strategy by the example ``name``.
+
+    The function is called after the last split, so that only the strategy's cost per step is measured.
+    """
 
     def change(state: State, own: dict[str, Any]) -> None:
         state.strategy.__class__ = own[name]
@@ -111,7 +117,7 @@ def measure(scene: Scene, data: str, rays: int, turns: int) -> dict[str, Any]:
         state.rays = rays
         until = Until(rays)
         until.go_on(state, BEFORE)
-        while state.strategy.left:  # the split is due at a fraction of the steps
+        while state.strategy.remaining:  # the split is due at a fraction of the steps
             until.go_on(state, GROUP)
         change(state, own)
         state.training_step.forget()

@@ -37,8 +37,8 @@ PRIMES = (1, 2654435761 - 2**32, 805459861)
 CHUNK, CELLS_CHUNK = 4096, 1 << 16
 #: Steps between updates of the occupancy grid (nerfacc).
 GRID_EVERY = 16
-#: A cell is occupied if its opacity over a thousandth of the scene's diagonal exceeds this threshold or the mean
-#: opacity of all cells (nerfacc).
+#: A cell is occupied if its opacity exceeds the smaller of GRID_OPACITY and the mean opacity of all cells (nerfacc).
+#: The opacity of a cell is its density times GRID_WAY diagonals of the scene.
 GRID_OPACITY, GRID_WAY = 1e-2, 1e-3
 #: Steps of the learning rate's warm-up (nerfacc: 100 of 20,000).
 RISE = 20
@@ -57,7 +57,7 @@ class RivalConfig:
     base: float = 16
     """The coarsest resolution."""
     finest: float | None = None
-    """The finest resolution. Default: half a pixel of the training views."""
+    """The finest resolution. Default: grid cells as wide as half a pixel of the training views."""
     width: int = 64
     """The width of the hidden layers: one for the density, two for the colour."""
     samples: int = 64
@@ -71,7 +71,7 @@ class RivalConfig:
     grid_decay: float = 0.8
     """The decay of a cell's stored opacity when the cell is evaluated again (nerfacc: 0.95)."""
     grid_share: float = 1 / 32
-    """The fraction of the cells that each later update evaluates; half of these are occupied cells."""
+    """The fraction of the cells that each later update evaluates; half of the evaluated cells are occupied cells."""
     lr: float = 2e-2
     """The learning rate of Adam at the start (nerfacc: 0.01)."""
     lr_final: float = 0.1
@@ -81,7 +81,7 @@ class RivalConfig:
 
 
 class ReadTable(torch.autograd.Function):
-    """The weighted sums [m, f] of eight table entries each; the table is [entries, f]."""
+    """A table look-up: returns weighted sums [m, f] of eight entries each from a table [entries, f]."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
@@ -146,7 +146,10 @@ class NGP(nn.Module):
         return ReadTable.apply(self.table, index.view(-1, 8), weight.view(-1, 8)).view(-1, self.features)
 
     def forward(self, positions: Tensor, seen: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns colour [n, 3] and density [n] at positions [n, 3] in 0..1 for encoded ray directions [r, 16]."""
+        """Returns colour [n, 3] and density [n] at positions [n, 3] in 0..1.
+
+        ``seen`` holds the encoded directions [r, 16] of the rays, and ``ray`` the ray [n] of each position.
+        """
         found = self.geometry(self.encode(positions))
         colour = self.colour(torch.cat((found[:, 1:], seen[ray]), 1)).sigmoid()
         return colour, TruncatedExp.apply(found[:, 0] - 1)

@@ -44,7 +44,7 @@ MIRROR = 0.05, 0.6
 NOISE, TURN, OFF = 0.008, 0.3, 0.003
 #: Points that each view adds to the model.
 POINTS = 20
-#: Light from nearer than this fraction of a surface's distance counts as in front of the surface.
+#: Samples at less than this fraction of a surface's distance count as in front of the surface.
 BEFORE = 0.95
 
 
@@ -126,7 +126,7 @@ def meet(caster: Caster, cameras: Cameras, view: int) -> tuple[Array, Array, Arr
 def look(
     caster: Caster, mirrors: int, origins: Array, directions: Array, depth: Array, number: NDArray[np.int64]
 ) -> Array:
-    """Returns the colours [r, 3] that rays see, with one reflection."""
+    """Returns the colours [r, 3] of rays that hit solids ``number`` at ``depth`` (inf: no hit), with one reflection."""
     colour = shaded(origins, directions, depth, number, caster)
     rows = (np.isfinite(depth) & (number < mirrors)).nonzero()[0]
     along = directions[rows]
@@ -213,7 +213,7 @@ def quaternion(turn: Array) -> Array:
 
 @torch.no_grad()
 def depth_errors(renderer: Renderer, scene: Scene, folder: Path) -> dict[str, float]:
-    """Returns for held-out views the median relative depth error, and the mean light in front of surfaces."""
+    """Returns the median relative depth error of held-out views, and the mean rendering weight in front of surfaces."""
     assert scene.transform is not None
     scale = float(torch.linalg.det(scene.transform[:3, :3])) ** (1 / 3)
     errors, early = [], []

@@ -4,8 +4,9 @@
     python benchmarks/starts.py --data BONSAI --downscale 8 --steps 440 --json benchmarks/results/starts.json
 
 A training fails if its PSNR is less than `ABOVE` dB above the PSNR of one-colour pictures. It also fails if its PSNR is
-more than `BELOW` dB below the median of its scene's trainings with the fewest rays, because more rays a step must not
-learn less. Seconds are processor time. To measure another version, put its folder into PYTHONPATH and set ``--label``.
+more than `BELOW` dB below the median of its scene's trainings with the fewest rays, because more rays per step should
+not make a training worse. Seconds are processor time. To measure another version, put its folder into PYTHONPATH and
+set ``--label``.
 """
 
 from __future__ import annotations

@@ -49,7 +49,8 @@ OPTIONAL = {"scipy": "scipy", "warp": "warp-lang", "numba": "numba"}
 """Optional packages: module name -> package to install."""
 LIMITS = {"ours": 0.8, "alternative": 0.5}
 QUICK_LIMITS = {"ours": 0.3, "alternative": 0.15}
-"""Time limits in seconds of a contender, which gets at least three timings (see ``harness.measure``)."""
+"""The time limits of a contender in seconds: LIMITS, or QUICK_LIMITS under --quick. A contender gets at least three
+timings (see ``harness.measure``)."""
 DISTURBED = 0.1
 """A row counts as disturbed if other processes keep more than this number of cores busy."""
 SLOW = ("compile", "F.grouped_mm")

@@ -127,12 +127,13 @@ def take_turns(
     if not turn > 0:
         raise ConfigError(f"--turn must be positive, got {turn}")
     trainings = list(trainings)
-    # Resumed trainings begin with a full turn, because they may have passed stops without a call of on_stop.
+    # Begin at the start of the current turn: a resumed training may have passed stops of this turn without a call of
+    # on_stop.
     done = turn * math.floor(min((training.seconds for training in trainings), default=budget) / turn)
     while done < budget:
         before, done = done, min(done + turn, budget)
         for training in list(trainings):
-            # A long step of the last turn may have passed a stop of this turn; on_stop is still called for it.
+            # The previous turn's last step may have passed a stop of this turn. on_stop is still called for the stop.
             due = [second for second in stops(training) if before < second <= done]
             if training.seconds >= done and not due:
                 continue

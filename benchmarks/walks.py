@@ -1,7 +1,7 @@
 """Writes captures of people who walk and look around: in a room, along a street, and on a roof above a city.
 
-They turn around twice on the way. The median viewing distance is four times the length of the walk in the room and the
-street, and thirty times on the roof. The files have the layout of `room.py`.
+The people turn around twice on the way. The median viewing distance is four times the length of the walk in the room
+and in the street, and thirty times its length on the roof. The files have the layout of `room.py`.
 
     python benchmarks/walks.py FOLDER --place street --seed 0
     voronerf train --data FOLDER --budget 40
@@ -30,7 +30,7 @@ BLOCKS, SKY = 8, (0.62, 0.75, 0.9)
 
 
 def walk(draw: random.Random, place: str, views: int, width: int, height: int) -> Cameras:
-    """Returns cameras along y that sway and turn twice around."""
+    """Returns cameras that move along y, sway, and turn around twice."""
     t = torch.linspace(0, 1, views)
     waves = [torch.sin(2 * math.pi * (draw.choice([2, 3, 5]) * t + draw.random())) for _ in range(5)]  # four used
     middle, reach, up = PLACES[place]

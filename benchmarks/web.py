@@ -152,7 +152,7 @@ def compared(run: Run, driver: Any, pixels: int) -> dict[str, Any]:
 
 
 def walked(run: Run, view: int) -> tuple[int, int]:
-    """Returns the numbers of strata and samples of a frame, estimated from every `APART`th ray along both sides."""
+    """Returns the numbers of strata and samples of a frame, estimated from every `APART`th pixel along both axes."""
     sampler, scene, cameras = run.renderer.sampler, run.scene, run.scene.test.cameras
     assert isinstance(sampler, Occupancy)
     side, (width, height) = FRAME // APART, cameras.size(view)
@@ -167,7 +167,7 @@ def walked(run: Run, view: int) -> tuple[int, int]:
     def look(live: Tensor, start: Tensor | None) -> Wave:
         nonlocal samples
         now = rays[live]
-        found, stop = sampler.march(now, near[live], far[live], start=start, most=FINE_WAVE, picture=True)
+        found, stop = sampler.march(now, near[live], far[live], start=start, max_samples=FINE_WAVE, picture=True)
         rgb, sigma = run.renderer.field(found.inputs, now.directions, found.ray_index)
         samples += len(sigma)
         stops[live] = stop

@@ -20,7 +20,7 @@ from voronerf import VoronoiDiagram, VoronoiRouter
 
 
 class Siren(nn.Module):
-    """A SIREN from 2 coordinates to 3 colours (Sitzmann et al. 2020), as in EmilienDupont/coin."""
+    """A SIREN from 2 coordinates to an RGB colour (Sitzmann et al. 2020), as in EmilienDupont/coin."""
 
     def __init__(self, width: int, depth: int = 6, w0: float = 30.0) -> None:
         super().__init__()

@@ -1,8 +1,8 @@
 """NVIDIA Warp kernels, installed as ``voronerf.kernels``: one file per op, one source for CPU and CUDA.
 
 They are for machines with a GPU but no CUDA compiler. On the CPU, where Warp has one thread, they serve as a check.
-Importing this package raises ``BackendUnavailable`` if Warp is missing or too old; ``import voronerf`` never imports
-it.
+Importing this package raises ``BackendUnavailable`` if Warp is missing or too old; ``import voronerf`` imports neither
+this package nor Warp.
 
 A file's kernels are compiled on first use, or by :func:`loads`. Compiled kernels stay in Warp's cache, in the folder
 WARP_CACHE_PATH or Warp's default.
@@ -90,7 +90,10 @@ _STEP_FILES = (
 
 
 def loads(device: torch.device, dtype: torch.dtype) -> list[Callable[[], None]]:
-    """Returns functions that load a training step's kernels for a dtype of weights, and compile only new kernels."""
+    """Returns functions that load the kernels of a training step for a dtype of weights.
+
+    Each function loads one module of kernels. It compiles the module first if Warp's cache does not hold it.
+    """
     from voronerf.kernels.grouped_mlp import THREADS, kernels
 
     where = wp.device_from_torch(device)

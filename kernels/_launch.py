@@ -14,14 +14,14 @@ from torch import Tensor
 def array(tensor: Tensor | None, like: Tensor, dtype: torch.dtype = torch.float32) -> Any:
     """Returns a Warp view of a tensor, with its strides and without a copy.
 
-    For None, returns an empty array of `dtype` on the device of `like`: Warp requires an array, but kernels do not read
-    it.
+    For None, returns an empty array of `dtype` on the device of `like`: Warp requires an array argument, but kernels do
+    not read this one.
     """
     if tensor is None:
         tensor = like.new_empty(0, dtype=dtype)
     if tensor.dtype == torch.bool:
         tensor = tensor.view(torch.uint8)
-    # Tensors in lists reach ops with an unresolved negative bit.
+    # PyTorch's dispatcher would resolve the negative bit of a tensor, but most calls of ops bypass the dispatcher.
     return wp.from_torch(tensor.detach().resolve_neg())
 
 
@@ -33,7 +33,10 @@ def filled(struct: Any, **fields: Any) -> Any:
 
 
 def of_both_dtypes(kernel: Any) -> None:
-    """Registers a float32 and a float64 overload of a kernel of points and centres; both compile with the file."""
+    """Registers overloads of a kernel for float32 and for float64 arguments ``points`` and ``centres``.
+
+    Registered overloads are compiled together with the other kernels of the file.
+    """
     for scalar in (wp.float32, wp.float64):
         wp.overload(kernel, dict.fromkeys(("points", "centres"), wp.array2d(dtype=scalar)))
 

@@ -2,17 +2,18 @@
 
 n samples, k cells, t tiles of rows, c columns.
 
-Data are tiled. Samples are sorted by cell, and the rows of each cell are padded to tiles of ``ROWS``, so that a tile
-belongs to one cell. The features of the encoded positions, of the directions and of each layer's output are padded to
-columns of ``WIDTH``. A weight matrix consists of blocks [WIDTH, WIDTH], each of which maps one column to another. A
-network with skips, branches and any widths is therefore a list of products::
+Samples are sorted by cell, and the rows of each cell are padded to tiles of ``ROWS`` rows, so that a tile belongs to
+one cell. Features are split into groups of ``WIDTH``, called columns here: the features of the encoded positions, of
+the directions and of each layer's output are each padded to whole columns. A weight matrix consists of blocks
+[WIDTH, WIDTH], each of which maps one column to another. A network with skips, branches and any widths is therefore a
+list of products::
 
     column o of the layers = bias o + sum over the products p of o: activation(column source[p]) @ block p ^T
 
 One kernel runs any list of products, so a new network compiles no code. A block of threads runs the whole list for one
-tile. The columns of a tile hold sums before the activation, which each reader applies. The columns lie in global
-memory: they do not all fit in shared memory, and a block's recent writes are in the cache. No other block accesses
-them.
+tile. A column of a layer stores the sums before the activation; each product that reads the column applies the
+activation to it. The columns lie in global memory, because they do not all fit in shared memory. A block's recent
+writes are in the cache, and no other block accesses its tile.
 
 Padding has weight 0 and changes no result. The encodings run in earlier launches. Sums and columns are float32. If
 weights are float16 or bfloat16, the operands of products are rounded to this dtype for the tensor cores.
@@ -47,8 +48,9 @@ from voronerf.ops.grouped_linear.reference import check_offsets
 from voronerf.ops.grouped_program.reference import cells_of
 
 ROWS, WIDTH, THREADS = 64, 16, 128
-"""The tile sizes. Wider columns would waste more padding: heads have 1 to 4 outputs. Each thread has 4 x 2 sums of a
-tile's column; with fewer threads per block, registers spill (.ci/warp_check.py)."""
+"""The numbers of rows per tile, features per column and threads per block. Wider columns would hold more padding,
+since heads have 1 to 4 outputs. Each thread accumulates 4 x 2 elements of a matrix [ROWS, WIDTH], one column of a tile;
+with fewer threads per block, registers spill (.ci/warp_check.py)."""
 _LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)) for activation in ACTIVATIONS}
 _TYPES = {torch.float32: wp.float32, torch.float16: wp.float16, torch.bfloat16: wp.bfloat16}
 
@@ -99,7 +101,8 @@ class Products:
 def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
     """Returns the forward and the backward kernel for a dtype of weights; each is compiled on first use."""
     scalar: Any = _TYPES[dtype]
-    # Tensor cores multiply 16-bit types. For float32 Warp's own products compile in one second instead of twenty.
+    # MathDx multiplies 16-bit types on tensor cores. float32 products use plain Warp code, which compiles in one second
+    # instead of twenty.
     options = {"enable_backward": False, "enable_mathdx_gemm": dtype != torch.float32}
     kernel = functools.partial(wp.kernel, module="unique", module_options=options)
 
@@ -120,7 +123,7 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
         outputs = products.first.shape[0] - 1
         inputs = products.activation.shape[0] - outputs
         for o in range(outputs):
-            # Refilling a shared tile is a barrier: then all threads see the earlier stores of all threads.
+            # Filling a shared tile synchronises the block, so that all threads see the earlier stores of all threads.
             total = wp.tile_zeros(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
             for p in range(products.first[o], products.first[o + 1]):
                 source = products.source[p]
@@ -147,9 +150,9 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
         """Runs each product in reverse twice: for the gradient of its weights and for the gradient of its source.
 
         ``gradients`` holds the gradients of the sums; initially only the gradients of the outputs are set. A column's
-        gradient is complete when the loop reaches it, since all readers of the column come later in the list. Columns
-        below ``lowest`` need no gradient. The tiles of a cell add the gradients of its weights by atomics, so the order
-        of this sum varies on a GPU.
+        gradient is complete when the loop reaches it, since all products that read the column come later in the list.
+        Columns below ``lowest`` need no gradient. The tiles of a cell add the gradients of its weights by atomics, so
+        the order of this sum varies on a GPU.
         """
         tile = wp.tid()
         cell = cells[tile]
@@ -160,7 +163,8 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
         inputs = products.activation.shape[0] - outputs
         for reverse in range(outputs):
             o = outputs - 1 - reverse
-            # Shared, because other threads may have just stored these values: refilling the tile is the barrier.
+            # Loading into a shared tile synchronises the block, so that values which other threads have just stored are
+            # visible.
             arrived = wp.tile_load(gradients, shape=(ROWS, WIDTH), offset=(row, (inputs + o) * WIDTH), storage="shared")
             wp.tile_atomic_add(of_biases, wp.tile_sum(arrived, axis=0), offset=(cell * outputs + o) * WIDTH)
             g = wp.tile_astype(arrived, dtype=scalar)
@@ -187,11 +191,11 @@ class _Tiles(NamedTuple):
     """The arguments of the kernels.
 
     Attributes:
-        x: float32 [t * ROWS, inputs * WIDTH].
-        blocks: [k, products, WIDTH, WIDTH].
-        biases: float32 [k, columns, WIDTH].
-        cells: the cells of the tiles, int32 [t].
-        plan: the result of `_plan`.
+        x: the encoded inputs of the samples in padded columns, float32 [t * ROWS, inputs * WIDTH].
+        blocks: the weight blocks of each cell, [k, products, WIDTH, WIDTH].
+        biases: the biases of each cell for the columns of the layers, float32 [k, columns, WIDTH].
+        cells: the cell of each tile, int32 [t]; -1 for none.
+        plan: the products and the output columns, as JSON; the result of `_plan`.
     """
 
     x: Tensor
@@ -313,12 +317,12 @@ def layers_of_cells(
 
     Args:
         inputs: positions [n, p]; then, if a layer reads directions, directions [n, q], or [r, q] with ``ray_index``.
-        offsets: int32 [k + 1].
-        weights: [k, o, i] for each layer.
-        biases: [k, o] or None for each layer.
-        layers: the table, whose widths match the weights.
-        ray_index: int32 [n], or None.
-        features: the table of the hash grid, [e, f] or [k, e, f], or None.
+        offsets: the first row of each cell, then the end of the last cell, int32 [k + 1].
+        weights: the weights of each layer, [k, o, i].
+        biases: the bias of each layer, [k, o] or None.
+        layers: the layer table; its widths match the weights.
+        ray_index: the row of the directions for each sample, int32 [n]; None if directions have a row per sample.
+        features: the entries of the hash grid, [e, f], or [k, e, f] for a grid per cell; None without a hash encoding.
         dtype: the dtype to which operands of products are rounded.
     """
     positions, cell = inputs[0], cells_of(offsets, inputs[0])
@@ -365,7 +369,8 @@ def grouped_linear(
 def _tiles(offsets: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Returns each tile's cell, int32 [t], each sample's row in the tiles, [n], and whether the sample has a cell, [n].
 
-    t is an upper bound, so that the host reads no values. The last tile has no cell and takes samples without a cell.
+    The number of tiles t is an upper bound from n and k, so that the host reads no offsets. The last tile has no cell
+    and takes samples without a cell.
     """
     (n,), k = cell.shape, offsets.shape[0] - 1
     tiles = (offsets.diff() + (ROWS - 1)) // ROWS
@@ -379,7 +384,10 @@ def _tiles(offsets: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _blocks(weight: Tensor, widths: Sequence[int]) -> Tensor:
-    """Returns the blocks [k, products, WIDTH, WIDTH] of a matrix [k, o, i] whose sources have widths ``widths``."""
+    """Returns the blocks [k, products, WIDTH, WIDTH] of a weight matrix [k, o, i].
+
+    ``widths`` are the widths of the inputs that are concatenated to the i features.
+    """
     wide = torch.cat([_padded(part) for part in weight.split(widths, dim=2)], dim=2)
     high = _padded(wide.mT).mT.unflatten(2, (-1, WIDTH)).unflatten(1, (-1, WIDTH))
     return high.transpose(2, 3).flatten(1, 2)
@@ -391,7 +399,7 @@ def _padded(x: Tensor) -> Tensor:
 
 @constant_result
 def _encodings(text: str) -> tuple[tuple[str, int] | None, ...]:
-    """Returns a table's encodings of positions and directions, as names and sizes."""
+    """Returns a layer table's encodings of positions and directions, as names and sizes."""
     return tuple(MLP.parse(text).encoding(source) for source in (POSITIONS, DIRECTIONS))
 
 

@@ -1,4 +1,4 @@
-"""Runs programs that are chains of layers: the layers in one Warp kernel, the later steps in plain PyTorch.
+"""Runs programs that are chains of layers: the layers in one Warp kernel, the steps after them in plain PyTorch.
 
 n rows, w columns. All other programs run in plain PyTorch.
 """
@@ -32,15 +32,15 @@ from voronerf.ops.grouped_program.reference import grouped_program as in_torch
 
 
 class Chain(NamedTuple):
-    """A program as a layer table and a program of the later steps.
+    """A program split into a layer table and a second program, made of the steps that follow the layers.
 
     Attributes:
-        layers: the table; its outputs are the layers that a later step or an output of the program reads.
+        layers: the table; its outputs are the layers that the second program reads or returns.
         reads: the indices of the inputs that the table reads: positions, then directions.
         weights: the index of each layer's weight among the program's parameters.
         biases: the index of each layer's bias, or None.
         features: the index of the hash grid's table, or None.
-        behind: the text of a program of the later steps; its single input is the outputs of the table.
+        behind: the text of the second program; its single input is the concatenated outputs of the table.
     """
 
     layers: MLP
@@ -157,7 +157,7 @@ class _Reader:
         )
 
     def _takes(self, step: Step) -> bool:
-        """Reads a step if it is a part of a layer, and returns whether it is."""
+        """Converts a step if it belongs to the layer table, and returns whether it does."""
         if step.op == "input":
             self.sources[step.out] = _INPUTS[int(step.numbers[0])]
         elif step.op == "encode":
@@ -176,7 +176,7 @@ class _Reader:
         return True
 
     def _add(self, step: Step) -> None:
-        """Reads a product of a layer, the first one or a later one."""
+        """Adds a "linear" step to the layer whose sum it continues, or starts a new layer with the step."""
         (x, *added), (weight, start, transposed) = step.operands, map(int, step.numbers)
         layer, shapes = _Layer(weight), self.program.parameters
         if added and added[0].of == VALUE:
@@ -206,7 +206,12 @@ class _Reader:
         self.layers.append(Layer(layer.inputs, self.program.parameters[layer.weight][0], activation))
 
     def _source(self, columns: Columns) -> int | str:
-        """Returns the layer source of a whole value."""
+        """Returns the entry of ``Layer.inputs`` that names the source of columns.
+
+        The columns must be all columns of an input or of a layer.
+
+        If the columns are the sum of a layer under construction, the layer is finished without an activation.
+        """
         if not self._is_whole(columns):
             raise LookupError
         if columns.index in self.started:

@@ -2,7 +2,8 @@
 
 One thread handles one level of one point, in the forward pass and for the gradient of the table. Atomics sum this
 gradient, so that on a GPU its last bits depend on the order. For the gradient of the positions one thread handles one
-point. With directions, the weight of each corner is replaced by its derivative along the direction.
+point. If each point has a direction, the encoding is replaced by its derivative along this direction: the weight of
+each corner becomes its directional derivative.
 """
 
 from __future__ import annotations
@@ -45,7 +46,10 @@ class Grid:
 
 @wp.struct
 class Place:
-    """A point on a level: its lower corner; on each axis, the upper corner's weight and its first two derivatives."""
+    """The voxel of a point on a level: the indices of the lower corner, and the weights of the upper corner.
+
+    ``upper`` holds the upper corner's weight on each axis, ``slope`` and ``bend`` the weight's first two derivatives.
+    """
 
     x: wp.int32
     y: wp.int32
@@ -106,9 +110,9 @@ def _entry(place: Place, corner: wp.int32, level: wp.int32, grid: Grid) -> wp.in
 
 @wp.func
 def _of_corner(upper: wp.vec3, corner: wp.int32, one: wp.float32) -> wp.vec3:
-    """Returns a corner's weights on each axis from the weights w of the upper corner.
+    """Returns the weight of a corner on each axis, from the weight of the upper corner, ``upper``.
 
-    On an axis where the corner is the lower one, its weight is ``one - w``; ``one`` is 0 for derivatives.
+    The weight of the lower corner is ``one - upper``: ``one`` is 1 for weights and 0 for their derivatives.
     """
     weights = upper
     for axis in range(3):
@@ -246,7 +250,7 @@ def _backward(backward_arguments: HashedGradient, results: list[Tensor]) -> None
 
 
 def _inputs(arguments: Hashed, table: Tensor) -> tuple[list[object], list[object], object]:
-    """Returns arguments of the kernels: points and directions; cells and the grid; the rows of a table."""
+    """Returns the kernels' arguments: [positions, directions], [cells, grid], and the table as rows of f features."""
     positions, cells, direction = arguments.positions, arguments.cells, arguments.direction
     along = positions[:0] if direction is None else direction
     levels, grid = HashGrid.parse(arguments.grid), Grid()

@@ -42,7 +42,8 @@ def _edge(near: wp.float32, far: wp.float32, stratum: wp.int32, samples: wp.int3
 
 @wp.func
 def _point(origin: wp.vec3, direction: wp.vec3, at: wp.float32, space: wp.array2d(dtype=wp.float32)) -> wp.vec3:
-    # Returns a point in the grid's space. `space` has one row (centre and radius of a sphere) or five (a perspective).
+    # Returns a point in the grid's space. `space` has one row (centre and radius of the sphere of a `Contraction`),
+    # five rows (normalised device coordinates, as in `Perspective.numbers`) or none (world space).
     x = origin[0] + at * direction[0]
     y = origin[1] + at * direction[1]
     z = origin[2] + at * direction[2]
@@ -103,7 +104,8 @@ def _cell(point: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) 
 class Inputs:
     """The rays and the grid.
 
-    ``space`` has shape [0, 0] for world space, [1, 4] for a sphere, [5, 3] for a perspective.
+    ``space`` is empty, [0, 0], for world space. It has shape [1, 4] for the sphere of a ``voronerf.nerf.Contraction``,
+    and [5, 3] for the normalised device coordinates of a ``Perspective``.
     """
 
     origins: wp.array2d(dtype=wp.float32)
@@ -121,7 +123,7 @@ class Inputs:
     space: wp.array2d(dtype=wp.float32)
     samples: wp.int32
     spacing: wp.int32
-    most: wp.int32
+    max_samples: wp.int32
 
 
 @wp.struct
@@ -191,7 +193,7 @@ def _march_kernel(inputs: Inputs, counting: wp.bool, offsets: wp.array(dtype=wp.
             stratum += 1
             if taken:
                 samples += 1
-            going = stratum < inputs.samples and samples < inputs.most
+            going = stratum < inputs.samples and samples < inputs.max_samples
     if counting:
         out.counts[ray] = samples
     elif end > begin:
@@ -208,7 +210,7 @@ def march_rays(arguments: Any) -> March:
     out = filled(Samples(), counts=counts[1:], positions=arguments.origins[:0])
     filled(out, ray_index=counts[:0], depths=near[:0], deltas=near[:0], stop=counts[:0])
     launch(_march_kernel, r, [inputs, True, array(counts[:0], near), out], near)
-    # The sum is int64, since the number of samples may exceed int32; the capacity does not.
+    # The number of samples may exceed int32, so it is summed in int64 and clamped before the cast.
     offsets = counts.cumsum(dim=0).clamp(max=MAX_COUNT if capacity is None else capacity).int()
     samples = memory(near, offsets, int(offsets[-1]) if capacity is None else capacity)
     for part in samples[1:5]:  # zeros in rows that belong to no ray
@@ -236,6 +238,6 @@ def _inputs(rays: Any) -> Any:
         space=near.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1]),
     )
     rest = ("origins", "directions", "near", "far", "occupied", "box", "samples")
-    most = rays.samples if rays.most is None else rays.most
-    filled(inputs, spacing=SPACINGS.index(rays.spacing), most=most)
+    max_samples = rays.samples if rays.max_samples is None else rays.max_samples
+    filled(inputs, spacing=SPACINGS.index(rays.spacing), max_samples=max_samples)
     return filled(inputs, **{name: getattr(rays, name) for name in rest})

@@ -26,8 +26,8 @@ def _place(x: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) -> 
 
 @wp.func
 def _stretch(x: wp.float32, y: wp.float32, z: wp.float32, space: wp.array2d(dtype=wp.float32)) -> wp.float32:
-    # Returns the world length of a unit of grid space. `space` has one row (centre and radius of a sphere) or five (a
-    # perspective).
+    # Returns the world length of a unit of grid space. `space` has one row (centre and radius of the sphere of a
+    # `Contraction`), five rows (normalised device coordinates, as in `Perspective.numbers`) or none (world space).
     if space.shape[0] == 1:
         offset = wp.vec3(x - space[0, 0], y - space[0, 1], z - space[0, 2])
         left = wp.float32(2.0) - wp.length(offset) / space[0, 3]
@@ -78,7 +78,7 @@ def _fade_kernel(
     i = wp.tid()
     if cells[i] < 0:
         return
-    # Computed from the old density, so that all samples of a cell write the same value.
+    # `before` is the old density, so all samples of a cell write the same value.
     density[cells[i]] = before[i] * decay
 
 

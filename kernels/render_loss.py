@@ -1,11 +1,11 @@
 """The loss of rendered rays and its gradient as Warp kernels. r rays, m samples of all rays (packed).
 
 One thread handles one ray, whose samples are adjacent. Let o_i = sigma_i delta_i be the optical depth of sample i and
-F_i the sum of the optical depths in front of it. Its weight is exp(-F_i) (1 - exp(-o_i)), and the background's weight
-is exp(-F), with the sum F over the whole ray. F is summed in float64, other values are float32. With G_i the gradient
-of weight i, the gradient of o_i is ``G_i exp(-F_i - o_i) - sum over j > i of G_j w_j``. A first sweep computes the
+F_i the sum of the optical depths in front of it. Its weight w_i is exp(-F_i) (1 - exp(-o_i)), and the background's
+weight is exp(-F), with the sum F over the whole ray. F is summed in float64, other values are float32. With G_i the
+gradient of w_i, the gradient of o_i is ``G_i exp(-F_i - o_i) - sum over j > i of G_j w_j``. A first sweep computes the
 colour of the ray and stores F_i in the memory of the density's gradient; a second sweep, from far to near, maintains
-the sum over the samples behind.
+the sum over the samples behind the current one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from voronerf.ops.render_loss.reference import robust_error
 wp.set_module_options({"enable_backward": False})
 
 _OPAQUE = wp.constant(wp.float32(1.0e30))
-"""The finite value for infinite density: every sample is opaque, but at length 0 the product is 0."""
+"""The finite value that replaces infinite density: a sample of any usual length is opaque, and a sample of length 0 has
+optical depth 0, not NaN."""
 
 
 @wp.func
@@ -178,7 +179,7 @@ def _density_kernel(inputs: Inputs, density: wp.array(dtype=wp.float32)) -> None
 
 
 def render_loss(raw: Tensor, *others: Any) -> list[Tensor]:
-    """Returns activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
+    """Applies activations, compositing and the error; see ``voronerf.ops.render_loss``."""
     *parts, _ = _render_loss(raw.float(), *others)
     return parts
 

@@ -6,10 +6,10 @@ from voronerf.ops import Guard, Rule, adam
 
 
 def assert_adam(count, *, backend, device="cpu", scale=None, spoilt=None, limit=1e18, rate=0.01):
-    """Compares three Adam steps with the formula; every second parameter is sparse (entries without a gradient stay).
+    """Compares three Adam steps with the formula.
 
-    ``spoilt`` makes the second step invalid: "loss" for a NaN loss, or the index of a dense parameter whose gradient
-    exceeds ``limit``.
+    Every second parameter is sparse: its entries without a gradient do not change. ``spoilt`` makes the second step
+    invalid: "loss" for a NaN loss, or the index of a dense parameter whose gradient exceeds ``limit``.
     """
     sizes = [(7 * number) % 1030 + 1 for number in range(count)]
     betas, epsilon = (0.9, 0.99), 1e-6
@@ -31,7 +31,7 @@ def assert_adam(count, *, backend, device="cpu", scale=None, spoilt=None, limit=
         rules = [Rule(at, rate, betas, epsilon, dense) for at, dense in zip(steps, dense_flags)]
         adam(rules, tensors[0], scaled, *tensors[1:], guard=guard, loss=loss, backend=backend)
         left_out = step == 1 and spoilt is not None
-        assert bool(guard.found) == left_out and float(guard.in_a_row) == left_out
+        assert bool(guard.skip) == left_out and float(guard.in_a_row) == left_out
         if left_out:
             continue
         done += 1

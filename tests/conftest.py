@@ -11,10 +11,11 @@ CPU::
     def test_empty(device):  # cpu, cuda
         ...
 
-``@pytest.mark.native``, ``@pytest.mark.cuda`` and ``@pytest.mark.warp`` say that a test needs the part of this name. A
-test whose part is absent is skipped with the reason; ``--require native,cuda,warp`` turns these skips into failures.
+``@pytest.mark.native``, ``@pytest.mark.cuda`` and ``@pytest.mark.warp`` mark tests that need the compiled module, a GPU
+or Warp. A test whose requirement is missing is skipped, with the reason; ``--require native,cuda,warp`` turns these
+skips into failures.
 
-``--emulate-cuda SEED`` runs the native backend's CUDA kernels in place of its CPU ones, on the CPU (cuda_emulation/).
+``--emulate-cuda SEED`` runs the native backend's CUDA kernels on the CPU, instead of its CPU kernels (cuda_emulation/).
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 @pytest.fixture(params=["portable", "neon", "avx2", "avx512", "avx512_bf16", "amx"])
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Runs the native CPU kernels with each instruction set of this processor; the fixture's value is its name."""
+    """Runs the native CPU kernels with each instruction set of this processor, and returns the set's name."""
     native = pytest.importorskip("voronerf.ops._core.native")
     if request.param not in native.SUPPORTED_ISAS:
         pytest.skip(f"this processor has no {request.param}")
@@ -138,7 +139,7 @@ def _emulated_cuda(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keeps only the first of a test's rows that need an absent GPU; this row reports the skip."""
+    """Keeps only one of a test's parametrised variants that need an absent GPU; the kept variant reports the skip."""
     seen: set[str] = set()
     rows: tuple[list[pytest.Item], list[pytest.Item]] = [], []
     for item in items:

@@ -1,4 +1,4 @@
-"""Tests of the build scripts: the commands of build.ninja, compilers of several words, and the CUDA check."""
+"""Tests of the build scripts: the commands of build.ninja, compilers behind a launcher (ccache), and the CUDA check."""
 
 import importlib.metadata
 import importlib.util
@@ -353,7 +353,7 @@ def test_instructions_of_a_layer_are_those_of_the_shortest_way_around(code, tmp_
     (tmp_path / "sass").write_text(SASS.format(products=products))
     program(tmp_path / "cuobjdump", f'test "$1 $2" = "-arch sm_90" && cat "{tmp_path}/sass"')
     layers = code["layers"](tmp_path / "program.o", "90", f"{tmp_path}:/bin:/usr/bin")
-    # Skipped instructions and those after the layer's end do not count.
+    # Skipped instructions and instructions after the layer's end do not count.
     assert layers == {"kernel": {"BRA": 3, "LDG": 1, "HMMA": 32}}
 
 

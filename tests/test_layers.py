@@ -11,8 +11,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# The layers from the bottom up: the library (ops to nerf), the application, the town. A "room" is a member of a layer.
-# A module may import from its own room and from rooms of lower layers.
+# The layers from the bottom up: the library (ops to nerf), the application, training in territories (town). A "room" is
+# a member of a layer. A module may import from its own room and from rooms of lower layers.
 LAYERS = (
     {"ops._core"},
     {"ops", "kernels"},
@@ -105,7 +105,7 @@ def test_imports_go_down() -> None:
 
 
 def test_backends_alone_choose() -> None:
-    """Only few rooms ask whether a backend is available; fast paths are rows in the table of backends."""
+    """Only a few rooms ask whether a backend is available; other code leaves the choice to the table of backends."""
     asking = [
         path
         for path in SOURCES

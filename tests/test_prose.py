@@ -39,7 +39,7 @@ def comments(source: str, mark: str) -> Iterator[tuple[int, str]]:
 
 
 def faults(path: Path, source: str) -> list[str]:
-    """Returns what breaks a rule in a file, each with its line."""
+    """Returns a message with the line number for each broken rule in a file."""
     mark = SUFFIXES[path.suffix]
     texts = [(line, text, OF_DOCSTRING) for line, text in docstrings(source)] if path.suffix == ".py" else []
     texts += [(line, text, OF_COMMENT) for line, text in comments(source, mark)] if mark else [(1, source, None)]

@@ -22,13 +22,13 @@ CHECKED = (
     *("grouped_mlp wide tf32", "grouped_mlp skips bfloat16 forward", "unaligned views"),
     "grouped_mlp of a hash grid for each cell bfloat16",
 )
-"""Small cases for memcheck, which run nearly all kernels."""
+"""Small cases that memcheck runs; they use nearly all kernels."""
 RACING = (
     *("cell_sort 5000 3 by counting", "cell_sort 4200 1022 by counting", "composite packed", "march_rays", "resample"),
     *("render_loss", "grouped_mlp branched bfloat16", "grouped_mlp wide tf32", "grouped_mlp broad float32"),
     *("routed_mlp", "nearest_centre k=700", "nearest_centre k=700, indexed=True", "spherical_harmonics", "adam"),
 )
-"""Small cases for racecheck and synccheck, which run every kernel with shared memory."""
+"""Small cases that racecheck and synccheck run; they use every kernel with shared memory."""
 
 STEPS: dict[str, tuple[int, str, bool, int]] = {
     "width 64": (64, "float32", False, 8),
@@ -42,7 +42,10 @@ STEPS: dict[str, tuple[int, str, bool, int]] = {
 
 
 def near(one: Any, other: Any, allowed: float = 1e-5, absolute: float = 1e-6) -> None:
-    """Raises AssertionError unless two tensors are close by the norm of their difference; NaN is never close."""
+    """Raises AssertionError unless two tensors are close; NaN is never close.
+
+    The norm of the difference may be ``allowed`` times the norm of ``other``, plus ``absolute``.
+    """
     difference, size = float((one.double() - other.double()).norm()), float(other.double().norm())
     if not difference <= allowed * size + absolute:
         raise AssertionError(f"{list(one.shape)}: off by {difference:.1e} of {size:.1e}, allowed {allowed:.0e}")
@@ -141,7 +144,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         close(run, [torch.rand(300, 3), *(torch.randn(5, o, i) / i**0.5 for o, i in shapes)])
 
     def hashed(precision: str, own: bool) -> None:
-        """Checks a network with a hash grid."""
+        """Checks a network with a hash grid for each cell (``own``) or for all cells."""
         grid = voronerf.HashGrid(levels=8, features=2, log2_entries=11, finest=60)
         rest = MLP((Layer((POSITIONS,), 32, "relu"), Layer((0,), 4)), (1,))
         layers = replace(rest, position_encoding="hash", grid=grid)
@@ -162,7 +165,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             near(one, other, size, 0.0)
 
     def views() -> None:
-        """Checks misaligned views in all other operations with floating-point inputs."""
+        """Checks misaligned inputs of frequency_encode, composite and cell_sort."""
         close(lambda x, b: voronerf.frequency_encode(shifted(x[0]), 10, backend=b), [torch.rand(90, 3)])
         close(
             lambda x, b: tuple(voronerf.composite(*map(shifted, x), backend=b)),
@@ -326,7 +329,10 @@ def captured_trainings(device: str, count: int = 20, **small: Any) -> list[tuple
 
 
 def _train_both(options: dict[str, Any], device: str, count: int) -> str:
-    """Compares both trainings to within 1 %, since atomic sums of hash grid gradients have no fixed order."""
+    """Compares a training that replays graphs with an eager training.
+
+    Their results may differ by 1 %, since atomic sums of hash grid gradients have no fixed order.
+    """
     import torch
     from gpu_journal import settling
 

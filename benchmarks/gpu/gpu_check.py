@@ -6,11 +6,11 @@ time.
 
     first, 390 s    build      links the objects of --prebuilt (prebuilt.py), else compiles
                     cases      gpu_parts.py: every operation, networks at 2^22 samples, steps in CUDA graphs, rows of
-                               timings, a step by torch.profiler, two trainings
+                               timings, a step profiled by torch.profiler, two trainings
                     counters   ncu over six launches, if ncu is installed
                     memcheck   compute-sanitizer over 21 of the small cases, if it is installed
     second, 240 s   build      as above
-                    cases      the cases of --cases, such as wrong cases of the first call, and all rows again
+                    cases      the cases of --cases, such as failed cases of the first call, and all rows again
                     tests      tests/ops on CUDA, a process for each file
                     racecheck, synccheck   compute-sanitizer over 14 of the small cases
 

@@ -1,7 +1,8 @@
 """Checks networks at full size: some rows against the reference, and 16-bit gradients against float32 gradients.
 
-With 132 multiprocessors, the small cases give each task one tile of rows. Here a task loops over many tiles, the last
-one partial, and sums run over tiles and tasks.
+A task is a range of rows of one cell that a thread block processes tile by tile (csrc/network/cuda/program_cuda.cu).
+With 132 multiprocessors, a task of a small case has one tile. Here a task has many tiles, the last one partial, and the
+sums of gradients run over tiles and tasks.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 N = 1 << 22
-"""The number of samples, with which every loop of the kernels runs several times."""
+"""The number of samples: so large that every loop of the kernels runs several times."""
 SUBSET = 1 << 12
 """The most rows per cell that the reference computes in float64."""
 ALLOWED = {"bfloat16": (2e-2, 0.25), "float32": (2e-4, 3e-2)}

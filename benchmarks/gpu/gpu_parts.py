@@ -3,9 +3,9 @@
     cases     the parts of --parts in one process, one case after another
                   small      every operation, forward and backward, against float64
                   large      networks at 2^22 samples, with gradients
-                  captured   steps of the route, and of trainings, in CUDA graphs
-                  rows       networks, lookups and sorts at full size, beside the machine's peak rates and torch's
-                             products
+                  captured   routed steps (lookup, sort, networks) and training steps, in CUDA graphs
+                  rows       networks, lookups and sorts at full size, compared with the machine's peak rates and
+                             torch's matrix products
                   training   short trainings, with PSNR
                   profile    a default step: launches, host waits, the slowest kernels
     counted   six launches between cudaProfilerStart and cudaProfilerStop, for ncu

@@ -1,4 +1,4 @@
-"""Timings of ``gpu_parts.py``: kernels at full size, beside the machine's peak rates and torch's products."""
+"""Timings of ``gpu_parts.py``: kernels at full size, compared with peak rates and with torch's matrix products."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ MOST_CALLS, MOST_REPEATS = 8, 30
 """Maximum number of calls in a graph, and of timings of a row."""
 LIMITS = ("bfloat16", "float32", "copy")
 SETS = 4
-"""Input sets that lookups use in turn; sorts use four times as many. All sets together exceed a GPU's caches."""
+"""The number of input sets of a lookup, which its calls use in turn; a sort has four times as many sets.
+
+All sets together exceed a GPU's caches."""
 HOPPER = {"bfloat16": 989e12, "float32": 67e12, "copy": 3.35e12, "issue": 4 * 132 * 1.98e9}
 """Peak rates of an H100 by its data sheet, used for the emulated device: operations, bytes, and warp instructions a
 second."""
@@ -135,7 +137,10 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
         return run, {"float32" if precision == "float32" else "bfloat16": operations, "copy": moved}
 
     def products(k: int, m: int, grouped: bool) -> tuple[Run, Work]:
-        """Returns torch's products for w64d4 on cells of equal size, without sort, offsets or encoding."""
+        """Returns a function that computes w64d4's layers by torch's matrix products, and its work.
+
+        Cells have equal sizes, and inputs are already sorted and encoded.
+        """
         # Multiples of 16, for _grouped_mm.
         shapes = [(i + -i % 16, o + -o % 16) for o, i in NETS["w64d4"].weight_shapes(3)]
         options: dict[str, Any] = {"dtype": torch.bfloat16, "device": where}
@@ -189,8 +194,8 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
     for k in (4096, 65_536):
         row(f"nearest_centre k={k} n={fewer}", functools.partial(find, k, fewer, False))
         row(f"nearest_centre k={k} n={fewer} by index", functools.partial(find, k, fewer, True))
-    # Counting sort reads cells twice and writes rows. Radix sort first writes keys of 2 bytes and rows, reads keys for
-    # the counts, and moves both once for each 8 bits.
+    # Counting sort reads the cells twice and writes row indices. Radix sort reads the cells, writes 2-byte keys and row
+    # indices, reads the keys for a histogram, and then reads and writes keys and row indices once per 8-bit digit.
     for k, way, moved in ((16, "counting", 12), (16, "radix", 24), (4096, "radix", 36)):
         row(f"cell_sort k={k} n={n} by {way}", functools.partial(sort, k, way), {"copy": float(moved * n)})
     networks("w64d4", 16, fewer, "bfloat16", tiles(fewer))
@@ -292,8 +297,8 @@ def _profile(scene: Any, device: str, seconds: float, options: dict[str, Any]) -
         finally:
             torch.cuda.set_sync_debug_mode("default")
     activities = [ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]
-    # Steps run in a second thread: the profiler would make them run eagerly in its own thread, but sees the whole
-    # device.
+    # Steps run in a second thread, because steps in a profiled thread run eagerly. The profiler records the work that
+    # all threads launch on the device.
     with profiled(activities=activities) as seen, ThreadPoolExecutor(1) as beside:
         steps = beside.submit(more).result()[1]
     times, counts = Counter[str](), Counter[str]()

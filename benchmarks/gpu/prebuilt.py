@@ -47,7 +47,7 @@ def main(arguments: list[str]) -> int:
 
 
 def make(build: dict[str, Any], folder: Path, architecture: str = "90") -> str:
-    """Compiles the objects into a portable folder."""
+    """Compiles all objects but the bindings into a folder that another machine can link; returns a summary."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "made").unlink(missing_ok=True)  # marks the folder as incomplete
     text = prepare(build, folder, architecture)
@@ -82,7 +82,7 @@ def link(build: dict[str, Any], folder: Path) -> str:
 
 
 def prepare(build: dict[str, Any], folder: Path, architecture: str) -> str:
-    """Generates the files of setup.py; returns the text of its build.ninja."""
+    """Writes the files that setup.py generates for a build; returns the text of build.ninja."""
     os.environ.update(VORONERF_CUDA="1", VORONERF_CUDA_ARCHITECTURES=architecture)
     cuda = build["find_cuda"]()
     text = str(build["ninja_file"](Path(module_name()), cuda, folder))

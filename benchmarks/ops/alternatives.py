@@ -1,8 +1,8 @@
 """Alternatives to grouped_mlp and grouped_linear, each at its best setting.
 
 Samples are sorted by cell. The alternatives get encoded inputs; the encoding is not timed. grouped_mlp encodes its
-inputs itself. Every call returns its output as one new tensor with a gradient. n samples, k cells, i inputs and o
-outputs of a layer.
+inputs itself. Every call returns its output as one new tensor; in backward cases, it also returns the gradients of the
+parameters. n samples, k cells, i inputs and o outputs of a layer.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ def onednn(batch: Batch, encoded: Encoded, *, piece: int | None = None) -> Conte
 
 
 def alternatives(batch: Batch) -> dict[str, Callable[[], Contender]]:
-    """Returns the applicable alternatives for a batch, by name; bfloat16 competes with float32 as well."""
+    """Returns the applicable alternatives for a batch, by name; for a bfloat16 batch, also loops in float32."""
     inputs: dict[torch.dtype, Encoded] = {}
 
     def encoded(dtype: torch.dtype) -> Encoded:

@@ -43,8 +43,8 @@ class Work:
     Attributes:
         ours: A function: backend -> contender.
         alternatives: Functions that set up alternatives, by name; each may raise ``NotApplicable``.
-        error: A function: result of call 0 -> largest error against float64: relative to the largest entry for floats,
-            the number of wrong entries for integers.
+        error: A function of the result of call 0. It returns the largest error against float64, relative to the largest
+            entry, or the number of wrong entries if the result has integers.
         tolerance: The largest error of an alternative that counts as correct.
         amount: The least number of operations, or of bytes read and written, of a call; the number of samples if
             ``bound`` is empty.
@@ -116,7 +116,10 @@ def optional(name: str) -> Any:
 
 
 def rotation(tensor_bytes: int) -> int:
-    """Returns the number of input sets of this size, at most 64, since small inputs are in cache in real use, too."""
+    """Returns the number (2 to 64) of input sets of ``tensor_bytes`` bytes each.
+
+    It is limited because small inputs are in cache in real use, too.
+    """
     return min(max(ROTATED_BYTES // max(tensor_bytes, 1), 2), 64)
 
 

@@ -86,7 +86,8 @@ class Field:
         evaluate: A function of the module and its arguments that returns the compared results.
         most: The largest number of samples, since second derivatives and splines of more samples take several GiB.
         most_cells: The largest number of cells, since the tables of more cells do not fit into memory.
-        share: Names of the parameters of ``encode``, which all cells share; ``decode`` has the other parameters.
+        share: Patterns of the names of the parameters that all cells share. The module's method ``encode`` uses only
+            these parameters; its method ``decode`` uses the other ones.
     """
 
     make: Callable[[], nn.Module]
@@ -165,7 +166,7 @@ def cases() -> list[Case]:
 
 
 def _sharing(module: nn.Module, first: nn.Module, names: set[str]) -> nn.Module:
-    """Replaces the named parameters of a module by those parameters of the first module."""
+    """Replaces the named parameters of ``module`` by the parameters of ``first`` with the same names."""
     for name in names:
         path, _, last = name.rpartition(".")
         module.get_submodule(path).register_parameter(last, first.get_parameter(name))
@@ -200,7 +201,7 @@ class Batch:
         self.expected: list[Tensor] = []
 
     def step(self, call: Call, parameters: Sequence[Tensor], number: int) -> list[Tensor]:
-        """Returns the results of a call and, with backward, the gradients of the parameters."""
+        """Returns the results of call ``number`` and, with backward, the gradients of the parameters."""
         arguments = self.arguments[number % 2]
         if not self.training:
             with torch.no_grad():
@@ -215,7 +216,7 @@ class Batch:
         ]
 
     def stacked(self, found: list[Tensor]) -> list[Tensor]:
-        """Returns results and gradients with the gradients of all cells stacked to [k, ...]."""
+        """Returns results and gradients; gradients of parameters that cells do not share are stacked to [k, ...]."""
         if not self.training:
             return found
         counts = [len(leaves) for leaves in self.leaves]

@@ -1,6 +1,7 @@
 """Cases of march_rays and balance_centres.
 
-r rays, s strata of a ray, n strata of all rays, or n samples; k centres.
+r rays, s strata of a ray, k centres. n is the number of strata of all rays in march_rays, and the number of samples in
+balance_centres.
 """
 
 from __future__ import annotations
@@ -158,7 +159,10 @@ def _balance_work(n: int, k: int, device: torch.device) -> Work:
         return Contender(lambda call: function(*sets[call % len(sets)]))
 
     def error(found: Any) -> float:
-        """Returns the remaining fraction of the imbalance; centres differ, because 500 steps amplify rounding."""
+        """Returns the imbalance after balancing, divided by the imbalance before.
+
+        Centres are not compared, because 500 steps amplify rounding.
+        """
         return _spread_of_masses(sets[0], found[0]) / before
 
     def tree() -> Contender:
@@ -193,7 +197,7 @@ def _masses_cdist(samples: Tensor, masses: Tensor, centres: Tensor) -> Tensor:
 def _balance_torch(
     find: Callable[[Tensor, Tensor, Tensor], Tensor], samples: Tensor, masses: Tensor, centres: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Runs the published update in a Python loop; `find` returns the mass in each cell."""
+    """Runs the published balancing update in a Python loop; `find` returns the mass in each cell."""
     for _ in range(STEPS):
         weights = find(samples, masses, centres)
         others = torch.cdist(centres, centres).topk(min(9, centres.shape[0]), largest=False).indices[:, 1:]
@@ -204,6 +208,6 @@ def _balance_torch(
 
 
 def _spread_of_masses(batch: list[Tensor], centres: Tensor) -> float:
-    """Returns std(W / max W) over the cells."""
+    """Returns std(W / max W) over the cells, where W is the mass of a cell."""
     weights = _masses_cdist(batch[0].double(), batch[1], centres.double())
     return float((weights / weights.max()).std())

@@ -109,7 +109,7 @@ def _work(
         op: The operation, with an argument ``backend``.
         functions: The alternatives by name; they take the arguments of the op.
         sets: The arguments of consecutive calls.
-        gradients: Gradients of the first results; None for a forward case.
+        gradients: Output gradients, one for each of the op's first outputs; None for a forward case.
         checked: A function of a flat result that returns the compared tensors.
         exact: A function that returns the compared tensors in float64.
         amount: The least number of bytes that a call reads and writes.

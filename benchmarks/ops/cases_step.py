@@ -24,7 +24,7 @@ RAYS, SAMPLES = 1 << 10, 1 << 13
 GRID = 64
 """Cells of the occupancy grid along each axis."""
 SCALE = 10.0
-"""The decay of the density."""
+"""The factor of the density, the ``density_scale`` of render_loss."""
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 Results = list[Tensor]
@@ -153,7 +153,7 @@ def loss_work(b: int, m: int, device: torch.device) -> Work:
 
 
 def observe_work(m: int, device: torch.device) -> Work:
-    """Builds the case of observing m samples near a sphere."""
+    """Builds the case of observe_occupancy for m samples near a sphere."""
     draw = generator(0)
     box = torch.tensor(BOX, device=device)
     count = rotation(m * 24)
@@ -218,7 +218,7 @@ def adam_work(entries: int, touched: float, device: torch.device) -> Work:
 
     def ours(backend: str) -> Contender:
         state = [table.clone(), torch.zeros_like(table), torch.zeros_like(table)]
-        rule = ops.Rule(torch.zeros((), device=device), 1e-2, every=False)
+        rule = ops.Rule(torch.zeros((), device=device), 1e-2, dense=False)
 
         def run(call: int) -> Results:
             lists = ([tensor] for tensor in (state[0], gradient, *state[1:]))

@@ -48,8 +48,15 @@ PARTS: dict[str, Part] = {"a": (3, W), "b": (W, W), "o": (W, 4), "net": 3}
 def own(name: str, call: Callable[..., Any], *inputs: Any, second: bool = False, **parts: Part) -> Row:
     """Returns the row of a :class:`Module`.
 
-    Two sizes make a linear layer; one size makes a network with four outputs. Layers a, b and o and a
-    network `net` always exist, used or unused, as in public code.
+    Layers a, b and o and a network `net` always exist, used or unused, as in public code.
+
+    Args:
+        name: The name of the row.
+        call: The forward: a function of the module and the arguments.
+        inputs: The arguments, see :class:`Row`. Default: positions.
+        second: Whether second derivatives are compared, too.
+        parts: The module's attributes by name. A pair (inputs, outputs) makes a linear layer, and a single number of
+            inputs makes a network with four outputs. A function makes any other part.
     """
 
     def build(part: Part) -> Any:
@@ -274,7 +281,7 @@ PERIODIC = [
     periodic("cosines", lambda s, h: torch.cos(3 * h) + s.c.cos(), c=parameter(W)),
 ]
 
-# functions that are not steps of a program ----------------------------------------------------------------------------
+# functions that the router cannot fuse --------------------------------------------------------------------------------
 
 
 class Clipped(torch.autograd.Function):
@@ -788,4 +795,5 @@ KINDS = {
     "between": BETWEEN,
 }
 IN_RUNS = ("gradients", "tables", "between")
-"""The kinds that are partly computed by PyTorch, between fused runs; all other kinds are fused completely."""
+"""The kinds whose modules are only partly fused: PyTorch computes functions between the fused parts. All other kinds
+are fused completely."""

@@ -23,7 +23,8 @@ N, K, SEED = 300, 4, 1
 ROUNDED = 1e-4
 """If the float32 error of a module exceeds this value, the module is compared in float64, too."""
 NO_PART = 1e-6
-"""A tensor below this fraction of the largest tensor counts as zero up to rounding."""
+"""A tensor's error is divided by its size (its largest entry or its norm), or by this fraction of the largest tensor's
+size, whichever is larger: a smaller tensor is zero except for rounding."""
 
 
 def uniform(lead: tuple[int, ...], *shape: int) -> Tensor:
@@ -199,12 +200,15 @@ def _error(got: list[Tensor], right: list[Tensor], size: Callable[[Tensor], Tens
 
 
 def _short(reason: str) -> str:
-    """Returns a reason without the lines that it quotes from the module."""
+    """Returns the first line of a reason, without its quotations from the module."""
     return re.sub(r" \([\w.]+\.py:\d+: .*\)", "", reason.splitlines()[0])
 
 
 def _way(router: VoronoiRouter, method: str) -> dict[str, Any]:
-    """Returns the evaluation path that `explain` reports for a method, and the functions between fused runs."""
+    """Returns the evaluation path that `explain` reports for a method.
+
+    If the method is only partly fused, also returns the functions that PyTorch computes between the fused parts.
+    """
     line = next(line for line in router.explain().splitlines() if line.startswith(f"{method}: "))
     name, _, why = line.removeprefix(f"{method}: ").partition(": ")
     if name != "fused in runs":

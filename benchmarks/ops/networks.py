@@ -81,8 +81,8 @@ def cost(net: MLP, features: int = 3) -> Cost:
 class Batch:
     """The inputs of a case: sets of samples, and one network per cell.
 
-    Samples of a set are sorted by cell, except for the route. All sets share ``offsets``, so that no alternative is
-    recompiled for other sizes.
+    Samples of a set are sorted by cell, except in cases of routed_mlp, which sorts them itself. All sets share
+    ``offsets``, so that no alternative is recompiled for other sizes.
 
     Attributes:
         net: The layer table.
@@ -161,7 +161,7 @@ def make_batch(
         direction: ``FORWARD`` or ``BACKWARD``.
         device: The device of all tensors.
         features: The input width of a single layer; None for positions.
-        centres: Centres [k, 3] for the route, whose samples are unsorted; None for samples sorted by cell.
+        centres: Centres [k, 3] for routed_mlp, whose samples are unsorted; None for samples sorted by cell.
     """
     sets = rotation(4 * n * (features or 3))
     points = [uniform_points(n, seed, device) for seed in range(sets)]
@@ -226,7 +226,7 @@ def network_error(batch: Batch, cells: Tensor | None = None) -> Callable[[Any], 
 
     Args:
         batch: The inputs.
-        cells: The cell of every sample, for the route; None for sorted samples.
+        cells: The cell of every sample, for routed_mlp; None for sorted samples.
     """
     expected: list[Tensor] = []
 

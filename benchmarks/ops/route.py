@@ -208,7 +208,11 @@ def gathered(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Conte
 def _contender(
     batch: Batch, parts: Callable[[int], Iterator[tuple[Tensor, Tensor]]], own: Parameters, dtype: torch.dtype
 ) -> Contender:
-    """Returns a contender that scatters the parts into one output; gradients start from the complete output."""
+    """Returns a contender that scatters the results of some rows at a time into one output.
+
+    ``parts`` is a function of the call's number that yields (row indices, result) pairs. The incoming gradient belongs
+    to the complete output.
+    """
 
     def empty() -> Tensor:
         return torch.empty(batch.n, batch.net.out_features, dtype=dtype, device=batch.positions[0].device)

@@ -149,7 +149,7 @@ def _published(variant: str, scene: str) -> Scores | None:
 def _kilo_variants(settings: Settings, scene: str) -> list[Variant]:
     common = {"field": "kilonerf"}
     uniform = {**common, "cells": (512,), "centres": "uniform"}
-    # The inherited grid is split at the time of the Voronoi cells' first split.
+    # KILO_LATE is split at the time of KILO_CELLS's first split, so that its cells inherit a trained network.
     first_split = (TrainConfig(field="kilonerf", cells=(16, 16)).plan[0].at,)
     return [
         Variant(KILO_START, {**uniform, "split_at": (KILO_FIRST_STEPS,)}),
@@ -166,7 +166,10 @@ def _kilo_published(variant: str, scene: str) -> Scores | None:
 
 
 def _changed(*variants: tuple[str, dict[str, Any]]) -> Callable[[Settings, str], list[Variant]]:
-    """Returns a function that makes variants of the settings' cells with the given changes."""
+    """Returns a function that makes a variant for each (name, changes to the configuration).
+
+    All variants have the number of cells in the settings.
+    """
     return lambda settings, scene: [Variant(name, {"cells": (settings.cells,), **more}) for name, more in variants]
 
 

@@ -85,7 +85,11 @@ def banded(axes: Any, label: str, curves: Sequence[Sequence[Point]], number: int
 
 
 def shown(evaluation: dict[str, Any]) -> Point:
-    """Returns the seconds and the PSNR: of the mean squared error over the views, or of the only picture."""
+    """Returns the training seconds and the PSNR of an evaluation.
+
+    The PSNR is computed from the mean squared error over all views. An evaluation of a single picture has only the
+    picture's PSNR.
+    """
     return evaluation["seconds"], evaluation.get("psnr_of_mean_error", evaluation["psnr"])
 
 
@@ -150,7 +154,7 @@ def counts(path: Path, rows: Sequence[Row]) -> Path:
 
 
 def balance(path: Path, rows: Sequence[Row]) -> Path:
-    """Plots std(W / max W) before and after balancing, as two boxes."""
+    """Plots std(W / max W) before and after balancing, as box plots."""
     figure, axes = panes(1)
     values, labels = [], []
     for row in rows:

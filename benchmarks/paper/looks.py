@@ -23,14 +23,15 @@ from voronerf.app.scenes import Scene
 from voronerf.app.train import State
 
 VERSION = 1  # format version of looks; looks of other versions are ignored
-#: Fraction of the run between the first split and the comparison of inherited with random networks.
+#: Fraction of the run between the looks "before" and "after". The look "after" shows inherited or random networks
+#: soon after the first split.
 AFTER = 0.04
 QUARTERS = (0.25, 0.5, 0.75)
 SLICE = 96  # points along each side of a slice
 
 
 def stops(training: Training) -> list[tuple[str, float]]:
-    """Returns names and training seconds of a run's looks, except the last."""
+    """Returns (name, training seconds) of each look of a run except the look "end"."""
     config = training.state.config
     found = {f"at-{100 * at:02.0f}": at for at in QUARTERS}
     if config.plan and config.plan[0].at + AFTER < 1:
@@ -40,7 +41,7 @@ def stops(training: Training) -> list[tuple[str, float]]:
 
 
 def held_out_view(scene: Scene) -> int:
-    """Returns the test view of the looks."""
+    """Returns the index of the test view that the looks show."""
     return len(scene.test) // 3
 
 
@@ -48,7 +49,7 @@ def reached(training: Training, second: float) -> None:
     """Writes the looks of a training that are due at ``second`` training seconds."""
     names = [name for name, at in stops(training) if at == second]
     if "after" in names and training.state.strategy.splits == 0:
-        # A step may be longer than the time between the two stops; one more step then performs the split.
+        # If a single step passes both "before" and "after", the split is still due. One more step performs it.
         training.advance(math.nextafter(training.seconds, math.inf))
     for name in names:
         look(training, second, name)
@@ -95,7 +96,7 @@ def load(folder: Path, name: str) -> dict[str, Any] | None:
 
 
 def numbers(folder: Path) -> list[dict[str, Any]]:
-    """Returns the numbers in the looks of a run, sorted by time."""
+    """Returns the scalars of each look of a run (its times, PSNR and number of cells), sorted by time."""
     found = []
     for path in (folder / "looks").glob("*.npz"):
         with np.load(path) as file:

@@ -36,9 +36,10 @@ Row = dict[str, Any]
 PUBLISHED_SIZE = 400
 #: The settings of the published method.
 AS_PUBLISHED = {"field": "nerf", "occupancy": False, "contraction": "none", "average": 0.0, "centres": "balanced"}
-#: The number of latest batches whose samples are kept, where not the default: 512 cells need samples of few steps.
+#: The number of latest batches whose samples are kept for a split, by field; other fields have the default. A smaller
+#: number keeps more samples of each batch; KiloNeRF needs them, since its 512 cells are made after few batches.
 BATCHES = {"kilonerf": 100}
-#: The minimum values of the settings; each of two passes needs a sample.
+#: The minimum values of the settings. ``samples`` is at least 2, because each of two passes needs a sample.
 LEAST = {"downscale": 1, "seeds": 1, "rays": 1, "samples": 2, "evaluations": 1, "eval_views": 1, "cells": 2}
 
 

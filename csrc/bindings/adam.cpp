@@ -4,8 +4,8 @@
 
 namespace voronerf {
 
-VN_STRUCT(AdamRule, rate, rate_at, step, decay, decay_sq, epsilon, every);
-VN_STRUCT(AdamGuard, loss, limit, found, skipped, in_a_row, scale);
+VN_STRUCT(AdamRule, rate, rate_at, step, decay, decay_sq, epsilon, dense);
+VN_STRUCT(AdamGuard, loss, limit, skip, skipped, in_a_row, scale);
 
 VN_BINDINGS(module) {
   module.cpu("adam", VN_CPU(adam_cpu));

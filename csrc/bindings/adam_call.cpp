@@ -15,11 +15,11 @@ bool number(PyObject* object, double& value) {
   return true;
 }
 
-// Loads a Rule of voronerf/ops/adam: the named tuple (step, learning_rate, betas, epsilon, every). Returns false if a
+// Loads a Rule of voronerf/ops/adam: the named tuple (step, learning_rate, betas, epsilon, dense). Returns false if a
 // value is not supported.
 bool load_rule(PyObject* rule, py::list& scalars, AdamRule& result) {
   PyObject *const step = PyTuple_GET_ITEM(rule, 0), *const rate = PyTuple_GET_ITEM(rule, 1),
-                  *const betas = PyTuple_GET_ITEM(rule, 2), *const every = PyTuple_GET_ITEM(rule, 4);
+                  *const betas = PyTuple_GET_ITEM(rule, 2), *const dense = PyTuple_GET_ITEM(rule, 4);
   const auto address = [&scalars](PyObject* scalar) {
     scalars.append(py::handle(scalar));
     TensorView view;
@@ -30,8 +30,8 @@ bool load_rule(PyObject* rule, py::list& scalars, AdamRule& result) {
   const bool pair = (PyTuple_Check(betas) || PyList_Check(betas)) && PySequence_Fast_GET_SIZE(betas) == 2;
   if (!pair || !number(PySequence_Fast_GET_ITEM(betas, 0), result.decay)) return false;
   if (!number(PySequence_Fast_GET_ITEM(betas, 1), result.decay_sq)) return false;
-  if (!number(PyTuple_GET_ITEM(rule, 3), result.epsilon) || !PyBool_Check(every)) return false;
-  result.every = every == Py_True;
+  if (!number(PyTuple_GET_ITEM(rule, 3), result.epsilon) || !PyBool_Check(dense)) return false;
+  result.dense = dense == Py_True;
   const auto is_share = [](double beta) { return beta >= 0 && beta < 1; };
   return is_share(result.decay) && is_share(result.decay_sq) && result.epsilon > 0;
 }
@@ -65,12 +65,12 @@ bool adam_step(const py::type& rule_class, const py::type& guard_class, const py
     if (!load_rule(rule, scalars, of_rules[i])) return false;
   }
   of_guard = {};
-  if (guard != Py_None) {  // a Guard: (found, skipped, in_a_row, scale, limit)
+  if (guard != Py_None) {  // a Guard: (skip, skipped, in_a_row, scale, limit)
     if (reinterpret_cast<PyObject*>(Py_TYPE(guard)) != guard_class.ptr()) return false;
     double limit = 0;
     if (PyTuple_GET_ITEM(guard, 3) != Py_None || !number(PyTuple_GET_ITEM(guard, 4), limit)) return false;
     of_guard.limit = static_cast<float>(limit);
-    float** const places[] = {&of_guard.found, &of_guard.skipped, &of_guard.in_a_row};
+    float** const places[] = {&of_guard.skip, &of_guard.skipped, &of_guard.in_a_row};
     for (Py_ssize_t i = 0; i < 3; ++i) {
       TensorView view;
       if (!view.look(PyTuple_GET_ITEM(guard, i))) return false;

@@ -57,7 +57,7 @@ struct Traced {
 bool tracing = false;
 std::vector<Traced> traced_calls;
 
-// Calls the C++ function, and traces the call if tracing is on. It runs without the GIL.
+// Calls the C++ function, and traces the call if tracing is on. The caller may have released the GIL.
 void call(const Loaded& loaded, Result& result) {
   Trace regions;
   if (tracing) trace = &regions;
@@ -79,18 +79,18 @@ class Recording {
   void begin() { recorded() = this; }
   void end() { recorded() = nullptr; }
 
-  // Adds a tensor argument of a call, or the base of a view. A tensor in memory that was made for the calls needs no
-  // check. Returns whether its rows are counted (RowCount).
+  // Adds a tensor argument of a call, or the base of a view. Replays check that the tensor is unchanged, unless a
+  // recording allocated its memory. Returns whether its number of rows may vary between replays (RowCount).
   bool add_tensor(const py::object& tensor) {
     const auto found = made_.find(py::cast<std::uintptr_t>(tensor.attr("untyped_storage")().attr("data_ptr")()));
     if (found != made_.end()) return found->second;
     tensors_.layout(tensor);
     return false;
   }
-  // Adds a tensor that was made for the calls but is also referenced elsewhere.
+  // Adds a tensor that this recording allocated. Replays check that its memory has not been replaced.
   void hold_tensor(const py::object& tensor) { tensors_.place(tensor); }
-  // Registers a storage, by its address, as memory made for these calls or for an earlier recording. `counted`: its
-  // rows are counted.
+  // Registers a storage, by its address, as memory that this recording or an earlier one allocated. `counted`: whether
+  // its number of rows may vary between replays (RowCount).
   void made(std::uintptr_t address, bool counted) { made_[address] = counted; }
   bool hold() const { return tensors_.holds(); }
   void add(std::unique_ptr<Loaded> loaded) {
@@ -99,9 +99,10 @@ class Recording {
     calls_.push_back(std::move(loaded));
   }
 
-  // Replays the calls [first, last) `times` times in a row. Before each replay the next random numbers are copied to
-  // `places`, `bytes` bytes to each place. Returns the number of complete replays: the replay stops before a call whose
-  // rows would exceed the memory of its tensors. Traced calls run on one thread.
+  // Replays the calls [first, last) `times` times in a row, on `threads` threads; while tracing is on, on one thread.
+  // Before each replay, each of `places` receives the next `bytes` bytes of the random numbers at the address `drawn`.
+  // Returns the number of complete replays: the replay stops before a call whose rows would exceed the memory of its
+  // tensors.
   int replay(int threads, int times, size_t first, size_t last, std::uintptr_t drawn,
              const std::vector<std::uintptr_t>& places, size_t bytes) {
     const py::gil_scoped_release released;
@@ -145,9 +146,9 @@ class Recording {
 
  private:
   static bool again(const Loaded& loaded) {
-    for (const auto& [rows, memory, more, most] : loaded.frame.counted()) {
-      if (*memory > most) return false;
-      *rows = *memory + more;
+    for (const auto& [rows, memory, offset, capacity] : loaded.frame.counted()) {
+      if (*memory > capacity) return false;
+      *rows = *memory + offset;
     }
     Result result{};
     call(loaded, result);
@@ -420,15 +421,16 @@ void bind_all(PyObject* python) {
   bind_program_calls(bound);
   bind_adam_step(bound);
   // know_torch takes Python objects of torch, with which this module is not linked: the dtypes by name, the classes of
-  // plain tensors, and the exchange of tensor_view.h or None.
+  // plain tensors, and the capsule of torch's DLPack exchange API (tensor_view.h) or None.
   bound.def("know_torch", [](const py::dict& names, const py::tuple& classes, const py::object& exchange) {
     for (const auto& entry : names) {
       dtypes()[py::cast<std::string>(entry.first)] = py::reinterpret_borrow<py::object>(entry.second).release().ptr();
     }
     know_tensors(classes.ptr(), exchange.ptr());
   });
-  // trace(on) switches the tracing of calls. It returns the calls traced before, as tuples: name, seconds, number of
-  // regions, seconds in regions, and the estimated seconds on each number of threads in Trace::kTeams.
+  // trace(on) switches the tracing of calls on or off. It returns the calls traced since the last call of trace, as
+  // tuples: name, seconds, number of parallel regions, seconds in these regions, and their estimated seconds for each
+  // number of threads in Trace::kTeams.
   bound.def("trace", [](bool on) {
     tracing = on;
     py::list calls;

@@ -19,8 +19,8 @@
 #include "bindings/load.h"
 #include "common/isa.h"
 
-// The CUDA functions are null pointers in a build without CUDA, and the CPU functions in the emulated build, but with
-// their signatures.
+// VN_CUDA and VN_CPU give a pointer to a function. In a build without CUDA, VN_CUDA gives a null pointer of the
+// function's type instead; in the emulated build, VN_CPU does.
 #ifdef VN_WITH_CUDA
 #define VN_CUDA(...) &__VA_ARGS__
 #else
@@ -48,17 +48,17 @@ VN_STRUCT(Cuda, device, stream);
 
 class Module {
  public:
-  // Binds a function that ends with (Isa, int threads) or (int threads).
+  // Binds a function whose last parameters are (Isa, int threads) or (int threads).
   template <typename R, typename... A>
   void cpu(const char* name, R (*function)(A...)) {
     add(name, function, &type_of<Cpu>());
   }
-  // Binds a function that ends with a stream, or queries the device.
+  // Binds a function whose last parameter is a stream, or a function that queries the device.
   template <typename R, typename... A>
   void cuda(const char* name, R (*function)(A...)) {
     add(name, function, &type_of<Cuda>());
   }
-  // Binds a function without a machine, such as a size or a check.
+  // Binds a function without a machine, such as one that returns a size or checks arguments.
   template <typename R, typename... A>
   void plain(const char* name, R (*function)(A...)) {
     add(name, function, nullptr);

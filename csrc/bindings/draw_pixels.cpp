@@ -4,7 +4,8 @@
 
 namespace voronerf {
 
-VN_STRUCT(DrawPixelsInputs, seed, ends, shift, first, n, places, bits, below, b, known, distances, p, several);
+VN_STRUCT(DrawPixelsInputs, seed, ends, shift, first, n, places, bits, below, b, known_pixels, distances, p,
+          known_count);
 
 VN_BINDINGS(module) {
   module.cpu("draw_pixels", VN_CPU(draw_pixels_cpu));

@@ -53,11 +53,11 @@ bool add_tensor(Recording& recording, PyObject* tensor);
 // The Python references that a call holds, released when it ends.
 class Frame {
  public:
-  // A row count of a recorded call: each replay sets *rows = *memory + more, where *memory is at most `most`.
+  // A row count of a recorded call: each replay sets *rows = *memory + offset, where *memory is at most `capacity`.
   struct Counted {
     RowCount* rows;
     const int64_t* memory;
-    int64_t more, most;
+    int64_t offset, capacity;
   };
   Frame() { kept_.reserve(16); }
   const std::vector<PyObject*>& kept() const { return kept_; }
@@ -168,7 +168,7 @@ class Frame {
     }
     const auto number = [object](const char* name) { return py::cast<int64_t>(py::handle(object).attr(name)); };
     const auto* memory = reinterpret_cast<const int64_t*>(py::cast<std::uintptr_t>(py::handle(object).attr("address")));
-    counted_.push_back({&rows, memory, number("more"), number("most")});
+    counted_.push_back({&rows, memory, number("offset"), number("capacity")});
     keep(object);  // the RowCount holds the memory
   }
 

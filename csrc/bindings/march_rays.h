@@ -9,6 +9,6 @@ namespace voronerf {
 VN_NAMES(MarchSpacing, "linear", "disparity");
 VN_STRUCT(MarchSpace, sphere, perspective);
 VN_STRUCT(MarchInputs, origins, directions, near, far, occupied, box, uniforms, seed, start, r, s, x, y, z, spacing,
-          most, space);
+          max_samples, space);
 
 }  // namespace voronerf

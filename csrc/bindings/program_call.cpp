@@ -19,10 +19,13 @@ TableType table_type(unsigned dtype) {
 class ProgramCall {
  public:
   // `widths` has, for each output, the number of columns and whether there is a row per ray. `sums` has, for each sum,
-  // the parameter whose number of tables is the number of entries (-1: one entry per cell), and the shape of an entry.
-  // `kept` has the columns of each kept look-up, `tables` the parameters that are tables, `sizes` the elements of each
-  // parameter per cell. `rays` is the first input with a row per ray, or -1. on_large is called with each result of at
-  // least `large` bytes, to place it on huge pages.
+  // an index and the shape of an entry. If the sum is the gradient of a hash grid's table, the index is the parameter
+  // with the table, and the sum has as many entries as that parameter. Otherwise the index is -1, and the sum has an
+  // entry per cell. `kept` has, for each look-up in a hash grid, the number of columns of the memory in which a call
+  // can keep the features for the backward pass, with padding. `tables` has the indices of the parameters that are
+  // tables of hash grids, and `sizes` the number of elements of each parameter per cell. `rays` is the index of the
+  // first input with a row per ray, or -1. on_large is called with each result of at least `large` bytes, to place it
+  // on huge pages.
   ProgramCall(py::object program, std::vector<std::pair<int64_t, bool>> widths,
               std::vector<std::pair<int, std::vector<int64_t>>> sums, std::vector<int64_t> kept,
               std::vector<size_t> tables, std::vector<int64_t> sizes, int rays, int64_t large, py::object on_large)
@@ -42,9 +45,11 @@ class ProgramCall {
     function_ = &function;
   }
 
-  // Runs the program on `rows`: inputs, parameters, offsets, order, ray_index and the kept look-ups of an earlier call.
-  // Returns the outputs, the sums and, if `keep`, the look-ups. Returns None if Python has to make the call: during a
-  // recording, for unsupported tensors or, with `asked`, if a part of torch must see the call.
+  // Runs the program on `rows`: inputs, parameters, offsets, order, ray_index and the look-ups (the features from hash
+  // grids) that an earlier call kept. `gradients` is the index of the first input that is a gradient, or -1. `caller`
+  // is the name of the op for error messages. Returns the outputs, the sums over rows and, if `keep`, the look-ups.
+  // Returns None if Python has to make the call: during a recording, for unsupported tensors and, if `asked`, while
+  // torch has to see the call (Questions::is_watched).
   py::object call(const py::tuple& rows, bool keep, int64_t gradients, const char* caller, bool asked) const {
     if (recorded() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
       return py::none();
@@ -75,17 +80,18 @@ class ProgramCall {
     in.r = rays_ < 0 ? 0 : views[static_cast<size_t>(rays_)].shape[0];
     in.k = offsets.shape[0] - 1;
 
-    // The row count of inputs per sample; -1 if rays and samples have the same count.
+    // The number of rows of a per-sample input. It is -1 if there are as many rays as samples, because the shape of an
+    // input then does not tell whether its rows are samples or rays.
     const int64_t samples = ray_index != Py_None && in.n == in.r ? -1 : int64_t{in.n};
     const unsigned dtype = views[0].dtype();
     if (dtype != kFloat32 && dtype != kBfloat16) return py::none();
     std::vector<void*> pointers(count + parameter_count + kept_.size());
     for (size_t i = 0; i < count; ++i) {
       if (views[i].dtype() != dtype) return py::none();
-      const bool turned = is_turned(views[i], samples) && !is_negative(at(inputs, i));
+      const bool transposed = is_transposed(views[i], samples) && !is_negative(at(inputs, i));
       in.input_types.push_back(table_type(dtype));
-      in.turned.push_back(static_cast<int32_t>(turned));
-      if (turned) {
+      in.transposed.push_back(static_cast<int32_t>(transposed));
+      if (transposed) {
         frame.keep(at(inputs, i));
         pointers[i] = views[i].address();
       } else if (!frame.load_view(any(), at(inputs, i), views[i], pointers[i])) {
@@ -150,9 +156,9 @@ class ProgramCall {
   static PyObject* at(const py::object& items, size_t i) {
     return PySequence_Fast_GET_ITEM(items.ptr(), static_cast<Py_ssize_t>(i));
   }
-  // Returns whether an input per sample is column-major, as PyTorch's look-ups in planes return it. Inputs with three
+  // Returns whether a per-sample input is column-major, as PyTorch's look-ups in planes return it. Inputs with three
   // columns are excluded: hash grids read their points in place, which must be row-major.
-  static bool is_turned(const TensorView& view, int64_t samples) {
+  static bool is_transposed(const TensorView& view, int64_t samples) {
     if (view.is_contiguous() || view.shape[0] != samples || view.shape[1] == 3 || view.dtype() != kFloat32)
       return false;
     return view.strides[0] == 1 && (view.shape[1] == 1 || view.strides[1] == view.shape[0]);

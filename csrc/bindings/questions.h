@@ -82,7 +82,7 @@ struct Questions {
     Py_XDECREF(count);
     return {isa, thread_count};
   }
-  // Returns whether this module is the compiled module in use, and not replaced by another.
+  // Returns whether voronerf uses this module: tests may replace native.compiled with another module.
   bool compiled_here() const {
     static PyObject* const word = PyUnicode_InternFromString("compiled");
     return native != nullptr && PyDict_GetItemWithError(native, word) == own;

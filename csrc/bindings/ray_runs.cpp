@@ -4,7 +4,7 @@
 
 namespace voronerf {
 
-VN_STRUCT(KnownSamples, positions, ray_index, depths, deltas, cells, own, n, bent);
+VN_STRUCT(KnownSamples, positions, ray_index, depths, deltas, cells, local_cells, n, curved);
 VN_STRUCT(OwnSamples, positions, ray_index, depths, deltas, cells, offsets);
 VN_STRUCT(RunsOfRays, sums, target, background, background_per_ray, q, first, r, rays, robust);
 

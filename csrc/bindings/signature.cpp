@@ -15,8 +15,8 @@ namespace {
 
 constexpr int kMostArguments = 32;
 
-// Returns how to call a custom op with these arguments. 0: without torch's dispatcher, which has nothing to do. 1:
-// without the dispatcher, but with gradients. 2: as Python decides, for example through the dispatcher.
+// Returns how to call a custom op with these arguments. 0: without torch's dispatcher and without gradients. 1: without
+// the dispatcher, but with gradients. 2: undecided; Python decides.
 int way_of(PyObject* arguments, bool top = true) {
   if (top && questions.is_watched()) return 2;
   bool learns = false;
@@ -44,7 +44,7 @@ struct Argument {
   Kind kind = Kind::any;
   py::str name;
   bool optional = false, detached = false, small = false, written = false;
-  py::object otherwise;  // the default; null: none
+  py::object otherwise;  // the default; null: no default
   TensorRule rule;
   int condition = -1;  // the shape is the first of two if this argument is not None
   int letter = -1;     // the letter of an integer argument that shapes refer to
@@ -438,7 +438,8 @@ class Signature {
         return true;
     }
   }
-  // Detaches the value if its argument has no gradient. Returns whether the value still requires a gradient.
+  // Detaches the value if the op is not differentiable with respect to this argument. Returns whether the value still
+  // requires a gradient.
   bool detach(size_t i, Call& call) const {
     if (!call.views[i].is_there() || (call.views[i].dtype() & kFloating) == 0) return false;
     if (!requires_gradient(call.values[i])) return false;

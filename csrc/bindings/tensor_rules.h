@@ -25,7 +25,7 @@ inline unsigned dtypes_of(const py::handle& names) {
   return bits;
 }
 
-// A numbering of the letters in shapes.
+// Numbers the letters of shapes, such as n in [n, 3], in the order of their first use.
 class Letters {
  public:
   // An entry of a shape: a number (`more`), or the value of a letter plus `more`. With or_one it may also be 1.
@@ -84,11 +84,11 @@ struct TensorRule {
   unsigned dtypes = 0;
   // same: the dtype of the first floating-point tensor; wide: the same dtype, but at least float32
   bool same = false, wide = false;
-  bool either = false;  // either of the two shapes
+  bool either = false;  // the tensor may have either of the two shapes
   bool filled = false;  // the letter of the first size is at least 1
   std::vector<Letters::Size> shape, otherwise;
 
-  // Reads (dtypes, "same", "wide", "filled" or "", shape, otherwise or None).
+  // Reads a tuple (dtypes, kind, shape, second shape or None); the kind is "same", "wide", "filled" or "".
   static TensorRule of(const py::handle& row, Letters& letters) {
     const auto parts = py::cast<py::tuple>(row);
     const auto kind = py::cast<std::string>(parts[1]);
@@ -131,8 +131,8 @@ struct TensorRule {
 // The rules for a list of tensors that are not separate arguments, such as the tensors of a network.
 class Rules {
  public:
-  // Reads the rows of checks.py: (dtypes, kind, shape, otherwise) is the rule of a tensor, (letter, number) the default
-  // of an unbound letter. A check returns the values of the letters `names`.
+  // Reads the rows of checks.py. A tuple for TensorRule::of is the rule of a tensor; a tuple (letter, number) gives the
+  // default of a letter that is still unbound. `names` are the letters whose values a check returns.
   Rules(const py::sequence& rows, const std::vector<std::string>& names) {
     for (const auto& row : rows) {
       const auto parts = py::cast<py::tuple>(row);

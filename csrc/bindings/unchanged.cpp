@@ -23,7 +23,7 @@ bool is_same(PyObject* was, PyObject* is) {
   return plain && are_equal(was, is);
 }
 
-// Calls look(key or null, value) for each element of a container until it returns false. Returns whether all calls
+// Calls look(key or null, value) for each element of a container until a call returns false. Returns whether all calls
 // returned true.
 template <typename Look>
 bool each(PyObject* container, Look&& look) {

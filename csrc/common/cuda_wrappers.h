@@ -176,7 +176,7 @@ __device__ __forceinline__ void add_in_global(float* to, const float* values) {
 #endif
 }
 
-// Loads a value that no kernel writes while this one runs.
+// Loads a value through the read-only data cache. Nothing may write the value while this kernel runs.
 template <typename T>
 __device__ __forceinline__ T load_constant(const T* from) {
 #ifdef VN_EMULATE
@@ -204,10 +204,10 @@ __device__ __forceinline__ void load_matrices(uint32_t (&words)[4], const uint32
   }
 }
 
-// Loads 16 rows by 16 columns transposed, with the rows as the depth of the product: as a left operand [columns][rows]
-// (kLeft), or as two right operands.
+// Loads a block of 16 rows by 16 columns, transposed so that the rows are the inner dimension of the product. kLeft: as
+// the fragments of one left operand [columns][rows]; otherwise as the fragments of two right operands.
 template <bool kShared, bool kLeft>
-__device__ __forceinline__ void load_turned(uint32_t (&words)[4], const uint32_t* from, int stride, int lane) {
+__device__ __forceinline__ void load_transposed(uint32_t (&words)[4], const uint32_t* from, int stride, int lane) {
 #ifndef VN_EMULATE
   if constexpr (kShared) {
     const int down = kLeft ? lane / 16 : lane / 8 % 2, across = kLeft ? lane / 8 % 2 : lane / 16;

@@ -1,4 +1,5 @@
-// Random numbers as hashes of a seed, a ray and a place: they do not depend on the number of threads or the order.
+// Random numbers. Each is a hash of a seed, the index of a ray, and the index of the number within the ray, so it
+// depends neither on the number of threads nor on the order in which the numbers are drawn.
 #pragma once
 
 #include <cstdint>
@@ -14,7 +15,8 @@ VN_HD uint32_t mixed(uint32_t x) {
   return x ^ x >> 16;
 }
 
-// `hash_key` returns the key of a ray. `hashed` returns a random number in [0, 1) for a key and a place.
+// `hash_key` returns the key of a ray. `hashed` returns the number with index `place` of the random numbers in [0, 1)
+// that belong to a key.
 VN_HD uint32_t hash_key(int32_t seed, int64_t ray) {
   return mixed(static_cast<uint32_t>(seed) + static_cast<uint32_t>(ray));
 }

@@ -13,7 +13,7 @@ struct MapPlace {
   int row, column;
 };
 
-// Returns the place of a lane's accumulator i (0..3) in a tile [16][8] of mma.sync.
+// Returns the row and column of a lane's accumulator i (0..3) in a tile [16][8] of mma.sync.
 VN_HD constexpr MapPlace accumulator_place(unsigned lane, int i) {
   return {static_cast<int>(lane / 4) + 8 * (i / 2), static_cast<int>(2 * (lane % 4)) + i % 2};
 }

@@ -5,7 +5,8 @@
 namespace voronerf {
 
 // The instruction sets. With avx512_bf16, networks multiply pairs of bfloat16 where this is allowed, and with amx they
-// do so in tile registers. Otherwise both are the same as avx512. The other instruction sets multiply float32.
+// do so in tile registers. In all other cases both run the same kernels as avx512. The other instruction sets multiply
+// float32.
 enum class Isa : int { portable = 0, neon, avx2, avx512, avx512_bf16, amx };
 
 // Returns whether this build has the instruction set, and the processor and the operating system can run it.

@@ -70,7 +70,7 @@ double measure_copy(Isa isa, int threads) {
   std::atomic<int64_t> copied{0};
   const auto copy = [&](bool streaming) {
     copied = 0;
-    // Each thread copies the same pieces every time: the pages that it has touched first.
+    // Each thread copies the same pieces in every call, so it writes to pages that it was the first to touch.
     parallel(threads, [&](int thread) {
       for (int64_t at = thread * kPiece; at < kCopied; at += threads * kPiece, copied += kPiece) {
         if (streaming) {

@@ -225,9 +225,9 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
 // index (vector, lane) left by one; after log2(kLanes) steps vector and lane are swapped.
 VN_INLINE void transpose(F32* v) {
   for (int step = 1; step < kLanes; step *= 2) {
-    F32 turned[kLanes];
-    for (int i = 0; i < kLanes / 2; ++i) zip(v[i], v[i + kLanes / 2], turned[2 * i], turned[2 * i + 1]);
-    for (int i = 0; i < kLanes; ++i) v[i] = turned[i];
+    F32 transposed[kLanes];
+    for (int i = 0; i < kLanes / 2; ++i) zip(v[i], v[i + kLanes / 2], transposed[2 * i], transposed[2 * i + 1]);
+    for (int i = 0; i < kLanes; ++i) v[i] = transposed[i];
   }
 }
 

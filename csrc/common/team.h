@@ -1,5 +1,5 @@
-// A team of threads that run the parallel regions of their leader (common/parallel.h). A recording is replayed by a
-// team.
+// A team of threads that run the parallel regions of their leader (common/parallel.h). The replay of a recorded step
+// (bindings/bind.cpp) runs all of its regions on one team.
 #pragma once
 
 #include <atomic>

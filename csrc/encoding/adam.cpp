@@ -29,13 +29,13 @@ bool is_skipped(const std::vector<AdamRule>& rules, const AdamGuard& guard, cons
   if (guard.loss != nullptr) {
     bool fine = std::fabs(*guard.loss) < guard.limit;
     for (size_t i = 0; i < sizes.size() && fine; ++i) {
-      fine = !rules[i].every || all_below(isa, guard.limit, gradients[i], sizes[i]);
+      fine = !rules[i].dense || all_below(isa, guard.limit, gradients[i], sizes[i]);
     }
-    *guard.found = fine ? 0.0f : 1.0f;
-    *guard.skipped += *guard.found;
-    *guard.in_a_row = (*guard.in_a_row + 1.0f) * *guard.found;
+    *guard.skip = fine ? 0.0f : 1.0f;
+    *guard.skipped += *guard.skip;
+    *guard.in_a_row = (*guard.in_a_row + 1.0f) * *guard.skip;
   }
-  return guard.found != nullptr && *guard.found != 0.0f;
+  return guard.skip != nullptr && *guard.skip != 0.0f;
 }
 
 // Increments the rule's step and returns its bias-corrected constants.
@@ -44,7 +44,7 @@ AdamStep next_step(const AdamRule& rule) {
   const double root = std::pow(1.0 - std::pow(rule.decay_sq, step), 0.5);
   const double rate = rule.rate_at == nullptr ? rule.rate : *rule.rate_at;
   return {static_cast<float>(rate * root / (1.0 - std::pow(rule.decay, step))), static_cast<float>(rule.decay),
-          static_cast<float>(rule.decay_sq), static_cast<float>(rule.epsilon * root), rule.every};
+          static_cast<float>(rule.decay_sq), static_cast<float>(rule.epsilon * root), rule.dense};
 }
 
 // Calls body(tensor, begin, end) for the blocks of all tensors.

@@ -47,8 +47,8 @@ struct AdamTensors {
 };
 static_assert(sizeof(AdamTensors) <= 3900, "arguments of a launch");
 
-// Block 0 computes the bias-corrected rates and checks the loss; every other block checks runs of parameters, one after
-// another. A launch that is not the `first` keeps the votes of earlier launches.
+// Block 0 computes the bias-corrected rates and checks the loss. The other blocks share the runs of parameters and
+// check their gradients. A launch that is not the `first` keeps the votes of earlier launches.
 __global__ void __launch_bounds__(kJudgeThreads)
     adam_judge_kernel(AdamTensors tensors, AdamGuard guard, float* corrected, float* votes, bool first) {
   const int thread = static_cast<int>(threadIdx.x);
@@ -84,22 +84,24 @@ __global__ void __launch_bounds__(kJudgeThreads)
   votes[blockIdx.x] = vote;
 }
 
-// Returns whether the step is skipped: with a loss, by `count` votes. The result is the same for all threads.
+// Returns whether the step is skipped. If the guard has a loss, the `count` votes decide, otherwise the guard's flag
+// `skip`. The result is the same for all threads.
 __device__ __forceinline__ bool is_skipped(const AdamGuard& guard, const float* votes, int count) {
-  if (guard.loss == nullptr) return guard.found != nullptr && *guard.found != 0.0f;
+  if (guard.loss == nullptr) return guard.skip != nullptr && *guard.skip != 0.0f;
   bool voted = false;
   for (int i = static_cast<int>(threadIdx.x) % 32; i < count; i += 32) voted |= votes[i] != 0.0f;
   return __ballot_sync(kAllLanes, voted) != 0;
 }
 
-// The `last` launch of a step writes the guard. With a loss no other block reads the guard.
+// The `last` launch of a step writes the guard. If the guard has a loss, all blocks decide by the votes, so that no
+// block reads the guard's flag while one block writes it.
 __global__ void __launch_bounds__(kThreads)
     adam_kernel(AdamTensors tensors, AdamGuard guard, const float* __restrict__ corrected,
                 const float* __restrict__ votes, int count, bool last) {
   const bool skipped_step = is_skipped(guard, votes, count);
   if (last && guard.loss != nullptr && blockIdx.x == 0 && threadIdx.x == 0) {
     const float flag = skipped_step ? 1.0f : 0.0f;
-    *guard.found = flag;
+    *guard.skip = flag;
     *guard.skipped += flag;
     *guard.in_a_row = (*guard.in_a_row + 1.0f) * flag;
   }
@@ -108,14 +110,14 @@ __global__ void __launch_bounds__(kThreads)
   while (number + 1 < tensors.count && blockIdx.x >= tensors.of[number + 1].first) ++number;
   const AdamTensor& tensor = tensors.of[number];
   const AdamStep rule{corrected[2 * number], static_cast<float>(tensor.rule.decay),
-                      static_cast<float>(tensor.rule.decay_sq), corrected[2 * number + 1], tensor.rule.every};
+                      static_cast<float>(tensor.rule.decay_sq), corrected[2 * number + 1], tensor.rule.dense};
   const float scale = guard.scale == nullptr ? 1.0f : *guard.scale;
   const unsigned block = blockIdx.x - tensor.first;
   for (int part = 0; part < kRun / kThreads; ++part) {
     const int64_t i = static_cast<int64_t>(block) * kRun + part * kThreads + threadIdx.x;
     if (i >= tensor.n) break;
     const float g = tensor.gradient[i];
-    if (rule.every || g != 0.0f) update_entry(rule, g / scale, tensor.parameter, tensor.mean, tensor.square, i);
+    if (rule.dense || g != 0.0f) update_entry(rule, g / scale, tensor.parameter, tensor.mean, tensor.square, i);
   }
   // adam_judge_kernel has read this step count already.
   if (block == 0 && threadIdx.x == 0) *tensor.rule.step += 1.0f;
@@ -138,7 +140,7 @@ void adam_cuda(const std::vector<AdamRule>& rules, float* const* parameters, con
         AdamTensor& tensor = tensors.of[tensors.count++];
         tensor = {gradients[i], parameters[i], means[i], squares[i], sizes[i], rules[i], blocks, tensors.judged};
         blocks += static_cast<unsigned>(ceil_div<int64_t>(std::max<int64_t>(sizes[i], 1), kRun));
-        if (guard.loss != nullptr && rules[i].every) {
+        if (guard.loss != nullptr && rules[i].dense) {
           tensors.judged += static_cast<unsigned>(ceil_div<int64_t>(sizes[i], kJudgedRun));
         }
       }

@@ -8,22 +8,22 @@
 
 namespace voronerf {
 
-// The update rule of a parameter. Its step is on the device, and its rate may be there too; with CUDA, the host reads
-// neither.
+// The update rule of a parameter. The step count is in the memory of the parameter's device, and the learning rate may
+// be there too; with CUDA, the host reads neither.
 struct AdamRule {
   double rate;           // the learning rate if rate_at is null
   const float* rate_at;  // [1], the learning rate, or null
   float* step;           // [1], completed steps; goes up by one unless the step is skipped
   double decay, decay_sq, epsilon;
-  bool every;  // as in AdamStep
+  bool dense;  // as in AdamStep
 };
 
-// A NaN guard: the step is skipped if `found` is not 0. With a loss, the step first sets `found` to whether the loss or
-// a gradient of a parameter with `every` reaches `limit` or is NaN.
+// A NaN guard: the step is skipped if `skip` is not 0. If there is a loss, the step first sets `skip` to whether the
+// loss or a gradient of a parameter with `dense` reaches `limit` or is NaN.
 struct AdamGuard {
   const float* loss;  // [1], or null
   float limit;
-  float* found;               // [1], or null to never skip
+  float* skip;                // [1], or null to never skip
   float *skipped, *in_a_row;  // [1], skipped steps in total, and in a row until this step; null without a loss
   const float* scale;         // [1], the loss scale that gradients are divided by, or null; CUDA only
 };
@@ -40,8 +40,8 @@ void average_cpu(float* const* averages, const float* const* parameters, const f
 // Adds gradients to totals.
 void add_cpu(const float* const* gradients, float* const* totals, const std::vector<int64_t>& sizes, int threads);
 
-// adam_cuda makes a step in two launches per 36 parameters. adam_workspace_cuda returns the floats of its workspace for
-// `count` parameters.
+// adam_cuda makes a step in two launches per 36 parameters. adam_workspace_cuda returns the size, in floats, of its
+// workspace for `count` parameters.
 int64_t adam_workspace_cuda(int64_t count);
 void adam_cuda(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,
                float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,

@@ -1,6 +1,6 @@
 // A step reads the whole gradient, but in the other three arrays only cache lines with a nonzero gradient: in a large
 // table most lines have none. A line is 16 floats. Its update has no branches, and entries with zero gradient are
-// written back unchanged. A rule with `every` streams through all arrays, which the hardware prefetches. Each operation
+// written back unchanged. A rule with `dense` streams through all arrays, which the hardware prefetches. Each operation
 // is rounded separately (the build turns contraction off), so that all instruction sets give the same bits.
 #include "encoding/adam_isa.h"
 
@@ -33,7 +33,7 @@ VN_INLINE int is_nonzero(const float* gradient) {
 // Updates kLanes entries.
 VN_INLINE void update(const AdamStep& rule, const float* gradient, float* parameter, float* mean, float* square) {
   const F32 g = load(gradient), p = load(parameter), m = load(mean), v = load(square);
-  const auto present = (g != F32{}) | (rule.every ? -1 : 0);
+  const auto present = (g != F32{}) | (rule.dense ? -1 : 0);
   const F32 new_m = rule.decay * m + (1.0f - rule.decay) * g;
   const F32 new_v = rule.decay_sq * v + (1.0f - rule.decay_sq) * (g * g);
   const F32 moved = p - rule.step_size * (new_m / (square_root(new_v) + rule.epsilon));
@@ -47,7 +47,7 @@ VN_INLINE void update(const AdamStep& rule, const float* gradient, float* parame
 void adam_block(const AdamStep& rule, const float* gradient, float* parameter, float* mean, float* square,
                 int64_t begin, int64_t end) {
   int64_t line = begin;
-  for (; rule.every && line + kLine <= end; line += kLine) {
+  for (; rule.dense && line + kLine <= end; line += kLine) {
     for (int j = 0; j < kLine; j += kLanes) {
       update(rule, gradient + line + j, parameter + line + j, mean + line + j, square + line + j);
     }

@@ -13,7 +13,7 @@ struct AdamStep {
   float step_size;        // the learning rate, corrected for the moments' start at zero
   float decay, decay_sq;  // decay rates of the moments
   float epsilon;          // with the same correction
-  bool every;             // also update entries with zero gradient, as torch does
+  bool dense;             // also update entries with zero gradient, as torch does
 };
 
 VN_DECLARE_FOR_ISA(void adam_block(const AdamStep& rule, const float* gradient, float* parameter, float* mean,

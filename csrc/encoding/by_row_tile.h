@@ -15,7 +15,8 @@ template <typename Formula>
 struct ByRow {
   static constexpr int64_t kColumns = (Formula::kMost + kLanes - 1) / kLanes * kLanes;
 
-  // Columns of x [rows][stride] from `row` on. Lanes after the last row repeat the last row.
+  // A function that returns column i of x [rows][stride] as a vector of the rows from `row` on. Lanes after the last
+  // row repeat the last row.
   struct Of {
     const float* x;
     int64_t stride, row, rows;

@@ -32,7 +32,8 @@ void over_ranges(const Encoding& in, int threads, const Run& run) {
   struct alignas(64) Line {
     float floats[kEncodeLanes];
   };
-  // Each range has a table, encoded rows, staged rows with one spare vector, and staged variances.
+  // The workspace of a range holds a table of three rows, the encoded rows of a tile, and copies of the tile's x and
+  // variances, each copy with a spare vector.
   const int64_t lines = ceil_div((3 + kEncodeRows) * stride + 2 * (kEncodeRows * in.d + kEncodeLanes), kEncodeLanes);
   const std::unique_ptr<Line[]> workspace(new Line[static_cast<size_t>(ranges * lines)]);
   parallel_for(ranges, 1, threads, [&](int64_t i) {

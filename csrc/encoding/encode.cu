@@ -27,7 +27,7 @@ __global__ void __launch_bounds__(kThreads)
   const int width = d * (2 * octaves + include_input);
   const int64_t first = static_cast<int64_t>(blockIdx.x) * kRows;
   const int rows = n - first < kRows ? static_cast<int>(n - first) : kRows;
-  // Elements of a block have 32-bit numbers, because 32-bit division is cheap.
+  // Elements have 32-bit indices within the block, because 32-bit division is cheap.
   for (int j = threadIdx.x; j < rows * width; j += kThreads) {
     const int64_t row = first + j / width, i = first * width + j;
     int column = j % width;
@@ -103,7 +103,7 @@ __global__ void __launch_bounds__(kFormulaThreads)
 
 unsigned blocks_of(int64_t size, int threads) { return static_cast<unsigned>(ceil_div<int64_t>(size, threads)); }
 
-// The kernels of encodings.h.
+// Octaves and ByRow launch the CUDA kernels for the two kinds of encodings in encodings.h.
 template <bool kBlurred>
 struct Octaves {
   static void values(const Encoding& in, float* out, void* stream) {

@@ -1,5 +1,6 @@
-// The encodings without parameters (encodings.h) and their gradients: x [n,d] -> [n, width]. They use the row kernels
-// of programs and agree with ENCODINGS in voronerf/ops/_core/encodings.py. n, d and width may be 0.
+// The encodings without parameters (encodings.h) and their gradients: x [n,d] -> [n, width]. They agree with
+// ENCODINGS in voronerf/ops/_core/encodings.py. On the CPU they use the row kernels of grouped programs
+// (network/program.h). n, d and width may be 0.
 #pragma once
 
 #include <cstdint>

@@ -10,9 +10,9 @@
 namespace voronerf {
 
 // sine_of_octave returns sin(angle + half pi): the sine for half = 0, the cosine for half = 0.5. With angle = (m -
-// half) pi + r and |r| <= pi / 2 it is (-1)^m sin r. Splitting pi into two floats and fused multiply-adds keep r exact
-// to rounding up to kLargestDeviceAngle; the polynomial's error is 5e-9. Larger angles and NaN use the library's
-// function with its full range reduction.
+// half) pi + r and |r| <= pi / 2 it is (-1)^m sin r. Pi is split into two floats for fused multiply-adds, so that r has
+// only rounding errors for angles up to kLargestDeviceAngle. The polynomial's error is 5e-9. Larger angles and NaN use
+// the library's function with its full range reduction.
 constexpr float kLargestDeviceAngle = 65536.0f;
 
 VN_HD float sine_of_octave(float angle, float half) {

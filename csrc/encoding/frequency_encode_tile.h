@@ -4,7 +4,7 @@
 //
 // A lane is a column of the encoding. A permutation selects its feature, a table gives its octave and phase, and one
 // sine with one range reduction computes it. So rows have the layout that the products read, without a transposition.
-// Encodings for tile registers are computed by encode_turned.
+// Encodings for tile registers are computed by encode_transposed.
 #pragma once
 
 #include "common/elementwise_math.h"
@@ -111,30 +111,30 @@ VN_INLINE void encode_strip(const float* x, int64_t x_stride, int64_t rows, cons
 
 #if VN_HALF == 2
 
-constexpr int64_t kMostTurned = 128;  // columns of `encode_turned`
+constexpr int64_t kMostTransposed = 128;  // columns of `encode_transposed`
 
-// Encodes up to kTurned rows with small angles, as pairs only. Lanes are rows. Sine and cosine of a feature share a
-// range reduction, and each octave follows from the previous one by the double-angle formulas, which double the error.
-// So every fifth octave is computed directly: the error stays at 2e-6, while rounding to bfloat16 causes 2e-3. All
-// columns are transposed at the end.
-void encode_turned(const float* x, int64_t x_stride, int64_t rows, const Columns& columns, float* pairs,
-                   int64_t pairs_stride) {
-  constexpr int kVectors = kTurned / kLanes;
-  constexpr int64_t kRow = kTurned / 2, kOctavesOfOne = 5;
+// Encodes up to kTransposed rows with small angles, and writes only pairs of bfloat16 numbers, no floats. Lanes are
+// rows. Sine and cosine of a feature share a range reduction, and each octave follows from the previous one by the
+// double-angle formulas, which double the error. So every fifth octave is computed directly: the error stays at 2e-6,
+// while rounding to bfloat16 causes 2e-3. All columns are transposed at the end.
+void encode_transposed(const float* x, int64_t x_stride, int64_t rows, const Columns& columns, float* pairs,
+                       int64_t pairs_stride) {
+  constexpr int kVectors = kTransposed / kLanes;
+  constexpr int64_t kRow = kTransposed / 2, kOctavesOfOne = 5;
   const int64_t d = columns.d;
-  alignas(64) float encoded[kMostTurned][kRow];
+  alignas(64) float encoded[kMostTransposed][kRow];
   const auto put = [&](int64_t column, const F32* values) {
     for (int v = 0; v < kVectors; v += 2) store(encoded[column] + v * kLanes / 2, joined(values[v], values[v + 1]));
   };
   F32 points[3][kVectors];
-  const bool direct = d == 3 && x_stride == 3 && rows == kTurned;
+  const bool direct = d == 3 && x_stride == 3 && rows == kTransposed;
   for (int v = 0; direct && v < kVectors; ++v) {
     load_points(x + 3 * v * kLanes, points[0][v], points[1][v], points[2][v]);
   }
   for (int64_t f = 0; f < d; ++f) {
     F32 values_of_x[kVectors], sine[kVectors], cosine[kVectors];
-    float lanes[kTurned];
-    for (int64_t row = 0; !direct && row < kTurned; ++row) lanes[row] = x[smaller(row, rows - 1) * x_stride + f];
+    float lanes[kTransposed];
+    for (int64_t row = 0; !direct && row < kTransposed; ++row) lanes[row] = x[smaller(row, rows - 1) * x_stride + f];
     for (int v = 0; v < kVectors; ++v) values_of_x[v] = direct ? points[f][v] : load(lanes + v * kLanes);
     if (columns.input) put(f, values_of_x);
     float scale = 1.0f;
@@ -156,9 +156,9 @@ void encode_turned(const float* x, int64_t x_stride, int64_t rows, const Columns
     }
   }
   const int64_t width = columns.width();
-  for (int64_t c = width; c % kTurned != 0; ++c) __builtin_memset(encoded[c], 0, sizeof encoded[c]);
-  for (int64_t c = 0; c < width; c += kTurned) {
-    turn_pairs({encoded[c], kRow, false}, kTurned, kTurned, pairs + c / 2, pairs_stride);
+  for (int64_t c = width; c % kTransposed != 0; ++c) __builtin_memset(encoded[c], 0, sizeof encoded[c]);
+  for (int64_t c = 0; c < width; c += kTransposed) {
+    turn_pairs({encoded[c], kRow, false}, kTransposed, kTransposed, pairs + c / 2, pairs_stride);
   }
 }
 
@@ -212,9 +212,10 @@ VN_INLINE void encode_floats(const float* x, int64_t x_stride, const float* tabl
   }
 }
 
-// Encodes rows as encode_floats does. For tile registers, `pairs` [rows][pairs_stride] is written too unless it is
-// null; its rows are whole vectors. If `left` is not 0, the rounding remainders follow `left` floats after the pairs.
-// With pairs and without `kept`, `out` may stay unwritten.
+// Encodes rows as encode_floats does. For tile registers, the result is also rounded to pairs of bfloat16 numbers in
+// `pairs` [rows][pairs_stride], unless it is null; its rows are whole vectors. If `left` is not 0, the remainders of
+// this rounding are stored as pairs too, `left` floats after the pairs. If `pairs` is given and `kept` is false (no
+// step reads the floats), `out` may stay unwritten.
 void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns, float* out,
             int64_t stride, [[maybe_unused]] float* pairs = nullptr, [[maybe_unused]] int64_t pairs_stride = 0,
             [[maybe_unused]] int64_t left = 0, [[maybe_unused]] bool kept = true) {
@@ -228,10 +229,10 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
     for (int64_t row = 0; small && row < rows; ++row) small = all_small(x + row * x_stride, d, largest);
   }
 #if VN_HALF == 2
-  if (pairs != nullptr && !kept && left == 0 && waves && columns.width() <= kMostTurned) {
-    for (int64_t row = 0; row < rows; row += kTurned) {
-      encode_turned(x + row * x_stride, x_stride, smaller(kTurned, rows - row), columns, pairs + row * pairs_stride,
-                    pairs_stride);
+  if (pairs != nullptr && !kept && left == 0 && waves && columns.width() <= kMostTransposed) {
+    for (int64_t row = 0; row < rows; row += kTransposed) {
+      encode_transposed(x + row * x_stride, x_stride, smaller(kTransposed, rows - row), columns,
+                        pairs + row * pairs_stride, pairs_stride);
     }
     for (int64_t row = 0; !small && row < rows; ++row) {  // corrects only rows with large angles
       const float* const from = x + row * x_stride;
@@ -248,8 +249,8 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
 #endif
 }
 
-// Multiplies encoded rows by the damping factors of the variances, for d <= kLanes and columns without x. Rows are as
-// in `encode`.
+// Multiplies encoded rows by the damping factors of the variances, for d <= kLanes and an encoding without x itself.
+// Rows are as in `encode`.
 void blur(const float* variances, int64_t x_stride, const float* table, int64_t rows, float* out, int64_t stride) {
   for (int64_t column = 0; column < stride; column += kLanes) {
     Bits index;

@@ -42,8 +42,8 @@ __device__ __forceinline__ Corners corners_of(const HashEncoding& in, int64_t po
   return corners;
 }
 
-// Returns the index of the first number of the level's part of the table that a point reads; negative if its cell has
-// no table.
+// Returns the index, in the array of all tables, at which a level begins in the table of a point's cell; negative if
+// the cell has no table.
 template <int kFeatures>
 __device__ __forceinline__ int64_t first_of(const HashEncoding& in, const GridLevel& level, int64_t point) {
   const int64_t table = in.in.cells == nullptr ? 0 : in.in.cells[point];

@@ -13,7 +13,8 @@
 
 namespace voronerf {
 
-// A grid as in voronerf/ops/_core/grids.py.
+// A hash grid: its levels, its box from `low` to `high`, the features of each level, and whether the interpolation is
+// smoothstep (else linear). It corresponds to HashGrid in voronerf/ops/_core/grids.py.
 struct HashGrid {
   std::vector<GridLevel> levels;
   std::vector<float> low, high;

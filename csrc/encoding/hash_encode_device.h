@@ -63,7 +63,8 @@ __device__ __forceinline__ void hash_add(float* to, const float (&values)[kFeatu
   for (int f = 0; f < kFeatures; f += kCount) add_in_global<kCount>(to + f, values + f);
 }
 
-// Calls run(index of the first feature, x, y, z) for each corner.
+// Calls run(index of the entry's first feature, x, y, z) for each corner; x, y and z are 0 at the lower and 1 at the
+// upper corner of their axis.
 template <int kFeatures, typename Run>
 __device__ __forceinline__ void hash_corners(const HashAxis (&axes)[3], const GridLevel& level, int64_t first,
                                              const Run& run) {

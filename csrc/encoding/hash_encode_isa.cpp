@@ -46,7 +46,8 @@ VN_INLINE void for_table(const HashEncoding& in, const Run& run) {
   });
 }
 
-// Calls run(first, rows, places) for each block of points `begin` to `end`.
+// Calls run(first, rows, places) for each block of points `begin` to `end`; `places` holds the block's scaled
+// coordinates.
 template <typename Run>
 VN_INLINE void for_blocks(const HashEncoding& in, int64_t begin, int64_t end, const Run& run) {
   HashPlaces places;

@@ -15,7 +15,7 @@ constexpr int64_t kHashBlock = 64;  // points of a block, whose corners stay in 
 VN_DECLARE_FOR_ISA(void hash_encode_rows(const HashEncoding& in, float* out, int64_t stride, int64_t begin,
                                          int64_t end))
 
-// The same for one level, whose features are the first of each row.
+// Computes the features of one level, and writes them to the beginning of each row.
 VN_DECLARE_FOR_ISA(void hash_encode_level(const HashEncoding& in, int64_t level, float* out, int64_t stride,
                                           int64_t begin, int64_t end))
 
@@ -23,7 +23,7 @@ VN_DECLARE_FOR_ISA(void hash_encode_level(const HashEncoding& in, int64_t level,
 VN_DECLARE_FOR_ISA(void hash_encode_level_backward(const HashEncoding& in, int64_t level, const float* gradient,
                                                    int64_t stride, int64_t begin, int64_t end, float* of_table))
 
-// Writes the gradients of the positions. of_positions may be the memory of the positions.
+// Writes the gradients with respect to the positions. of_positions may be the memory of the positions.
 VN_DECLARE_FOR_ISA(void hash_encode_positions_backward(const HashEncoding& in, const float* gradient, int64_t stride,
                                                        float* of_positions, int64_t begin, int64_t end))
 

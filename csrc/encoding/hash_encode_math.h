@@ -15,7 +15,7 @@ namespace voronerf {
 constexpr int kMaxHashLevels = 24;
 constexpr uint32_t kHashPrimeY = 2654435761u, kHashPrimeZ = 805459861u;
 
-// A level as in voronerf/ops/_core/grids.py.
+// One level of a hash grid. The members have the same meanings as in GridLevel of voronerf/ops/_core/grids.py.
 struct GridLevel {
   float scale, shift;
   int32_t side;     // stride of the second axis
@@ -44,7 +44,8 @@ struct HashEncoding {
   float low[3], inverse[3];
 };
 
-// A coordinate scaled to 0..1, and its derivative, which is 0 outside the box. NaN stays NaN.
+// A coordinate scaled to 0..1 (`place`), and the derivative of this scaling (`slope`), which is 0 outside the box. NaN
+// stays NaN.
 struct HashPlace {
   float place, slope;
 };
@@ -56,13 +57,13 @@ VN_HD HashPlace hash_place(float x, float low, float inverse) {
 }
 
 // One axis of a level: the lower corner, and for both the lower and the upper corner the factor of the weight and its
-// first and second derivatives with respect to the place.
+// first and second derivatives with respect to the scaled coordinate.
 struct HashAxis {
   uint32_t corner;
   float at[2], slope[2], bend[2];
 };
 VN_HD HashAxis hash_axis(float place, const GridLevel& level, bool smooth) {
-  // Rounded twice, as in the reference, so that both choose the same corners.
+  // The product and the sum are rounded separately, as in the reference, so that the corners are the same.
 #ifdef __CUDA_ARCH__
   const float where = __fadd_rn(__fmul_rn(place, level.scale), level.shift);
 #else
@@ -99,7 +100,7 @@ VN_HD float hash_weight(const HashAxis* axes, bool directed, const float* along,
          a.at[x] * (along[1] * b.slope[y] * c.at[z] + b.at[y] * (along[2] * c.slope[z]));
 }
 
-// Returns the derivative of hash_weight with respect to the place on axis i.
+// Returns the derivative of hash_weight with respect to the scaled coordinate on axis i.
 VN_HD float hash_weight_slope(const HashAxis* axes, bool directed, const float* along, int i, const int* corner) {
   const int j = (i + 1) % 3, k = (i + 2) % 3;
   const HashAxis &a = axes[i], &b = axes[j], &c = axes[k];

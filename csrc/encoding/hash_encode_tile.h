@@ -17,14 +17,14 @@ namespace {
 typedef int32_t HashInts __attribute__((vector_size(4 * kLanes)));
 typedef uint32_t HashWords __attribute__((vector_size(4 * kLanes)));
 
-// Points of a block, by axis: places in 0..1, their derivatives with respect to the coordinate, and these derivatives
-// times the direction.
+// The points of a block, by axis: coordinates scaled to 0..1 (see HashPlace), the derivatives of this scaling, and
+// these derivatives times the direction.
 struct HashPlaces {
   alignas(64) float place[3][kHashBlock], slope[3][kHashBlock], along[3][kHashBlock];
 };
 
 // The entries of the corners on one level (x varies fastest, then y and z) and their factors: one set of weights, or
-// three sets for the derivatives with respect to each place.
+// three sets for the derivatives with respect to the scaled coordinates.
 struct HashCorners {
   alignas(64) int32_t entry[8][kHashBlock];
   alignas(64) float weight[3][8][kHashBlock];
@@ -38,7 +38,7 @@ VN_INLINE const float* whole_block(const float* from, int64_t rows, float* padde
   return padded;
 }
 
-// Computes the places of points `first` to `first + rows`, at most a block.
+// Computes the scaled coordinates of points `first` to `first + rows`, at most a block.
 VN_INLINE void hash_places(const HashEncoding& in, int64_t first, int64_t rows, HashPlaces& to) {
   alignas(64) float padded[3 * kHashBlock], padded_direction[3 * kHashBlock];
   const float* points = whole_block(in.in.positions + 3 * first, rows, padded);
@@ -69,7 +69,7 @@ struct HashVectorAxis {
 VN_INLINE HashVectorAxis hash_vector_axis(F32 place, F32 along, const GridLevel& level, bool smooth) {
   const F32 one = splat(1.0f), zero = splat(0.0f), scale = splat(level.scale);
   const F32 where = place * scale + splat(level.shift);
-  // Places are not negative, so the conversion rounds down. NaN converts to the smallest integer.
+  // `where` is not negative, so the conversion rounds down. NaN converts to the smallest integer.
   HashInts below = __builtin_convertvector(where, HashInts);
   below = below & ~(below >> 31);
   const F32 t = where - __builtin_convertvector(below, F32);
@@ -107,7 +107,7 @@ VN_INLINE void hash_entries(const HashVectorAxis* axes, const GridLevel& level, 
 }
 
 // Computes the corners of a level. kAlong: weights of the derivative along the direction. kSlopes: weights of the
-// derivatives with respect to each place.
+// derivatives with respect to each scaled coordinate.
 template <bool kAlong, bool kSlopes>
 VN_INLINE void hash_corners(const HashEncoding& in, const GridLevel& level, const HashPlaces& places, int64_t rows,
                             HashCorners& to) {
@@ -288,7 +288,8 @@ VN_INLINE void hash_scatter(const HashEncoding& in, const GridLevel& level, cons
   }
 }
 
-// Adds the gradients of the places from one level to sums [3][block]; the lanes are still to be summed.
+// Adds one level's gradients with respect to the scaled coordinates (HashPlace) to sums [3][block]. Each sum is a
+// vector; the caller must still add up its lanes.
 template <int kFeatures, typename T>
 VN_INLINE void hash_slopes(const HashEncoding& in, const GridLevel& level, const HashCorners& corners, int64_t first,
                            int64_t rows, const float* gradient, int64_t stride, Four (*sums)[kHashBlock]) {

@@ -26,8 +26,8 @@ constexpr int64_t kLine = 16;         // int32 of a cache line
 // Returns whether a cell lies in 0..k-1. As an unsigned number, a negative cell is above k too.
 bool inside(int32_t cell, int64_t k) { return static_cast<uint32_t>(cell) < static_cast<uint32_t>(k); }
 
-// Turns counts into the places of first rows. Two cells at a time take 0.28 ns a cell; one at a time takes 0.31 to 0.55
-// ns, depending on the loop's alignment.
+// Replaces counts of rows by the positions of the first rows in the sorted order: an exclusive prefix sum. Two cells at
+// a time take 0.28 ns a cell; one at a time takes 0.31 to 0.55 ns, depending on the loop's alignment.
 void first_places(int32_t* counts, int64_t k) {
   int32_t start = 0;
   int64_t c = 0;
@@ -108,9 +108,9 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCo
   });
   if (!valid) return false;
 
-  // In place, a count becomes the first place of the cell's rows in the chunk. One pass over the chunks sums the cells'
-  // totals, a second pass assigns places; both read memory in order. The last chunk's counters hold the total, then the
-  // next free place, and in the end that chunk's own first place.
+  // Each count is replaced by the position, in the sorted order, of the first of the cell's rows in the chunk. One pass
+  // over the chunks sums the cells' totals, a second pass assigns positions; both read memory in order. The last
+  // chunk's counters hold the total, then the next free position, and in the end that chunk's own first position.
   int32_t* const last = offsets + 1;
   for (int64_t chunk = 0; chunk < chunks - 1; ++chunk) {
     const int32_t* const count = counters(chunk);

@@ -2,13 +2,14 @@
 // by counting, in chunks as on the CPU. One warp owns a chunk, so that no counter is shared:
 //
 //   1. cell_sort_chunk    the chunk's histogram, counts[bucket][chunk]
-//   2. scan_*             exclusive scan of counts in that order: the first place of each bucket's rows of each chunk
-//   3. cell_sort_chunk    writes the rows to their places, in order
+//   2. scan_*             exclusive scan of counts in that order: the first position, in the sorted order, of each
+//                         bucket's rows of each chunk
+//   3. cell_sort_chunk    writes the rows to their positions, in order
 //
 // A warp takes 32 rows at a time; rows with the same bucket find each other with __match_any_sync, are ranked by lane,
-// and their first lane moves the counter, in shared memory. There are no atomics. In global memory the counters of a
-// block's eight chunks are adjacent, one sector of 32 bytes per bucket, and are copied to and from shared memory in
-// this layout.
+// and the first of their lanes advances the counter, in shared memory. There are no atomics. In global memory the
+// counters of a block's eight chunks are adjacent, one sector of 32 bytes per bucket, and are copied to and from shared
+// memory in this layout.
 //
 // If a warp has too few counters for the cells, the toolkit's radix sort sorts by the bits of the bucket numbers. With
 // counters in global memory every 32 rows would wait for a counter, and the many counters would allow too few chunks to
@@ -33,9 +34,9 @@ constexpr int kScanThreads = 1024;
 constexpr int64_t kScanTile = kCellSortScanTile;
 constexpr int kScanItems = static_cast<int>(kScanTile) / kScanThreads;
 
-// Calls place(row, position) for every row of the warp's chunk; position is the row's counter before this row. Counters
-// belong to this warp alone; __syncwarp makes the write of one lane visible to the lane that reads next. While kAhead
-// steps of cells are counted, the next steps are being loaded.
+// Calls place(row, position) for every row of the warp's chunk; position is the value of the bucket's counter before
+// the row is counted. Counters belong to this warp alone; __syncwarp makes the write of one lane visible to the lane
+// that reads next. While the cells of kAhead x 32 rows are counted, the cells of the next rows are being loaded.
 template <typename Place>
 __device__ void count_rows(const int32_t* cells, int32_t* counters, int64_t begin, int64_t end, int64_t k,
                            Place place) {
@@ -151,7 +152,7 @@ __global__ void __launch_bounds__(kScanThreads) scan_tiles(int32_t* tile_sums, i
   }
 }
 
-// Replaces counts by places; offsets[c] is the first place of bucket c + 1.
+// Replaces counts by positions in the sorted order; offsets[c] is the first position of bucket c + 1.
 __global__ void __launch_bounds__(kScanThreads)
     scan_places(int32_t* __restrict__ counts, const int32_t* __restrict__ tile_sums, int32_t* __restrict__ offsets,
                 int64_t size, int64_t chunks) {

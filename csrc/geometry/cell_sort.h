@@ -14,7 +14,7 @@ namespace voronerf {
 // Returns false if a cell lies outside 0..k-1; `order` and `offsets` are then undefined.
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCount n, int64_t k, int threads);
 
-// Writes the result if all samples are in one cell: cells 0, offsets 0 and n.
+// Writes the result for a diagram of one cell: all `cells` [n] are 0, and `offsets` [2] are 0 and n.
 void one_cell_cpu(int32_t* cells, int32_t* offsets, RowCount n, int threads);
 
 // The sorting method on CUDA: by counting if a warp's counters fit in shared memory, since this moves the fewest bytes
@@ -38,8 +38,8 @@ struct CellSortPlan {
   int64_t bytes;
 };
 
-// Returns the plan. It depends on its arguments alone. `temporary`: bytes that the radix sort needs (radix_sort.h).
-// Throws std::runtime_error if `way` is counting and there are too many cells.
+// Returns the plan of a sort, which depends on the arguments alone. `temporary`: bytes that the radix sort needs
+// (radix_sort.h). Throws std::runtime_error if `way` is counting and there are too many cells.
 CellSortPlan cell_sort_plan(int64_t n, int64_t k, CellSortWay way, int64_t temporary);
 
 // Cells below 0 sort before offsets[0], and cells from k on after offsets[k], because raising an error would need a

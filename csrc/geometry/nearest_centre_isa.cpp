@@ -66,7 +66,8 @@ VN_INLINE void tile(const float* points, const float* centres, int bits_taken, i
     const int32_t count = static_cast<int32_t>(k - start < kChunk ? k - start : kChunk);
     search<U>(x, y, z, centres + 3 * start, distance_bits, count, near, next);
     for (int u = 0; u < U; ++u) {
-      // A best or second value that is NaN or infinite leaves the lane to float64; an infinity with index bits is NaN.
+      // If the best or the second value is NaN or infinite, float64 decides the lane's point. An infinity with index
+      // bits is NaN.
       const F32 v = as_float(near[u]);
       second[u] = min(max(v, best[u]), min(as_float(next[u]), second[u]));
       cell[u] = select(less(v, best[u]), add(splat(static_cast<int32_t>(start)), both(near[u], index_mask)), cell[u]);

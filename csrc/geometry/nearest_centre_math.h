@@ -3,16 +3,16 @@
 // The answer is defined in float64: the lowest index that minimises |x - c|^2, evaluated as (dx^2 + dy^2) + dz^2 (and
 // so on) with every operation rounded separately (no contraction to fma), so that all backends agree to the last bit.
 //
-// Float32 input is screened in float32, and decided in float64 only if float32 is not certain. Let u = 2^-24 and D the
-// squared distance. A difference, a product and two sums round, so float32 computes D up to an error of g D, where g =
-// 5u + O(u^2) < 3.6e-7; fused multiply-adds only reduce the error. Let b be the index of the smallest computed value. A
-// centre nearer than b has D <= D_b (up to 1e-15, float64's own error), hence a computed value of at most D_b + 2 g D_b
-// in terms of the computed D_b. If the second smallest computed value is above D_b + kMargin D_b + kFloor, no centre is
-// nearer than b. kMargin = 2e-6 covers 2g and the roundings of this sum (3u), kFloor the underflow of the squares,
-// flushed to zero or not. NaN and overflow fail the comparison and are decided in float64.
+// Float32 input is screened in float32, and decided in float64 only if float32 is not certain. Let u = 2^-24, D the
+// squared distance, and V the value of D that float32 computes. A difference, a product and two sums round, so the
+// error of V is at most g D, where g = 5u + O(u^2) < 3.6e-7; fused multiply-adds only reduce the error. Let b be the
+// index of the smallest V. A centre nearer than b has D <= D_b (up to 1e-15, float64's own error), hence
+// V <= V_b + 2 g V_b. If the second smallest V is above V_b + kMargin V_b + kFloor, no centre is nearer than b.
+// kMargin = 2e-6 covers 2g and the roundings of this sum (3u). kFloor covers the underflow of the squares, whether it
+// is flushed to zero or not. NaN and overflow fail the comparison and are decided in float64.
 //
-// The CPU stores an index in a value's lowest b bits, which changes the value by a factor of less than 1 + t, t =
-// 2^(b-23). nearest_margin adds 2.5 t >= (1+t)/(1-t) - 1.
+// The CPU stores an index in a value's lowest n bits, which changes the value by a factor of less than 1 + t, t =
+// 2^(n-23). nearest_margin adds 2.5 t >= (1+t)/(1-t) - 1.
 #pragma once
 
 #include <cstdint>

@@ -10,7 +10,8 @@ namespace voronerf {
 template <typename Key>
 int64_t radix_sort_bytes(int64_t n, int bits);
 
-// Input and output do not overlap. Key: uint16_t or uint32_t.
+// Sorts keys [n], and reorders values [n] in the same way. Inputs and outputs must not overlap. `temporary` has `bytes`
+// bytes. Key: uint16_t or uint32_t.
 template <typename Key>
 void radix_sort(void* temporary, int64_t bytes, const Key* keys, Key* sorted, const int32_t* values,
                 int32_t* sorted_values, int64_t n, int bits, void* stream);

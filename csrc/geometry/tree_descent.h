@@ -80,7 +80,7 @@ void descend_group(const DescentTree& tree, const DescentLevel<T>& level, int de
   }
 }
 
-// Returns false if a point is not at a leaf after the last level.
+// Moves the n points of a block down the tree. Returns false if a point is not at a leaf after the last level.
 template <typename T, typename Find>
 bool descend_block(const DescentTree& tree, const T* points, int32_t* leaves, int32_t n, DescentBlock<T>& block,
                    int32_t* place, const Find& find) {
@@ -103,9 +103,12 @@ bool descend_block(const DescentTree& tree, const T* points, int32_t* leaves, in
 }
 
 // Moves all n points to their leaves; threads share the blocks. `workspace` holds descent_stride(m) int32 for each
-// thread and is aligned to 8 bytes. find(points, rows, count, first, size, level, found, start, thread) finds one of
-// `size` centres from row `first` on for each of `count` points. Point i has row `start + rows[i]` among all points.
-// Returns false if a point does not reach a leaf.
+// thread and is aligned to 8 bytes. Returns false if a point does not reach a leaf.
+//
+// find(points, rows, count, first, size, level, found, start, thread) finds a centre for each of `count` points. The
+// centres are the rows first : first + size, and found[i] gets the index of the centre of point i, counted from
+// `first`. `level` is the level of the tree, from 0, and `thread` the index of the calling thread. Among all points,
+// point i is row start + rows[i].
 template <typename T, typename Find>
 bool descend(const DescentTree& tree, const T* points, int32_t* leaves, int32_t* workspace, int64_t n, int64_t m,
              int threads, const Find& find) {

@@ -17,8 +17,8 @@ VN_INLINE F32 constant(float a) { return splat(a); }
 // Selects `yes` in lanes with x > 0 and `no` in the other lanes.
 VN_INLINE F32 positive(F32 x, F32 yes, F32 no) { return x > splat(0.0f) ? yes : no; }
 
-// Returns the derivative of the given order of x^(p + order): x^p times its factors. If p is a multiple of 0.5, the
-// power is computed by multiplications and a square root.
+// Returns the derivative of x^(p + order) of order `order`: (p + order) (p + order - 1) ... (p + 1) x^p. If p is a
+// multiple of 0.5, the power is computed by multiplications and a square root.
 VN_INLINE F32 raised(F32 x, float p, int order) {
   float factor = 1.0f;
   for (int i = 0; i < order; ++i) factor *= p + static_cast<float>(order - i);

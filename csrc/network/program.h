@@ -30,21 +30,22 @@ struct ProgramOutput {
   // output is the unsummed rows [n, w] in the caller's order, and the caller sums them: with deterministic algorithms,
   // PyTorch sums without atomics.
   bool ray;
-  int32_t memory;  // holds the unsummed rows of a ray output, or another output itself; -1: none
+  int32_t memory;  // index of the call's array for the unsummed rows if `ray`, else for the output itself; -1: none
 };
 
-// A look-up in a hash grid at the points of an input. The result is memory [n][stride] of the call.
+// A look-up in a hash grid at the points of an input. The result is array number `memory` of the call, [n][stride].
 struct ProgramLookup {
   int32_t input, parameter, grid, memory;
 };
-// The gradient of a table, from the memory with the gradient of the look-up's result.
+// The gradient of a table, from array number `memory` of the call, which holds the gradient of the look-up's result.
 struct ProgramScatter {
   int32_t input, parameter, grid, memory, sum;
 };
 
 // The kind of products for which packs and slots are laid out. floats: float32. pairs: pairs of bfloat16. tiles: pairs
 // of bfloat16 in tile registers with tiles of a multiple of 32 rows, or on CUDA any 16-bit numbers. parts: in tile
-// registers, each float split into a high and a low part, as high x high + high x low + low x high.
+// registers, with each float split into a high and a low bfloat16 part; a product is computed as high x high + high x
+// low + low x high.
 enum class ProgramLayout : int { floats, pairs, tiles, parts };
 
 // The description of a program by Python.
@@ -55,7 +56,7 @@ struct ProgramTable {
   std::vector<ProgramSum> sums;
   std::vector<ProgramInput> inputs;
   std::vector<ProgramOutput> outputs;
-  std::vector<int32_t> memories;  // floats per row of each memory
+  std::vector<int32_t> memories;  // floats per row of each array of the call
   std::vector<ProgramLookup> lookups;
   std::vector<ProgramScatter> scatters;
   std::vector<HashGrid> grids;
@@ -77,8 +78,8 @@ inline std::unique_ptr<Program> make_program(const ProgramTable& table) {
 struct ProgramInputs {
   const void* const* inputs;  // [n, w] or [r, w]; float32 or bfloat16
   std::vector<TableType> input_types;
-  std::vector<int32_t> turned;    // the input is float32 [w, n] in memory, as PyTorch's look-ups in planes return it
-  const void* const* parameters;  // [k, ...] or [1, ...]; float32, but tables of hash grids may have 16 bits
+  std::vector<int32_t> transposed;  // the input is float32 [w, n] in memory, as PyTorch's look-ups in planes return it
+  const void* const* parameters;    // [k, ...] or [1, ...]; float32, but tables of hash grids may have 16 bits
   std::vector<TableType> parameter_types;
   std::vector<int64_t> strides;  // entries from one cell's parameter to the next; 0: all cells share it
   const int32_t* offsets;

@@ -6,7 +6,7 @@
 
 namespace voronerf {
 
-// Returns this derivative. Small values use a series, which is three times as fast as expm1.
+// Returns the derivative of the density. Small values use a series, which is three times as fast as expm1.
 inline float density_slope(float density, float scale, bool activated) {
   if (activated) return 1.0f;
   const float x = density / scale;

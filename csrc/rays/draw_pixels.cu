@@ -14,10 +14,10 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.b) return;
   const uint32_t key = hash_key(*in.seed, i);
-  const int64_t place = draw_place(key, i < in.several ? in.p : in.below);
+  const int64_t place = draw_place(key, i < in.known_count ? in.p : in.below);
   for (int channel = 0; channel < 3; ++channel) uniforms[3 * i + channel] = hashed(key, 2 + channel);
-  if (i < in.several) {
-    pixels[i] = in.known[place];
+  if (i < in.known_count) {
+    pixels[i] = in.known_pixels[place];
     distances[i] = in.distances[place];
     return;
   }

@@ -1,5 +1,5 @@
-// Draws the b pixels of a training step from n runs of pixels and from p known pixels. The formulas are in
-// voronerf/ops/draw_pixels/reference.py.
+// Draws the b pixels of a training step from n runs of consecutive pixels, and from p pixels whose distance is known. A
+// place is an index in the concatenation of all runs. The formulas are in voronerf/ops/draw_pixels/reference.py.
 #pragma once
 
 #include <cstdint>
@@ -18,14 +18,14 @@ struct DrawPixelsInputs {
   int64_t bits;
   int64_t below;  // the total number of places in all runs
   RowCount b;
-  const int64_t* known;    // [p], the known pixels, from which the first pixels are drawn; or null
-  const float* distances;  // [p], the distances of the known pixels
+  const int64_t* known_pixels;  // [p], the known pixels, from which the first pixels are drawn; or null
+  const float* distances;       // [p], the distances of the known pixels
   int64_t p;
-  RowCount several;  // how many leading pixels are drawn from the known pixels
+  RowCount known_count;  // how many leading pixels are drawn from the known pixels
 };
 
-// `first_run` returns the first run that can hold a place; from there, `run_of` finds the run of the place. Both stay
-// within the tables, even if their entries are invalid.
+// `first_run` returns the first run that can hold a place; from this run on, `run_of` searches for the run of the
+// place. Both functions stay within the tables, even if the tables' entries are invalid.
 VN_HD int64_t first_run(const DrawPixelsInputs& in, int64_t place) {
   const int64_t at = place >> in.bits, run = in.first[at < in.places ? at : in.places - 1];
   return run < 0 ? 0 : run < in.n ? run : in.n - 1;
@@ -41,7 +41,7 @@ VN_HD int64_t draw_place(uint32_t key, int64_t below) {
   return static_cast<int64_t>(fraction * static_cast<double>(below));
 }
 
-// pixels: [b]. uniforms: [b,3], in [0, 1). distances: [several].
+// pixels: [b]. uniforms: [b,3], in [0, 1). distances: [known_count], of the pixels drawn from the known pixels.
 void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, float* distances, int threads);
 void draw_pixels_cuda(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, float* distances, void* stream);
 

@@ -1,4 +1,5 @@
-// draw_points on the CPU: threads share blocks of points. Each point is a hash of its number alone.
+// draw_points on the CPU: threads share blocks of points. A point's coordinates follow from hashes of the seed and the
+// point's index, so the result does not depend on the number of threads.
 #include "rays/draw_points.h"
 
 #include "common/hashed.h"

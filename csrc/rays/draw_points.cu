@@ -16,7 +16,7 @@ __global__ void __launch_bounds__(kThreads)
   if (i >= n) return;
   const uint32_t key = hash_key(*seed, i);
   for (int axis = 0; axis < 3; ++axis) {
-    // Rounded twice, as on the CPU.
+    // The product and the sum are rounded separately, as on the CPU.
     const float along = march_product(box[3 + axis] - box[axis], hashed(key, static_cast<uint32_t>(axis)));
     points[3 * i + axis] = box[axis] + along;
   }

@@ -1,8 +1,9 @@
-// A sample is encoded as one number: the bits of its importance, which sort like positive floats, above the negated
-// bits of its place. So no two numbers are equal, larger numbers are kept, and the kept samples do not depend on the
-// order of comparisons. Each part of the samples collects entries above a common bound. When a part has 2 q entries, it
-// drops the smaller half and raises the bound to its smallest entry, since q entries are no smaller. Few samples are
-// collected: about q (1 + ln(n / q)) of n samples in random order.
+// A sample is encoded as one 64-bit integer, its entry. The upper half holds the bits of the importance, which is not
+// negative, so its bits sort like the number. The lower half holds the inverted bits of the sample's index. So no two
+// entries are equal, larger entries are kept, and the kept samples do not depend on the order of comparisons. Each part
+// of the samples collects entries above a common bound. When a part has 2 q entries, it drops the smaller half. The
+// bound is raised to the smallest of the remaining q entries, because no smaller entry is among the q largest. Few
+// samples are collected: about q (1 + ln(n / q)) of n samples in random order.
 #include "rays/keep_heaviest.h"
 
 #include <algorithm>

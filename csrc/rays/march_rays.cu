@@ -47,7 +47,7 @@ __global__ void __launch_bounds__(kThreads)
   int64_t samples = 0;
   for (int64_t w = 0; w < words; ++w) {
     uint32_t word = 0;
-    if (ray.far > ray.near && (w + 1) * kMarchWord > start && samples < in.most) {
+    if (ray.far > ray.near && (w + 1) * kMarchWord > start && samples < in.max_samples) {
       const int64_t stratum = w * kMarchWord + lane;
       bool kept = false;
       if (stratum >= start && stratum < in.s) {
@@ -58,7 +58,7 @@ __global__ void __launch_bounds__(kThreads)
       }
       word = __ballot_sync(kAllLanes, kept);
       // Drop the last samples beyond the maximum.
-      word = __ballot_sync(kAllLanes, kept && samples + __popc(word & lanes_below(lane)) < in.most);
+      word = __ballot_sync(kAllLanes, kept && samples + __popc(word & lanes_below(lane)) < in.max_samples);
       samples += __popc(word);
     }
     if (lane == 0) mask[i * words + w] = word;
@@ -118,10 +118,10 @@ __global__ void __launch_bounds__(kThreads)
     deltas[row + rank] = length;
     ray_index[row + rank] = static_cast<int32_t>(i);
     for (int axis = 0; axis < 3; ++axis) positions[3 * (row + rank) + axis] = point[axis];
-    // A ray with its maximum of samples continues behind the last one.
-    if (rank + 1 == in.most) stop[i] = static_cast<int32_t>(stratum + 1);
+    // If a ray has its maximum of samples, its next march starts at the stratum after the last sample.
+    if (rank + 1 == in.max_samples) stop[i] = static_cast<int32_t>(stratum + 1);
   }
-  if (lane == 0 && rank_of_word <= room && rank_of_word < in.most) stop[i] = static_cast<int32_t>(in.s);
+  if (lane == 0 && rank_of_word <= room && rank_of_word < in.max_samples) stop[i] = static_cast<int32_t>(in.s);
 }
 
 }  // namespace

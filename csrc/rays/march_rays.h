@@ -34,7 +34,7 @@ struct MarchInputs {
   int64_t s;
   int64_t x, y, z;
   MarchSpacing spacing;
-  int64_t most;  // the maximum number of samples of a ray
+  int64_t max_samples;  // the maximum number of samples of a ray
   MarchSpace space;
 };
 

@@ -55,7 +55,7 @@ void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin
     const int64_t start = in.start == nullptr || in.start[i] < 0 ? 0 : in.start[i];
     const uint32_t key = march_key(in, i);
     int64_t samples = 0;
-    for (int64_t w = start / kMarchWord; ray.far > ray.near && w < words && samples < in.most; ++w) {
+    for (int64_t w = start / kMarchWord; ray.far > ray.near && w < words && samples < in.max_samples; ++w) {
       const int64_t first = w * kMarchWord, left = in.s - first;
       int32_t cells[kMarchWord];
       float uniforms[kMarchWord];
@@ -76,7 +76,7 @@ void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin
       if (left < kMarchWord) word &= (uint32_t{1} << left) - 1;
       if (start > first) word &= ~uint32_t{0} << (start - first);
       // Drop the last bits beyond the maximum.
-      while (samples + bits_of(word) > in.most) word &= ~(uint32_t{1} << (31 - __builtin_clz(word)));
+      while (samples + bits_of(word) > in.max_samples) word &= ~(uint32_t{1} << (31 - __builtin_clz(word)));
       ray_mask[w] = word;
       samples += bits_of(word);
     }
@@ -161,7 +161,8 @@ VN_INLINE void enter(const MarchInputs& in, float width, int64_t i, int64_t j, W
   walk.ray[j] = static_cast<int32_t>(i), walk.samples[j] = 0;
   walk.stratum[j] = in.start == nullptr || in.start[i] < 0 ? 0 : in.start[i];
   walk.near[j] = ray.near, walk.far[j] = ray.far, walk.length[j] = __builtin_sqrtf(square);
-  // slack: the rounding error of a place, in cells. share: strata per unit of progress.
+  // slack: the rounding error of a position, in cells. share: the number of strata per unit of `progress`
+  // (march_rays_math.h).
   walk.slack[j] = 1e-3f + 1e-6f * (away + __builtin_fabsf(ray.far) * walk.length[j]) / width;
   walk.share[j] = Rule::rate(ray) * ray.count;
 }
@@ -175,8 +176,8 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
   const int32_t strata = static_cast<int32_t>(in.s);
   const float width = 1.0f / __builtin_fmaxf(scale[0], __builtin_fmaxf(scale[1], scale[2]));
   const float sides[3] = {static_cast<float>(in.x), static_cast<float>(in.y), static_cast<float>(in.z)};
-  // A place in strata plus `before`, truncated, is the first stratum whose middle is not in front of the place, with a
-  // tolerance of 0.01 strata plus rounding errors.
+  // Let p be a position along the ray in units of strata. p + `before`, truncated, is the first stratum whose middle is
+  // at or behind p, with a tolerance of 0.01 strata plus rounding errors.
   const float count = static_cast<float>(in.s), before = 0.5f - (0.01f + 2e-6f * count);
   const MarchRay any = march_ray(in, begin);  // all rays have the same number of strata
   Walk walk;
@@ -238,7 +239,7 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
     for (; hits != 0; hits &= hits - 1) {
       const int64_t j = __builtin_ctz(hits);
       mask[walk.ray[j] * words + walk.stratum[j] / kMarchWord] |= uint32_t{1} << (walk.stratum[j] % kMarchWord);
-      if (++walk.samples[j] == in.most) next[j] = strata;
+      if (++walk.samples[j] == in.max_samples) next[j] = strata;
     }
     for (int64_t j = 0; j < kTogether; ++j) {
       walk.stratum[j] = next[j];
@@ -321,7 +322,7 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
           waiting = 0;
         }
         strata[waiting++] = static_cast<int32_t>(stratum);
-        if (++filled == in.most) next = stratum + 1;
+        if (++filled == in.max_samples) next = stratum + 1;
       }
     }
     if (waiting > 0) {

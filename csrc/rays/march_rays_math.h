@@ -80,7 +80,7 @@ VN_HD float march_sample(const MarchRay& ray, int64_t i, float inside, float fir
 
 VN_HD uint32_t march_key(const MarchInputs& in, int64_t i) { return in.seed == nullptr ? 0 : hash_key(*in.seed, i); }
 
-// Returns the place of a sample in its stratum, in 0..1.
+// Returns the relative position of a sample in its stratum, in 0..1.
 VN_HD float march_inside(const MarchInputs& in, uint32_t key, int64_t i, int64_t stratum) {
   if (in.seed != nullptr) return hashed(key, static_cast<uint32_t>(stratum));
   return in.uniforms != nullptr ? in.uniforms[i * in.s + stratum] : 0.5f;

@@ -1,4 +1,4 @@
-// The check of ray offsets, and the light that a ray's samples let through.
+// The check of ray offsets, and the transmittance of a whole ray.
 #pragma once
 
 #include <cstdint>
@@ -20,7 +20,7 @@ inline void check_ray_offsets(const std::string& op, const int32_t* offsets, int
   }
 }
 
-// Returns the fraction of the light that no sample of a ray has absorbed.
+// Returns the transmittance of a whole ray, 1 minus the sum of its samples' weights.
 template <typename In>
 double light_left(const In& in, int64_t ray) {
   double left = 1.0;

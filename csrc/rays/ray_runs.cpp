@@ -16,14 +16,14 @@ namespace voronerf {
 int64_t own_samples_cpu(const KnownSamples& in, const OwnSamples& out, int) {
   int64_t count = 0, runs = 0, before = -2;
   for (int64_t i = 0; i < in.n; ++i) {
-    const int32_t cell = in.own[in.cells[i]];
+    const int32_t cell = in.local_cells[in.cells[i]];
     if (cell < 0) continue;
     const int32_t ray = in.ray_index[i];
     bool begins = i - before != 1 || ray != out.ray_index[count - 1];
     if (!begins) {
-      // The distance is less than the shorter delta, so no stratum lies in between.
+      // If the two depths differ by less than the shorter delta, no stratum lies between the samples.
       const bool near = in.depths[i] - out.depths[count - 1] < std::min(in.deltas[i], out.deltas[count - 1]);
-      begins = !near && (in.bent || cell != out.cells[count - 1]);
+      begins = !near && (in.curved || cell != out.cells[count - 1]);
     }
     if (begins) out.offsets[runs++] = static_cast<int32_t>(count);
     for (int k = 0; k < 3; ++k) out.positions[3 * count + k] = in.positions[3 * i + k];
@@ -52,7 +52,7 @@ float compose_runs_cpu(const RunsOfRays& in, float* answers, int) {
     ++ends[ray_of(run)];
   }
   for (int64_t ray = 0, sum = 0; ray <= in.r; ++ray) sum += std::exchange(ends[ray], sum);
-  // Each entry of `ends` becomes the end of its ray.
+  // `ends` holds the start of each ray's runs in `order`; this loop advances it to their end.
   for (int64_t run = 0; run < in.q; ++run) order[ends[ray_of(run)]++] = run;
   const float share = 2.0f / (3.0f * static_cast<float>(in.rays));
   double loss = 0.0;

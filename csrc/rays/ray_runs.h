@@ -8,14 +8,14 @@ namespace voronerf {
 
 // The samples in the order of their rays, near to far; some belong to other ranks.
 struct KnownSamples {
-  const float* positions;    // [n,3]
-  const int32_t* ray_index;  // [n]
-  const float* depths;       // [n]
-  const float* deltas;       // [n]
-  const int32_t* cells;      // [n]
-  const int32_t* own;        // [k], the number of each cell among the rank's own cells, or -1
+  const float* positions;      // [n,3]
+  const int32_t* ray_index;    // [n]
+  const float* depths;         // [n]
+  const float* deltas;         // [n]
+  const int32_t* cells;        // [n]
+  const int32_t* local_cells;  // [k], the number of each cell among the rank's own cells, or -1
   int64_t n;
-  bool bent;  // rays are curved by a contraction
+  bool curved;  // rays are curved by a contraction
 };
 
 // The rank's own samples. Each array has space for n samples.
@@ -41,8 +41,8 @@ struct RunsOfRays {
   float robust;  // as in RenderLossInputs
 };
 
-// Writes an answer for each sum to `answers` [q,6], and returns the part of the loss due to these rays. Throws
-// std::invalid_argument if a run belongs to another ray.
+// Writes to `answers` [q,6] the values that each run needs from its whole ray (render_loss.h). Returns the part of the
+// loss due to rays `first` to `first + r`. Throws std::invalid_argument if a run belongs to another ray.
 float compose_runs_cpu(const RunsOfRays& in, float* answers, int threads);
 
 }  // namespace voronerf

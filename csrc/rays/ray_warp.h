@@ -69,8 +69,9 @@ __device__ inline float depth_in_front(float optical, int lane, Carry& carry) {
   return front;
 }
 
-// Returns the sum of `share` over the samples behind each lane's sample; the sum is subtracted in the gradient of the
-// sample's optical depth. Lanes without a sample have share 0. The carry moves to the front of the chunk.
+// Returns the sum of `share`, a sample's weight times the gradient with respect to the weight, over the samples behind
+// each lane's sample. The sum is subtracted in the gradient of the optical depth of the lane's sample. Lanes without a
+// sample have share 0. The carry moves to the front of the chunk.
 __device__ inline float share_behind(float share, int lane, Carry& carry) {
   const float rest = running_sum_back(share, lane);
   float after = __shfl_down_sync(kAllLanes, rest, 1);

@@ -78,7 +78,7 @@ class Pool {
         descent_(call.cells.child == nullptr ? 0 : locate_cell_workspace(call.cells.m, 1)),
         cell_offsets_(call.network.k + 1) {}
 
-  // Returns false if a position is not at a leaf.
+  // Renders rays until `items` has none left. Returns false if the descent of a sample's position ends without a leaf.
   bool run(Items& items, int thread) {
     while (refill(items, thread) > 0) {
       if (!wave()) return false;
@@ -127,7 +127,7 @@ class Pool {
     march.near = near_.data(), march.far = far_.data();
     march.start = start_.data();
     march.r = count_;
-    march.most = call_.rule.wave;
+    march.max_samples = call_.rule.wave;
     count_strata(call_.isa, march, call_.room, mask_.data(), offsets_.data() + 1);
     offsets_[0] = 0;
     for (int64_t i = 0; i < count_; ++i) offsets_[i + 1] += offsets_[i];
@@ -155,7 +155,7 @@ class Pool {
     return true;
   }
 
-  // Sorts the samples by cell. Returns false if a position is not at a leaf.
+  // Sorts the samples by cell. Returns false if the descent of a sample's position ends without a leaf.
   bool sort(ProgramInputs& in) {
     const SeeCells& cells = call_.cells;
     in.offsets = cell_offsets_.data();
@@ -215,7 +215,7 @@ class Pool {
   const Call& call_;
   ProgramInputs network_;
   ProgramResults results_{nullptr, {TableType::float32}, nullptr};
-  ProgramRows::Own own_;
+  ProgramRows::WorkerMemory own_;
   const int64_t size_;
   int64_t count_ = 0, next_ = 0, end_ = 0;
   std::vector<int32_t> number_, start_, stop_;

@@ -63,7 +63,8 @@ VN_INLINE F32 transmittance(F32 x) {
   return minus < splat(-87.0f) ? splat(0.0f) : exponential(minus);
 }
 
-// Computes light and weights from the samples' optical depths and the optical depths in front of them.
+// Computes the transmittance in front of each sample (`light`) and the sample's weight, from its optical depth and the
+// optical depth in front of it.
 VN_INLINE void weigh(int64_t count, Chunk& chunk) {
   for (int64_t i = count; i % kLanes != 0; ++i) chunk.front[i] = 0.0f;
   for (int64_t i = 0; i < count; i += kLanes) {

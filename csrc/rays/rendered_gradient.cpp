@@ -1,7 +1,9 @@
-// Walks along each ray once, from its end. The walk sums the weights behind each sample, which gives the light behind
-// it, and these weights times their gradients, so no exponential of an optical depth is recomputed. Rays are
-// independent, so results do not depend on the number of threads. Colours are activated only if a gradient needs them.
-// The slope of the softplus is a sigmoid, whose exp takes half the time of the expm1 of density_slope.h.
+// Walks along each ray once, from its end, with two running sums over the samples j behind the current sample: of w_j
+// and of w_j * dL/dw_j, where w_j are the weights. The first sum plus the transmittance of the whole ray is the
+// transmittance behind the sample, so no exponential of an optical depth is recomputed. The second sum is subtracted in
+// the gradient of the sample's optical depth. Rays are independent, so results do not depend on the number of threads.
+// Colours are activated only if a gradient needs them. The slope of the softplus is a sigmoid, whose exp takes half the
+// time of the expm1 of density_slope.h.
 #include "rays/rendered_gradient.h"
 
 #include <cmath>

@@ -1,7 +1,7 @@
 // Inverse-CDF sampling on CUDA, one warp per ray. The running mass of a ray's bins, float64 as on the CPU, goes to the
-// workspace [r,s]; then every lane finds the bins of its targets by bisection. Uniforms may have any order: a depth's
-// place is the rank of its uniform. A lane counts ranks by walking over the ray's uniforms (count^2 / 32 steps, in
-// cache). This sort is stable and needs no scratch memory.
+// workspace [r,s]; then every lane finds the bins of its targets by bisection. Uniforms may have any order: the index
+// of a depth in the result is the rank of its uniform. A lane counts ranks by walking over the ray's uniforms (count^2
+// / 32 steps, in cache). This sort is stable and needs no scratch memory.
 #include "common/cuda_wrappers.h"
 #include "rays/ray_warp.h"
 #include "rays/resample.h"

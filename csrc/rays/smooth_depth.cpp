@@ -20,8 +20,9 @@ float disparity_of(const SmoothDepth& in, int64_t ray) {
   return static_cast<float>(sum);
 }
 
-// Adds the gradient of a ray's samples, from the gradient of its disparity. The sum over samples behind runs from the
-// end.
+// Adds the gradient of the loss with respect to the outputs for a ray's samples. to_disparity: the gradient with
+// respect to the ray's disparity. The loop runs from the last sample to the first, since each sample needs sums over
+// the samples behind it.
 void learn_ray(const SmoothDepth& in, int64_t ray, float to_disparity, float* gradient) {
   double through = light_left(in, ray), behind = through / static_cast<double>(in.far[ray]);
   for (int64_t i = in.offsets[ray + 1]; i-- > in.offsets[ray];) {

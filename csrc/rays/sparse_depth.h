@@ -1,5 +1,6 @@
-// A loss for rays whose light does not come from near a known point, and its gradient: the first s of r rays, m
-// samples. Ray i owns samples offsets[i] : offsets[i + 1]. The formulas are in voronerf/ops/sparse_depth_gradient.
+// A loss for rays that end at known points, and its gradient: the first s of r rays, m samples. The loss of a ray is
+// small if its light comes from samples near the point. Ray i owns samples offsets[i] : offsets[i + 1]. The formulas
+// are in voronerf/ops/sparse_depth_gradient.
 #pragma once
 
 #include <cstdint>

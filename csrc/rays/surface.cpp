@@ -17,8 +17,9 @@ float fall(const Surface& in, int64_t i, float opacity, float next) {
   return beside ? std::max(opacity - next, 0.0f) : 0.0f;
 }
 
-// Returns the loss of a ray, and adds its gradient to the gradient of the samples. Places are disparities, which
-// decrease along the ray, so sums over samples behind run from the end. Samples without light are ignored.
+// Returns the loss of a ray, and adds its gradient to the gradient of the samples. The position of a sample (`place`)
+// is its disparity, which decreases along the ray. The loop runs from the last sample to the first, since each sample
+// needs sums over the samples behind it. Samples are ignored if the transmittance in front of them is at most `hidden`.
 float learn_ray(const Surface& in, int64_t ray, float share, float* gradient) {
   const int64_t begin = in.offsets[ray];
   int64_t end = begin;

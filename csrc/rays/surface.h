@@ -1,5 +1,5 @@
-// A loss for rays whose light does not come from a single surface, and its gradient: r rays, m samples. Ray i owns
-// samples offsets[i] : offsets[i + 1]. The formulas are in voronerf/ops/surface_gradient.
+// The distortion loss and the orientation loss of rays, and their gradient: r rays, m samples. Ray i owns samples
+// offsets[i] : offsets[i + 1]. The formulas are in voronerf/ops/surface_gradient.
 #pragma once
 
 #include <cstdint>

@@ -1,5 +1,5 @@
-// unseen_rays on the CPU. Each triple is a hash of the number of its middle ray, so that results do not depend on the
-// number of threads.
+// unseen_rays on the CPU. The random numbers of a triple are hashes of the seed and the index of its middle ray, so
+// that results do not depend on the number of threads.
 #include "rays/unseen_rays.h"
 
 #include <cmath>

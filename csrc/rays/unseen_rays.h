@@ -1,5 +1,5 @@
-// Triples of neighbouring rays from unseen places; they are the last of r rays. The formulas are in
-// voronerf/ops/unseen_rays.
+// Replaces the last 3 * triples of r rays by triples of neighbouring rays from positions without a camera. The formulas
+// are in voronerf/ops/unseen_rays.
 #pragma once
 
 #include <cstdint>
@@ -14,7 +14,7 @@ struct UnseenRays {
   RowCount triples, r;
 };
 
-// Changes origins and directions [r,3] in place.
+// Changes the last 3 * triples rows of origins and directions [r,3] in place.
 void unseen_rays_cpu(const UnseenRays& in, float* origins, float* directions, int threads);
 
 }  // namespace voronerf

@@ -10,7 +10,8 @@ CSRC = Path(__file__).resolve().parents[2] / "csrc"
 DECLARED = re.compile(r"constexpr (?:int|int32_t|int64_t) (k[A-Z][^;]*);")
 VALUE = re.compile(r"k\w+ = (?:int64_t\{(\d+)\}|(\d+))(?: << (\d+))?(?=,|$)")
 SMALL, MOST = 5, 1 << 20
-#: For blocks of at least this size, three blocks are tried only with one row more: full blocks, then one row.
+#: For blocks of at least this size, ``3 * size + 1`` is the only row count near three blocks: three full blocks and a
+#: block of one row.
 LARGE = 1 << 14
 
 

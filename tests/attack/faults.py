@@ -104,8 +104,8 @@ FAULTS = (
         "march_rays",
         "a ray that has all its samples goes on at the last of them",
         "rays/march_rays_isa.cpp",
-        "if (++filled == in.most) next = stratum + 1;",
-        "if (++filled == in.most) next = stratum;",
+        "if (++filled == in.max_samples) next = stratum + 1;",
+        "if (++filled == in.max_samples) next = stratum;",
     ),
     _kernel(
         "composite",
@@ -139,7 +139,7 @@ FAULTS = (
         "own_samples",
         "runs of bent rays go on across cells",
         "rays/ray_runs.cpp",
-        "(in.bent || cell != out.cells[count - 1])",
+        "(in.curved || cell != out.cells[count - 1])",
         "cell != out.cells[count - 1]",
     ),
     _kernel(
@@ -167,7 +167,7 @@ FAULTS = (
         "draw_pixels",
         "pixels of known depth are moved",
         "rays/draw_pixels.cpp",
-        "const int64_t first = std::min(std::max<int64_t>(begin, in.several), end);",
+        "const int64_t first = std::min(std::max<int64_t>(begin, in.known_count), end);",
         "const int64_t first = begin;",
     ),
     _kernel(
@@ -399,9 +399,9 @@ FAULTS = (
     _python(
         "What few samples have shown is not looked at again with more of them",
         "router/plan.py",
-        "if self.skip or (self.few and n >= FEWEST):",
+        "if self.skip or (self.small and n >= FEWEST):",
         "if self.skip:",
-        "tests/router/test_known.py",
+        "tests/router/test_call_cache.py",
     ),
     _python(
         "A loop over cells has PyTorch's third derivatives of layer norms",
@@ -422,7 +422,7 @@ FAULTS = (
         "router/dispatch.py",
         "has_rays, *call.kinds.items()]",
         "has_rays]",
-        "tests/router/test_known.py",
+        "tests/router/test_call_cache.py",
     ),
     _python(
         "A contraction's inverse is that of a ball of radius 1",

@@ -32,7 +32,7 @@ def plant(words: Sequence[str], results: Path | None = None) -> int:
         results: A JSON file for the outcomes; outcomes of other faults in the file stay.
 
     Returns:
-        The status of the command: 0 if at most one in fifteen was missed.
+        The exit status of the command: 0 if at most one in fifteen faults was not detected.
     """
     chosen = [fault for fault in FAULTS if not words or any(word in fault.what for word in words)]
     rows = []

@@ -73,7 +73,10 @@ def compare(op: str, call: dict[str, Any], viewed: dict[str, Any], *, gradients:
 
 
 def nearer(part: Tensor, other: Tensor, exact: Tensor) -> bool:
-    """Returns whether `part` is at least as close to float64 as the reference `other`, which may have cancellation."""
+    """Returns whether `part` is at least as close to the float64 result `exact` as the reference's result `other`.
+
+    The reference's float32 result may have lost digits to cancellation.
+    """
     if part.shape != other.shape:
         return False
     far, near = ((each.double() - exact).norm(torch.inf) for each in (other, part))
@@ -188,14 +191,14 @@ def check_message(op: str, call: dict[str, Any], names: list[str], error: Except
 
 
 def named(value: Any) -> set[str]:
-    """Returns the names of all parts of structs."""
+    """Returns the field names of all structs in a value, however deeply nested."""
     names = {str(key) for key, _ in parts(value)} if not isinstance(value, (list, tuple)) else set()
     names |= set(getattr(value, "_fields", ()))
     return names.union(*(named(part) for _, part in parts(value)))
 
 
 def parts(value: Any) -> list[tuple[Any, Any]]:
-    """Returns keys and parts of a list or struct."""
+    """Returns the (key, part) pairs of a list, dict or struct; other values have no parts."""
     if isinstance(value, (list, tuple)):
         return list(enumerate(value))
     if isinstance(value, dict):

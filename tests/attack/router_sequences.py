@@ -204,7 +204,7 @@ def random_sequence(rng: random.Random, folder: Path, inputs: Path) -> str:
     measure = dispatch.measure
 
     def drawn(ways: Any, call: Any, grouping: Any) -> list[float]:
-        """Runs the evaluation paths as in a measurement, but returns random times."""
+        """Runs each evaluation path like `dispatch.measure`, but returns random times, so that any path may win."""
         return [rng.random() for _ in measure(ways, call, grouping)]
 
     sequence = Sequence(rng)
@@ -356,7 +356,7 @@ class Sequence:
         return tensors(result)
 
     def _expected(self, method: str, flat: list[Tensor]) -> tuple[list[Tensor], list[nn.Module]]:
-        """Returns the results of the loop over masks (constants in frozen cells), and the module of each cell."""
+        """Returns the results of the loop over masks, and the module of each cell; frozen cells have no gradient."""
         router, results = self.router, list[Tensor]()
         cells, frozen = router.assign(flat[0][:, :3].detach()), router.frozen
         modules = [router.cell(i) for i in range(router.num_cells)]

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from voronerf import OccupancyGrid
-from voronerf.nerf import Batch, PlannedSplit, RenderOutput, Seen, SplitStrategy
+from voronerf.nerf import Batch, PlannedSplit, RayValues, RenderOutput, SplitStrategy
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # the tests' helpers
 
@@ -73,8 +73,8 @@ def _set_strategy(training: Training) -> None:
 
 
 def _add_term(training: Training) -> None:
-    def clear(seen: Seen, batch: Batch) -> Tensor:
-        return 0.1 * (seen.opacity * (1 - seen.opacity)).mean() + 0.01 * (seen.colour * seen.weights.sum()).mean()
+    def clear(rays: RayValues, batch: Batch) -> Tensor:
+        return 0.1 * (rays.opacity * (1 - rays.opacity)).mean() + 0.01 * (rays.colour * rays.weights.sum()).mean()
 
     training.loss.terms = (*training.loss.terms, clear)
 
@@ -136,7 +136,7 @@ def _move(training: Training, rng: random.Random) -> None:
 
 
 def _lay_out(training: Training, rng: random.Random) -> None:
-    """Transposes or flips the images or the poses, or expands the first one."""
+    """Transposes or flips the tensor of the images or of the poses, or expands its first entry to all entries."""
     tensor = rng.choice((training.batches.images, training.batches.cameras.poses))
     every = [-1] * (tensor.dim() - 1)
     tensor.data = rng.choice(

@@ -19,7 +19,7 @@ def test_constants_of_kernels_are_found():
 @pytest.mark.native
 @pytest.mark.parametrize("op", COMPARED)
 def test_over_the_blocks_of_kernels(op):
-    """Compares with the reference on one and three threads; rays and cells are few, so that blocks split them."""
+    """Compares with the reference on one and three threads; rays and cells are few, so they extend over many blocks."""
     case, most, before = op_attacks.CASES[op], 5_000 if op in op_attacks.SLOW else 200_000, torch.get_num_threads()
     try:
         for n in blocks.sizes(most):

@@ -124,7 +124,7 @@ def test_foreign_contenders_compute_what_masks_do(name):
 
 @pytest.mark.parametrize("name", [name for name in cases_foreign.FIELDS if not re.search("2.19|torch-ngp", name)])
 def test_fused_foreign_fields_compute_what_masks_do(name):
-    """Compares the values and the gradients of every parameter; some fields have second derivatives in them."""
+    """Compares values and the gradients of every parameter; some values are derivatives of the field."""
     work = cases_foreign.foreign_work(cases_foreign.FIELDS[name], 300, 4, "forward+backward", CPU)
     fused = work.alternatives["fused"]()
     assert work.error(fused.adapt(fused.run(0))) < 1e-3

@@ -1,4 +1,4 @@
-"""Tests of benchmarks/cores.py: rows have all variants and a model, and a parallel region has a cost."""
+"""Tests of benchmarks/cores.py: the measured rows, and the modelled step times on more cores."""
 
 import cores
 import pytest

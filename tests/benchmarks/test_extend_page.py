@@ -13,7 +13,10 @@ from voronerf.nerf import SplitStrategy
 
 
 def test_the_distortion_of_the_page_is_that_of_its_source() -> None:
-    """Compares both terms with a float64 double sum over the samples of each ray, and compares their gradients."""
+    """Compares the page's `distortion` and `Distortion` with a float64 double sum over the samples of each ray.
+
+    The gradients of the two terms are compared with each other.
+    """
     own = own_parts.examples()
     gradients = []
     for term in (own["distortion"], own["Distortion"](0.01)):
@@ -37,7 +40,7 @@ def test_the_distortion_of_the_page_is_that_of_its_source() -> None:
 
 
 def test_what_is_timed_is_what_the_table_says() -> None:
-    """Checks that the named hooks run in Python, and that a replayed class has none."""
+    """Checks that the parts named in the table run hooks in Python, except `Twice`, which is marked as replayed."""
     own, python = own_parts.examples(), []
     for name, change in own_parts.WAYS.items():
         training = Training(cells=2)

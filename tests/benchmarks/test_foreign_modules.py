@@ -1,4 +1,4 @@
-"""Tests that all kinds of modules in public code's style run fused, and that public modules have stored results."""
+"""Tests that modules in the styles of public code run fused, and that the results file has a row per public module."""
 
 import json
 import sys

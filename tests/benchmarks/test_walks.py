@@ -1,4 +1,4 @@
-"""Tests of benchmarks/walks.py: cameras stay inside their place, and captures load with the right kind."""
+"""Tests of benchmarks/walks.py: cameras stay inside the box of their walk, and captures load as "inside-out"."""
 
 import pytest
 import walks

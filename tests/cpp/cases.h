@@ -63,7 +63,8 @@ void same(const Array<T>& a, const Array<T>& b, const char* what) {
 }
 
 // Results of the portable path in a case. The other instruction sets repeat its calls on the same random numbers.
-// Integers must be equal. Floats may differ by a small norm, since rounding may switch single ReLU units.
+// Integers must be equal. For floats, the norm of the difference must be small. Single floats may differ more, since
+// rounding may switch a ReLU unit.
 inline std::vector<Array<double>> portable;
 inline size_t compared = 0;
 

@@ -30,9 +30,9 @@ void members(voronerf::ProgramOperand& o) {
   read(o.parameter, o.spread, o.slot, o.stride, o.memory, o.input, o.pairs, o.start, o.width, o.place);
 }
 void members(voronerf::ProgramStep& s) {
-  read(s.op, s.function, s.binary, s.encoding, s.finish, s.hands, s.order, s.width, s.slot, s.stride, s.memory);
+  read(s.op, s.function, s.binary, s.encoding, s.finish, s.to_registers, s.order, s.width, s.slot, s.stride, s.memory);
   read(s.number, s.depth, s.sources, s.parameter, s.pairs, s.floats, s.from_registers, s.points, s.in_place, s.a, s.b);
-  read(s.first, s.taken);
+  read(s.first, s.operand_count);
 }
 void members(voronerf::ProgramSum& s) {
   read(s.sum, s.kind, s.adds, s.partial, s.o, s.i, s.start, s.width, s.stride, s.size);
@@ -131,7 +131,7 @@ Array<float> widened(const Tensor& tensor) {
 
 struct Case {
   const Description& d;
-  Array<int32_t> offsets, order, ray_index, turned;
+  Array<int32_t> offsets, order, ray_index, transposed;
   Array<Tensor> inputs, parameters;
   Array<TableType> input_types, parameter_types, output_types;
   Array<int64_t> strides;
@@ -171,9 +171,9 @@ struct Case {
           if (static_cast<int64_t>(at) % width >= width / 2) values[at] = std::fabs(values[at]);
         }
       }
-      turned.push_back(!ray && !half && width != 3 && below(4) == 0);
+      transposed.push_back(!ray && !half && width != 3 && below(4) == 0);
       for (int64_t at = 0; d.gradients >= 0 && static_cast<int64_t>(i) >= d.gradients && at < n * width; ++at) {
-        if (dark[turned.back() ? at % n : at / width]) values[at] = 0.0f;
+        if (dark[transposed.back() ? at % n : at / width]) values[at] = 0.0f;
       }
       input_types.push_back(half ? TableType::bfloat16 : TableType::float32);
       inputs.push_back(stored(values, input_types.back()));
@@ -222,7 +222,7 @@ struct Case {
     const bool keeping = keeps && !plain && !keep.empty();
     voronerf::ProgramInputs given{in.data(),
                                   input_types,
-                                  turned,
+                                  transposed,
                                   of_cells.data(),
                                   parameter_types,
                                   strides,

@@ -142,7 +142,11 @@ def any_steps(draw: random.Random) -> Program:
 
 
 def random_program(draw: random.Random, number: int) -> tuple[Program, int]:
-    """Returns a random program, and the index of its first gradient input if zero rows there add nothing, else -1."""
+    """Returns a random program, and the index of its first gradient input, or -1.
+
+    The compiled module leaves out the rows in which all gradient inputs are 0. The index is -1 if the program has no
+    gradient inputs, or if such rows contribute to its results.
+    """
     while True:
         program, first = (layer_table if number % 4 < 2 else any_steps)(draw), -1
         for _ in range(draw.choice(((0,), (1,), (0,), (1, 1, 2))[number % 4])):
@@ -175,7 +179,7 @@ ENUMERATORS = {"op": "ProgramOp", "function": "ProgramFunction", "binary": "Prog
 ENUMERATORS |= {
     "encoding": "ProgramEncoding",
     "finish": "ProgramFinish",
-    "hands": "ProgramHands",
+    "to_registers": "ProgramToRegisters",
     "layout": "ProgramLayout",
 }
 

@@ -28,7 +28,7 @@ def module() -> ModuleType:
 
 
 class _Both:
-    """The compiled module, in which the emulated module's entries take precedence."""
+    """A module with the entries of two modules: the emulated one (``over``) takes precedence over the compiled one."""
 
     def __init__(self, over: Any, under: Any) -> None:
         self._over, self._under = over, under

@@ -48,8 +48,9 @@ DENSE = MLP(
 )
 BROAD = MLP((Layer((POSITIONS,), 270, "sigmoid"), Layer((0, POSITIONS), 300, "sine"), Layer((1,), 3)), (2,), 2)
 
-# A network whose ReLU outputs are read late, twice, side by side, and while another value is live. A layer has two
-# chunks of outputs, and one chunk is narrow. Encodings are read twice, and there is every kind of head.
+# A network whose ReLU outputs are read by a much later layer, by two layers, beside other values in one layer, and
+# while another value is live. A layer has two chunks of outputs, and one chunk is narrow. Encodings are read twice. The
+# network returns its last layer (twice), a ReLU layer and a sigmoid layer.
 SKIPS = MLP(
     (
         Layer((POSITIONS,), 100, "relu"),

@@ -26,7 +26,7 @@ float float_of(uint32_t bits) {
 }
 
 // d += a b for a [16][kDepth] and b [kDepth][8], with kPerRegister elements per register; value(bits, part) unpacks
-// one.
+// one element.
 template <int kDepth, int kPerRegister, typename Value>
 void multiply(const char* name, float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2], const Value& value) {
   constexpr int kQuad = 4 * kPerRegister;  // elements along k in one register of each of four lanes

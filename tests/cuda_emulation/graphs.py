@@ -26,7 +26,7 @@ from torch.utils._pytree import tree_leaves
 from voronerf.ops._core import native as _native
 
 ASKED = "_workspace", "multiplies_halves"
-"""Suffixes of the names of functions that launch nothing."""
+"""Name suffixes of compiled functions that only answer a question of the host, such as a size, and launch no kernel."""
 
 
 def reads(function: Any, args: Any) -> bool:
@@ -108,7 +108,7 @@ class Graph(TorchDispatchMode):
 
 
 class Kernels:
-    """The compiled module, whose launches a capture stores."""
+    """A wrapper of the compiled module; during a capture, its functions store launches instead of running them."""
 
     def __init__(self, compiled: Any, seen: Seen) -> None:
         self._compiled, self._seen = compiled, seen

@@ -66,7 +66,7 @@ class Asked(TorchDispatchMode):
 
 
 class Watched:
-    """The compiled module with counted functions."""
+    """A wrapper of the compiled module, which counts the launches of each function."""
 
     def __init__(self, compiled: Any, module: Any, counted: Asked) -> None:
         self._compiled, self._module, self._counted = compiled, module, counted

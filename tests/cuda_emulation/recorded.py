@@ -23,13 +23,13 @@ from voronerf.ops._core import native as _native
 from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops.cell_sort.native import sort as sort_cells
 
-# The precision of products, and KiB of shared memory. The cases' 227 KiB give tiles of 64 rows, 40 KiB give tiles of 32
-# rows, and 12 KiB keep values in the workspace.
+# The precision of products, and KiB of shared memory. The ops' cases have 227 KiB, where each warp has its own rows.
+# With less memory, four warps share rows or, if even these do not fit, values are in the workspace (device memory).
 NETWORKS = (("bfloat16", 40), ("float16", 12), ("float32", 12))
 
 
 class Recorder:
-    """The compiled module, which records its kernel calls."""
+    """A wrapper of the compiled module, which records the calls of its kernels."""
 
     def __init__(self, compiled: Any, kernels: Any) -> None:
         self._compiled, self._kernels, self.calls = compiled, kernels, []
@@ -99,7 +99,8 @@ def recorded() -> list[tuple[int, str, list[Any]]]:
         records.append((shared * 1024, cases()[op].hostile, recorder.calls))
 
     for op in backends.ops("native", "cuda"):
-        # Sanitizers are slow per thread; lookups by an index already run in nearest_centre.
+        # Sanitizers cost time for every thread, so kinds with a lookup by an index are left out. The cases
+        # ``on_devices`` of nearest_centre have such lookups.
         kinds = (pins for kind, pins in cases()[op].kinds.items() if kind != "by an index")
         for pins in (*kinds, *cases()[op].on_devices):
             record(op, call_case, op, pins, cases()[op].device_rows)

@@ -50,7 +50,10 @@ def argument(module, value, memory):
 
 
 def harm(numbers, before, after):
-    """Replaces hostile indices and numbers in the arrays that a function only reads."""
+    """Writes hostile indices, and NaN or other hostile floats if ``numbers``, into arrays that a function only reads.
+
+    ``before`` and ``after`` hold the arrays before and after the recorded call; ``before`` is changed.
+    """
     for number, (array, changed) in enumerate(zip(before, after)):
         if array.tobytes() != changed.tobytes():
             continue
@@ -63,7 +66,7 @@ def harm(numbers, before, after):
 
 
 def same(found, expected):
-    """Returns whether values equal the recorded values; sums may differ slightly, since their order is free."""
+    """Returns whether values equal the recorded values; sums may differ by rounding, as their order is not fixed."""
     if found.dtype.kind != "f" or not found.size:
         return found.dtype.itemsize < 4 or np.array_equal(found, expected)
     size = max(np.abs(np.nan_to_num(expected, posinf=0, neginf=0)).max(), 1e-6)

@@ -1,4 +1,4 @@
-"""Tests of layer tables on the emulated CUDA kernels, with each kind of product and of tile."""
+"""Tests of layer tables on the emulated CUDA kernels, with every kind of product and three sizes of shared memory."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 
 EVERY = tuple(ALLOWED)
 TILES = (227, 40, 12)
-"""KiB of shared memory, for tiles of 64 rows, tiles of 32 rows, and values in the workspace."""
+"""KiB of shared memory. Where it suffices, each warp has its own rows. Otherwise, four warps share rows or, if even
+these rows do not fit, values are in the workspace (device memory)."""
 SMOOTH = {
     "branched": (BRANCHED, [70, 0, 1, 150], 3, EVERY),
     "wide": (WIDE, [37, 3], 7, EVERY[:2]),
@@ -116,8 +117,8 @@ def test_rows_are_gathered_and_scattered_and_every_order_of_threads_gives_the_sa
 
 WHOLE = {
     "two parts": MLP((Layer((POSITIONS,), 40, "relu"), Layer((0,), 70, "relu"), Layer((1, 0), 5)), (2,)),
-    # Values of one or two chunks stay in registers from layer to layer. Layers sum up to three products, and both the
-    # next and a later layer read a value.
+    # Values of one or two chunks stay in registers from layer to layer. A layer is the sum of at most three products.
+    # Some values are read both by the next and by a later layer.
     "in registers": MLP(
         (
             *(Layer((POSITIONS,), 64, "relu"), Layer((0,), 64, "relu"), Layer((1,), 32, "relu")),

@@ -24,7 +24,8 @@ from test_grouped_program import NUMBERS, arguments, check, derivatives, offsets
 
 KIB = 1024
 TILES = [227 * KIB, 40 * KIB, 12 * KIB]
-"""Bytes of shared memory: enough for rows per warp, for rows shared by a team of warps, and for neither."""
+"""Bytes of shared memory. Where it suffices, each warp has its own rows. Otherwise, four warps share rows or, if even
+these rows do not fit, values are in the workspace (device memory)."""
 ALLOWED = {"float32": 2e-5, "tf32": 4e-3, "float16": 4e-3, "bfloat16": 3e-2}
 """Allowed relative errors (norm) by the precision of products."""
 LARGEST = 65504.0
@@ -100,7 +101,7 @@ def test_values_and_derivatives_of_second_order() -> None:
 @pytest.mark.parametrize("products", ALLOWED)
 @pytest.mark.parametrize("widths", [[3, 5, 1], [17, 70, 33, 66], [64, 64, 64, 4]], ids=str)
 def test_products_of_every_precision(products: str, widths: list[int], shared_bytes: int) -> None:
-    """Covers widths near the width of a block and of a strip."""
+    """Covers layers near 4, 16, 32 and 64 columns; kernels compute 64 columns at a time, or fewer in narrow layers."""
     program, sizes = layers_of(widths), [65, 0, 31, 1]
     tensors = tensors_of(program, sizes)
     exact = outcome(program, tensors, offsets_of(sizes))
@@ -254,7 +255,7 @@ def test_what_was_looked_up_is_not_looked_up_again() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_types_in_memory(dtype: torch.dtype) -> None:
-    """Compares with float32 results for the same arguments, rounded afterwards."""
+    """Checks that results equal float32 results for the same arguments, rounded to the type."""
     program = every_step()
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
     inputs = plans.Rows(rows, [p.float() for p in parameters], offsets, None, None)

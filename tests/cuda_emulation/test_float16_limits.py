@@ -1,6 +1,6 @@
 """Tests of networks on CUDA with values near and above float16's largest number: no NaN where float32 has none.
 
-The tests cover every activation, in tiles of 64 rows and with values in the workspace. Values are clamped to 65,504
+The tests cover every activation, with values in shared memory and in the workspace. Values are clamped to 65,504
 when a layer reads them. Gradients overflow to infinity, which a GradScaler detects. Other samples and cells keep their
 precision.
 """

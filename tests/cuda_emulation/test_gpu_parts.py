@@ -41,7 +41,10 @@ def check():
 @pytest.mark.slow
 @pytest.mark.native
 def test_the_first_call_on_the_emulated_device(tmp_path):
-    """Runs every case in its small version, in separate processes, and checks the verdict."""
+    """Runs the first call of `make gpu-check`, every case with small sizes, in separate processes.
+
+    Checks that all cases are right, and what the summary and the printed verdict contain.
+    """
     command = [sys.executable, str(GPU / "gpu_check.py"), "first", "--emulated", "--parts", "cases", "counters"]
     result = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True)
     assert result.returncode == 0, result.stdout
@@ -81,7 +84,10 @@ def test_cases_by_name(parts, tmp_path):
 
 @pytest.mark.native
 def test_a_row_of_a_network_is_captured(parts, monkeypatch, tmp_path):
-    """Captures a row with gradients, which is too slow for the emulated call; a row that waits is not captured."""
+    """Captures the benchmark of a network with gradients as a CUDA graph; the test of the first call lacks the time.
+
+    A benchmark in which the host waits for the device is not captured.
+    """
     timings, journal = sys.modules["gpu_timings"], parts.Journal(tmp_path / "cases.json")
     monkeypatch.setattr(timings, "MOST_CALLS", 2)
     monkeypatch.setattr(timings, "MOST_REPEATS", 1)
@@ -94,7 +100,7 @@ def test_a_row_of_a_network_is_captured(parts, monkeypatch, tmp_path):
 
 
 def test_counted_launches(parts):
-    """Checks that each entry launches a kernel of this project."""
+    """Checks that each of the launches for ncu launches a kernel of this project."""
     with emulated() as module:
         launches = parts.counted("cpu", 256)
         for name, before, launch in launches:
@@ -248,7 +254,7 @@ def test_the_summary_has_all_that_a_part_has_found(check, monkeypatch, tmp_path)
 
 
 def test_calls_fit_their_time(check, parts, monkeypatch, tmp_path):
-    """Checks that parts run in turn, the last part ends with the call, and no tool changes the GPU's settings."""
+    """Checks that the time limits of parts rise up to the limit of the call, and no tool changes the GPU's settings."""
     monkeypatch.setattr(check.shutil, "which", lambda name, **_: f"/bin/{name}")
     for call, seconds in (("first", 390), ("second", 240)):
         known = check.parts(call, tmp_path, tmp_path, ["adam"], emulated=False)

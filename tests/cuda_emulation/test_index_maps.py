@@ -18,7 +18,7 @@ def test_a_lanes_sums_are_those_of_the_tile():
 
 
 def test_a_tile_is_of_the_cell_that_counts_it():
-    """Checks all combinations of up to four cells with up to three tiles each."""
+    """Finds the cell of each tile: for all sets of up to four cells with up to three tiles each, and for many cells."""
     for cells in range(1, 5):
         for tiles in itertools.product(range(4), repeat=cells):
             first = [0, *itertools.accumulate(tiles)]

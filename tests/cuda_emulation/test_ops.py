@@ -88,12 +88,12 @@ def test_cell_sort_keeps_cells_that_are_none_at_the_ends(way, k):
 
 def test_draw_pixels():
     lengths = torch.randint(1, 9, (70,))
-    runs = draw_pixels_reference.Runs.of(torch.arange(70) * 10, lengths)
-    known = draw_pixels_reference.Known(torch.randint(99, (20,)), torch.rand(20), 0)
+    runs = draw_pixels_reference.PixelRuns.of(torch.arange(70) * 10, lengths)
+    known = draw_pixels_reference.KnownPixels(torch.randint(99, (20,)), torch.rand(20), 0)
     for below, given in ((10**10, None), (runs.total, runs)):
         for count in (0, 1, 300):
             arguments = torch.randint(-(2**31), 2**31, (1,), dtype=torch.int32), count, below, given
-            arguments += (known._replace(several=count // 2) if count > 1 else None,)
+            arguments += (known._replace(draws=count // 2) if count > 1 else None,)
             expected = draw_pixels_reference.draw_pixels(*arguments)
             assert same(draw_pixels.draw_pixels(*arguments), expected)
 

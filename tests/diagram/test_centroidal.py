@@ -1,4 +1,4 @@
-"""Centroidal centres against a plain loop: weighted, re-seeded and nested ones."""
+"""Weighted, re-seeded and nested centroidal centres, compared with a plain loop."""
 
 import sys
 

@@ -256,7 +256,7 @@ def test_uniform_centres_of_any_number_lie_apart_in_the_box(k):
     assert centres.shape == (k, 3)
     assert bool(((centres > box[0]) & (centres < box[1])).all())
     assert torch.unique(centres, dim=0).shape[0] == k
-    # Each part of the box has the same volume, so uniform points fall into cells of about equal size.
+    # The box is cut into k parts of equal volume, one for each centre, so cells get about equal numbers of points.
     points = box[0] + torch.rand(20_000, 3, generator=seeded(0)) * (box[1] - box[0])
     counts = torch.bincount(VoronoiDiagram(centres).locate(points), minlength=k) * k / points.shape[0]
     assert float(counts.max()) < 2.2

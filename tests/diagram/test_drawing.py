@@ -78,7 +78,7 @@ def test_many_cells(device, k, temperature):
 
 
 def test_numbers_at_and_beyond_the_ends(device):
-    """0 draws the last centre that has mass, and a number just below 1 draws the first such centre."""
+    """Numbers up to 0 and NaN draw the last centre with a nonzero probability, numbers near or above 1 the first."""
     centres = torch.tensor([[50.0, 0, 0], [0, 0, 0], [1, 0, 0], [60, 0, 0]], device=device)
     uniforms = torch.tensor([0.0, -3.0, math.nan, 1 - 2**-24, 1.0, 7.0], device=device)
     leaves = draw(torch.zeros(6, 3, device=device), centres, uniforms, 0.5)
@@ -86,7 +86,10 @@ def test_numbers_at_and_beyond_the_ends(device):
 
 
 def test_the_reference_where_sums_do_not_rise(monkeypatch):
-    """If sums are added in a tree, as on a GPU, rounding makes the last padded column exceed the last centre's sum."""
+    """Padding columns are not drawn if cumulative sums are added in a tree, as on a GPU.
+
+    Rounding then makes the sum at the last padding column larger than the sum at the last centre.
+    """
 
     def tree(values, dim):
         step = 1
@@ -132,5 +135,5 @@ def test_many_points_cross_the_pieces_and_do_not_depend_on_their_neighbours(devi
     leaves = run(slice(None))
     expected = slow(points[::97].cpu(), centres.cpu(), (CHILD_OFFSETS, CHILD), uniforms[::97].cpu(), 0.2, DEPTH)
     agree(leaves[::97].cpu(), *expected, tolerance=1e-5)
-    # The order of the sums may depend on the shape.
+    # The order in which sums are added may depend on the shape, so a leaf may differ.
     assert int((run(slice(5, 4242)) != leaves[5:4242]).sum()) <= 1

@@ -64,7 +64,7 @@ def test_named_cells_and_minimum_of_samples():
 
 
 def test_just_enough_samples_are_enough():
-    """A cell splits if its distinct samples number at least the children and the minimum, and else stays a leaf."""
+    """A cell splits if it has at least as many distinct samples as children, and at least the minimum of samples."""
     root = VoronoiDiagram(torch.tensor([[0.0, 0, 0], [10.0, 0, 0]]))
     points = torch.cat((torch.rand(4, 3, generator=seeded(2)), torch.rand(3, 3, generator=seeded(3)) + root.centres[1]))
     split = split_diagram(root, points, torch.ones(7), 4, generator=seeded(1))

@@ -60,7 +60,7 @@ def test_an_instruction_set_that_is_not_there_is_refused() -> None:
 
 
 def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Functions are bound by name, not by number, so one side cannot confuse a function that the other lacks."""
+    """Functions are bound by name, not by number: a function that only Python knows is not mistaken for another."""
     monkeypatch.setitem(FUNCTIONS, "cube", Function(lambda x, a, b: x**3))
     b = Builder()
     program = b.program([b.apply("cube", b.input(3))])
@@ -85,7 +85,8 @@ def test_layers_hand_words_and_sums_to_the_next_on_cuda(monkeypatch: pytest.Monk
         table = MLP(layers, (len(layers) - 1,))
         text = table.program(3, 0, tuple(layer.width for layer in layers), (True,) * len(layers), False).text
         lowering.lower.__wrapped__(text, layout, True)
-        return [(s.hands, s.from_registers, s.pairs >= 0 or s.floats) for s in programs[-1].steps if s.op == "linear"]
+        steps = [s for s in programs[-1].steps if s.op == "linear"]
+        return [(s.to_registers, s.from_registers, s.pairs >= 0 or s.floats) for s in steps]
 
     first, positions = Layer(("positions",), most, "relu"), Layer(("positions",), 5)
     assert linear(first, Layer((0,), most, "relu"), Layer((1,), 4)) == [
@@ -93,7 +94,8 @@ def test_layers_hand_words_and_sums_to_the_next_on_cuda(monkeypatch: pytest.Monk
         ("words", True, False),
         ("nothing", True, True),
     ]
-    # The partial sum of two products stays in registers, and so do the words that the first layer hands on.
+    # The partial sum of two products stays in registers. So does the output of the first layer, as words (packed pairs
+    # of 16-bit numbers).
     assert linear(first, Layer(("positions", 0), 5)) == [
         ("words", False, False),
         ("sums", False, False),
@@ -101,6 +103,6 @@ def test_layers_hand_words_and_sums_to_the_next_on_cuda(monkeypatch: pytest.Monk
     ]
     assert linear(first, Layer((0,), 7, "relu"), Layer((1, 0), 5))[0] == ("words", False, True)
     wide = Layer((0,), most + 1, "relu")
-    assert [hands for hands, _, _ in linear(first, wide, Layer((1,), 4))] == ["nothing"] * 3
-    assert [hands for hands, _, _ in linear(first, Layer((0,), 4), layout="floats")] == ["nothing"] * 2
+    assert [to_registers for to_registers, _, _ in linear(first, wide, Layer((1,), 4))] == ["nothing"] * 3
+    assert [to_registers for to_registers, _, _ in linear(first, Layer((0,), 4), layout="floats")] == ["nothing"] * 2
     assert linear(positions) == [("nothing", False, True)]

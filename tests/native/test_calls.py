@@ -122,7 +122,10 @@ def test_arguments_of_other_kinds_are_checked_in_python():
 
 
 def test_freed_memory_is_refused():
-    """This holds also for transposed inputs of programs and for scalars of Adam, whose addresses are read directly."""
+    """Tensors without memory are refused, also scalars of Adam and transposed inputs of programs.
+
+    The compiled module reads the addresses of these tensors directly.
+    """
     gone = torch.tensor(0.0)
     gone.untyped_storage().resize_(0)
     ones = [torch.ones(3)], [torch.ones(3)], [torch.zeros(3)], [torch.zeros(3)]
@@ -163,7 +166,7 @@ def test_a_recording_has_calls_of_which_modes_hear_nothing():
         taken = recording.take(points)
         with _disable_current_modes():
             cells = nearest_centre(taken, centres)
-    assert recording.replay(threads=1, taken=[others])
+    assert recording.replay(threads=1, inputs=[others])
     assert torch.equal(recording.now(cells), nearest_centre(others, centres))
 
 

@@ -123,7 +123,8 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     torch.set_num_threads(before)
 
 
-# Up to k / 64 rows are sorted by digits. Up to 4096 cells take two chunks per thread. Long sorts prefetch.
+# A call with at most k / 64 rows is a radix sort. In other calls, threads have two chunks if there are at most 4096
+# cells and many rows. Calls with the most rows prefetch.
 @pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 4096, 4097, 5000, 100_000])
 @pytest.mark.parametrize("n", [0, 1, 2, 33, 64, 1562, 1563, 2047, 2048, 2049, 8191, 8192, 50_001, 131_329])
 def test_sort(threads: int, n: int, k: int) -> None:

@@ -18,7 +18,8 @@ from voronerf.ops.grouped_linear import reference as specification
 native = pytest.importorskip("voronerf.ops.grouped_linear.native")
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
-# Even and odd widths, whole vectors of 16 or 32, more than a panel; o above and below a granule.
+# Even and odd widths, multiples of 16 and 32, and more columns than a panel of packed weights (16 or 64). o is below,
+# equal to or above 16, since outputs are padded to a multiple of 16.
 WIDTHS = ((63, 64), (64, 63), (64, 64), (48, 16), (16, 48), (1, 1), (3, 90), (90, 4), (256, 32), (32, 129))
 # The cells have 0, 1, 96, 0, 199 and 2 rows; a tile has 96. Rows without a cell lie before and after them.
 OFFSETS = (2, 2, 3, 99, 99, 298, 300)

@@ -59,7 +59,7 @@ NETWORKS = {
     "hashed 256": hashed(nerf(256, 2), 2, levels=5, features=8, finest=30, box=((-1, -1, -1), (0, 1, 2))),
     "sigmoid": chain(20, 2, activation="sigmoid"),
     "sine": chain(20, 2, activation="sine"),
-    # Layers with few outputs: inputs fill whole vectors, some are concatenated, and other layers read some outputs.
+    # Layers with few outputs: inputs fill whole vectors or are concatenations, and other layers read some outputs.
     "heads": MLP(
         (
             Layer(("positions",), 64, "softplus"),

@@ -36,7 +36,7 @@ def encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], lis
 
 
 def all_encodings(n: int, octaves: int = 4) -> list[tuple[Callable[..., Tensor], list[Tensor]]]:
-    """Returns the encodings, and spherical harmonics, which are not small for large directions."""
+    """Returns the frequency and integrated encodings, and spherical harmonics of degrees 2 to 4, with their inputs."""
 
     def harmonics(degree: int, x: Tensor, backend: str) -> Tensor:
         return spherical_harmonics(x, degree, backend=backend)

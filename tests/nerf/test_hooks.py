@@ -306,7 +306,10 @@ class Called(RayLoss):
 
 
 def test_no_behaviour_of_a_subclass_is_passed_over():
-    """A property, an overridden ``__call__``, and a base's hook behind a class marked as replayed all run in Python."""
+    """A property, an overridden ``__call__`` and a hook of an unmarked base class run in Python.
+
+    In the method resolution order, the base class follows a class that is marked as replayed.
+    """
 
     @replayed
     class Marked(SplitStrategy):

@@ -301,7 +301,7 @@ def test_the_empty_space_of_a_contracted_scene_is_skipped(space):
 
 
 def test_a_translucent_field_is_walked_to_its_end():
-    """Rays that never become opaque are sampled up to the last wave."""
+    """Rays that never become opaque are sampled to their end, a few samples at a time (in waves)."""
     options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 128, "background": WHITE}
     plain = render_image(Ball(0.7), cameras(), 1, **options)
     quick = render_image(Ball(0.7), cameras(), 1, occupancy=tight_grid(), **options)
@@ -321,7 +321,7 @@ def test_a_ray_that_ends_has_the_colour_before_its_end():
     rays = Rays(torch.tensor([[0.0, 0, -1], [0, 0, 0.9]]), torch.tensor([[0.0, 0, 1]]).expand(2, 3))
     sampler = Occupancy(OccupancyGrid(BOX, 4, threshold=0.1), 200, picture_samples=200)
     ends = torch.zeros(2), torch.tensor([2.0, 0.1])
-    seen = sampler.see(fog, rays, *ends, background=WHITE, heaviest=True)
+    seen = sampler.render_colours(fog, rays, *ends, background=WHITE, heaviest=True)
     left = math.exp(-0.8)  # light from behind the second ray, which is not ended early
     torch.testing.assert_close(seen.colour[:, 0], torch.tensor([0.25, 0.25 * (1 - left) + left]))
     torch.testing.assert_close(seen.opacity, torch.tensor([1.0, 1 - left]))
@@ -355,7 +355,7 @@ def test_rays_that_meet_nothing_show_the_background():
     ends = torch.full((3,), 0.1), torch.full((3,), 0.9)
     asked = Ball()
     sampler = Occupancy(grid, 8, picture_samples=8)
-    seen = sampler.see(asked, rays, *ends, background=WHITE, heaviest=True)
+    seen = sampler.render_colours(asked, rays, *ends, background=WHITE, heaviest=True)
     assert asked.asked == 0
     assert torch.equal(seen.colour, torch.ones(3, 3)) and torch.equal(seen.depth, ends[1])
     assert torch.equal(seen.heaviest, 0.9 * torch.eye(3))
@@ -421,7 +421,10 @@ def ends(rays):
 )
 @pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
 def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse_depth, robust):
-    """The loss includes the sparse depths of the last rays, which lie before, inside and behind the grid."""
+    """The loss and its gradients equal the results for the same field without a layer table.
+
+    Some cases have the sparse-depth term of the batch's last rays, which end in front of, inside and behind the grid.
+    """
     grid = tight_grid()
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
     rays = cameras().image_rays(0)

@@ -27,7 +27,7 @@ def test_dense_groups_are_torchs():
 
 @pytest.mark.parametrize("option", ["weight_decay", "amsgrad", "maximize", "differentiable"])
 def test_options_that_are_not_there_are_refused(option):
-    """Unsupported options are refused in a new group, and before a step changes anything if they are set later."""
+    """Unsupported options are refused in a new group; if set later, they are refused at the start of a step."""
     weight = torch.nn.Parameter(torch.ones(3))
     value = 0.1 if option == "weight_decay" else True
     with pytest.raises(ValueError, match=f"Adam: {option} of a group must be 0 or False, got {value}"):

@@ -25,9 +25,9 @@ class Borrowed(Sampler):
     def sample(self, rays, near, far, *, jitter=False, generator=None):
         return self.other.sample(rays, near, far, jitter=jitter, generator=generator)
 
-    def see(self, field, rays, near, far, **options):
+    def render_colours(self, field, rays, near, far, **options):
         self.seen += 1
-        return self.other.see(field, rays, near, far, **options)
+        return self.other.render_colours(field, rays, near, far, **options)
 
 
 class Never(Strategy):
@@ -62,7 +62,7 @@ def test_a_sampler_with_a_grid_is_fused_and_walks_pictures() -> None:
     assert losses[1].explain().startswith("samples: Borrowed, 16 a ray\nloss: networks, colours, loss and gradients in")
     results = [loss(batch, torch.Generator().manual_seed(1)) for loss in losses]
     assert torch.equal(results[0].loss, results[1].loss) and 0 < len(results[0].weights) < 32
-    pictures = [loss.renderer.see(rays, batch.near, batch.far) for loss in losses]
+    pictures = [loss.renderer.render_colours(rays, batch.near, batch.far) for loss in losses]
     assert torch.equal(pictures[0].colour, pictures[1].colour) and losses[1].renderer.sampler.seen == 1
     assert losses[1].renderer.occupancy is grid
 
@@ -73,7 +73,7 @@ def test_a_training_asks_no_more_of_a_rule_than_strategy_names(tmp_path) -> None
     state = build(config, scene)
     state.strategy = state.training_step.strategy = Never()
     run(state, [Checkpoints(tmp_path)])
-    assert state.strategy.steps == state.step == 12 and state.strategy.left == 0
+    assert state.strategy.steps == state.step == 12 and state.strategy.remaining == 0
     again = build(config, scene)
     again.strategy = Never()
     load(again, snapshot(state))

@@ -109,7 +109,7 @@ def batch_of(rays=64, sparse=0, unseen=0):
 
 
 def losses(field, monkeypatch, backend="auto", **terms):
-    """Returns a loss with the fast step and one with separate operations; both differentiate all samples."""
+    """Returns two losses, with the fast step and with separate operations; both differentiate all samples."""
     monkeypatch.setattr("voronerf.nerf.loss.HIDDEN", 0.0)
     grid = OccupancyGrid(BOX, 8, threshold=0.1)
     grid.occupied = torch.rand(8, 8, 8, generator=seeded(5)) < 0.7
@@ -159,7 +159,7 @@ def term_of_all(seen, batch):
 
 @pytest.mark.parametrize("name", ["softplus", "relu", "table"])
 def test_with_a_term_in_torch(name, monkeypatch):
-    """Both steps carry the term's gradients through the outputs of the networks."""
+    """The fast step and separate operations carry the term's gradients through the outputs of the networks."""
     router, field = make(name)
     fast, separate = losses(field, monkeypatch, terms=[SparseDepth(0.3), term_of_all])
     compare(router, fast, separate, batch_of(sparse=20))
@@ -319,10 +319,11 @@ def test_pictures_and_densities_are_those_of_the_field(name):
     with torch.no_grad():
         for of in (field, lambda *arguments: field(*arguments)):
             renderer = renderer_of({"field": of}, samples=40, occupancy=grid)
-            seen.append(renderer.see(batch.rays, batch.near, batch.far, torch.ones(3)))
+            seen.append(renderer.render_colours(batch.rays, batch.near, batch.far, torch.ones(3)))
             densities.append(density_of(of, points))
     torch.testing.assert_close(*densities, rtol=1e-4, atol=1e-5)
-    # Rays end after a wave. The lengths of waves differ here, and so does the remaining light at the end.
+    # An opaque ray ends after a wave (a few samples of each ray). The waves of the two renderings have different
+    # lengths, so rays end with different amounts of remaining light.
     torch.testing.assert_close(seen[0].colour, seen[1].colour, rtol=0, atol=0.06)
     with torch.no_grad():
         assert isinstance(radiance_of(field), Radiance)

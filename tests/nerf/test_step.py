@@ -133,13 +133,16 @@ def test_numbers_of_rows_that_were_the_same():
         results = [nearest_centre(recording.take(torch.rand(6, 3)), centres) for _ in range(2)]
     for rows in ((4, 7), (7, 6), (6, 6)):
         points = [torch.rand(count, 3) for count in rows]
-        assert recording.replay(1, taken=points) == 1
+        assert recording.replay(1, inputs=points) == 1
         for cells, arguments in zip(recording.now(results), points, strict=True):
             assert torch.equal(cells, nearest_centre(arguments, centres))
 
 
 def test_a_number_of_rows_that_is_no_count_is_refused():
-    """A replay would repeat the recorded number of rows, or write to memory with fewer rows."""
+    """A recording refuses a row count that is a plain int, since a replay cannot read the count again.
+
+    The replay would use the recorded number of rows, or write beyond the end of memory that has fewer rows.
+    """
     points, centres = torch.rand(6, 3), torch.rand(5, 3)
     with Recording() as recording:
         nearest_centre(points, centres)
@@ -154,14 +157,14 @@ def test_a_number_of_rows_that_is_no_count_is_refused():
 
 
 def test_torch_entry_by_entry_is_computed_again():
-    """Replays repeat pointwise operations in place, into new memory and on a column; others are refused."""
+    """Replays repeat pointwise operations of torch on tensors of rows and on column slices, in place or not."""
     with Recording() as recording:
         x = recording.take(torch.rand(6, 3))
         y = torch.sigmoid(x[:, 1]) * 2
         x[:, :2].addcmul_(y[:, None], y[:, None], value=3.0)
     for rows in (5, 7, 6):
         arguments = torch.rand(rows, 3)
-        assert recording.replay(1, taken=[arguments]) == 1
+        assert recording.replay(1, inputs=[arguments]) == 1
         expected = arguments.clone()
         own = torch.sigmoid(expected[:, 1]) * 2
         expected[:, :2].addcmul_(own[:, None], own[:, None], value=3.0)
@@ -177,12 +180,12 @@ def test_a_replay_refuses_what_a_call_finds_wrong():
     cells = torch.tensor([0, 2, 1, 2, 0, 1], dtype=torch.int32)
     with Recording() as recording:
         order, _ = cell_sort(recording.take(cells), 3)
-    assert recording.obstacle is None and recording.replay(1, taken=[cells]) == 1
+    assert recording.obstacle is None and recording.replay(1, inputs=[cells]) == 1
     cells[3] = 5
     with pytest.raises(ValueError, match="cell_sort: indices out of range"):
-        recording.replay(1, taken=[cells])
+        recording.replay(1, inputs=[cells])
     cells[3] = 0
-    assert recording.replay(1, taken=[cells]) == 1 and order.tolist() == [0, 3, 4, 2, 5, 1]
+    assert recording.replay(1, inputs=[cells]) == 1 and order.tolist() == [0, 3, 4, 2, 5, 1]
 
 
 @pytest.mark.parametrize(
@@ -229,7 +232,7 @@ def test_what_changes_is_followed(change):
 
 
 def new_data(*tensors):
-    """Moves tensors to other memory; values stay the same, but images are inverted."""
+    """Moves tensors to other memory and keeps their values, except that images (uint8) are inverted."""
     for tensor in tensors:
         tensor.data = 255 - tensor.data if tensor.dtype == torch.uint8 else tensor.data.clone()
 
@@ -321,7 +324,10 @@ def test_recordings_that_are_never_replayed_are_made_less_often():
 
 
 def test_gradients_that_were_dropped_are_given_back():
-    """A step restores its gradient tensors if the loop has set gradients to None, replaced or added them."""
+    """A step restores its own gradient tensors after the loop has changed ``grad`` attributes.
+
+    The loop has set a gradient to None, replaced a gradient, and assigned a gradient to a frozen parameter.
+    """
     one, other = Training(), Training()
     for training, as_it_is in ((one, False), (other, True)):
         list(training.router.parameters())[-2].requires_grad_(False)

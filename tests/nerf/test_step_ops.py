@@ -45,7 +45,7 @@ class Calls(TorchDispatchMode):
 @pytest.mark.native
 @pytest.mark.parametrize("contracted", [False, True])
 def test_a_step_computes_in_ops_alone(contracted):
-    """The step has near cameras, sparse points, unseen rays and empty voxels, and evaluates voxels."""
+    """The step scales gradients near cameras, has sparse points, unseen rays and empty voxels, and evaluates voxels."""
     cameras = orbit_cameras(4, radius=2.0, elevation=10.0, width=20, height=20, focal=22.0)
     images = torch.randint(255, (4, 20, 20, 3), dtype=torch.uint8)
     sparse = torch.randint(1600, (50,)), torch.rand(50) + 1

@@ -128,7 +128,10 @@ def test_what_is_near_the_camera_learns_less(marched):
 
 
 def test_the_last_rays_end_at_points():
-    """The loss is minus the log of the weights near a point: within 3 % of its distance plus a sample length, 0.25."""
+    """The loss is minus the log of the sum of the weights near a point.
+
+    A sample is near if its distance from the point is at most 3 % of the point's depth, plus the sample's length, 0.25.
+    """
     ahead = Rays(torch.zeros(3, 3), torch.tensor([[0.0, 0, 1]]).expand(3, 3))
     fog = lambda positions, *_: (torch.zeros_like(positions), torch.full_like(positions[:, 0], 0.5))  # noqa: E731
     renderer = renderer_of({"field": fog}, samples=8)

@@ -19,7 +19,7 @@ COUNTS = {
     "unequal": [1, 0, 9001, 2],
     "single cell": [33],
 }
-"""The numbers of samples in the cells: none, one, odd numbers and empty cells, more than two pieces, a single cell."""
+"""The numbers of samples in the cells, by name; "unequal" has a cell with more rows than two tasks of a kernel."""
 
 
 def need(op, backend, device, dtype):

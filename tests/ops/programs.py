@@ -44,7 +44,9 @@ class ByPrograms(torch.autograd.Function):
 
 
 def derivatives(run, tensors, orders=3):
-    """Returns the results of ``run(*leaves)`` and derivatives; each order differentiates a weighted sum of the last.
+    """Returns the results of a function, and their derivatives up to an order.
+
+    Each order has the gradients of a randomly weighted sum of the previous order's tensors.
 
     Args:
         run: a function of tensors that returns a list of tensors.
@@ -52,7 +54,7 @@ def derivatives(run, tensors, orders=3):
         orders: the number of derivatives.
 
     Returns:
-        The results, followed by the gradients to all arguments for each order.
+        The results, followed by the gradients with respect to all arguments for each order.
     """
     generator = torch.Generator().manual_seed(5)
     leaves = [tensor.clone().requires_grad_() for tensor in tensors]

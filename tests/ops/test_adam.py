@@ -32,17 +32,17 @@ def test_leaves_out_a_step_wherever_a_gradient_is_not_finite(device, backend):
     sizes, judged = [3, 90, 530_001, 0, 4097], [True, False, True, True, True]
     tensors = [[torch.ones(n, device=device) for n in sizes] for _ in range(4)]
     gradients, guard = tensors[1], Guard.on(device)
-    rules = [Rule(torch.zeros((), device=device), 0.1, every=every) for every in judged]
+    rules = [Rule(torch.zeros((), device=device), 0.1, dense=every) for every in judged]
     places = [(0, 2), (2, 0), (2, 4095), (2, 4096), (2, 127 * 4096), (2, 530_000), (4, 0), (4, 4096)]
     for number, (which, place) in enumerate(places):
         gradients[which][place] = torch.nan
-        adam(rules, *tensors, guard=guard, loss=guard.found + 1, backend=backend)
-        assert bool(guard.found) and float(guard.in_a_row) == float(guard.skipped) == number + 1
+        adam(rules, *tensors, guard=guard, loss=guard.skip + 1, backend=backend)
+        assert bool(guard.skip) and float(guard.in_a_row) == float(guard.skipped) == number + 1
         assert all(bool((parameter == 1).all()) for parameter in tensors[0]) and not any(rule.step for rule in rules)
         gradients[which][place] = 1
     gradients[1][89] = torch.nan  # the gradient of a table, which is not checked
-    adam(rules, *tensors, guard=guard, loss=guard.found + 1, backend=backend)
-    assert not guard.found and not guard.in_a_row and float(guard.skipped) == len(places)
+    adam(rules, *tensors, guard=guard, loss=guard.skip + 1, backend=backend)
+    assert not guard.skip and not guard.in_a_row and float(guard.skipped) == len(places)
     assert all(bool((parameter != 1).all()) and rule.step for parameter, rule in zip(tensors[0], rules, strict=True))
 
 
@@ -53,8 +53,8 @@ def test_a_table_may_have_any_gradient(device, backend):
     guard, step = Guard.on(device), torch.zeros((), device=device)
     guard.begin(3)
     arguments = [[tensor] for tensor in table]
-    adam([Rule(step, 0.1, every=False)], *arguments, guard=guard, loss=step + 1, backend=backend)
-    assert float(step) == 1 and float(guard.skipped) == 3 and float(guard.found) == 0
+    adam([Rule(step, 0.1, dense=False)], *arguments, guard=guard, loss=step + 1, backend=backend)
+    assert float(step) == 1 and float(guard.skipped) == 3 and float(guard.skip) == 0
 
 
 def test_what_was_found_before_leaves_out_a_step(device, backend):
@@ -66,7 +66,10 @@ def test_what_was_found_before_leaves_out_a_step(device, backend):
 
 
 def test_refuses_what_would_be_read_out_of_bounds():
-    """Each call has one wrong argument, since one fast check of all tensors decides whether each is checked alone."""
+    """Each call has a single wrong argument, so that every part of the compiled module's fast check is tested.
+
+    The tensors are checked one by one only if the fast check fails.
+    """
 
     def call(rules=None, **changed):
         arguments = {name: [torch.ones(())] for name in ("parameters", "gradients", "means", "squares")}
@@ -82,7 +85,7 @@ def test_refuses_what_would_be_read_out_of_bounds():
         "adam: parameters must have length 1 like rules, got 0": {"parameters": []},
         "adam: step must have shape [], got [1]": {"rules": [rule._replace(step=torch.zeros(1))]},
         "adam: loss must come with a guard, got none": {"loss": torch.ones(())},
-        "adam: found must have shape [], got [3]": {"guard": Guard(*torch.ones(3, 3))},
+        "adam: skip must have shape [], got [3]": {"guard": Guard(*torch.ones(3, 3))},
         "adam: loss must have shape [], got [1]": {"guard": Guard.on("cpu"), "loss": torch.ones(1)},
         "adam: epsilon must be positive, got 0.0": {"rules": [rule._replace(epsilon=0.0)]},
         "adam: betas must lie in [0, 1), got (0.9, 1.0)": {"rules": [rule._replace(betas=(0.9, 1.0))]},
@@ -148,7 +151,7 @@ def loop(parameter, gradient, mean, square, step, rate, betas, epsilon):
 def test_a_table_equals_a_slow_loop(device, backend, shape, share):
     arguments = table(shape, share)
     actual = [t.to(device).clone() for t in arguments]
-    rule = Rule(torch.tensor(2.0, device=device), 0.01, (0.9, 0.99), 1e-10, every=False)
+    rule = Rule(torch.tensor(2.0, device=device), 0.01, (0.9, 0.99), 1e-10, dense=False)
     adam([rule], *([tensor] for tensor in (actual[0], strided(actual[1]), *actual[2:])), backend=backend)
     expected = loop(*arguments, 3, 0.01, (0.9, 0.99), 1e-10)
     untouched = arguments[1] == 0
@@ -163,7 +166,7 @@ def test_gradients_of_minus_zero_are_none_and_nan_spreads(device, backend):
     before = [t.clone() for t in tensors]
     tensors[1].fill_(-0.0)
     tensors[1][5] = torch.nan
-    rule = Rule(torch.zeros((), device=device), 0.1, every=False)
+    rule = Rule(torch.zeros((), device=device), 0.1, dense=False)
     adam([rule], *([tensor] for tensor in tensors), backend=backend)
     for now, then in zip((tensors[0], *tensors[2:]), (before[0], *before[2:]), strict=True):
         assert bool(now[5].isnan())
@@ -180,7 +183,7 @@ def test_native_bits_depend_neither_on_threads_nor_on_instructions():
                 torch.set_num_threads(count)
                 tensors = [t.clone() for t in arguments]
                 with native.using_isa(isa):
-                    rule = Rule(torch.tensor(6.0), 0.01, every=False)
+                    rule = Rule(torch.tensor(6.0), 0.01, dense=False)
                     adam([rule], *([tensor] for tensor in tensors), backend="native")
                 results.append(tensors)
     finally:
@@ -192,9 +195,9 @@ def test_native_bits_depend_neither_on_threads_nor_on_instructions():
 @pytest.mark.parametrize(
     ("error", "message", "change"),
     [
-        (TypeError, "found must be a tensor, got NoneType", {"guard": Guard(None, None, None)}),
+        (TypeError, "skip must be a tensor, got NoneType", {"guard": Guard(None, None, None)}),
         (ValueError, "skipped must have shape [], got [0]", {"guard": Guard(torch.ones(()), *[torch.ones(0)] * 2)}),
-        (TypeError, "every must be True or False, got int", {"rules": [Rule(torch.ones(()), 0.1, every=1)]}),
+        (TypeError, "dense must be True or False, got int", {"rules": [Rule(torch.ones(()), 0.1, dense=1)]}),
         (ValueError, "learning_rate must have shape [], got [0]", {"rules": [Rule(torch.ones(()), torch.ones(0))]}),
         (ValueError, "step must have shape [], got [0]", {"rules": [Rule(torch.ones(0), 0.1)]}),
     ],

@@ -24,7 +24,10 @@ KINDS = {
 
 
 def with_activations(table, biased, ray):
-    """Returns the program of a table with halved outputs; it also outputs the tanh of the first and its square."""
+    """Returns the program of a layer table, with halved outputs and a second result of two columns.
+
+    With t, the tanh of the table's first output, the columns of the second result are t squared and t.
+    """
     inner = table.program(6 if table.integrated else 3, 3 if table.uses_directions else 0, None, biased, ray)
     b = Builder()
     inputs = {i: b.input(width, ray=i in inner.rays) for i, width in enumerate(inner.inputs)}

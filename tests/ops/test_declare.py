@@ -15,7 +15,7 @@ from voronerf.ops._core.declare import Shaped, declared
 def test_the_public_function_has_the_signature_and_the_docstring():
     assert list(inspect.signature(cell_sort).parameters) == ["cells", "k", "backend"]
     assert cell_sort.__module__ == "voronerf.ops.cell_sort" and cell_sort.__doc__.startswith("Returns the stable order")
-    assert "    cells: int32 [n], values 0 to k - 1" in cell_sort.__doc__
+    assert "    cells: int32 [n], the cell of each sample, 0 to k - 1" in cell_sort.__doc__
     assert '\n        backend: "auto", "reference", "native" or "warp".\n\n    Returns:' in cell_sort.__doc__
     assert "    background: same [c] or [r, c] or None, a colour added with" in composite.__doc__
     with pytest.raises(TypeError, match=r"cell_sort\(\) missing 1 required positional argument: 'k'"):

@@ -1,11 +1,11 @@
-"""Tests that pixels of a batch are drawn from the runs."""
+"""Tests that the pixels of a batch are drawn from runs, ranges of consecutive pixels."""
 
 import pytest
 import torch
 from helpers import refuses
 
 from voronerf.ops import draw_pixels as draw
-from voronerf.ops.draw_pixels.reference import Known, Runs, draw_pixels
+from voronerf.ops.draw_pixels.reference import KnownPixels, PixelRuns, draw_pixels
 
 SEED = torch.tensor([-7], dtype=torch.int32)
 # The first pixels and the lengths of runs: one pixel, many runs of equal length, and runs of very different lengths.
@@ -17,7 +17,7 @@ RUNS = {
 
 
 def runs_of(start, length):
-    return Runs.of(torch.tensor(start), torch.tensor(length))
+    return PixelRuns.of(torch.tensor(start), torch.tensor(length))
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -42,7 +42,7 @@ def test_native_draws_are_those_of_the_reference(name, count):
     for threads in (1, 3):
         torch.set_num_threads(threads)
         for several in (None, 0, count // 3, count):
-            known = None if several is None else Known(torch.arange(70, 80), torch.rand(10), several)
+            known = None if several is None else KnownPixels(torch.arange(70, 80), torch.rand(10), several)
             arguments = SEED, count, below, runs, known
             for actual, expected in zip(drawn(*arguments), draw_pixels(*arguments), strict=True):
                 assert torch.equal(actual, expected)
@@ -65,8 +65,8 @@ def test_tables_of_runs_that_do_not_fit_each_other_stay_in_bounds(backend):
 
 @pytest.mark.parametrize("backend", ["reference", "native"])
 def test_known_pixels_come_first_with_their_distances(backend):
-    known = Known(torch.tensor([1000, 3000, 2000]), torch.tensor([1.0, 3.0, 2.0]), 300)
-    pixels, uniforms, distances = draw(SEED, 1000, 50, known=known, backend=backend)
+    known = KnownPixels(torch.tensor([1000, 3000, 2000]), torch.tensor([1.0, 3.0, 2.0]), 300)
+    pixels, uniforms, distances = draw(SEED, 1000, 50, known_pixels=known, backend=backend)
     assert torch.equal(pixels[:300].float(), 1000 * distances) and len(distances) == 300
     assert bool(((distances.unique(return_counts=True)[1] - 100).abs() < 45).all())  # five standard deviations
     others = draw(SEED, 1000, 50, backend=backend)
@@ -77,13 +77,16 @@ def test_known_pixels_come_first_with_their_distances(backend):
     ("change", "message"),
     [
         ({"pixels": torch.zeros(2, dtype=torch.int64)}, "distances must have shape [p] with p = 2, got [3]"),
-        ({"pixels": torch.zeros(0, dtype=torch.int64), "distances": torch.zeros(0)}, "known must hold at least one"),
-        ({"several": 4}, "several must be at most 3, got 4"),
+        (
+            {"pixels": torch.zeros(0, dtype=torch.int64), "distances": torch.zeros(0)},
+            "known_pixels must hold at least one",
+        ),
+        ({"draws": 4}, "draws must be at most 3, got 4"),
     ],
 )
 def test_known_pixels_are_checked(change, message):
-    known = Known(torch.tensor([1, 2, 3]), torch.rand(3), 2)._replace(**change)
-    refuses(f"draw_pixels: {message}", draw, SEED, 3, 5, known=known)
+    known = KnownPixels(torch.tensor([1, 2, 3]), torch.rand(3), 2)._replace(**change)
+    refuses(f"draw_pixels: {message}", draw, SEED, 3, 5, known_pixels=known)
 
 
 @pytest.mark.parametrize(
@@ -101,11 +104,12 @@ def test_forged_runs_are_refused(change, message):
 
 def test_runs_that_do_not_fit_each_other_are_refused_where_they_are_made():
     runs = runs_of([2, 10, 50], [7, 100, 3])
-    assert Runs(*runs) == runs
-    rising = "Runs: ends must ascend from at least 1 to the total, 110, got "
+    assert PixelRuns(*runs) == runs
+    rising = "PixelRuns: ends must ascend from at least 1 to the total, 110, got "
     for ends in ([100, 7, 110], [7, 7, 110], [0, 107, 110], [7, 107, 111]):
-        refuses(f"{rising}{ends}", Runs, torch.tensor(ends), *runs[1:])
-    refuses("Runs: ends must ascend from at least 1 to the total, 9, got [7, 7, 9]", runs_of, [2, 10, 50], [7, 0, 2])
-    places = f"Runs: first must hold the run of every {1 << runs.bits}th of the 110 pixels, got "
+        refuses(f"{rising}{ends}", PixelRuns, torch.tensor(ends), *runs[1:])
+    rising = "PixelRuns: ends must ascend from at least 1 to the total, 9, got "
+    refuses(f"{rising}[7, 7, 9]", runs_of, [2, 10, 50], [7, 0, 2])
+    places = f"PixelRuns: first must hold the run of every {1 << runs.bits}th of the 110 pixels, got "
     for first in (runs.first + 3, runs.first[:1], runs.first.flip(0)):
-        refuses(f"{places}{first.tolist()}", Runs, runs.ends, runs.shift, first, runs.bits, runs.total)
+        refuses(f"{places}{first.tolist()}", PixelRuns, runs.ends, runs.shift, first, runs.bits, runs.total)

@@ -42,7 +42,7 @@ RUNS = [
 ]
 NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "routed_program", "adam", "average")
 NETWORKS += ("hash_encode",)
-"""The ops for which other arguments determine the number of tensors and their shapes."""
+"""The ops that take tensors whose number or shapes depend on an argument that is no tensor, such as a program."""
 SINGLE = ("balance_centres", "cell_sort", "march_rays", "pixel_rays")
 """The ops without floating-point tensors, or with a single floating-point dtype."""
 

@@ -110,7 +110,7 @@ def test_a_loss_on_second_derivatives(name, device, backend):
 
 @pytest.mark.op("grouped_mlp")
 def test_slopes_of_no_samples_by_frozen_networks(device, backend):
-    """This occurs while normals are trained, if a march finds only empty space."""
+    """A loss on normals needs these derivatives of zero samples if a march finds only empty space."""
     need("grouped_mlp", backend, device, torch.float32)
     x = torch.zeros(0, 3, device=device, requires_grad=True)
     weights = [draw(K, 6, 15, seed=2).to(device), draw(K, 2, 6, seed=3).to(device)]

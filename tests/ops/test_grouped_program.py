@@ -474,7 +474,7 @@ def test_gradient_programs_of_encodings_by_differences(kind: str) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="pages are protected otherwise")
 @pytest.mark.parametrize("name", ENCODINGS)
 def test_nothing_is_read_behind_a_gradient(name: str) -> None:
-    """The gradient of an encoding, read in place for few rows, is followed by a protected page."""
+    """An encoding's incoming gradient, which is read in place for few rows, ends at the start of a protected page."""
     _, raw, size = ENCODED[name]
     b = Builder()
     program = b.program([b.encode(name, b.input(raw), size)])
@@ -496,7 +496,10 @@ def test_nothing_is_read_behind_a_gradient(name: str) -> None:
 
 
 def test_which_derivatives_the_compiled_module_has() -> None:
-    """The compiled module has F_0, G_1 and T_0; a program with any other derivative has high orders."""
+    """The compiled module runs an encoding (F_0) and its gradients with respect to x (G_1) and to the table (T_0).
+
+    For a program with any other derivative of an encoding, `orders` exceeds 3, the limit of the compiled module.
+    """
     program = encoded()
     first = gradient(program, *ALL)
     assert program.orders == 0 and first.orders == 1
@@ -666,7 +669,7 @@ def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
         {"name": "frequency", "numbers": (1, 1, 0, 0)},
     ):
         refuses("Program: steps must be made of existing", replace, program, steps=changed(**fields))
-    # Only steps that look up tables may read a table, and a sum has one layout.
+    # Only steps that look up tables may read a table, and only scatter steps may add to a table's gradient.
     b = Builder(program)
     refuses(
         "Program: steps must be made of existing", b.program, [b.binary("mul", of_a_ray, Columns(PARAMETER, 0, 0, 3))]
@@ -677,7 +680,7 @@ def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
     column = Step("columns", scatter.out, 3, (of_a_ray,), (0,))
     for steps in ((*first.steps, column), (first.steps[0], column._replace(out=scatter.out), *first.steps[1:])):
         refuses("Program: steps must be made of existing", replace, first, steps=steps)
-    # G_1 must read the encoding of its own x.
+    # The step of the gradient with respect to x (G_1) must read the encoding of the same x.
     back = next(step for step in first.steps if step.op == "encode" and step.numbers[3] and step.name == "hash")
     wrong = back._replace(operands=(*back.operands[:2], back.operands[1]))
     steps = tuple(wrong if step == back else step for step in first.steps)
@@ -722,7 +725,7 @@ def test_rows_of_rays_that_lie_turned() -> None:
 
 
 def test_second_derivatives_where_rows_have_no_gradient() -> None:
-    """Second derivatives include rows that add nothing to the first derivative, as a hash grid keeps all rows."""
+    """Second derivatives include rows whose gradient is zero; a program with a hash grid leaves no rows out."""
     b, n = Builder(), 40
     table = b.parameter(*GRID.table_shape)
     e = b.encode("hash", b.input(3), b.grid(GRID.text), table)
@@ -741,7 +744,7 @@ def test_second_derivatives_where_rows_have_no_gradient() -> None:
 
 @pytest.mark.parametrize("products", ["float32", "bfloat16"])
 def test_shapes_of_a_gpu_that_is_not_there(products):
-    """A run with fake tensors on a GPU device returns their shapes; it works without a GPU."""
+    """A run with fake tensors on a GPU device returns fake results with the right shapes; it works without a GPU."""
     b = Builder()
     program = b.program([b.linear(b.input(5), b.parameter(7, 5), 7)])
     with FakeTensorMode():

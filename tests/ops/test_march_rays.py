@@ -107,10 +107,10 @@ def test_equals_the_reference_to_the_last_bit(device, backend, rest, r, samples)
             {},
             {"uniforms": torch.rand(r, samples)},
             {"start": torch.randint(0, samples + 2, (r,), dtype=torch.int32)},
-            {"most": 3, "uniforms": torch.rand(r, samples)},
-            {"most": 9, "seed": torch.randint(-(2**31), 2**31, (1,), dtype=torch.int32)},
+            {"max_samples": 3, "uniforms": torch.rand(r, samples)},
+            {"max_samples": 9, "seed": torch.randint(-(2**31), 2**31, (1,), dtype=torch.int32)},
             {"capacity": 41},
-            {"capacity": 5000, "most": 2, "start": torch.randint(0, samples, (r,), dtype=torch.int32)},
+            {"capacity": 5000, "max_samples": 2, "start": torch.randint(0, samples, (r,), dtype=torch.int32)},
         ):
             expected = march(arguments, samples, torch.device("cpu"), "reference", **rest, **more)
             same(march(arguments, samples, device, backend, **rest, **more), expected)
@@ -127,7 +127,11 @@ def test_many_rays_of_a_picture_equal_the_reference(device, backend, rest, spaci
             arguments["near"][:40] * (1 + 1e-5),
             100.0,
         )  # very short strata and long strata
-        for more in ({}, {"most": 3}, {"start": torch.randint(0, 70, (900,), dtype=torch.int32), "most": 5}):
+        for more in (
+            {},
+            {"max_samples": 3},
+            {"start": torch.randint(0, 70, (900,), dtype=torch.int32), "max_samples": 5},
+        ):
             expected = march(arguments, 64, torch.device("cpu"), "reference", **rest, **more)
             same(march(arguments, 64, device, backend, **rest, **more), expected)
 
@@ -152,7 +156,7 @@ def test_a_seed_stands_for_uniforms_of_its_own(device, backend):
 def test_waves_give_together_what_one_call_gives(device, backend):
     arguments, uniforms = case(30), torch.rand(30, 40)
     whole = march(arguments, 40, device, backend, uniforms=uniforms)
-    for options in ({"most": 1}, {"most": 7}, {"capacity": 100}, {"capacity": 60, "most": 4}):
+    for options in ({"max_samples": 1}, {"max_samples": 7}, {"capacity": 100}, {"capacity": 60, "max_samples": 4}):
         depths = [[] for _ in range(30)]
         start = torch.zeros(30, dtype=torch.int32)
         for _ in range(41):
@@ -186,7 +190,7 @@ def test_refuses_what_makes_no_sense():
     refuses("samples must be at least 1, got 0", samples=0)
     seed = torch.zeros(1, dtype=torch.int32)
     refuses("seed must be None where uniforms are given, got both", uniforms=torch.zeros(4, 8), seed=seed)
-    refuses("most must be at least 1, got 0", most=0)
+    refuses("max_samples must be at least 1, got 0", max_samples=0)
     refuses("capacity must be at least 1, got 0", capacity=0)
     refuses("contraction must be a tensor, got str", contraction="sphere")
     refuses("contraction must have shape [4], got [3]", contraction=torch.zeros(3))

@@ -82,7 +82,10 @@ def test_a_ray_sees_the_same_bits_beside_any_others(kind):
 
 
 def test_leaps_over_empty_cells_find_the_same():
-    """Only the larger batch has enough strata, compared with the grid cells, for native rays to leap."""
+    """The native backend lets rays leap over empty grid cells only if there are at least four strata per grid cell.
+
+    Strata are the sampling intervals of all rays. Only the larger batch has enough strata to leap.
+    """
     arguments = CASE.make(Draw(3, samples=130, side=4), 40)
     arguments["occupied"] = torch.zeros(12, 12, 12, dtype=torch.bool)
     arguments["occupied"][5:7, 4:8, 3:9] = True

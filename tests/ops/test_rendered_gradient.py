@@ -128,6 +128,6 @@ def test_a_recording_reads_its_numbers_of_rows_again():
     assert recording.obstacle is None
     for counts in ((5, 2, 1, 3), (6,), (3, 0, 4)):
         arguments = batch(*counts)
-        assert recording.replay(1, taken=[*arguments.values()]) == 1
+        assert recording.replay(1, inputs=[*arguments.values()]) == 1
         rendered_gradient(**arguments, **SCALED, backend="native")
         assert torch.equal(recording.now(taken["gradient"]), arguments["gradient"])

@@ -83,7 +83,7 @@ class Corners(nn.Module):
 
 
 class Planes(nn.Module):
-    """A field with a plane and a volume, sampled on grids with samples in the second and the last but one dimension."""
+    """A field that reads a plane and a volume; samples are dimension 1 of the plane's grid, and 3 of the volume's."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -35,7 +35,7 @@ def routed(module: nn.Module, way: str = "fused", cells: Any = K, **options: Any
 
 
 def drawn(generator: torch.Generator, *shape: int, dtype: torch.dtype = torch.int64) -> Tensor:
-    """Draws labels, of all networks except the last."""
+    """Draws labels of all networks except the last one, which gets no sample."""
     return torch.randint(K - 1, shape, generator=generator, dtype=dtype)
 
 

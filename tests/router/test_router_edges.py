@@ -208,7 +208,7 @@ def test_networks_traced_in_two_threads_leave_custom_functions_as_they_were() ->
 
 
 def test_centres_go_where_the_module_is(device: torch.device) -> None:
-    """Centres move from the CPU to the module's device, even the single centre of a coarse stage, without look-ups."""
+    """Centres move from the CPU to the module's device, even a single centre, which no look-up needs."""
     router, x = VoronoiRouter(network().to(device), torch.zeros(1, 3), coords="first3"), samples().to(device)
     router.generator = torch.Generator(device).manual_seed(3)
     coarse = router(x)

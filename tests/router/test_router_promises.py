@@ -319,7 +319,7 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
 
 @pytest.mark.parametrize("width", [37, 74, 259, 1147])
 def test_widths_that_are_numbers_of_samples_of_a_trace(width):
-    """All widths are multiples of 37; 1147 is a multiple of the first two numbers of samples of a trace."""
+    """All widths are multiples of 37, and 1147 is 31 * 37; a trace tries 37 samples first, and 31 samples second."""
     torch.manual_seed(0)
     field = nn.Sequential(nn.Linear(3, width), nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, 4))
     router = VoronoiRouter(field, torch.rand(3, 3), coords="first3", fuse=True, way="fused")

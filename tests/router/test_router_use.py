@@ -281,7 +281,7 @@ class Labelled(Tensor):
 
 
 class Named(nn.Module):
-    """A module that uses column names always, if there are some, for results, or never."""
+    """A module using column names in one of four ways: always, if the input has names, to name results, or never."""
 
     def __init__(self, use: str) -> None:
         super().__init__()

@@ -35,13 +35,13 @@ def test_partial_sums_are_one_composite(ranks):
         mask = (owner == rank).reshape(-1)
         samples_of_rays = torch.zeros(rays * samples, 3), index, depths.reshape(-1), deltas.reshape(-1)
         numbers = torch.where(torch.arange(ranks) == rank, 0, -1)
-        mine = own_samples(*samples_of_rays, owner.reshape(-1), numbers, bent=False)
+        mine = own_samples(*samples_of_rays, owner.reshape(-1), numbers, curved=False)
         partial_sums.append(sum_runs(mine, parts[1].reshape(-1, 3)[mask], parts[0].reshape(-1)[mask]))
     ray, start = torch.cat([runs.ray for runs in partial_sums]), torch.cat([runs.start for runs in partial_sums])
     order = along_rays(ray, start)
     sums = [torch.cat([getattr(runs, name) for runs in partial_sums])[order] for name in ("colour", "optical")]
     seen = compose(*(part.detach() for part in sums), ray[order], rays)
-    behind = seen.behind(sums[0].detach(), ray[order], slopes, background)
+    behind = seen.loss_behind(sums[0].detach(), ray[order], slopes, background)
     torch.autograd.backward(sums, (seen.front[:, None] * slopes[ray[order]], -behind))
 
     colour = seen.colour + seen.through[:, None] * background
@@ -99,8 +99,8 @@ def test_a_gap_that_another_rank_may_fill_ends_a_run():
     depths, deltas = torch.tensor([0.1, 0.19, 0.5, 0.9]), torch.full((4,), 0.1)
     samples = torch.zeros(4, 3), torch.zeros(4, dtype=torch.int32), depths, deltas
     cells, numbers = torch.tensor([0, 1, 2, 2]), torch.arange(3)
-    assert own_samples(*samples, cells, numbers, bent=False).run_offsets.tolist() == [0, 2, 4]
-    assert own_samples(*samples, cells, numbers * 0 - 1, bent=False).run_offsets.tolist() == [0]
+    assert own_samples(*samples, cells, numbers, curved=False).run_offsets.tolist() == [0, 2, 4]
+    assert own_samples(*samples, cells, numbers * 0 - 1, curved=False).run_offsets.tolist() == [0]
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])

@@ -35,7 +35,7 @@ def command(out, *more):
 
 
 def in_step(number, harm):
-    """Returns a context in which rank 1 calls `harm` before a step."""
+    """Returns a context in which rank 1 calls `harm` before step `number`."""
     real, steps = rays.step_together, iter(range(10_000))
 
     def step_together(group, *arguments):
@@ -238,7 +238,7 @@ def test_parts_of_steps_are_replayed(tmp_path, monkeypatch):
 
 
 def test_a_start_that_failed_begins_again(tmp_path, monkeypatch):
-    """All territories restart if none learns; light from other territories counts as learnt."""
+    """A territory restarts if its rays, with the light of all territories, show nothing; here all fields are empty."""
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
     monkeypatch.setattr("voronerf.app.train.start.JUDGED", 30)
     town, said = build_some(tmp_path, 70), []

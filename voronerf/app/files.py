@@ -116,8 +116,10 @@ def write_text(path: Path, text: str) -> None:
 
 
 def json_text(value: Any, *, indent: int | None = None) -> str:
-    """Returns a value as JSON; infinity and NaN become null, and an object that had them gets an entry such as
-    ``"not_finite": {"psnr": "inf"}``."""
+    """Returns a value as JSON; infinity and NaN become null.
+
+    An object with such numbers gets a further entry, for example ``"not_finite": {"psnr": "inf"}``.
+    """
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 
 

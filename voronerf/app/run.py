@@ -199,10 +199,10 @@ def open_run(
         path: The run directory.
         scene: The scene, if it is loaded already.
         data: Scene folder; None for the folder of the training. Since a run may be another person's, the folder of the
-            training must lie in the run directory, the working directory or ``VORONERF_DATA``, unless the user has
-            named it before.
+            training must lie in the run directory, the working directory or ``VORONERF_DATA``, unless this user has
+            passed it to a training.
         downscale: Downscale factor of the images; None for the factor of the training.
-        allow_outside: Also read images that lie outside of the scene folder.
+        allow_outside: Whether to read images outside the scene folder too.
         samples: Samples per ray of each pass; None for the numbers of the training.
         occupancy: Skip empty space, found by evaluating the field once. A run trained with occupancy always uses its
             own grid, because its field has learnt nothing in empty space.

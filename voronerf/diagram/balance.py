@@ -99,7 +99,8 @@ def balance(
 
         v_i <- v_i + 0.05 * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i,
 
-    where N(i) are the 8 closest centres (all others if there are fewer), and `norm_i` is the largest W of i and N(i).
+    where v_i is centre i, W_i is the importance of its cell, N(i) are the 8 closest centres (all others if there are
+    fewer), and `norm_i` is the largest W of i and N(i).
     Light cells move towards heavy neighbours, and heavy cells away from light ones. Each update compares all pairs of
     centres, so balanced centres suit up to some hundreds of cells.
 
@@ -107,9 +108,9 @@ def balance(
         points: floating [m, d], finite.
         importance: floating [m], finite, >= 0, not all 0.
         k: the number of cells, 1 <= k <= number of distinct points.
-        centres: "balanced", as published; "centroidal", centres at the importance-weighted centroids of their cells,
-            which are then compact but of unequal importance (Du, Faber and Gunzburger 1999); "random", distinct samples
-            with equal probabilities; or "uniform", `uniform_centres` over the bounding box of the samples.
+        centres: "balanced", by the updates above; "centroidal", centres at the importance-weighted centroids of their
+            cells, which are then compact but of unequal importance (Du, Faber and Gunzburger 1999); "random", distinct
+            samples with equal probabilities; or "uniform", `uniform_centres` over the bounding box of the samples.
         steps: the number of updates of balanced centres.
         generator: the CPU generator for random draws; None for torch's global generator.
         backend: the backend of the ops, see `voronerf.ops._core.backends`.
@@ -168,7 +169,11 @@ def balance(
 
 
 def first_centres(samples: Tensor, masses: Tensor, k: int, centres: str, generator: torch.Generator | None) -> Tensor:
-    """Draws initial centres, float32 [k, d], from CPU samples float32 [m, d], by masses [m] if they are centroidal."""
+    """Returns initial centres, float32 [k, d]: `uniform_centres` for "uniform", else different samples drawn at random.
+
+    The samples, float32 [m, d], are on the CPU. For "centroidal", the probability of a sample is proportional to its
+    mass, [m]; for the other choices, all samples are equally likely.
+    """
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)
     if k > distinct.shape[0]:
         raise ValueError(f"balance: k must be at most the number of distinct points, {distinct.shape[0]}, got {k}")
@@ -297,5 +302,5 @@ def in_space(points: Tensor) -> Tensor:
 
 
 def in_torch(op: str, points: Tensor) -> Callable[..., Any]:
-    """Returns the reference implementation of an operation, which accepts any number of coordinates."""
+    """Returns the PyTorch reference of the operation ``op``, which accepts any number of coordinates."""
     return backends.resolve(op, backend="reference", device=points.device, dtype=points.dtype)

@@ -1,4 +1,4 @@
-"""Draws leaves of a tree of diagrams at random, by distance.
+"""Draws a leaf of a tree of diagrams at random for each point; cells with near centres are more likely.
 
 Letters: n points, m centres of all diagrams, g diagrams.
 """
@@ -54,9 +54,8 @@ def draw_cell(
             nearest = distance.masked_fill(elsewhere, torch.inf).amin(1, keepdim=True)
             # Centres at a distance of infinity or NaN get mass 0.
             mass = ((nearest - distance) / temperature).exp().masked_fill(elsewhere, 0).nan_to_num(0.0)
-            # A GPU computes cumulative sums as a tree, and rounds each one differently. A sum may be below the previous
-            # sum, and the last sum above the sum at the last centre with mass. So only centres with mass are
-            # candidates.
+            # A GPU rounds each cumulative sum separately, so the sums need not increase, and a centre without mass may
+            # have a larger sum than the last centre with mass. Therefore only centres with mass are candidates.
             sums = mass.cumsum(1).masked_fill(mass == 0, 0)
             total = sums.amax(1, keepdim=True)
             drawn = (sums >= wanted[:, level, None] * total).to(torch.uint8).argmax(1)

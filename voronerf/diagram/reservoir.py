@@ -17,7 +17,7 @@ class SampleReservoir:
     """The heaviest samples of the last `batches` batches.
 
     Every batch contributes its `quota = ceil(capacity / batches)` heaviest samples, or all of its samples if they are
-    fewer. At most `batches * quota` samples of d coordinates are held; then each new batch replaces the oldest batch.
+    fewer. The samples of at most `batches` batches are held; each further batch replaces the oldest batch.
     Samples with an importance of 0, or with a position or importance that is not finite, are not kept. A heavy sample
     with a position that is not finite still counts towards the quota.
 
@@ -73,8 +73,8 @@ class SampleReservoir:
 
         Args:
             points: floating [..., d], scene units.
-            importance: floating [...]; any scale, since only ratios count. If ``error`` is given, these are the weights
-                w, and each is multiplied by the error of its sample's ray.
+            importance: floating [...], the importance of each sample, on any scale, since only ratios count. With
+                ``error``, the weight w of each sample instead, which is multiplied by the error of the sample's ray.
             error: floating [r], the error E of each ray; None counts as 1.
             ray_index: int32 [m], the ray of each of m samples; required with ``error``.
             backend: the backend of the op.

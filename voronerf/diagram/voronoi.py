@@ -27,7 +27,7 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.checks import check_integer
 
 MANY_CELLS = 2048
-"""The minimum number of cells for which a flat diagram keeps an index."""
+"""The minimum number of cells for which a flat diagram keeps a search index of its centres."""
 _DECIDE, _DECIDE_CELL = 20_000, 4  # maximum number of points in `from_points`: in total or, if more, per cell
 
 
@@ -135,7 +135,7 @@ class VoronoiDiagram(nn.Module):
             >>> diagram = VoronoiDiagram.from_points(torch.rand(64, 32, 3), 8)  # rays of 32 samples
             >>> diagram
             VoronoiDiagram(cells=8, depth=1)
-            >>> VoronoiDiagram.from_points(torch.rand(5000, 2), 16).locate(torch.rand(10, 2)).shape  # of an image
+            >>> VoronoiDiagram.from_points(torch.rand(5000, 2), 16).locate(torch.rand(10, 2)).shape  # 2-D points
             torch.Size([10])
         """
         flat = points.detach().reshape(-1, points.shape[-1])
@@ -251,7 +251,8 @@ class VoronoiDiagram(nn.Module):
         GPU, only the version counter and the address are compared, to avoid a wait for the device.
 
         Returns:
-            int32 [w]; None for a nested diagram, fewer than `MANY_CELLS` cells, or traced centres.
+            int32 [w]; None for a nested diagram, fewer than `MANY_CELLS` cells, or centres that torch traces or
+            transforms.
         """
         centres = self.centres
         if self.depth > 1 or self.num_cells < MANY_CELLS or centres.shape[1] == 0 or torch.compiler.is_compiling():
@@ -348,7 +349,8 @@ class VoronoiDiagram(nn.Module):
             copies = (table.to(device, copy=True) for table in (graft.centres, graft.child_offsets, graft.child))
             return VoronoiDiagram._from_tables(*copies), parents
 
-        # The rows and diagrams of the grafts are appended, so only leaf numbers and links have to be shifted.
+        # The rows and diagrams of the children are appended to the tables. The old rows and diagrams keep their
+        # numbers; leaf numbers, and the row and diagram numbers of the children, have to be shifted.
         first_leaf = (counts.cumsum(0) - counts).to(device, torch.int32)
         child = torch.where(self.child < 0, -1 - first_leaf[(-1 - self.child).clamp(min=0)], self.child)
         leaf_rows = self.leaf_rows.tolist()
@@ -432,7 +434,11 @@ class VoronoiDiagram(nn.Module):
 
 
 def _is_unchanged(seen: Tensor, centres: Tensor) -> bool:
-    """Returns whether centres are unchanged since an index was made; compares values or, on a GPU, addresses."""
+    """Returns whether ``centres`` are the same as ``seen``, the centres from which an index was built.
+
+    On the CPU, the values are compared; on a GPU, only the addresses. Without the compiled module there is no index,
+    and the result does not matter.
+    """
     if seen.device != centres.device or seen.shape != centres.shape:
         return False
     native = backends.compiled()

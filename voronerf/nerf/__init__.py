@@ -1,4 +1,4 @@
-"""The parts of a radiance-field training, each usable alone: cameras, samplers, rendering, the loss, splits."""
+"""The parts of a radiance-field training, each usable alone: cameras, samplers, rendering, the loss, cell splits."""
 
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches, RaySource
@@ -14,7 +14,7 @@ from voronerf.nerf.sampling import stratified_depths
 from voronerf.nerf.segment import replayed
 from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
-from voronerf.nerf.terms import LossAlongRays, Seen, SmoothDepth, SparseDepth, Surface, Term
+from voronerf.nerf.terms import LossAlongRays, RayValues, SmoothDepth, SparseDepth, Surface, Term
 from voronerf.nerf.volume import Batch, RayColours, Rendered, RenderOutput, Samples, Space
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "RayColours",
     "RayLoss",
     "RaySource",
+    "RayValues",
     "Rays",
     "RenderOutput",
     "Rendered",
@@ -42,7 +43,6 @@ __all__ = [
     "Renderer",
     "Sampler",
     "Samples",
-    "Seen",
     "SmoothDepth",
     "Space",
     "SparseDepth",

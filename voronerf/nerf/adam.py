@@ -21,8 +21,9 @@ from voronerf.router.optimizers import trained_parts
 
 #: The largest averaging window as a fraction of the steps done: short windows at first, when weights change fast.
 WINDOW = 1 / 30
-#: The weight decay of tables, which removes unread entries such as early noise in empty space. With more than
-#: `DECAY_VIEWS` views, the decay is divided by views / `DECAY_VIEWS`, since a point is then sampled less often.
+#: The weight decay of tables. Entries that no sample reads any more, such as noise of the first steps in empty space,
+#: shrink towards 0. With more than `DECAY_VIEWS` views, the decay is divided by views / `DECAY_VIEWS`, since a point is
+#: then sampled less often.
 TABLE_DECAY, DECAY_VIEWS = 0.1, 300
 #: The key of the averaged weights in an optimiser's state, beside Adam's moments.
 _AVERAGE = "average"
@@ -36,7 +37,7 @@ class Adam(torch.optim.Adam):
     state has the same keys as in torch. One op updates all parameters, which must be float32 and contiguous: for
     networks of this size, torch's own step takes longer to prepare than to compute.
 
-    The state also holds averages of the weights over the last steps (``average``), for pictures and scores. Averages
+    The state also holds exponential moving averages of the weights (``average``), for pictures and scores. Averages
     reduce noise: each cell gets few samples of a batch, so its weights fluctuate.
 
     Args:
@@ -46,7 +47,7 @@ class Adam(torch.optim.Adam):
             gradients than its parent. With torch's 0.999, the moments of the parent would determine the step sizes of
             the cell for a thousand steps. The default gains 0.7 dB after 800 steps of Lego at 100 x 100.
         eps: The constant that is added to the root of the second moment.
-        average: Decay per step of the averaged weights, smaller in the first steps; 0 for no averages.
+        average: Decay factor per step of the weights' moving averages, smaller in the first steps; 0 for no averages.
         backend: The backend of the ops.
 
     Examples:
@@ -102,7 +103,7 @@ class Adam(torch.optim.Adam):
             lr: The learning rate.
             views: The number of training views; tables decay less with more views.
             sparse: Name patterns of sparse tables: a step reads few of their entries. See ``FieldType``.
-            average: Decay per step of the averaged weights.
+            average: Decay factor per step of the weights' moving averages; 0 for no averages.
             backend: The backend of the ops.
         """
         dense, tables = parameter_groups(routers, sparse)
@@ -146,7 +147,7 @@ class Adam(torch.optim.Adam):
                 loss = closure()
         # A GradScaler sets these attributes on a fused optimiser: the scale, and whether a gradient overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
-        # Without a loss, the guard counts no steps.
+        # Without a loss, `update` does not write to the guard, so `overflow` can stand in for the guard's two counters.
         self.update(None if overflow is None else Guard(overflow, overflow, overflow, scale))
         return loss
 
@@ -156,9 +157,10 @@ class Adam(torch.optim.Adam):
         Once per group suffices, since weights change little within a group; reading a large table in each step would
         take time.
 
-        The decay is decoupled from the gradients (Loshchilov and Hutter 2019): weights are multiplied by 1 - lr * RATE
-        for each step. Parameters without a gradient and frozen cells do not decay. The decay of an average per step is
-        1 - 1 / w with the window w = `WINDOW` * step, until it reaches ``average``.
+        Weight decay is decoupled from the gradients (Loshchilov and Hutter 2019): weights are multiplied by
+        1 - lr * shrink * `GROUP`, with the rate ``shrink`` of the parameter group. Parameters without a gradient and
+        frozen cells do not decay. The moving averages have a decay factor of 1 - 1 / w per step, with the window
+        w = `WINDOW` * step, until the factor reaches ``average``.
 
         Args:
             step: The number of steps done.
@@ -266,7 +268,7 @@ def _check_group(group: Mapping[str, Any]) -> None:
 
 
 def _shrink_rate(group: Mapping[str, Any]) -> float:
-    """Returns the fraction by which the weights of a group shrink in one update."""
+    """Returns the fraction by which the weights of a parameter group shrink in `GROUP` steps."""
     return schedule.GROUP * float(group["lr"]) * float(group["shrink"])
 
 

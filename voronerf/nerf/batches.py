@@ -13,12 +13,14 @@ from voronerf.nerf.occupancy import draw_seed
 from voronerf.nerf.segment import replayed
 from voronerf.nerf.volume import Batch
 from voronerf.ops._core.rows import following_count
-from voronerf.ops.draw_pixels import Known, Runs, draw_pixels
+from voronerf.ops.draw_pixels import KnownPixels, PixelRuns, draw_pixels
 from voronerf.ops.unseen_rays import unseen_rays
 
 #: The fraction of rays that are drawn through the points of a sparse model, if there is one.
 SPARSE = 0.25
-#: The number of triples of unseen rays per ray of a batch, and the largest change of their directions along each axis.
+#: Unseen rays start beside a camera, so no pixel shows their colour; they come in triples of neighbours
+#: (`voronerf.ops.unseen_rays`). UNSEEN is the number of triples per ray of a batch. TILT is the largest difference
+#: between the directions of a middle ray and its neighbours, along each axis.
 UNSEEN, TILT = 1 / 12, 0.15
 
 
@@ -31,7 +33,7 @@ class RaySource(Protocol):
     Examples:
         >>> import torch
         >>> from voronerf.nerf import Batch, Rays
-        >>> class Sphere:  # looks from a sphere at what is white
+        >>> class Sphere:  # rays from a sphere towards its centre; all targets are white
         ...     device = torch.device("cpu")
         ...     def draw(self, count, generator):
         ...         inwards = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
@@ -69,14 +71,16 @@ class RayBatches:
         far: The distance along a ray at which the scene ends.
         box: [2, 3], the box of the scene; None for no box.
         background: [3], the colour behind the scene; None for black.
-        random_background: Whether to draw a background colour for each ray, for images with alpha and for photographs
-            without a background. A translucent surface then never has the right colour, so surfaces learn to be opaque.
+        random_background: Whether to draw a background colour for each ray, for images with alpha, and for opaque
+            images if ``background`` is None. A translucent surface then never has the right colour, so surfaces learn
+            to be opaque.
         masks: bool [c, h, w], False for pixels that are never drawn; None for no masks.
         sparse: The pixels that show points of a sparse model (int64 [s], flat indices over all images), and the
             distances of the points (float32 [s]). The fraction `SPARSE` of the rays is drawn from these pixels. None
             for no sparse model.
-        unseen: The largest offset of an unseen ray's origin from its camera, along each axis; 0 for no unseen rays. A
-            batch of n other rays ends with n * `UNSEEN` triples of neighbouring unseen rays. Must be 0 with a box.
+        unseen: The largest offset of an unseen ray's origin from a camera, along each axis; 0 for no unseen rays.
+            Unseen rays have no target colour; they serve loss terms such as `SmoothDepth`. The last rays of a batch of
+            n rays are n * `UNSEEN` triples of neighbouring unseen rays. Must be 0 with a box.
         views: int64, the indices of the pictures to draw from; None for all.
         cones: Whether the rays have radii.
         fetch: Function that is called with the pixels, int64 [r], of a batch before they are read; for images on disk.
@@ -131,7 +135,7 @@ class RayBatches:
                 pixels, distances = pixels[in_views], distances[in_views]
             self.sparse = (pixels, distances) if len(pixels) else None
 
-    def _useful_pixels(self, masks: Tensor | None, views: Tensor | None) -> Runs | None:
+    def _useful_pixels(self, masks: Tensor | None, views: Tensor | None) -> PixelRuns | None:
         """Returns the pixels to draw from; None for all pixels."""
         cameras = self.cameras
         if self.box is None and masks is None and cameras.sizes is None and views is None:
@@ -151,7 +155,7 @@ class RayBatches:
             last = (edges == -1).nonzero(as_tuple=True)[1]
             runs.append(torch.stack(((image * cameras.height + row) * cameras.width + column, last - column)))
         start, length = torch.cat(runs, dim=1)
-        return Runs.of(start, length) if 0 < int(length.sum()) < self._pixel_count else None
+        return PixelRuns.of(start, length) if 0 < int(length.sum()) < self._pixel_count else None
 
     @property
     def _pixel_count(self) -> int:
@@ -161,7 +165,7 @@ class RayBatches:
         """Returns the number of rays to draw from."""
         return self._pixel_count if self.useful is None else self.useful.total
 
-    def end_unseen(self) -> None:
+    def stop_unseen_rays(self) -> None:
         """Stops drawing unseen rays."""
         self.unseen = 0.0
 
@@ -170,9 +174,9 @@ class RayBatches:
         seed = draw_seed(self.place, generator)
         known = None
         if self.sparse is not None and (several := following_count(count, lambda rays: int(SPARSE * rays))):
-            known = Known(*self.sparse, several)
+            known = KnownPixels(*self.sparse, several)
         index, uniforms, distances = draw_pixels(
-            seed, count, len(self), runs=self.useful, known=known, backend=self.backend
+            seed, count, len(self), runs=self.useful, known_pixels=known, backend=self.backend
         )
         depths = None if known is None else distances.to(self.device)
         if self.fetch is not None:

@@ -3,8 +3,8 @@
 c cameras, r rays, b chosen pixels, n points.
 
 Frames. A pose maps camera to world coordinates. Camera axes are OpenGL's: x right, y up, the camera looks along -z. The
-world is z up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the first pixel
-is at (0.5, 0.5). Distortion acts on image-plane coordinates u = (x - cx) / fx, v = (y - cy) / fy. See
+world's z axis points up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the
+first pixel is at (0.5, 0.5). Distortion acts on image-plane coordinates u = (x - cx) / fx, v = (y - cy) / fy. See
 `voronerf.nerf.lenses.distort` for the distortion models.
 """
 
@@ -33,9 +33,9 @@ __all__ = [
     "turntable_cameras",
 ]
 
-#: Cameras count as standing around an object if the median of their `axis_misses` is at most this value. It corresponds
-#: to 24 degrees, an angle inside the pictures of most lenses. The median is 0.06 to 0.13 for captures around an object,
-#: 0.22 for captures aimed 12 degrees off, and below 0.4 for 1 % of random walks.
+#: Cameras count as standing around an object if the median of their `axis_misses` is below this value. At this value,
+#: the object is 24 degrees off the optical axis, still inside the field of view of most lenses. The median is 0.06 to
+#: 0.13 for captures around an object, 0.22 for captures aimed 12 degrees off, and below 0.4 for 1 % of random walks.
 AROUND = 0.4
 
 
@@ -124,7 +124,7 @@ class Cameras:
             raise ValueError(f"Cameras: width and height must be >= 1, got {self.width} x {self.height}")
 
     def moved(self, move: Tensor) -> Cameras:
-        """Returns the cameras after a similarity [4, 4] of the world, such as a change of the frame."""
+        """Returns the cameras after a similarity transform [4, 4] of the world, such as a change of the frame."""
         scale = torch.linalg.det(move[:3, :3]).abs() ** (1 / 3)
         poses = (move @ self.poses.to(move)).clone()
         poses[:, :3, :3] /= scale
@@ -139,7 +139,7 @@ class Cameras:
         distortion: Tensor | None = None,
         models: Tensor | None = None,
     ) -> Cameras:
-        """Returns the cameras of at least one image, whose (width, height) `sizes` int64 [c, 2] may differ."""
+        """Returns the cameras of c >= 1 images, which may have different `sizes`, int64 [c, 2], (width, height)."""
         width, height = sizes.amax(0).tolist()
         differ = bool((sizes != sizes[:1]).any())
         return cls(poses, intrinsics, width, height, distortion, models, sizes if differ else None)
@@ -204,7 +204,7 @@ class Cameras:
         return self._mapped(lambda tensor: tensor.to(device))
 
     def _mapped(self, change: Callable[[Tensor], Tensor]) -> Cameras:
-        """Applies `change` to every tensor, and returns the resulting cameras; they share the lens tables."""
+        """Returns new cameras with `change` applied to every tensor; old and new cameras share the lens tables."""
         members = ((field.name, getattr(self, field.name)) for field in fields(self))
         changed: dict[str, Any] = {name: change(value) for name, value in members if isinstance(value, Tensor)}
         return replace(self, **changed)._with_lenses(change(self.lenses[0]), self.lenses[1])
@@ -217,7 +217,7 @@ class Cameras:
     def lenses(self) -> tuple[Tensor, LensTables | None]:
         """The lens index of each camera (int32 [c], -1 for no distortion), and the tables of the distinct lenses.
 
-        Cameras share the tables with the cameras that they were indexed, moved or copied from.
+        Indexing, moving and copying cameras does not copy the tables: the new cameras share them.
 
         Raises:
             ValueError: The tables would take too much memory.
@@ -347,7 +347,13 @@ class Cameras:
         return Rays(rays.origins, rays.directions, radii), rays.near, rays.far
 
     def pixel_rays(self, images: Tensor, index: Tensor, **options: Any) -> PixelRays:
-        """Calls `voronerf.ops.pixel_rays` for these cameras and their images, uint8 [c, height, width, 3 or 4]."""
+        """Returns rays through pixels of the cameras' images, with the pixels' colours; see `voronerf.ops.pixel_rays`.
+
+        Args:
+            images: uint8 [c, height, width, 3 or 4], the images.
+            index: int64 [b], the flat indices of the pixels over all images.
+            **options: The further arguments of `voronerf.ops.pixel_rays`.
+        """
         lens, tables = self.lenses
         if tables is not None:
             options |= {"lens": lens, "tables": tables.on(self.poses.device)}

@@ -145,7 +145,10 @@ class Perspective:
         return torch.cat((across, depth), dim=-1) @ self.axes.to(points) + self.centre.to(points)
 
     def stretch(self, points: Tensor) -> Tensor:
-        """Returns [...], world depth per contracted depth at contracted points [..., 3]; at most 2,000,000 near."""
+        """Returns [...], the derivative of world depth with respect to contracted depth at contracted points [..., 3].
+
+        The derivative is at most 2,000,000 times ``near``.
+        """
         return 2 * self.near / (1 - points[..., 2]).clamp_min(1e-3).square()
 
     @property

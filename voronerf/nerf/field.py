@@ -19,7 +19,13 @@ class Field(Protocol):
     """
 
     def __call__(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
-        """Maps positions [n, 3], unit directions [r, 3], ray_index int32 [n] to rgb [n, 3] in 0..1, sigma [n] >= 0."""
+        """Returns the colours [n, 3] in 0..1 and the densities [n] >= 0 at n samples of r rays.
+
+        Args:
+            positions: [n, 3], the positions of the samples; [n, 6] Gaussians for cones.
+            directions: [r, 3], the unit directions of the rays.
+            ray_index: int32 [n], the row of ``directions`` for each sample.
+        """
         ...
 
 
@@ -42,7 +48,7 @@ class DirectionPerSample(nn.Module):
         ...         found = self.layer(torch.cat([positions, directions], dim=-1))
         ...         return found[:, :3].sigmoid(), found[:, 3].exp()
         >>> router = VoronoiRouter(Fog(), torch.rand(8, 3), coords="first3", fuse=True)
-        >>> field = DirectionPerSample(router)  # which a Renderer takes
+        >>> field = DirectionPerSample(router)  # a field for a Renderer
     """
 
     def __init__(self, network: nn.Module) -> None:

@@ -73,7 +73,7 @@ def fold(terms: Sequence[float], model: int) -> float:
     Beyond the image, the distorted radius may decrease again, and directions far outside would appear in the image.
 
     Args:
-        terms: The coefficients of `distort`, except for an FOV lens, which never folds.
+        terms: The eight coefficients of `distort`. Not for an FOV lens, which never folds.
         model: PERSPECTIVE, FISHEYE or EQUIRECTANGULAR.
     """
     k1, k2, _, _, k3, k4, k5, k6 = terms
@@ -91,9 +91,10 @@ def fold(terms: Sequence[float], model: int) -> float:
 
 
 def _inverse_roots(factors: Sequence[float]) -> Tensor:
-    """Returns complex128, 1 / root for all roots of a polynomial; its first coefficient is the constant 1.
+    """Returns 1 / root, complex128, for all roots of a polynomial.
 
-    The results are eigenvalues of a matrix whose entries need no division, so tiny coefficients do no harm.
+    `factors` are the coefficients in ascending order; the first one, the constant term, must be 1. The results
+    are eigenvalues of a matrix whose entries need no division, so tiny coefficients do no harm.
     """
     matrix = torch.diag(torch.ones(len(factors) - 1, dtype=torch.float64), -1)[:-1, :-1]
     matrix[:1] -= torch.tensor(factors[1:], dtype=torch.float64)
@@ -103,8 +104,9 @@ def _inverse_roots(factors: Sequence[float]) -> Tensor:
 def undistort(u: Tensor, v: Tensor, coefficients: Tensor, model: int = PERSPECTIVE) -> tuple[Tensor, Tensor]:
     """Inverts `distort`: FOV in closed form, other models by Newton's method from the distorted point.
 
-    Newton's method converges quadratically if the lens model is invertible between the start and the solution, which
-    holds inside the image of any lens of the model. With float64 the error is below a millionth of a pixel.
+    Newton's method converges quadratically if the lens model is invertible between the start and the solution. Inside
+    the image of a lens, the model is invertible unless it folds over there (`fold`). With float64 the error is below a
+    millionth of a pixel.
     """
     if model == FOV:
         omega, radius = float(coefficients[0]), torch.hypot(u, v).clamp_min(TINY)

@@ -13,7 +13,7 @@ from voronerf.nerf.occupancy import HIDDEN
 from voronerf.nerf.radiance import Radiance, radiance_of, router_of
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.segment import Stage, in_python, replayed, run_stages
-from voronerf.nerf.terms import LossAlongRays, Seen, Term, stages_of
+from voronerf.nerf.terms import LossAlongRays, RayValues, Term, stages_of
 from voronerf.nerf.volume import (
     Batch,
     Rendered,
@@ -40,7 +40,7 @@ class RayLoss:
     Args:
         renderer: The networks and the sampler.
         terms: Further terms of the loss: a :class:`Term`, such as :class:`SparseDepth` or :class:`Surface`, or a
-            function of :class:`Seen` rays and their :class:`Batch` that returns a scalar. Torch differentiates this
+            function of the :class:`RayValues` and the :class:`Batch` that returns a scalar. Torch differentiates this
             function, with gradients for the networks alone. A term gets all rays; the last ``3 * batch.unseen`` have no
             target colour.
         robust: The scale of errors above which the loss is linear instead of squared; see `voronerf.ops.render_loss`.
@@ -51,7 +51,7 @@ class RayLoss:
         >>> from voronerf import NeRF, VoronoiRouter
         >>> from voronerf.nerf import Batch, RayLoss, Rays, Renderer, SparseDepth, Stratified
         >>> router = VoronoiRouter(NeRF(width=16, depth=2), torch.zeros(1, 3))
-        >>> clear = lambda seen, batch: 0.1 * (seen.opacity * (1 - seen.opacity)).mean()
+        >>> clear = lambda rays, batch: 0.1 * (rays.opacity * (1 - rays.opacity)).mean()
         >>> loss = RayLoss(Renderer({"field": router}, Stratified(8)), terms=[SparseDepth(0.003), clear])
         >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
         >>> output = loss(Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3)), backward=True)
@@ -68,7 +68,7 @@ class RayLoss:
         self,
         renderer: Renderer,
         *,
-        terms: Iterable[Term | Callable[[Seen, Batch], Tensor]] = (),
+        terms: Iterable[Term | Callable[[RayValues, Batch], Tensor]] = (),
         robust: float = 0.0,
     ) -> None:
         self.renderer, self.terms, self.robust = renderer, tuple(terms), robust
@@ -102,22 +102,23 @@ class RayLoss:
         backward: bool,
         now: Callable[[Any], Any] = lambda held: held,
     ) -> list[Stage]:
-        """Returns the stages that compute "output" from "batch".
+        """Returns the stages that read the result named "batch" and write the result named "output".
 
         Args:
             field: The result of :meth:`radiance`.
             generator: Random generator of the samples.
             backward: Whether to add the gradients at once, as in :meth:`__call__`.
-            now: Function from a recorded tensor to its currently valid rows, for stages that run in Python.
+            now: Function that cuts recorded tensors to the rows of the present step, for stages that run in Python; the
+                identity if no step is recorded.
         """
         sampler = self.renderer.sampler
         if isinstance(field, str):
             sample = Stage("sample", functools.partial(self._sample_passes, generator), ("batch",))
-            evaluate = Stage("look", self._evaluate_unfused, ("batch", "samples", "before"))
+            evaluate = Stage("evaluate", self._evaluate_unfused, ("batch", "samples", "before"))
         else:
             name, python = f"{type(sampler).__name__}.sample", in_python(sampler, "sample")
             sample = Stage(name, functools.partial(self._sample, generator), ("batch",), python)
-            evaluate = Stage("look", functools.partial(self._evaluate, field), ("batch", "samples"))
+            evaluate = Stage("evaluate", functools.partial(self._evaluate, field), ("batch", "samples"))
         terms = [stage for number, term in enumerate(self.terms) for stage in stages_of(number, term, now)]
         return [
             sample,
@@ -151,19 +152,19 @@ class RayLoss:
         renderer = self.renderer
         network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index)
         tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
-        # If almost no light reaches a sample, it learns nothing and is left out of the backward pass.
+        # A sample that almost no light reaches has a negligible gradient and is left out of the backward pass.
         along = self._along(tape.raw, field.rule, batch, samples, HIDDEN)
         return {"along": along, "learning": (self._learn_fused, tape)}
 
     def _sample_passes(self, generator: torch.Generator | None, batch: Batch) -> dict[str, Any]:
         renderer = self.renderer
 
-        def look(name: str, samples: Samples) -> Rendered:
+        def render(name: str, samples: Samples) -> Rendered:
             arguments = renderer.fields[name], batch.rays, batch.far, samples, renderer.sampler.space
             return render_samples(*arguments, background=batch.background, backend=renderer.backend)
 
         ends = batch.near, batch.far
-        samples, before = renderer.sampler.draw(look, batch.rays, *ends, jitter=True, generator=generator)
+        samples, before = renderer.sampler.draw(render, batch.rays, *ends, jitter=True, generator=generator)
         return {"samples": samples, "before": before}
 
     def _evaluate_unfused(self, batch: Batch, samples: Samples, before: Sequence[Rendered]) -> dict[str, Any]:
@@ -220,7 +221,7 @@ class RayLoss:
             with_target = len(batch.rays) - 3 * batch.unseen
             for first in before:
                 target = torch.cat((batch.target[:with_target], first.colour[with_target:].detach()))
-                loss = loss + self.renderer.sampler.loss_before(first, last, target)
+                loss = loss + self.renderer.sampler.earlier_loss(first, last, target)
         return run_backward(loss, defer)
 
     def explain(self) -> str:

@@ -27,7 +27,7 @@ from voronerf.ops.draw_points import draw_points
 from voronerf.ops.formulas import voxels_of
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
-from voronerf.ops.render_opaque import RaysSeen, render_opaque
+from voronerf.ops.render_opaque import RenderedRays, render_opaque
 
 #: Voxels of a grid along each axis, for a box and for contracted space, which holds the whole world.
 RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
@@ -36,16 +36,18 @@ RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
 OPACITY = 0.02
 #: A voxel of contracted space is empty if the whole voxel has less than this opacity.
 CONTRACTED_OPACITY = 0.1
-#: The number of consecutive samples of negligible density after which a new voxel counts as empty. 8 samples take about
-#: thirty steps; in this time the field learns something about most voxels. In contracted space fewer samples are
-#: better: occupied voxels in front of the cameras keep fog that explains one view and spoils the others.
+#: A new voxel counts as empty after more than this number of batches in a row that have samples in the voxel, all of
+#: negligible density. 8 such batches take about thirty steps; in this time the field learns something about most
+#: voxels. In contracted space a smaller number is better: occupied voxels in front of the cameras keep fog that
+#: explains one view and spoils the others.
 PATIENCE, CONTRACTED_PATIENCE = 8, 4
-#: The factor by which each sample of a training batch reduces the stored density of its voxel.
+#: Each training batch multiplies the stored densities of the voxels that contain its samples by this factor, once per
+#: voxel.
 DECAY = 0.8
 CHUNK = 1 << 17  # points in one evaluation of a field
 HIDDEN = 1e-3  # a sample is hidden if at most this fraction of the light reaches it
 # A hole is an empty voxel whose 3 x 3 x 3 block has at least HOLE_NEIGHBOURS occupied voxels, and whose density is at
-# least HOLE_DENSITY thresholds at all of HOLE_POINTS random points.
+# least HOLE_DENSITY times the threshold at each of HOLE_POINTS random points.
 HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 9, 2, 2.0
 
 
@@ -64,7 +66,7 @@ class OccupancyGrid:
     Examples:
         >>> import torch
         >>> from voronerf import OccupancyGrid
-        >>> def ball(positions, directions, ray_index):  # of radius 0.5
+        >>> def ball(positions, directions, ray_index):  # a ball of radius 0.5
         ...     return torch.ones_like(positions), torch.where(positions.norm(dim=-1) < 0.5, 10.0, 0.0)
         >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 16, threshold=1.0)
         >>> grid.share
@@ -90,10 +92,10 @@ class OccupancyGrid:
             box: [2, 3], the lowest and the highest corner.
             resolution: The number of voxels along each axis, one number for all axes or three numbers.
             threshold: The minimum density of an occupied voxel, in the unit of `density`, > 0 and finite.
-            remembered: The density of a new voxel, in thresholds, >= 1. With a larger density, the voxel counts as
-                empty only after more samples of negligible density.
-            contraction: The contraction that maps world space to the space of the box and of positions, or None. Rays
-                are in world coordinates.
+            remembered: The density of a new voxel as a multiple of ``threshold``, >= 1. With a larger density, the
+                voxel counts as empty only after more batches of samples of negligible density.
+            contraction: The contraction that maps world space to the space of the box, or None. The methods take
+                positions in the space of the box, but rays in world coordinates.
             device: The device of the grid; None for the device of the box.
         """
         shape = (resolution,) * 3 if isinstance(resolution, int) else tuple(resolution)
@@ -256,7 +258,7 @@ class OccupancyGrid:
             density: [m], the densities at the positions; NaN counts as infinite.
             deltas: [m], lengths of the strata of the samples.
             weights: [m], contributions of the samples to their rays, from `composite`.
-            decay: Factor on the old densities of the voxels of these samples, 0..1.
+            decay: Factor on the old density of each voxel with samples, 0..1; applied once per call.
             fixed: bool [x, y, z], voxels that do not change; None for none.
             backend: "auto", "reference", "native" or "warp".
 
@@ -304,11 +306,11 @@ class OccupancyGrid:
         self.occupied[specks] = False
 
     def _neighbours(self) -> Tensor:
-        """Returns float32 [x, y, z], the number of occupied voxels among the 27 around and in each voxel."""
+        """Returns float32 [x, y, z], the number of occupied voxels in the 3 x 3 x 3 block around each voxel."""
         return torch.nn.functional.avg_pool3d(self.occupied[None].float(), 3, 1, 1, divisor_override=1)[0]
 
     def _enter(self, *samples: Tensor, **rule: Any) -> None:
-        """Enters samples, with densities in world units, into the grid; see `voronerf.ops.observe_occupancy`."""
+        """Updates the grid from samples with densities per world unit; see `voronerf.ops.observe_occupancy`."""
         rule |= {"threshold": self.threshold, "contraction": self._numbers}
         observe_occupancy(self.density, self.occupied, self.box, *samples, **rule)
 
@@ -321,7 +323,7 @@ class OccupancyGrid:
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return march_rays(*arguments, contraction=self._numbers, **rule)
 
-    def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaysSeen:
+    def render_colours(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RenderedRays:
         """Renders rays by evaluating networks in occupied voxels; for the options see `voronerf.ops.render_opaque`."""
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return render_opaque(*arguments, contraction=self._numbers, **rule)
@@ -376,7 +378,7 @@ class OccupancyGrid:
 
 
 def draw_seed(device: torch.device, generator: torch.Generator | None) -> Tensor:
-    """Draws a seed for ``march_rays``, int32 [1] on `device`, the device of the rays."""
+    """Draws a seed for an op such as ``march_rays``, int32 [1] on `device`, the device of the op's other arguments."""
     source = device if generator is None else generator.device
     return torch.randint(-(2**31), 2**31, (1,), device=source, dtype=torch.int32, generator=generator).to(device)
 

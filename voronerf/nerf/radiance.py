@@ -40,8 +40,8 @@ class Radiance(NamedTuple):
 
     Attributes:
         router: The router of the networks.
-        cells: The program of a call of the router.
-        networks: The programs of the radiance field.
+        cells: The program of the module's ``forward``, as the router runs it, and the parameters of all cells.
+        networks: The programs that compute the same values, but have the inputs and outputs of a radiance field.
     """
 
     router: VoronoiRouter
@@ -55,7 +55,7 @@ class Radiance(NamedTuple):
         return {"activated": True} if scale is None else {"density_scale": scale}
 
     def arguments(self, inputs: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any]:
-        """Returns the arguments of `forward_with_tape`; see :class:`voronerf.nerf.Field` and :class:`Networks`."""
+        """Returns the arguments with which `forward_with_tape` evaluates the field at samples; see `Networks`."""
         places, rays = self.router.places(inputs), self.networks.program.rays
         tensors = {"inputs": [inputs, directions], "ray_index": ray_index} if rays else {"inputs": [inputs]}
         return {"program": self.networks.program, "parameters": self.cells.parameters, **tensors, **places}
@@ -90,7 +90,7 @@ def radiance_of(field: Field, samples: tuple[Tensor, Tensor] | None = None, *, i
 
 
 def router_of(field: Field) -> VoronoiRouter | None:
-    """Returns the router of a field: the field itself, or its network in a `DirectionPerSample`; else None."""
+    """Returns the field, or the network that a `DirectionPerSample` wraps, if it is a router; else None."""
     inner = field.network if isinstance(field, DirectionPerSample) else field
     return inner if isinstance(inner, VoronoiRouter) else None
 
@@ -103,7 +103,14 @@ def _example(inputs: int, device: torch.device) -> tuple[Tensor, Tensor]:
 
 @functools.lru_cache(maxsize=256)
 def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], ...], inputs: int) -> Networks | str:
-    """Returns the networks of a `CellProgram`, or the reason why it is no radiance field."""
+    """Returns the networks of a `CellProgram`, or the reason why it is no radiance field.
+
+    Args:
+        text: The text of the program.
+        reads: The attribute ``reads`` of the `CellProgram`.
+        shapes: The attribute ``shapes`` of the `CellProgram`.
+        inputs: The number of columns of positions or Gaussians.
+    """
     program = Program.parse(text)
     if len(shapes) != 2 or shapes[0] != (3,) or shapes[1] not in ((), (1,)):
         return (
@@ -124,7 +131,11 @@ def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], 
 
 
 def _without_moves(program: Program) -> Program:
-    """Returns the program without copies by "move" steps, so that the density does not depend on the colour."""
+    """Returns the program with its "move" steps bypassed: steps and outputs read the columns that a "move" copies.
+
+    A "move" may join colour and density in one value. A program that read the density from this value would compute
+    the colour too.
+    """
     moves = {step.out: step for step in program.steps if step.op == "move"}
 
     def source(columns: Columns) -> Columns:

@@ -71,7 +71,7 @@ class Renderer:
         >>> renderer = Renderer(networks, Hierarchical(8, 8))
         >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
         >>> first, second = renderer.render(rays, 1.0, 3.0)
-        >>> first.weights.shape, second.weights.shape  # the second pass asks at the points of both
+        >>> first.weights.shape, second.weights.shape  # the second pass includes the points of the first
         (torch.Size([40]), torch.Size([80]))
     """
 
@@ -137,14 +137,14 @@ class Renderer:
         """
         near, far = per_ray(near, rays), per_ray(far, rays)
 
-        def look(name: str, samples: Samples) -> Rendered:
+        def render(name: str, samples: Samples) -> Rendered:
             arguments = self.fields[name], rays, far, samples, self.sampler.space
             return render_samples(*arguments, background=background, backend=self.backend)
 
-        samples, before = self.sampler.draw(look, rays, near, far, jitter=jitter, generator=generator)
-        return (*before, look("field", samples))
+        samples, before = self.sampler.draw(render, rays, near, far, jitter=jitter, generator=generator)
+        return (*before, render("field", samples))
 
-    def see(
+    def render_colours(
         self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None = None, heaviest: bool = True
     ) -> RayColours:
         """Renders rays of a picture, without randomness.
@@ -157,7 +157,7 @@ class Renderer:
             heaviest: Whether to find the samples with the largest weights; else `heaviest` of the result is undefined.
         """
         arguments = self.field, rays, near, far
-        if (seen := self.sampler.see(*arguments, background=background, heaviest=heaviest)) is not None:
+        if (seen := self.sampler.render_colours(*arguments, background=background, heaviest=heaviest)) is not None:
             return seen
         last = self.render(rays, near, far, background=background)[-1]
         places = rays.origins
@@ -205,7 +205,7 @@ class Renderer:
         parts = []
         for start in range(0, max(1, count if hits is None else len(hits)), chunk):
             rows = slice(start, start + chunk) if hits is None else hits[start : start + chunk]
-            parts.append(self.see(rays[rows], first[rows], last[rows], background, heaviest))
+            parts.append(self.render_colours(rays[rows], first[rows], last[rows], background, heaviest))
         seen = RayColours(*map(torch.cat, zip(*parts, strict=True)))
         if hits is not None and len(hits) < count:
             behind = torch.zeros_like(rays.origins) if background is None else background.expand(count, 3)

@@ -39,33 +39,35 @@ from voronerf.ops.resample import resample
 
 #: The weight of the first pass in the loss if one network serves two passes (mip-NeRF, section 3.2).
 COARSE_SHARE = 0.1
-#: The number of strata is divided by this while an occupancy grid settles.
+#: The divisor of the number of strata per ray in the first steps, while an occupancy grid is not updated yet.
 SETTLING_PART = 4
-#: The number of first steps in which the grid of a contracted sphere learns nothing; for other grids, `WARMUP_STEPS`.
-#: An untrained field is thin everywhere: the grid would take it for empty, and emptied voxels learn no more. The more
-#: samples a step has, the sooner the whole grid would be empty.
+#: The number of first steps in which a grid over space contracted to a ball (`Contraction`) is not updated; other grids
+#: use `WARMUP_STEPS`. An untrained field has low densities everywhere, so an updated grid would become empty, and the
+#: field is not trained in empty voxels. The more samples a step has, the sooner the whole grid would be empty.
 SETTLING_STEPS = 400
 #: The fraction of voxels that are evaluated at random before each `GROUP` of steps, and the maximum number of these
 #: voxels: about the number of samples of a few steps.
 REVISITED, MOST_REVISITED = 1 / 8, 32_768
-#: The factor on the strata of a ray for pictures, and their maximum number. A training needs fewer strata, since its
-#: jittered samples cover each stratum over time. Twice the 256 strata of a long training would improve no picture by
-#: more than 0.05 dB.
+#: The number of strata per ray in pictures: the ratio to the number in training, and the maximum. A training needs
+#: fewer strata, since its jittered samples cover each stratum over time. Twice the 256 strata of a long training would
+#: improve no picture by more than 0.05 dB.
 PICTURE_SAMPLES, MOST_PICTURE_SAMPLES = 2, 384
 #: The transmittance below which a ray of a picture ends; the ray then counts as opaque with its colour so far.
 OPAQUE = 0.05
-#: The samples per ray of a wave, in a box and in contracted space. Small waves have more overhead, large waves evaluate
-#: samples behind the surface in vain. Photographs need contracted space and have more rays, so the overhead of a wave
-#: counts less.
+#: Pictures are rendered in waves. A wave evaluates the next few samples of each ray that is not yet opaque. These are
+#: the numbers of samples per ray and wave, in a box and in contracted space. Small waves have more overhead, large
+#: waves evaluate samples behind the surface in vain. Photographs need contracted space and have more rays, so the
+#: overhead of a wave counts less.
 WAVE, CONTRACTED_WAVE = 12, 8
 #: The samples per ray of a wave if one operation runs all waves; the overhead of a wave is then negligible.
 FINE_WAVE = 4
-#: The strata of a ray through contracted space, by the minimum training time in seconds. Shorter strata make steps
+#: The number of strata per ray in contracted space, by the minimum training time in seconds. More strata make steps
 #: slower, but pictures sharper in the end.
 CONTRACTED_SAMPLES = {0.0: 128, LONG: 256, 90.0: 384}
-#: The minimum time of a long training in a box, in seconds per pixel along the box, and its maximum number of strata.
+#: A training in a box is long if it has at least `LONG_IN_BOX` seconds for each pixel that the longest side of the box
+#: spans in the training views. A long training has at most `LONG_SAMPLES` strata per ray.
 LONG_IN_BOX, LONG_SAMPLES = 0.45, 256
-#: A function that renders samples with the field of a name.
+#: A function (name, samples) that renders the samples with the field of this name.
 RenderPass = Callable[[str, Samples], Rendered]
 
 
@@ -74,7 +76,7 @@ class Sampler:
     """A rule that chooses the sample points of rays; it may learn from the steps of a training.
 
     A subclass defines :meth:`sample`. A subclass with several passes also defines :meth:`draw` and
-    :meth:`loss_before`. A subclass that learns defines :meth:`step_pre_backward` and :meth:`step_post_backward`. A
+    :meth:`earlier_loss`. A subclass that learns defines :meth:`step_pre_backward` and :meth:`step_post_backward`. A
     subclass that skips empty space defines ``grid``. The library uses only these members, never the class of a sampler.
 
     Each training step calls :meth:`step_pre_backward`, then :meth:`sample` after drawing its rays, then
@@ -88,7 +90,7 @@ class Sampler:
         samples: s, the number of samples per ray in the first pass.
         space: The coordinates in which rays are sampled and the field is evaluated.
         backend: The backend of the ops.
-        settling_steps: The number of first training steps in which the grid learns nothing.
+        settling_steps: The number of first training steps in which the grid is not updated.
 
     Args:
         samples: s, the number of samples per ray in the first pass, at least 1.
@@ -161,7 +163,7 @@ class Sampler:
 
     def draw(
         self,
-        look: RenderPass,
+        render: RenderPass,
         rays: Rays,
         near: Tensor,
         far: Tensor,
@@ -172,7 +174,7 @@ class Sampler:
         """Returns the samples of the last pass, and the rendered results of the earlier passes.
 
         Args:
-            look: Function that renders the samples of an earlier pass with the field of a name.
+            render: Function (name, samples) that renders the samples of an earlier pass with the field of this name.
             rays: r rays.
             near: [r], the distances at which the rays begin.
             far: [r], the distances at which the rays end.
@@ -181,7 +183,7 @@ class Sampler:
         """
         return self.sample(rays, near, far, jitter=jitter, generator=generator), ()
 
-    def see(
+    def render_colours(
         self, field: Field, rays: Rays, near: Tensor, far: Tensor, *, background: Tensor | None, heaviest: bool
     ) -> RayColours | None:
         """Renders rays of a picture with fewer samples than :meth:`draw`; returns None if this is not possible.
@@ -196,11 +198,11 @@ class Sampler:
         """
         return None
 
-    def loss_before(self, before: Rendered, last: Rendered, target: Tensor) -> Tensor:
+    def earlier_loss(self, earlier: Rendered, last: Rendered, target: Tensor) -> Tensor:
         """Returns the loss [] that an earlier pass adds to the loss of the last pass.
 
         Args:
-            before: The rendered result of the earlier pass.
+            earlier: The rendered result of the earlier pass.
             last: The rendered result of the last pass.
             target: [r, 3], the colours of the rays.
         """
@@ -210,12 +212,12 @@ class Sampler:
         """Updates the sampler before a training step draws its rays.
 
         Args:
-            field: The field that learns.
+            field: The field being trained.
             step: The number of the step, from 0.
-            generator: Random generator of the choices.
+            generator: Random generator for the sampler.
         """
 
-    def asks_at(self, step: int) -> bool:
+    def evaluates_at(self, step: int) -> bool:
         """Returns whether :meth:`step_pre_backward` evaluates the field before a step.
 
         Args:
@@ -223,11 +225,11 @@ class Sampler:
         """
         return False
 
-    def steps_alike(self, step: int) -> int:
-        """Returns the number of steps that may follow one call of :meth:`step_pre_backward`.
+    def steps_per_update(self, step: int) -> int:
+        """Returns the number of steps, from ``step`` on, for which one call of :meth:`step_pre_backward` suffices.
 
         Args:
-            step: The number of the first of these steps.
+            step: The number of the first step after the call, from 0.
         """
         return 1
 
@@ -291,7 +293,7 @@ class Occupancy(Sampler):
 
     Attributes:
         grid: The occupancy grid; all space outside its box is empty.
-        settling: Whether the grid has not learnt yet. A training step then uses only a fraction of the strata: no space
+        settling: Whether the grid is not updated yet. A training step then uses only a fraction of the strata: no space
             is skipped yet, and an untrained field finds its surfaces sooner with fewer and longer strata.
 
     Args:
@@ -300,7 +302,7 @@ class Occupancy(Sampler):
         picture_samples: The number of strata per ray in pictures; None for `PICTURE_SAMPLES` times ``samples``. Since
             rays of a picture end at the first surface, additional strata cost little.
         space: The coordinates in which rays are sampled and the field is evaluated.
-        empty: bool [v], voxels that stay empty in a training; None for none.
+        empty: bool [v] for all v voxels of the grid, True for voxels that stay empty in a training; None for none.
         backend: The backend of the ops.
 
     Raises:
@@ -315,7 +317,7 @@ class Occupancy(Sampler):
         >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 4, threshold=0.1)
         >>> rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
         >>> samples = render_rays(fog, rays, 0.0, 4.0, samples=Occupancy(grid, 8)).samples
-        >>> samples.positions[:, 2], samples.ray_index  # those inside of the box
+        >>> samples.positions[:, 2], samples.ray_index  # the samples inside the box
         (tensor([-0.7500, -0.2500,  0.2500,  0.7500]), tensor([0, 0, 0, 0], dtype=torch.int32))
     """
 
@@ -349,7 +351,7 @@ class Occupancy(Sampler):
 
     @property
     def settling_steps(self) -> int:  # type: ignore[override]
-        """The number of first training steps in which the grid learns nothing."""
+        """The number of first training steps in which the grid is not updated."""
         return SETTLING_STEPS if isinstance(self.grid.contraction, Contraction) else WARMUP_STEPS
 
     @property
@@ -362,10 +364,10 @@ class Occupancy(Sampler):
         return f"{super().explain()}; {self.grid.share:.0%} of the grid is occupied"
 
     @torch.no_grad()
-    def see(
+    def render_colours(
         self, field: Field, rays: Rays, near: Tensor, far: Tensor, *, background: Tensor | None, heaviest: bool
     ) -> RayColours:
-        """Renders rays in waves, each ray until it is opaque; see :meth:`Sampler.see`.
+        """Renders rays in waves, each ray until it is opaque; see :meth:`Sampler.render_colours`.
 
         A wave is a few samples of every ray that is not yet opaque, so the field evaluates few samples behind the first
         surface of each ray. A ray that ends early counts as opaque with its colour at that point. The samples are the
@@ -375,12 +377,12 @@ class Occupancy(Sampler):
             >>> import torch
             >>> from voronerf import OccupancyGrid
             >>> from voronerf.nerf import Occupancy, Rays
-            >>> def wall(positions, directions, ray_index):  # from z = 0 on
+            >>> def wall(positions, directions, ray_index):  # opaque where z > 0
             ...     return torch.ones_like(positions), torch.where(positions[:, 2] > 0, 1e9, 0.0)
             >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 4, threshold=0.1)
             >>> rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
             >>> ends = torch.zeros(1), torch.full((1,), 4.0)
-            >>> seen = Occupancy(grid, 8).see(wall, rays, *ends, background=None, heaviest=True)
+            >>> seen = Occupancy(grid, 8).render_colours(wall, rays, *ends, background=None, heaviest=True)
             >>> seen.colour, seen.depth
             (tensor([[1., 1., 1.]]), tensor([2.1250]))
         """
@@ -389,13 +391,14 @@ class Occupancy(Sampler):
         if network is not None:
             options = {"spacing": self.space.spacing, "backend": self.backend, "heaviest": heaviest, "wave": FINE_WAVE}
             options |= {"opaque": OPAQUE, "background": None if background is None else background.to(near)}
-            seen = self.grid.see(rays, near, far, self.picture_samples, **network, **options)
+            seen = self.grid.render_colours(rays, near, far, self.picture_samples, **network, **options)
         else:
             wave = WAVE if contraction is None else CONTRACTED_WAVE
 
-            def look(live: Tensor, start: Tensor | None) -> Wave:
+            def render_wave(live: Tensor, start: Tensor | None) -> Wave:
                 live_rays = rays if start is None else rays[live]
-                samples, stop = self.march(live_rays, near[live], far[live], start=start, most=wave, picture=True)
+                ends = near[live], far[live]
+                samples, stop = self.march(live_rays, *ends, start=start, max_samples=wave, picture=True)
                 rgb, sigma = (
                     values.to(near.dtype) for values in field(samples.inputs, live_rays.directions, samples.ray_index)
                 )
@@ -403,7 +406,7 @@ class Occupancy(Sampler):
                 part = composite(sigma, rgb, *intervals, ray_offsets=samples.ray_offsets, backend=self.backend)
                 return Wave(part, samples.ray_index, samples.ray_offsets, samples.depths, stop)
 
-            seen = walk(look, far, self.picture_samples, wave, OPAQUE, background, heaviest)
+            seen = walk(render_wave, far, self.picture_samples, wave, OPAQUE, background, heaviest)
         positions = rays.origins
         if heaviest:
             positions = rays.origins + seen.heaviest[:, None] * rays.directions
@@ -433,7 +436,7 @@ class Occupancy(Sampler):
         self.settling = step < self.settling_steps
         if step == 0:
             self._leave_empty()  # the grid was reset
-        if not self.asks_at(step):
+        if not self.evaluates_at(step):
             return
         voxels = self.grid.occupied.numel()
         count = min(max(1, int(voxels * REVISITED)), MOST_REVISITED)
@@ -441,12 +444,15 @@ class Occupancy(Sampler):
         with evaluating(field):
             self.grid.revisit(field, fixed_count(count), seed, fixed=self.empty, backend=self.backend)
 
-    def asks_at(self, step: int) -> bool:
-        """Returns True before each `GROUP` of steps once the grid has settled; see :meth:`Sampler.asks_at`."""
+    def evaluates_at(self, step: int) -> bool:
+        """Returns True before each `GROUP` of steps once the grid has settled; see :meth:`Sampler.evaluates_at`."""
         return step >= self.settling_steps and step % schedule.GROUP == 0
 
-    def steps_alike(self, step: int) -> int:
-        """Returns the number of steps up to the next evaluation of voxels; see :meth:`Sampler.steps_alike`."""
+    def steps_per_update(self, step: int) -> int:
+        """Returns the number of steps until the grid has settled; later, until the next evaluation of voxels.
+
+        See :meth:`Sampler.steps_per_update`.
+        """
         settling = self.settling_steps - step
         return settling if settling > 0 else schedule.GROUP - step % schedule.GROUP
 
@@ -458,7 +464,7 @@ class Occupancy(Sampler):
             self.grid.observe(*values, decay=DECAY, fixed=self.empty, backend=self.backend)
 
     def finish(self, field: Field, seed: int) -> None:
-        """Removes specks from a grid of a box; fills holes in surfaces in a grid of a contracted sphere.
+        """Removes specks from a grid over a box; fills holes in surfaces in a grid over space contracted to a ball.
 
         See `OccupancyGrid.drop_specks` and `OccupancyGrid.fill_holes`. Other grids gain nothing from either method.
 
@@ -495,10 +501,10 @@ class Occupancy(Sampler):
         *,
         seed: Tensor | None = None,
         start: Tensor | None = None,
-        most: int | None = None,
+        max_samples: int | None = None,
         picture: bool = False,
     ) -> tuple[Samples, Tensor]:
-        """Returns the samples in occupied voxels, and the stratum [r] after the last sample of each ray.
+        """Returns the samples in occupied voxels, and the index [r] of the stratum after each ray's last sample.
 
         See `ops.march_rays`.
 
@@ -508,11 +514,11 @@ class Occupancy(Sampler):
             far: [r], the distances at which the rays end.
             seed: int32 [1], the seed of random samples; None for the middles of the strata.
             start: int32 [r], the first stratum of each ray; None for 0.
-            most: The maximum number of samples per ray; None for no limit.
+            max_samples: The maximum number of samples per ray; None for no limit.
             picture: Whether each ray has ``picture_samples`` strata instead of ``strata``.
         """
         samples = self.picture_samples if picture else self.strata
-        options: dict[str, Any] = {"seed": seed, "start": start, "most": most, "backend": self.backend}
+        options: dict[str, Any] = {"seed": seed, "start": start, "max_samples": max_samples, "backend": self.backend}
         if seed is not None and start is None and not near.is_cpu:  # a training step does not wait for the device
             options["capacity"] = max(1, len(near) * samples)
         result = self.grid.march(rays, near, far, samples, spacing=self.space.spacing, **options)
@@ -523,7 +529,7 @@ class Occupancy(Sampler):
 
 @replayed
 class Hierarchical(Stratified):
-    """A sampler with two passes; the second pass draws its samples by the weights of the first pass.
+    """A sampler with two passes; the second pass draws more samples where the weights of the first pass are larger.
 
     Source: NeRF, section 5.2; mip-NeRF, section 3.2. For points, the network "coarse" renders the first pass, and
     "field" renders the points of both passes. For cones, "field" renders both passes, the second one in new intervals,
@@ -562,7 +568,7 @@ class Hierarchical(Stratified):
 
     def draw(
         self,
-        look: RenderPass,
+        render: RenderPass,
         rays: Rays,
         near: Tensor,
         far: Tensor,
@@ -570,9 +576,9 @@ class Hierarchical(Stratified):
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Samples, tuple[Rendered, ...]]:
-        """Draws the second pass by the weights of the first; see :meth:`Sampler.draw`."""
+        """Renders the first pass, and draws the second from its distribution of weights; see :meth:`Sampler.draw`."""
         first = self.sample(rays, near, far, jitter=jitter, generator=generator)
-        before = look(self.first, first)
+        before = render(self.first, first)
         edges, weights, count = first.edges, first.by_ray(before.weights.detach()), self.fine_samples
         assert edges is not None
         if self.space.cones:
@@ -586,9 +592,9 @@ class Hierarchical(Stratified):
             depths, edges = union_depths(depths, edges, weights, count, uniforms=uniforms, backend=self.backend)
         return self.space.samples(rays, depths, edges), (before,)
 
-    def loss_before(self, before: Rendered, last: Rendered, target: Tensor) -> Tensor:
+    def earlier_loss(self, earlier: Rendered, last: Rendered, target: Tensor) -> Tensor:
         """Returns the loss [] of the colours of the first pass."""
-        return (COARSE_SHARE if self.space.cones else 1.0) * colour_loss(before.colour, target)
+        return (COARSE_SHARE if self.space.cones else 1.0) * colour_loss(earlier.colour, target)
 
 
 #: The samplers by the names of ``--sampling``.
@@ -617,7 +623,7 @@ def usual_samples(pixels: float, *, contracted: bool = False, seconds: float = 0
     256 in a training of at least 25 seconds, or 384 in a training of at least 90 seconds.
 
     Args:
-        pixels: The pixels of the training views along the largest side of the box.
+        pixels: The length in pixels of the longest side of the box in the training views.
         contracted: Whether space is contracted.
         seconds: The training time in seconds, on two cores of an AMD EPYC (Zen 5).
     """

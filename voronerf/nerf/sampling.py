@@ -1,4 +1,4 @@
-"""Sample depths along rays, and the loss of their colours. r rays, s samples per ray; distances in world units."""
+"""Depths of samples along rays, and the loss of colours. r rays, s samples per ray; distances in world units."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def stratified_depths(
 
     Args:
         near: [r], the start of each ray; must be positive for "disparity". This is not checked, because the host would
-            have to wait for the device. A ray with near == 0 gets finite depths, all 0 except for the far end.
+            have to wait for the device. With "disparity", a ray with near == 0 gets depths of 0 except for the far end.
         far: [r], the end of each ray, >= near.
         samples: s, >= 1.
         jitter: Whether each sample is uniformly random in its stratum, instead of in the middle (for "disparity", the
@@ -132,7 +132,7 @@ def blurred_weights(weights: Tensor) -> Tensor:
 def union_depths(
     depths: Tensor, edges: Tensor, weights: Tensor, count: int, *, uniforms: Tensor | None = None, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """Returns the samples of a first pass and new samples drawn by the first samples' weights (NeRF, section 5.2).
+    """Returns the samples of a first pass, and new samples drawn from its distribution of weights (NeRF, section 5.2).
 
     Args:
         depths: [r, s], the depths of the first pass.

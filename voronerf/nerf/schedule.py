@@ -8,17 +8,17 @@ import math
 #: the revisited voxels change only between such groups. Longer groups gain little: 3 % of the time is spent between
 #: groups.
 GROUP = 16
-#: The maximum number of warm-up steps, in which the learning rate rises. Densities stay low while the rate is small. An
-#: occupancy grid forgets in eight to thirty steps and would empty all voxels for good, so it learns only after the
-#: warm-up.
+#: The maximum number of warm-up steps, in which the learning rate rises. Densities stay low while the rate is small.
+#: The densities that an occupancy grid stores decay within eight to thirty steps, so all voxels would become empty for
+#: good. The grid is therefore updated only after the warm-up.
 WARMUP_STEPS = 100
 #: The longest warm-up as a fraction of the training.
 WARMUP = 0.02
 #: The learning rate at the end, as a fraction of the rate at the start.
 FINAL = 0.05
-#: The target number of a step's samples in occupied space, as a fraction of the first step's samples; see `next_rays`.
-#: The fraction grows with the samples of a ray beyond `FILL_SAMPLES`, or `CONTRACTED_FILL_SAMPLES` in contracted space:
-#: fields with more samples have larger tables, whose update costs less per ray in a larger batch.
+#: `next_rays` aims at `FILL` * (rays of the first step) * (strata per ray) samples in occupied space. If a ray has more
+#: strata than `FILL_SAMPLES`, or `CONTRACTED_FILL_SAMPLES` in contracted space, the factor `FILL` is enlarged in
+#: proportion: trainings with more strata also have larger tables, whose update costs less per ray in a larger batch.
 FILL, FILL_SAMPLES, CONTRACTED_FILL_SAMPLES = 0.25, 64, 128
 
 

@@ -17,7 +17,8 @@ from voronerf.ops._core.recording import Recording, entries_of, mapped
 
 T = TypeVar("T", bound=type)
 
-#: The maximum number of eager calls after a recording that could not be replayed; the number starts at 1 and doubles.
+#: The maximum number of eager calls after a recording that could not be replayed. The number is 0 after the first such
+#: recording and 1 after the second, and then doubles.
 MAX_BACKOFF = 64
 _REPLAYED = set[type]()
 _HARMLESS = {
@@ -31,9 +32,9 @@ def replayed(kind: T) -> T:
 
     Its methods must compute only with ops and elementwise functions of torch, and data that changes from step to step
     must lie in tensors. Other Python code runs only once, while the step is recorded. All classes of this package are
-    marked. If an unmarked subclass overrides a hook, this hook is called in each step; if it overrides another member
-    that hooks may use, all its hooks are called. A step detects changes of instance attributes, but not of class
-    attributes.
+    marked. If an unmarked subclass overrides a hook, this hook runs in Python in each step. If it overrides another
+    member that hooks may use, all its hooks run in Python in each step. A step detects changes of instance
+    attributes, but not of class attributes.
 
     Examples:
         >>> from voronerf.nerf import SplitStrategy, replayed
@@ -50,7 +51,12 @@ def replayed(kind: T) -> T:
 
 
 def in_python(part: Any, hook: str = "") -> bool:
-    """Returns whether a hook of an object (any hook for "") must be called in each step instead of being replayed."""
+    """Returns whether a hook of an object must be called in each step instead of being replayed.
+
+    Args:
+        part: The object.
+        hook: The name of the hook; "" asks whether this is true of any hook of the object.
+    """
     kind: Any = type(part)
     return hook in getattr(part, "__dict__", ()) or _overrides(kind, hook)
 
@@ -80,7 +86,7 @@ def free_names(part: Any) -> list[str]:
 
 @functools.lru_cache(maxsize=256)
 def _names_read(kind: Any) -> frozenset[str]:
-    """Returns the attributes of `self` that a class and its bases use; only `replayed` classes count."""
+    """Returns the attributes of `self` that the `replayed` classes among a class and its bases use."""
     names, codes = set[str](), list[types.CodeType]()
     for base in filter(_REPLAYED.__contains__, kind.__mro__):
         for value in vars(base).values():
@@ -100,11 +106,12 @@ class Stage(NamedTuple):
     """A stage of a training step.
 
     Attributes:
-        name: The name that users see.
+        name: The name of the stage in :meth:`TrainingStep.explain`.
         function: Function from results of earlier stages to new results by name, or to None.
         reads: The names of the results that the function takes.
         python: Whether the function is called in each step; else it may be replayed.
-        lazy: Whether a function in Python gets the whole recorded tensors, and itself selects their current rows.
+        lazy: Whether a function in Python gets the recorded tensors with all their rows, and itself selects the rows of
+            the present step; else it gets only these rows.
     """
 
     name: str
@@ -123,10 +130,10 @@ def run_stages(stages: Iterable[Stage], earlier: Mapping[str, Any]) -> dict[str,
 
 
 class SegmentResult(NamedTuple):
-    """The result of a segment, until its next call.
+    """The result of a call of a segment, valid until the next call.
 
     Attributes:
-        value: The result of the recorded call, or of this call.
+        value: The function's result in the recorded call, or in this call if it ran eagerly.
         recording: The recording that holds the result; None if this call ran eagerly.
         times: The number of times that this call ran or replayed the function.
     """
@@ -136,7 +143,11 @@ class SegmentResult(NamedTuple):
     times: int = 1
 
     def now(self, value: Any) -> Any:
-        """Returns ``value``, the value or a part of it, with only the rows that this call has filled."""
+        """Returns the argument with only the rows that this call has filled.
+
+        Args:
+            value: The attribute ``value``, or a part of it.
+        """
         return value if self.recording is None else self.recording.now(value)
 
 

@@ -1,4 +1,4 @@
-"""Cell splits in a training: kept samples refine the diagram, and new cells inherit their networks.
+"""Cell splits in a training: kept samples determine the new cells, which inherit the networks of their parents.
 
 m samples, k cells.
 """
@@ -37,18 +37,21 @@ class PlannedSplit:
         at: The time of the split: a fraction of the training if below 1, else a number of steps.
         children: Number of new cells for each split cell.
         cells: "all" to split all cells, or "worst" to split only the cell with the largest accumulated error.
-        most: Largest number of cells after the split, or None for no limit.
+        max_cells: Largest number of cells after the split, only for "worst"; None for no limit.
+
+    Raises:
+        ValueError: ``max_cells`` with ``cells="all"``.
 
     Examples:
         >>> from voronerf.nerf import PlannedSplit
-        >>> PlannedSplit(at=0.2, children=16).most is None
+        >>> PlannedSplit(at=0.2, children=16).max_cells is None
         True
     """
 
     at: float
     children: int
     cells: Literal["all", "worst"] = "all"
-    most: int | None = None
+    max_cells: int | None = None
 
 
 def plan_splits(
@@ -57,11 +60,12 @@ def plan_splits(
     """Returns the splits of a training, in order.
 
     Args:
-        cells: The number of children of a split, for each level.
-        times: The time of each level, as ``PlannedSplit.at``; with ``max_cells`` the times of the first and the last
+        cells: For each split in order, the number of children per split cell.
+        times: The time of each split, as ``PlannedSplit.at``; with ``max_cells`` the times of the first and the last
             split. By default, a single split is at 0.2, and several splits are evenly spaced from 0.15 to 0.5.
-        max_cells: The number of cells to reach by splitting the worst cell into ``cells[-1]`` at evenly spaced times
-            after the first split; the last split may make fewer children. None for no such splits.
+        max_cells: The number of cells to reach. After the first split, the worst cell is repeatedly split into
+            ``cells[-1]`` children, at evenly spaced times; the last split may make fewer children. None to split all
+            cells each time.
     """
     levels = len(cells) if max_cells is None else 2
     if times is None:
@@ -82,7 +86,7 @@ def final_cells(plan: Sequence[PlannedSplit]) -> int:
     cells = 1
     for split in plan:
         cells = cells * split.children if split.cells == "all" else cells + split.children - 1
-        cells = cells if split.most is None else min(cells, split.most)
+        cells = cells if split.max_cells is None else min(cells, split.max_cells)
     return cells
 
 
@@ -90,7 +94,7 @@ class SplitDone(NamedTuple):
     """The result of a split.
 
     Attributes:
-        split: The refined diagram, parents and balances. There are no balances if no cell held enough samples.
+        split: The result of `split_diagram`. Its ``balances`` are empty if no cell held enough samples.
         points: [m, 3], the samples from which the new cells were computed.
         importance: [m], the importance of each sample.
     """
@@ -104,7 +108,8 @@ class SplitDone(NamedTuple):
 class Strategy:
     """The base class of rules for splitting cells in a training; this class itself never splits a cell.
 
-    Before each step the loop checks :meth:`is_due`. A loop that can postpone the split also checks :meth:`has_samples`.
+    Before each step the training loop checks :meth:`is_due`. If it can postpone splits, it also checks
+    :meth:`has_samples`.
     If a split is due, the loop calls :meth:`step_pre_backward`, the only hook that may change networks and optimiser.
     After the optimiser, each step calls :meth:`step_post_backward`, which may change only the strategy itself. The
     tensors that the hook receives belong to the step, and must be read before the hook returns. A replayed step calls
@@ -113,7 +118,7 @@ class Strategy:
     Attributes:
         inherit: Whether new cells start as copies of their parent.
         splits: The number of splits made.
-        left: The number of splits still planned.
+        remaining: The number of splits still planned.
 
     Examples:
         >>> from voronerf.nerf import Strategy
@@ -125,7 +130,7 @@ class Strategy:
     splits: int = 0
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """The number of splits still planned."""
         return 0
 
@@ -153,7 +158,7 @@ class Strategy:
         return None
 
     def step_post_backward(self, output: RenderOutput) -> None:
-        """Learns from a step after its loss was computed.
+        """Collects data for the next split from a step, after its loss was computed.
 
         Args:
             output: The result of :class:`voronerf.nerf.RayLoss`.
@@ -240,11 +245,11 @@ class SplitStrategy(Strategy):
 
     @property
     def planned(self) -> PlannedSplit | None:
-        """The next split; None after the last split, since samples are then no longer kept."""
+        """The next split, for which samples are kept; None after the last split."""
         return self.plan[self.splits] if self.splits < len(self.plan) else None
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """The number of splits of the plan that are still to be made."""
         return len(self.plan) - self.splits
 
@@ -255,7 +260,7 @@ class SplitStrategy(Strategy):
     def is_due(self, fraction: float, step: int) -> bool:
         """Returns whether the next split is due; the arguments are as in :meth:`step_pre_backward`."""
         planned = self.planned
-        if planned is None or (planned.most is not None and step % TRY_EVERY):
+        if planned is None or (planned.max_cells is not None and step % TRY_EVERY):
             return False
         return (fraction if planned.at < 1 else step) >= planned.at - 1e-9
 
@@ -270,7 +275,8 @@ class SplitStrategy(Strategy):
             step: The number of steps done.
 
         Returns:
-            The split; None if no split was due, or if the worst cell does not yet hold enough samples.
+            The split; None if no split was due, or if no cell holds enough samples for a split with ``max_cells``,
+            which is then tried again later.
 
         Raises:
             ValueError: The first split has more cells than there are kept samples.
@@ -279,8 +285,8 @@ class SplitStrategy(Strategy):
         if planned is None or not self.is_due(fraction, step):
             return None
         children, cells = planned.children, self.diagram.num_cells
-        if planned.most is not None:
-            children = min(children, planned.most - cells + 1)
+        if planned.max_cells is not None:
+            children = min(children, planned.max_cells - cells + 1)
         points, importance = self.reservoir.samples()
         if len(points) < children and self.splits == 0:
             raise ValueError(
@@ -300,7 +306,7 @@ class SplitStrategy(Strategy):
                 generator=self.generator,
                 backend=self.backend,
             )
-        if planned.most is not None and not split.balances:
+        if planned.max_cells is not None and not split.balances:
             return None
         if split.balances:
             for router in self.routers.values():

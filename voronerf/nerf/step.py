@@ -78,7 +78,7 @@ class StepOutput:
 
     @property
     def output(self) -> RenderOutput:
-        """The result of :class:`RayLoss`; its tensors belong to the step."""
+        """The result of :class:`RayLoss`; later steps may overwrite its tensors."""
         return self._output if self._recording is None else cast(RenderOutput, self._recording.now(self._output))
 
 
@@ -195,10 +195,11 @@ class TrainingStep:
         Args:
             rays: The number of rays of each step.
             steps: The number of steps, at least 1.
-            at: The number of steps done before, or None if the loop calls the hooks itself. With a number, the step
-                also calls the sampler's ``step_pre_backward``, as often as ``steps_alike`` demands or, with user hooks,
-                before each step. It calls the optimiser's ``after_step`` after each multiple of `GROUP` steps. Both
-                hooks are recorded.
+            at: The number of steps done before. This method then also calls two hooks. It calls the sampler's
+                ``step_pre_backward`` before each step if there are user hooks, else before each run of steps; a run
+                ends after ``steps_per_update`` steps or at a multiple of `GROUP`. It calls the optimiser's
+                ``after_step`` after each multiple of `GROUP` steps. Both hooks are recorded, except a hook that must
+                run in Python (see `replayed`). None if the training loop calls both hooks itself.
 
         Returns:
             The result of the last step.
@@ -212,10 +213,10 @@ class TrainingStep:
             return self._run_steps(rays, steps)
         sampler, end = self.loss.renderer.sampler, at + steps
         while at < end:
-            alike = 1 if self._calls_hooks() else sampler.steps_alike(at)
+            alike = 1 if self._calls_hooks() else sampler.steps_per_update(at)
             count = min(end - at, schedule.GROUP - at % schedule.GROUP, alike)
             pre_backward = self._pre_backward(at)
-            if sampler.asks_at(at) and not in_python(sampler, "step_pre_backward"):
+            if sampler.evaluates_at(at) and not in_python(sampler, "step_pre_backward"):
                 self._run_or_replay_hook("before", pre_backward)
             else:
                 pre_backward()
@@ -231,12 +232,13 @@ class TrainingStep:
     def begin(self, at: int) -> None:
         """Begins a step whose segments are run by an outer loop, with host code in between.
 
-        Calls the sampler's ``step_pre_backward``. The loop then calls :meth:`do` for each segment, and :meth:`end`.
+        Calls the sampler's ``step_pre_backward``. The loop then calls :meth:`run_segment` for each segment, and then
+        :meth:`end`.
 
         Args:
             at: The number of steps done before.
         """
-        evaluates, pre_backward = self.loss.renderer.sampler.asks_at(at), self._pre_backward(at)
+        evaluates, pre_backward = self.loss.renderer.sampler.evaluates_at(at), self._pre_backward(at)
         if not evaluates:
             pre_backward()  # may change the sampler
         self._unchanged = self._is_unchanged()
@@ -246,16 +248,16 @@ class TrainingStep:
             if not self._obstacle:
                 self._note_dependencies()
         if evaluates:
-            self.do("before", pre_backward)
+            self.run_segment("before", pre_backward)
         self.optimizer.zero_grad(set_to_none=True)
 
     def draw(self, rays: int) -> Batch:
         """Draws a batch of ``rays`` rays."""
         draw = functools.partial(self.batches.draw, generator=self.generator)
-        result = self.do("rays", draw, rays) if not self._draws_in_python() else SegmentResult(draw(rays))
+        result = self.run_segment("rays", draw, rays) if not self._draws_in_python() else SegmentResult(draw(rays))
         return cast(Batch, result.now(result.value))
 
-    def do(self, name: str, function: Callable[..., Any], *arguments: Any) -> SegmentResult:
+    def run_segment(self, name: str, function: Callable[..., Any], *arguments: Any) -> SegmentResult:
         """Runs or replays a segment of a step, see :class:`Segment`.
 
         Args:
@@ -278,12 +280,12 @@ class TrainingStep:
             gradients: The segments that have computed gradients of parameters; if none, the optimiser is not called.
         """
         if gradients:
-            self.do(f"update of {len(gradients)}", self._update, output.loss, *gradients)
+            self.run_segment(f"update of {len(gradients)}", self._update, output.loss, *gradients)
         for stage in self._post_backward_stages():
             stage.function(output)
         self.optimizer.steps_done = at
         if at % schedule.GROUP == 0:
-            self.do("after", functools.partial(self.optimizer.after_step, at))
+            self.run_segment("after", functools.partial(self.optimizer.after_step, at))
 
     # Stages of a step -------------------------------------------------------------------------------------------------
 
@@ -383,7 +385,10 @@ class TrainingStep:
             return run_stages(stages, {**earlier, **hook_results, "rays": rays})
 
     def _settle_gradients(self, segment: Segment) -> None:
-        """Sets ``grad`` of all parameters to the memory that replays write; eager steps or the loop may replace it."""
+        """Points ``grad`` of all parameters to the memory that replays write.
+
+        Eager steps or the loop may have set ``grad`` to other tensors.
+        """
         if segment.replayed:
             for parameter, gradient in self._gradients:
                 if parameter.grad is not gradient:
@@ -395,7 +400,7 @@ class TrainingStep:
                     recording.hold(gradient)
 
     def _run_or_replay_hook(self, name: str, function: Callable[[], None]) -> None:
-        """Calls a hook outside the step, or replays the calls that the hook has recorded."""
+        """Calls a hook before or after a step, or replays the compiled calls that were recorded in the hook."""
         if self._last.recording is not None and self._is_unchanged():
             self._segments.setdefault(name, Segment())(function)
         else:
@@ -492,7 +497,7 @@ class TrainingStep:
         scaler.update()
 
     def _standing_obstacle(self) -> str | None:
-        """Returns the reason why no step can be replayed, or None; does not check the calls of a step."""
+        """Returns the reason why no step can be replayed, or None; other obstacles may appear in the recording."""
         if is_watched():
             return "a mode, a transform or a profiler of torch is active"
         renderer, device = self.loss.renderer, self.batches.device

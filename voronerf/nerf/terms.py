@@ -35,7 +35,7 @@ class LossAlongRays(NamedTuple):
         density: [m], the density at each sample per scene unit.
         error: [r], the squared error of the colour of each ray, summed over the channels.
         samples: The samples at which the networks were evaluated.
-        hidden: The largest transmittance at a hidden sample, which needs no gradient.
+        hidden: A sample whose transmittance is at most this value is hidden, and needs no gradient.
         backend: The backend of the ops.
 
     Examples:
@@ -82,12 +82,12 @@ class Term(Protocol):
         >>> import torch
         >>> from voronerf import NeRF
         >>> from voronerf.nerf import Batch, RayLoss, Rays, Renderer, Stratified
-        >>> class Thin:  # densities, with a factor that grows
+        >>> class Thin:  # the mean density, with a growing factor
         ...     factor = 0.0
         ...     def add(self, along, batch):
         ...         self.factor += 0.01
         ...         along.loss.add_(self.factor * along.density.mean())
-        ...         along.gradient[:, 3].add_(self.factor / len(along.density))  # of a field that has activated
+        ...         along.gradient[:, 3].add_(self.factor / len(along.density))  # for activated outputs
         >>> loss = RayLoss(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8)), terms=[Thin()])
         >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
         >>> output = loss(Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3)))
@@ -133,9 +133,9 @@ class SparseDepth:
 
 @replayed
 class SmoothDepth:
-    """A loss on the deviation of the depths of unseen rays from the plane through their neighbours.
+    """A loss on depths that are not locally planar, for triples of neighbouring rays that no training pixel shows.
 
-    See `voronerf.ops.smooth_depth_gradient`.
+    The triples are the last rays of a batch (``Batch.unseen``). See `voronerf.ops.smooth_depth_gradient`.
 
     Args:
         factor: The factor on the mean of this loss over the triples of rays.
@@ -186,16 +186,16 @@ class Surface:
         surface_gradient(*arguments, distortion=self.distortion, orientation=self.orientation, **options)
 
 
-class Seen:
+class RayValues:
     """The rendered rays, for a term that torch differentiates. All attributes except ``samples`` have gradients.
 
     The tensors belong to the step: they are valid until the next step, and must not be written to.
 
     Examples:
         >>> from voronerf import NeRF
-        >>> from voronerf.nerf import Batch, RayLoss, Renderer, Seen, Stratified
-        >>> def clear(seen: Seen, batch: Batch):  # rays end at a surface, or nowhere
-        ...     return 0.01 * (seen.opacity * (1 - seen.opacity)).mean()
+        >>> from voronerf.nerf import Batch, RayLoss, Renderer, RayValues, Stratified
+        >>> def clear(rays: RayValues, batch: Batch):  # rays end at a surface, or nowhere
+        ...     return 0.01 * (rays.opacity * (1 - rays.opacity)).mean()
         >>> loss = RayLoss(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8)), terms=[clear])
     """
 
@@ -250,7 +250,7 @@ class Seen:
 
 
 class DifferentiatedTerm:
-    """A term that torch differentiates: a function of `Seen` rays and their batch.
+    """A term that torch differentiates: a function of `RayValues` and their `Batch`.
 
     Only the function itself runs in Python and is differentiated by torch. A replayable op then backpropagates the
     resulting gradients to the networks' outputs.
@@ -259,22 +259,31 @@ class DifferentiatedTerm:
         function: The function, which returns a scalar.
     """
 
-    def __init__(self, function: Callable[[Seen, Batch], Tensor]) -> None:
+    def __init__(self, function: Callable[[RayValues, Batch], Tensor]) -> None:
         self.function = function
 
     def differentiate(self, now: Callable[[Any], Any], along: LossAlongRays, batch: Batch) -> dict[str, Tensor]:
-        """Adds the term to the loss; returns its gradients with respect to the attributes that it has read, by name."""
-        seen = Seen(along, batch, now)
+        """Adds the term to the loss, and returns the term's gradients.
+
+        Args:
+            now: Function that cuts recorded tensors to the rows of the present step.
+            along: The rendered rays.
+            batch: The rays.
+
+        Returns:
+            The gradients with respect to the attributes of `RayValues` that the function has read, by name.
+        """
+        values = RayValues(along, batch, now)
         with torch.enable_grad():
-            term = self.function(seen, now(batch))
+            term = self.function(values, now(batch))
         if not isinstance(term, Tensor) or term.dim():
             got = list(term.shape) if isinstance(term, Tensor) else repr(term)[:60]
             raise ValueError(f"RayLoss: a term must give a scalar tensor, got {got}")
         now(along.loss).add_(term.detach())
-        if not (term.requires_grad and seen.leaves):
+        if not (term.requires_grad and values.leaves):
             return {}
-        slopes = torch.autograd.grad(term, [*seen.leaves.values()], allow_unused=True)
-        return {name: slope for name, slope in zip(seen.leaves, slopes, strict=True) if slope is not None}
+        slopes = torch.autograd.grad(term, [*values.leaves.values()], allow_unused=True)
+        return {name: slope for name, slope in zip(values.leaves, slopes, strict=True) if slope is not None}
 
     def backpropagate(self, along: LossAlongRays, batch: Batch, slopes: Mapping[str, Tensor]) -> None:
         """Backpropagates the gradients of `differentiate` to the raw outputs."""
@@ -282,13 +291,13 @@ class DifferentiatedTerm:
             along.add_gradient(batch, **slopes)
 
 
-def stages_of(number: int, term: Term | Callable[[Seen, Batch], Tensor], now: Callable[[Any], Any]) -> list[Stage]:
-    """Returns the stages of a step that compute a term from "along" and "batch".
+def stages_of(number: int, term: Term | Callable[[RayValues, Batch], Tensor], now: Callable[[Any], Any]) -> list[Stage]:
+    """Returns the stages that read the results named "along" and "batch" and add a term to the loss.
 
     Args:
         number: The index of the term.
         term: The term of :class:`RayLoss`.
-        now: Function from a recorded tensor to its currently valid rows, for stages that run in Python.
+        now: Function that cuts recorded tensors to the rows of the present step, for stages that run in Python.
     """
     if hasattr(term, "add"):
         return [Stage(f"{type(term).__name__}.add", term.add, ("along", "batch"), in_python(term, "add"))]

@@ -132,7 +132,7 @@ class Rendered(NamedTuple):
     Examples:
         >>> import torch
         >>> from voronerf.nerf import Rays, render_rays
-        >>> def wall(positions, directions, ray_index):  # from z = 1 on
+        >>> def wall(positions, directions, ray_index):  # opaque where z > 1
         ...     return torch.ones_like(positions), torch.where(positions[:, 2] > 1, 1e9, 0.0)
         >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
         >>> result = render_rays(wall, rays, 0.0, 2.0, samples=8)
@@ -164,7 +164,7 @@ class RayColours(NamedTuple):
         >>> def fog(positions, directions, ray_index):
         ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
         >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
-        >>> seen = Renderer({"field": fog}, Stratified(8)).see(rays, torch.zeros(1), torch.ones(1))
+        >>> seen = Renderer({"field": fog}, Stratified(8)).render_colours(rays, torch.zeros(1), torch.ones(1))
         >>> seen.opacity.round(decimals=4)  # 1 - exp(-0.5)
         tensor([0.3935])
     """

@@ -19,7 +19,7 @@ from voronerf.ops.balance_centres import balance_centres
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
-from voronerf.ops.draw_pixels.reference import Known, Runs
+from voronerf.ops.draw_pixels.reference import KnownPixels, PixelRuns
 from voronerf.ops.draw_points import draw_points
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.frequency_encode import frequency_encode
@@ -37,7 +37,7 @@ from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
 from voronerf.ops.ray_runs.reference import OwnSamples
 from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradient
-from voronerf.ops.render_opaque import RaysSeen, render_opaque
+from voronerf.ops.render_opaque import RenderedRays, render_opaque
 from voronerf.ops.rendered_gradient import rendered_gradient
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
@@ -53,15 +53,15 @@ __all__ = [
     "Composite",
     "Guard",
     "HashGrid",
-    "Known",
+    "KnownPixels",
     "Layer",
     "March",
     "OwnSamples",
     "PixelRays",
-    "RaysSeen",
+    "PixelRuns",
     "RenderLoss",
+    "RenderedRays",
     "Rule",
-    "Runs",
     "Tape",
     "adam",
     "average",
@@ -104,9 +104,10 @@ __all__ = [
 
 
 class _Package(ModuleType):
-    """The package of an op. The function of the same name hides it here, so the function gets its submodules too.
+    """The package of an op. It also sets its submodules as attributes of the op's function.
 
-    ``import voronerf.ops.adam.reference as reference`` looks up ``reference`` in the function ``voronerf.ops.adam``.
+    In ``voronerf.ops``, the function of an op hides the package of the same name. Therefore, for example, ``import
+    voronerf.ops.adam.reference as reference`` looks up ``reference`` in the function ``voronerf.ops.adam``.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -79,8 +79,10 @@ def activate(raw: Tensor, density_scale: float = 1.0, activated: bool = False) -
     return torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
 
 
-class RaysSeen(NamedTuple):
+class RenderedRays(NamedTuple):
     """The rendered colours, opacities and depths of rays.
+
+    A ray is terminated when its transmittance is at most ``opaque``, as in `render_opaque`.
 
     Attributes:
         colour: [r, 3], with the background. The colour of a terminated ray is divided by its accumulated opacity.
@@ -90,8 +92,8 @@ class RaysSeen(NamedTuple):
         heaviest: [r], the depth of the sample with the largest weight; the far end for a ray without samples.
 
     Examples:
-        >>> from voronerf.ops import RaysSeen
-        >>> RaysSeen._fields
+        >>> from voronerf.ops import RenderedRays
+        >>> RenderedRays._fields
         ('colour', 'opacity', 'depth', 'light', 'heaviest')
     """
 
@@ -103,17 +105,17 @@ class RaysSeen(NamedTuple):
 
 
 class Wave(NamedTuple):
-    """One wave of samples, composited.
+    """The composited samples of one wave. A wave contains the next few samples of each ray that is not yet opaque.
 
     Attributes:
-        seen: The result of compositing these samples alone.
+        composite: The result of compositing only the samples of this wave.
         ray_index: int32 [m], the ray of each sample.
         ray_offsets: int32 [rays + 1], the first sample of each ray, then m.
         depths: [m], the distances of the samples along the rays.
-        stop: int32 [rays], the stratum at which each ray continues.
+        stop: int32 [rays], the stratum from which the next wave continues each ray; s for a finished ray.
     """
 
-    seen: Composite
+    composite: Composite
     ray_index: Tensor
     ray_offsets: Tensor
     depths: Tensor
@@ -122,19 +124,19 @@ class Wave(NamedTuple):
 
 @torch.no_grad()
 def walk(
-    look: Callable[[Tensor, Tensor | None], Wave],
+    render_wave: Callable[[Tensor, Tensor | None], Wave],
     far: Tensor,
     samples: int,
     wave: int,
     opaque: float,
     background: Tensor | None,
     heaviest: bool,
-) -> RaysSeen:
+) -> RenderedRays:
     """Renders rays in waves of samples, each ray until it is opaque.
 
     Args:
-        look: A function that evaluates the next wave. Its arguments are the indices of the rays (int64) and their first
-            strata (int32, or None for 0).
+        render_wave: A function that evaluates the next wave. Its arguments are the indices of the rays (int64) and
+            their first strata (int32, or None for 0).
         far: [r], the far ends of the rays.
         samples: The number of strata of a ray, s.
         wave: The largest number of samples of a ray in a wave.
@@ -146,8 +148,8 @@ def walk(
     through, heaviest_weight, heaviest_depth = torch.ones_like(far), torch.zeros_like(far), far.clone()
     live, start = torch.arange(len(far), device=far.device), None
     while live.numel() > 0:
-        step = look(live, start)
-        part, light = step.seen, through[live]
+        step = render_wave(live, start)
+        part, light = step.composite, through[live]
         colour[live] += light[:, None] * part.colour
         opacity[live] += light * part.opacity
         depth[live] += light * part.depth
@@ -165,7 +167,7 @@ def walk(
     colour, opacity = torch.where(ended[:, None], colour / opacity[:, None], colour), opacity.masked_fill(ended, 1)
     if background is not None:
         colour = colour + (1 - opacity)[:, None] * background.to(colour)
-    return RaysSeen(colour, opacity, depth, through, heaviest_depth)
+    return RenderedRays(colour, opacity, depth, through, heaviest_depth)
 
 
 def _heaviest(wave: Wave, most: int) -> tuple[Tensor, Tensor]:
@@ -173,7 +175,7 @@ def _heaviest(wave: Wave, most: int) -> tuple[Tensor, Tensor]:
 
     `most` is the largest number of samples of a ray.
     """
-    weights, rays = wave.seen.weights, len(wave.stop)
+    weights, rays = wave.composite.weights, len(wave.stop)
     row = torch.arange(len(weights), device=weights.device) - wave.ray_offsets[wave.ray_index]
     table = weights.new_full((2, rays * most), -1.0)
     table[:, wave.ray_index.long() * most + row] = torch.stack((weights, wave.depths))
@@ -182,20 +184,20 @@ def _heaviest(wave: Wave, most: int) -> tuple[Tensor, Tensor]:
 
 
 class Composed(NamedTuple):
-    """Rays composited from runs of samples."""
+    """Rays composited from runs of samples. A run is a sequence of consecutive samples of a ray."""
 
     colour: Tensor  # [r, c], without a background
     through: Tensor  # [r], the transmittance of each ray's runs together
-    before: Tensor  # [q], the optical depth in front of each run
+    optical_in_front: Tensor  # [q], the optical depth in front of each run
     place: Tensor  # int64 [q], the index of each run in a flat table with one row for each ray
     width: int  # the number of columns of the table
 
     @property
     def front(self) -> Tensor:
         """Returns the transmittance in front of each run, [q]."""
-        return torch.exp(-self.before)
+        return torch.exp(-self.optical_in_front)
 
-    def behind(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
+    def loss_behind(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
         """Returns the part of the loss that is due to light from behind each run, [q], to first order.
 
         Args:
@@ -225,7 +227,8 @@ def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed
     place = ray * width + slot
     table = optical.new_zeros(rays, width)
     table.view(-1)[place] = optical
-    # Shifting makes the sum exclusive: subtracting each last term would give inf - inf for an opaque run.
+    # Shifting the terms makes the cumulative sum exclusive. Subtracting each run's own term from an inclusive sum would
+    # give inf - inf for an opaque run.
     before = F.pad(table[:, :-1], (1, 0)).cumsum(1).view(-1)[place]
     total = colour.new_zeros(rays, colour.shape[1]).index_add(0, ray, torch.exp(-before)[:, None] * colour)
     return Composed(total, torch.exp(-table.sum(1)), before, place, width)

@@ -1,4 +1,4 @@
-"""VoronoiRouter: any module as one network per Voronoi cell."""
+"""VoronoiRouter, which makes one network per Voronoi cell from any module."""
 
 from voronerf.router.grouped import register
 from voronerf.router.program import CellProgram, layered_program

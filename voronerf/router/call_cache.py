@@ -1,7 +1,9 @@
-"""A cache for calls that run as one program: the first call of a kind stores what later calls of this kind need.
+"""A cache for calls that run as one program.
 
-Letters: n samples, k cells, d coordinates. A later call neither analyses its arguments nor sorts its samples: two
-operations find the cells and compute the results.
+Calls are of one kind if they have the same key (:func:`call_key`). After the first call of a kind, later calls
+neither analyse their arguments nor sort their samples: two operations find the cells and compute the results.
+
+Letters: n samples, k cells, d coordinates.
 """
 
 from __future__ import annotations
@@ -26,7 +28,11 @@ _VALUES = {type(None), bool, int, float, str}
 
 
 def call_key(method: str, training: bool, args: Sequence[Any], kwargs: dict[str, Any], coords: Any) -> Any:
-    """Returns the cache key of a call, for any number of samples; None if the call has no compact key."""
+    """Returns the cache key of a call; None if the call cannot be cached.
+
+    The key does not depend on the first dimension of the tensors. A call cannot be cached if it has no tensor argument,
+    or an argument that is neither a plain tensor nor a number, text, bool or None.
+    """
     key: list[Any] = [method, training, torch.is_grad_enabled(), *kwargs]
     device = None
     for value in (*args, *kwargs.values(), coords):
@@ -54,7 +60,7 @@ class CachedCall:
     """The cached form of all calls of one kind, made from the first call and its plan.
 
     Attributes:
-        unchanged: A guard that holds while the module is the same as in the first call.
+        unchanged: A guard that detects changes of the module since the first call.
     """
 
     unchanged: Any
@@ -136,7 +142,8 @@ class CachedCall:
         for i in self._reads:
             x = arguments[i] if arguments[i].dim() == 2 else arguments[i].reshape(n, -1)
             x = x if x.dtype is torch.float32 else x.float()
-            # Autograd can tell whether a view needs a gradient, but not whether a leaf tensor does.
+            # The operation gets a view instead of a leaf, because in torch.autograd.grad the engine can tell the
+            # backward pass whether a view's gradient is used, but not whether a leaf's is (`needed_gradients`).
             rows.append(x.view_as(x) if x.requires_grad and self._learns else x)
         parameters = self._parameters(k, rows[0].device, router.backend)
         if self._shares:

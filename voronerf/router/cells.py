@@ -124,7 +124,14 @@ def _leaves(value: Any) -> list[Any]:
 
 
 def _held_by(function: types.FunctionType, objects: dict[int, str]) -> str:
-    """Returns the description of an object that a function (and any copy of it) refers to, or an empty text."""
+    """Returns the description of the first of the objects that a function refers to; "" if it refers to none.
+
+    A copy of the module would still refer to this object, since ``copy.deepcopy`` does not copy functions.
+
+    Args:
+        function: The function, with its globals, closure and defaults.
+        objects: The descriptions of parameters and submodules, by the id of the object.
+    """
     names = function.__code__.co_names
     values = [function.__globals__[name] for name in names if name in function.__globals__]
     for cell in function.__closure__ or ():

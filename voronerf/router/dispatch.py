@@ -40,9 +40,11 @@ from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, loo
 _OP = "VoronoiRouter"
 _PLANS = 256  # maximum number of kinds of calls with plans
 _TRACES = 8  # maximum number of traces for a kind of call; a module that changes more often runs grouped
-_TURNS, _SECONDS = 8, 0.08  # maximum number of timings of each way, time in seconds after which none begins
+_TURNS, _SECONDS = 8, 0.08  # the maximum number of turns; time in seconds after which no turn begins
 _BEHIND = 1.5  # a loop that is slower than the fastest way by this factor is not timed again
-_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # lost timings that end the fused way, seconds between them, time ratio of a loss
+# The fused way is given up after _LOOKS slow timings, which are at least _APART seconds apart. A timing is slow if the
+# fused way takes more than _CLEAR times as long as the fastest way.
+_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3
 _EQUAL = 1.02  # times within this factor of the least count as equal; the plan's first such way is chosen
 _OF_DTYPES = re.compile("same dtype|expected scalar type|Input type")  # PyTorch's messages about dtypes
 _LIBRARY_FOLDERS = tuple(
@@ -85,7 +87,8 @@ class Dispatch:
 
         Args:
             call: The call.
-            grouping: The samples of the call by cell, to trace it if no earlier call was traced; None to trace nothing.
+            grouping: The samples of the call by cell, with which the call is traced if no earlier trace fits; None to
+                trace nothing.
             device: The device of the samples.
             k: The number of cells.
             options: The user's options.
@@ -97,7 +100,7 @@ class Dispatch:
             return f"{call.name} runs under autocast"
         self._check_parameters(call, k, options.names)
         constants = call.constants()
-        plans = [plan for plan in self.plans.get(_plan_key(call, device), []) if plan.fused or not plan.few]
+        plans = [plan for plan in self.plans.get(_plan_key(call, device), []) if plan.fused or not plan.small]
         plan = next((plan for plan in plans if not plan.changed(constants)), None)
         if plan is None and grouping is None:
             return f"{call.name} is traced at its {'next' if plans else 'first'} call"
@@ -111,7 +114,7 @@ class Dispatch:
         return CellProgram(encoded, program.reads, shapes, plan.fused.parameters(k, device, backend))
 
     def evaluate(self, call: Call, grouping: Grouping, options: Options, frozen: Tensor | None) -> Results:
-        """Runs a call on the samples of all cells, or on two placeholders if there are no samples.
+        """Runs a call on the samples of all cells, or on two placeholder samples if there are none.
 
         Args:
             call: The call.
@@ -134,7 +137,11 @@ class Dispatch:
         return results
 
     def _plain(self, call: Call) -> Call:
-        """Returns the call with plain tensors; for new tensor types, raises TypeError if the module needs them."""
+        """Returns the call with plain tensors instead of tensors of a subclass.
+
+        Raises TypeError if the module gives other results for plain tensors. This is checked once for each method and
+        set of tensor types.
+        """
         if (plain := call.plain()) is not call:
             key = call.method, frozenset(map(type, tensors_of((call.args, call.kwargs))))
             if key not in self._subclasses:
@@ -199,9 +206,9 @@ class Dispatch:
         """Returns the plan for calls of this kind; a first call, or a call with changed constants, makes a plan."""
         layout, key = call.layout, _plan_key(call, grouping.device)
         constants, few = call.constants() if options.fuse else {}, layout.n < FEWEST
-        plans = [plan for plan in self.plans.get(key, []) if few or not plan.few]
+        plans = [plan for plan in self.plans.get(key, []) if few or not plan.small]
         plan = next((plan for plan in plans if not plan.changed(constants)), None)
-        if plan is not None and (few or not plan.open or plan.skip or recorded()):
+        if plan is not None and (few or not plan.may_group or plan.skip or recorded()):
             return plan
         if not layout.n:
             return CallPlan([Loop("no samples yet")])
@@ -213,7 +220,7 @@ class Dispatch:
                 return plan
             inputs, too_many = self._inputs(call, constants, plans, key) if plan is None and plans else ([Inputs()], "")
             # If a new trace fails, calls run grouped without an error.
-            options = replace(options, several=options.several or bool(plans))
+            options = replace(options, many_methods=options.many_methods or bool(plans))
             try:
                 if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
                     check_rays(copied)
@@ -237,7 +244,7 @@ class Dispatch:
         old_plans = set(map(id, self.plans.get(key, [])))
         self.cached = {call_key: other for call_key, other in self.cached.items() if id(other.plan) not in old_plans}
         if plans and [way.name for way in plans[0].ways] == [way.name for way in ways]:
-            new_plan.chosen, new_plan.lost = plans[0].chosen, plans[0].lost
+            new_plan.choices, new_plan.lost_timings = plans[0].choices, plans[0].lost_timings
         self.plans[key] = (
             [new_plan] if new_plan.fused is None else [new_plan, *(other for other in plans if other is not plan)]
         )
@@ -246,7 +253,11 @@ class Dispatch:
     def _inputs(
         self, call: Call, constants: dict[str, Any], plans: list[CallPlan], key: Any
     ) -> tuple[list[Inputs], str]:
-        """Lists the inputs to try for a new trace; if values changed too often, lists none, and gives the reason."""
+        """Returns a list of alternative inputs of a new trace, to be tried in this order, and an empty text.
+
+        Numbers, and tensors in attributes, that have changed since the last trace become inputs. If the module was
+        traced too often, the list is empty, and the text is the reason.
+        """
         fused = plans[0].fused
         assert fused is not None
         changed, parts = plans[0].changed(constants), list(parts_of(call.module).values())
@@ -282,10 +293,10 @@ class Dispatch:
         if not plan.measured or len(ways) == 1 or n < FEWEST:
             return ways[0], ways[0].why
         size, n = plan.size(n, k), min(n, measured_samples(ways))
-        losses, retry_time, why = plan.lost.get(size, (0, 0.0, ""))
-        if losses and size not in plan.chosen and (recorded() or time.monotonic() < retry_time):
+        losses, retry_time, why = plan.lost_timings.get(size, (0, 0.0, ""))
+        if losses and size not in plan.choices and (recorded() or time.monotonic() < retry_time):
             return ways[0], why
-        if size not in plan.chosen:
+        if size not in plan.choices:
             with self._lock, aside(call) as copied:
                 times = measure(ways, copied, grouping)
             fused = isinstance(ways[0], Fused)  # the fused way is kept unless it is clearly slower each time
@@ -298,10 +309,10 @@ class Dispatch:
             why = f"{1e3 * times[first]:.3g} ms for {n} samples, {others}" if min(times) else ""
             if is_slower and first == 0:
                 why = "; ".join(filter(None, (ways[0].why, f"{why}, to be measured again")))
-                plan.lost[size] = losses, time.monotonic() + _APART, why
+                plan.lost_timings[size] = losses, time.monotonic() + _APART, why
                 return ways[0], why
-            plan.chosen[size] = first, why
-        first, why = plan.chosen[size]
+            plan.choices[size] = first, why
+        first, why = plan.choices[size]
         return ways[first], "; ".join(filter(None, (ways[first].why, why)))
 
     def _run(self, plan: CallPlan, call: Call, grouping: Grouping) -> Results:
@@ -398,9 +409,10 @@ def _misfit(error: Exception, call: Call) -> Exception | None:
 
 
 def _plan_key(call: Call, device: torch.device) -> Any:
-    """Returns the key of a call's plans: modes, and the kinds, types and sizes of arguments for any number of samples.
+    """Returns the key of a call's plans, which does not depend on the number of samples.
 
-    Raises ValueError for tensors that are neither per sample nor per ray, or could be both.
+    The key holds the method, the modes (training, gradients, autocast), and the kinds, types and sizes of the
+    arguments. Raises ValueError for tensors that are neither per sample nor per ray, or could be both.
     """
     autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
     lead, d = call.layout.lead, len(call.layout.lead)
@@ -435,15 +447,19 @@ class _Constant(torch.autograd.Function):
 def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
     """Returns each way's time in seconds for a part of a batch: forward and, if gradients are on, backward.
 
-    The ways take turns, and the least time of each way counts; a much slower loop has one turn. The ways run on a
-    double of the module, so the module gets no writes and no gradients. The state of random generators is restored.
+    The ways take turns, and the least time of each way counts. The loop over cells (`Loop`) is not timed again if it is
+    much slower than the fastest way. The ways run on a double of the module, so the module itself gets no writes and no
+    gradients. The state of random generators is restored.
     """
     most, times = measured_samples(ways), _least_times(ways, call, grouping, SLICE, 2)
     return _least_times(ways, call, grouping, most, 1) if min(most, call.layout.n) > 2 * SLICE else times
 
 
 def _least_times(ways: list[Way], call: Call, grouping: Grouping, most: int, fewest: int) -> list[float]:
-    """Returns each way's least time in seconds over at least ``fewest`` turns, on at most ``most`` samples."""
+    """Returns each way's least time in seconds over at least ``fewest`` turns.
+
+    A call on more than ``most`` samples is cut to about ``most``, unless the grouping itself selects samples.
+    """
     k, device, selection = grouping.k, grouping.device, call.part(most) if grouping.rows is None else None
     if selection is not None:
         call, rows = selection

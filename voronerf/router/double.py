@@ -37,8 +37,8 @@ class Double:
 
     Args:
         module: The routed module, or a field.
-        reads: A set to which runs add (place of the submodule, name) of each attribute that they read; None to record
-            nothing.
+        reads: A set to which each run adds (index of the submodule in ``modules()``, name) for every attribute that it
+            reads; None to record nothing.
     """
 
     def __init__(self, module: nn.Module, reads: set[tuple[int, str]] | None = None) -> None:
@@ -70,7 +70,7 @@ class Double:
     def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any], mode: Any = None) -> Any:
         """Runs a call with ``rows`` as its arguments, and with ``values``, by parameter id, as its parameters.
 
-        The ``mode`` is active only while the method runs.
+        The PyTorch function mode ``mode``, if any, is active only while the method runs.
 
         Raises:
             Forbidden: If the method adds, removes or replaces parameters, or writes into them.
@@ -134,7 +134,11 @@ def _twin(part: nn.Module, place: int, reads: set[tuple[int, str]] | None) -> nn
 
 
 class _Unregistered:
-    """A base class without ``__init_subclass__``, which keeps recording classes out of registries of subclasses."""
+    """A base class whose ``__init_subclass__`` does nothing.
+
+    Many classes register their subclasses in ``__init_subclass__``. The subclasses that `_recording_class` makes must
+    not appear in such a registry.
+    """
 
     __slots__ = ()
 
@@ -143,7 +147,7 @@ class _Unregistered:
 
 
 def _recording_class(kind: type[nn.Module], place: int, reads: set[tuple[int, str]]) -> type[nn.Module]:
-    """Makes a subclass that adds (place, name) of each accessed attribute to ``reads``."""
+    """Makes a subclass that adds (``place``, name) of each accessed attribute to ``reads``."""
 
     def getattribute(self: nn.Module, name: str) -> Any:
         reads.add((place, name))
@@ -156,7 +160,7 @@ def _recording_class(kind: type[nn.Module], place: int, reads: set[tuple[int, st
 
 
 def _versions(placed: list[tuple[dict[str, Any], str, Any]]) -> list[int]:
-    """Lists the version counters of tensors; it must be fast, because a loop over cells calls it hundreds of times."""
+    """Lists the version counters of tensors; this must be fast, since a loop over cells does it hundreds of times."""
     try:
         return [value._version for _, _, value in placed]
     except RuntimeError:  # inference-mode tensors have no version counter

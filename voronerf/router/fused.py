@@ -70,7 +70,7 @@ class ParameterEntries:
 
 @dataclass
 class Segment:
-    """One program with its outputs and the sources of its inputs and parameters."""
+    """A run of steps as one program, with its outputs and the sources of its inputs and parameters."""
 
     program: Program
     inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier runs
@@ -94,7 +94,7 @@ class Fused:
 
     Attributes:
         inputs: The numbers and buffers that are looked up in each call.
-        reads: The attributes that ``forward`` reads, as (place of the submodule, name).
+        reads: The attributes that ``forward`` reads, as (index of the submodule in ``modules()``, name).
     """
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
@@ -167,7 +167,11 @@ class Fused:
                 self._entries.pop(value, None)
 
     def _is_left_to_torch(self, node: fx.Node) -> bool:
-        """Returns whether a node only moves entries of PyTorch's values, or takes no tensors, like ``zeros``."""
+        """Returns whether PyTorch computes a node, although the node could be steps of a program.
+
+        Such a node takes no tensors, like ``zeros``, or only moves entries of arguments and of values that PyTorch
+        computes.
+        """
         sources = node.all_input_nodes
         if not all(source in self._ready for source in sources):
             return False
@@ -271,7 +275,7 @@ class Fused:
         return columns if columns.index not in self._lowering.sources else self._lowering.builder.apply("copy", columns)
 
     def _cut(self) -> dict[int, Segment]:
-        """Groups the steps into runs by the steps' levels."""
+        """Returns the runs of steps, by number; the level of a step is the number of its run."""
         lowering, steps = self._lowering, self._lowering.builder.steps
         live = self._live
         level = {value: lowering.level(value) for value in live}
@@ -331,7 +335,7 @@ class Fused:
 
     @functools.cached_property
     def encoded(self) -> Program:
-        """The program of :attr:`whole_program` with encodings as steps."""
+        """The program of :attr:`whole_program`, in which `encode` steps replace sines and cosines of octaves."""
         (run,), whole_program = self._runs.values(), cast(WholeProgram, self.whole_program)
         constants = {i: entries.constants() for i, entries in enumerate(run.parameters)}
         return with_encodings(
@@ -379,7 +383,7 @@ class Fused:
         return [entries.resolve(values).float() for entries in run.parameters]
 
     def _with_inputs(self, call: Call, device: torch.device) -> Call:
-        """Returns the call with the numbers that are inputs replaced by tensors."""
+        """Returns the call with tensors instead of the numbers that are inputs of the trace."""
         names = {source for source in self.inputs.sources if isinstance(source, str)}
         return call.with_tensors(names, lambda value: self.inputs.tensor(value, device)) if names else call
 
@@ -421,7 +425,14 @@ class Fused:
 
 
 def _renumbered(steps: list[Step], results: list[Columns], lowering: Lowering, outputs: list[Any]) -> Segment:
-    """Makes a program of some of the steps, with new numbers for its values and parameters."""
+    """Makes a segment of some steps; the values and parameters of its program are numbered anew.
+
+    Args:
+        steps: The steps of the segment.
+        results: The columns that the program outputs.
+        lowering: The lowering to which the steps belong.
+        outputs: The node or value of each output.
+    """
     b, run = Builder(), Segment(Program((), (), (), ()), outputs=outputs)
     values: dict[int, int] = {}
     parameters: dict[int, int] = {}

@@ -130,7 +130,7 @@ def register(function: Any, rule: Rule) -> None:
 
 
 class Ungroupable(Exception):
-    """An error for a module that cannot run on the samples of all cells at once; the message says where."""
+    """An error for a module that cannot run on the samples of all cells at once; the message gives the reason."""
 
     def __init__(self, reason: str, of_batch: bool = False) -> None:
         super().__init__(reason)
@@ -149,7 +149,7 @@ class PerCell(torch.Tensor):
 
     stacked: Tensor
     origin: tuple[Tensor, int]
-    # Not needed, because the wrapper itself has the shape and the dtype.
+    # The wrapper needs no override of functions, because it has the shape and the dtype of a cell's tensor.
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     @staticmethod
@@ -240,7 +240,8 @@ class GroupedRun(TorchFunctionMode):
     """A mode that is active while a module runs on the n sorted rows of all cells; rules get it as ``run``.
 
     Attributes:
-        tables: The look-up tables that the call has used; all parts of its rows share them.
+        tables: The look-up tables that the call has read, with buffers for their gradients. If the rows of the call are
+            run in parts, all parts share this dict.
         failed: The reason why the results are invalid, even if the module caught the error; None if they are valid.
         widest: The size in bytes of the largest tensor of rows in the run.
     """
@@ -280,7 +281,10 @@ class GroupedRun(TorchFunctionMode):
         return tensor
 
     def fail(self, reason: str, of_batch: bool = False) -> Ungroupable:
-        """Records why the run cannot continue, and returns the error to raise."""
+        """Records why the run cannot continue, and returns the error to raise.
+
+        ``of_batch`` tells whether another batch may run grouped.
+        """
         self.failed = self.failed or Ungroupable(reason + line_of(user_frame()), of_batch)
         return self.failed
 
@@ -371,8 +375,9 @@ class Grouped:
         """Returns results in the order of the grouping; raises :class:`Ungroupable`."""
         arguments = call.arranged(grouping)
         parts = grouping.parts(self.piece) if grouping.device.type == "cpu" else [grouping]
-        # Parameters are split once for all parts, so their gradients are concatenated once. If each part took a slice,
-        # each gradient would be a zero-filled tensor of all cells. Parts of one cell share a piece.
+        # Each parameter is split once for all parts, so the gradients of the pieces are concatenated once. If each part
+        # took a slice, the gradient of each slice would be a zero-filled tensor of all cells. If the rows of a large
+        # cell are cut into several parts, these parts use the same piece.
         sizes, pieces = {part.start: part.k for part in parts}, []
         for p in cell_parameters(call.module):
             pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))

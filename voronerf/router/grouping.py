@@ -163,7 +163,11 @@ class Assigned(NamedTuple):
     methods: set[str]  # names of the methods that have used this grouping
 
     def serves(self, method: str, positions: Tensor, key: Any, drawn: bool) -> bool:
-        """Returns whether the grouping fits a call's positions; randomly drawn cells serve each method once."""
+        """Returns whether a call can reuse the grouping, and notes the call's method.
+
+        The key and the positions must be the same. If cells are drawn at random, each method uses the grouping only
+        once; its next call draws new cells.
+        """
         if key != self.key or (drawn and method in self.methods) or positions.device != self.positions.device:
             return False
         self.methods.add(method)
@@ -208,7 +212,7 @@ def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
 
 
 class _Cells(torch.autograd.Function):
-    """A split of a stacked tensor by cell; its backward joins the gradients in memory of `on_huge_pages`."""
+    """A split of a stacked tensor by cell; its backward writes the gradients into one tensor on huge memory pages."""
 
     generate_vmap_rule = True
 

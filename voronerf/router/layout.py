@@ -140,8 +140,8 @@ class Layout:
     def kind(self, name: str, tensor: Tensor, nested: bool) -> str:
         """Returns the kind of a tensor: per sample, per ray, broadcast or shared.
 
-        Raises ValueError for an ambiguous shape. A shape that fits no kind also raises, but counts as shared if the
-        tensor is ``nested`` in an object.
+        A tensor whose shape fits no kind is shared if it is ``nested`` in an object; otherwise its shape raises
+        ValueError. An ambiguous shape always raises ValueError.
         """
         shape, lead, d = tuple(tensor.shape), self.lead, len(self.lead)
         if not shape or _named(name, self.shared):
@@ -280,7 +280,9 @@ class Call:
         return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)
 
     def part(self, most: int) -> tuple[Call, Tensor] | None:
-        """Returns a call on at most ``most`` samples, and their numbers, int64 [m]; None if the call is no larger.
+        """Returns a call on about ``most`` of the samples, and the numbers of these samples, int64 [m].
+
+        Returns None if the call has at most ``most`` samples.
 
         The samples are evenly spaced along the longest leading dimension, so that many rays stay complete.
         """

@@ -65,7 +65,11 @@ _FUNCTIONS: dict[str, Callable[..., list[tuple[str, float, float]]]] = {
     "logical_not": lambda: [("affine", -1, 1)],
     "bitwise_not": lambda: [("affine", -1, 1)],
 }
-"""Functions of one tensor and numbers, as sequences of the program's functions (name, a, b)."""
+"""ATen functions of one tensor and constants, by name.
+
+Each entry maps the constants to a list of functions of the program, (name, a, b), which are applied one after the
+other; a and b are their constants.
+"""
 _BINARY = {
     **{name: name for name in ("add", "sub", "mul", "div")},
     **dict.fromkeys(("bitwise_and", "logical_and"), "mul"),
@@ -138,7 +142,7 @@ def _layer_norm(x: Tensor, shape: Sequence[int], weight: Any, bias: Any, eps: fl
 
 
 def _convolution(x: Tensor, weight: Tensor, bias: Any, *rule: Any) -> Tensor:
-    """Writes a convolution of [n, c, ...] as a linear layer; its kernel has one place, or covers the whole input."""
+    """Writes a convolution of [n, c, ...] as a linear layer; its kernel must have size 1 or cover the whole input."""
     (stride, padding, dilation, transposed, _, groups), size, more = rule, weight.shape[2:], x.shape[2:]
     covers_all = size == more and set(dilation) == {1}
     if transposed or groups != 1 or any(padding) or not (covers_all or set(size) == {1}):
@@ -222,7 +226,7 @@ class Lowering:
         rows: The number of samples of the trace.
         levels: For each value, the number of the run that computes it.
         sources: For each input, the node of the trace whose rows it reads.
-        columns: (value, column in the value), by the number of the column in codes.
+        columns: For each column number in codes, the value and the index of the column in this value.
         parameters: The source of each parameter of the program: a node or tensor, and the numbers of its entries.
     """
 
@@ -261,7 +265,7 @@ class Lowering:
         return (torch.arange(self.rows)[:, None] << 32) + torch.arange(first, first + x.width)
 
     def level(self, value: int) -> int:
-        """Returns the number of the run that computes a value."""
+        """Returns the index of the run (a group of fused steps) that computes a value."""
         for step in self.builder.steps[self._leveled :]:
             self.levels.setdefault(
                 step.out, max((self.levels[c.index] for c in step.operands if c.of == VALUE), default=0)
@@ -288,7 +292,10 @@ class Lowering:
         return {self.columns[number][0] for number in (codes & _LOW).unique().tolist()}
 
     def parts(self, numbers: Tensor) -> list[tuple[Columns, int]]:
-        """Divides columns, given by their numbers, into as few pieces as possible; lists each piece with its place."""
+        """Joins the columns with these numbers into as few pieces as possible.
+
+        Returns a list of (piece, index of its first column in ``numbers``).
+        """
         parts: list[tuple[Columns, int]] = []
         for at, number in enumerate(numbers.tolist()):
             value, column = self.columns[number]
@@ -318,7 +325,7 @@ class Lowering:
         return self._parameter_numbers[key]
 
     def vector(self, entries: Entries, codes: Tensor) -> Columns:
-        """Returns an operand of the parameter's entries with these codes, [w]."""
+        """Adds the entries with these codes, [w], to the program as a parameter; returns it as an operand."""
         low, width = int(codes.min()), len(codes)
         if bool((codes == low).all()):
             one = Entries(codes[:1], entries.of)
@@ -379,7 +386,7 @@ class _EntryMode(TorchDispatchMode):
         return self._entries.get(id(tensor), (None, None))[1]
 
     def of_result(self, tensor: Tensor) -> Entries:
-        """Returns the entries of a result, as a tensor of samples."""
+        """Returns the entries of a result; a result without samples is first expanded to a tensor of samples."""
         entries = self.entries(tensor)
         return entries if entries is not None and entries.of is None else self.of_samples(tensor, entries)
 
@@ -445,7 +452,7 @@ class _EntryMode(TorchDispatchMode):
         raise NotAStep(f"no kind of step computes {name}")
 
     def _sample_entries(self, tensor: Tensor) -> Entries:
-        """Returns the entries of a tensor of samples; raises NotAStep for others."""
+        """Returns the entries of a tensor of samples; raises NotAStep for a tensor that does not depend on samples."""
         entries = self.entries(tensor)
         if entries is None or entries.of is not None:
             raise NotAStep("a product with a tensor that does not depend on samples")
@@ -510,7 +517,7 @@ class _EntryMode(TorchDispatchMode):
         return self.of_samples(value.expand(target.shape), entries)
 
     def _placed(self, value: Columns, places: Tensor, shape: Sequence[int]) -> Entries:
-        """Returns the entries of a tensor that holds a value's columns at ``places``."""
+        """Returns the entries of a tensor that holds a value's columns at the flat indices ``places``, [rows, w]."""
         codes = torch.empty(math.prod(shape), dtype=torch.int64)
         columns = self.b.rows(value)
         codes[places] = self.lowering._codes(columns).expand(places.shape) if columns.width > 0 else 0
@@ -528,7 +535,10 @@ class _EntryMode(TorchDispatchMode):
         return self._placed(x, places, result.shape)
 
     def _operands(self, tensors: Sequence[Any], shape: Sequence[int]) -> tuple[list[Columns], Tensor]:
-        """Broadcasts tensors to a shape; returns them as operands of one width, and the places of their entries."""
+        """Broadcasts tensors to a shape, and returns them as operands of one width w.
+
+        Also returns the flat indices, [rows, w], of each sample's entries in a tensor of this shape.
+        """
         columns: list[Columns] = []
         first = next(e for t in tensors if isinstance(t, Tensor) and (e := self.entries(t)) and e.of is None)
         places, _ = self.lowering.order(first.codes.expand(list(shape)))

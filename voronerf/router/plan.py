@@ -23,11 +23,12 @@ class CallPlan:
     Attributes:
         ways: The ways that agree with the loop, the most promising first and the loop last.
         measured: Whether timings on the first batch of each size choose the way; else the first way runs.
-        open: Whether another batch may run grouped although the first did not.
-        few: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another plan.
-        chosen: The number of the fastest way and the reason, by the size of a batch and the number of cells.
-        lost: The lost timings of the fused way, by the key of ``chosen``: their count, the time of the next timing, and
-            an explanation.
+        may_group: Whether another batch may run grouped although the first did not.
+        small: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another plan.
+        choices: For each size (:meth:`size`), the index of the chosen way in ``ways``, and the reason for the choice.
+            For a single cell, the grouped way is not counted in the index.
+        lost_timings: For each size, the number of timings in which the fused way was clearly slower; the earliest time
+            of the next timing, in seconds of ``time.monotonic``; and an explanation.
         constants: The arguments of the traced call that are not tensors, by name; only for the fused way.
         watch: The values of the module that the trace has read.
         skip: The number of calls that run cell by cell before another way is tried again.
@@ -36,10 +37,10 @@ class CallPlan:
 
     ways: list[Way]
     measured: bool = False
-    open: bool = False
-    few: bool = False
-    chosen: dict[tuple[int, int], tuple[int, str]] = field(default_factory=dict)
-    lost: dict[tuple[int, int], tuple[int, float, str]] = field(default_factory=dict)
+    may_group: bool = False
+    small: bool = False
+    choices: dict[tuple[int, int], tuple[int, str]] = field(default_factory=dict)
+    lost_timings: dict[tuple[int, int], tuple[int, float, str]] = field(default_factory=dict)
     constants: dict[str, Any] = field(default_factory=dict)
     watch: Watch = field(default_factory=Watch)
     skip: int = 0
@@ -55,14 +56,14 @@ class CallPlan:
 
     def takes_first(self, n: int, k: int) -> bool:
         """Returns whether the first way is already chosen for n samples in k cells."""
-        if self.skip or (self.few and n >= FEWEST):
+        if self.skip or (self.small and n >= FEWEST):
             return False
         if not self.measured or len(self.ways) == 1 or n < FEWEST:
             return True
-        return self.chosen.get(self.size(n, k), (1, ""))[0] == 0
+        return self.choices.get(self.size(n, k), (1, ""))[0] == 0
 
     def size(self, n: int, k: int) -> tuple[int, int]:
-        """Returns the key of ``chosen``, which is the same for sizes within a factor of four."""
+        """Returns the key of ``choices``: the size class of the batch, which spans a factor of four, and k."""
         return min(n, self._most).bit_length() // 2, k
 
     def changed(self, constants: dict[str, Any]) -> list[Source]:
@@ -80,5 +81,9 @@ class CallPlan:
 
 
 def measured_samples(ways: list[Way]) -> int:
-    """Returns the sample limit of a timing. It is higher for fused runs, as tensors between runs outgrow the cache."""
+    """Returns the maximum number of samples of a timing.
+
+    The maximum is higher if the module is fused in several parts: the tensors between the parts outgrow the cache in
+    large batches only, and the timing must include this cost.
+    """
     return SLICE * 8 if any(way.name == "fused in runs" for way in ways) else SLICE

@@ -35,11 +35,11 @@ Outcome = tuple[Results, list[Tensor]]  # results and gradients
 
 @dataclass(frozen=True)
 class Options:
-    """The user's options."""
+    """The options of a router that decide which ways are tried."""
 
     fuse: bool  # user promises that ``forward`` is a pure function
     way: str  # "fastest"; or "fused", "grouped" or "loop" without timing
-    several: bool  # whether several methods are routed; if so, a method that cannot be fused is no error
+    many_methods: bool  # whether several methods are routed; if so, a method that cannot be fused is no error
     names: tuple[str, ...]  # names of the parameters that the module was wrapped with
 
 
@@ -75,12 +75,12 @@ class Probe:
     ) -> tuple[list[Way], bool]:
         """Returns the ways that agree with the loop, the loop last, and whether another batch may run grouped.
 
-        The module is fused with the first of ``inputs`` that succeeds. If ``too_many`` is a reason, not an empty text,
-        the module is not fused.
+        The module is fused with the first of ``inputs`` that succeeds. It is not fused if its constants have changed
+        too often; ``too_many`` is then the explanation, otherwise it is empty.
 
         Raises:
             TypeError: If the module changes its parameters or mixes samples.
-            ValueError: If fusion is required, but fails for the only method.
+            ValueError: If fusion is required, but fails, and only one method of the module is routed.
         """
         call = self._call
         for loop in (Loop(), Loop(again=True)):
@@ -103,7 +103,7 @@ class Probe:
                 self._check_rows(loop)
                 why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
                 message = f"fuse=True needs a network that can be fused, but in {call.name} {why}"
-                if not options.several:
+                if not options.many_methods:
                     raise ValueError(f"{_OP}: {message}") from error
                 unfused = f"not fused, since {why}"
                 warn_once(f"fuse {call.method}", message)
@@ -159,9 +159,10 @@ class Probe:
         return results, gradients
 
     def _agrees(self, way: Way, loop: Way, expected: Outcome) -> bool:
-        """Returns whether a way agrees with the loop, if necessary without autocast or in float64.
+        """Returns whether the results and gradients of a way agree with the loop.
 
-        Rounding errors exceed the tolerance with autocast; in a deep network of fast sines, they are as large as the
+        If they differ, both are computed and compared again without autocast, and then in float64. With autocast,
+        rounding errors exceed the tolerance; in a deep network of sines of high frequency, they are as large as the
         results.
         """
         outcome, device = self._outcome(way), self._entries.device.type
@@ -259,7 +260,7 @@ def _perturbed(parameter: Tensor, generator: torch.Generator) -> nn.Parameter:
 
 
 def check_rays(call: Call) -> None:
-    """Raises ValueError if [n, 1, f] gives other results than [rays, samples, f], for a few samples of one cell."""
+    """Raises ValueError if a module's results for [n, 1, f] and [rays, samples, f] differ; tests a few samples."""
     lead = call.layout.lead
     for samples in (6, lead[-1]):  # a module may need a certain number of samples
         try:
@@ -276,7 +277,11 @@ def check_rays(call: Call) -> None:
 
 
 def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
-    """Returns the first cell's results for a few samples, once as rays and once in the router's shapes."""
+    """Returns the first cell's results for a few samples, in two shapes.
+
+    The module gets the samples first as [rays, samples, f], then in the shapes that the router passes. ``few`` has the
+    leading dimensions of the few samples.
+    """
     tensors: list[Tensor] = []
 
     def first(tensor: Tensor, kind: str) -> Tensor:

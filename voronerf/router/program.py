@@ -258,7 +258,12 @@ def _is_plain(part: nn.Module) -> bool:
 
 @functools.lru_cache(maxsize=64)
 def _by_ray(text: str, reads: tuple[int, ...]) -> Program:
-    """Returns a program that reads directions once for each ray."""
+    """Returns a program whose directions are given per ray instead of per sample.
+
+    Args:
+        text: The program with a direction for each sample, as text.
+        reads: The argument that each input of the program reads; 1 for the directions.
+    """
     program, b = Program.parse(text), Builder()
     inputs = {i: b.input(width, ray=reads[i] == 1) for i, width in enumerate(program.inputs)}
     return b.program(b.replay(program, inputs))
@@ -266,7 +271,7 @@ def _by_ray(text: str, reads: tuple[int, ...]) -> Program:
 
 @functools.lru_cache(maxsize=64)
 def _with_steps(text: str, steps: str) -> Program:
-    """Returns a program that appends steps to a program of one output; both are given as texts."""
+    """Returns the program ``text``, which has one output, continued by the program ``steps``."""
     program, b = Program.parse(text), Builder()
     inputs = {number: b.input(width) for number, width in enumerate(program.inputs)}
     return b.program(b.replay(Program.parse(steps), {0: b.replay(program, inputs)[0]}))

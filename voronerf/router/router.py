@@ -115,8 +115,8 @@ class VoronoiRouter(nn.Module):
         coords: The rule that finds the positions in a call's arguments: ``"first3"``, the first three features of the
             first tensor (``"first2"`` for d = 2 and so on); a slice of its features; or a function of the arguments
             that returns positions [..., d]. A call can pass positions instead, ``router(x, coords=positions)``, unless
-            the module itself has an argument ``coords``. For a field with a ``program`` the positions are its first
-            argument.
+            the module itself has an argument ``coords``. For a field with a ``program`` the positions are the first
+            argument of the call.
         per_ray: Names or numbers of the arguments that have one row for each ray. If None, shapes decide, and ambiguous
             shapes are refused.
         shared: Names or numbers of tensor arguments that are the same for all samples.
@@ -423,7 +423,7 @@ class VoronoiRouter(nn.Module):
             diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children of each
                 cell that has enough samples (:func:`voronerf.split_diagram`). A router without centres takes
                 :meth:`VoronoiDiagram.without_centres` together with ``parents``.
-            parents: The present cell that contains each new cell, int64 [new cells]; None for the cell that holds the
+            parents: The old cell that contains each new cell, int64 [new cells]; None for the cell that holds the
                 new centre.
             optimizer: The optimiser that holds this router's parameters.
             inherit: Whether children start as copies. If False, the children of a split cell get newly drawn parameters
@@ -618,7 +618,7 @@ class VoronoiRouter(nn.Module):
         """Returns the arguments of `routed_mlp` that choose the cells of samples and name the frozen cells.
 
         Args:
-            positions: Positions [n, 3] in scene units, or Gaussians [n, 6].
+            positions: Positions [n, 3] in scene units, or Gaussians [n, 6], means and variances.
             coords: Positions [..., d] that choose the cells, or labels, int32 [..., 1]; None for the positions of the
                 samples.
         """
@@ -707,7 +707,7 @@ class VoronoiRouter(nn.Module):
         return self._dispatch.explain(("forward", *self.methods), default_ways)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Sets an attribute, but raises AttributeError for the module's attributes, which the router would not use."""
+        """Sets an attribute; raises AttributeError for an attribute of the module, which is set on ``module``."""
         members = self.__dict__
         is_own = hasattr(type(self), name) or any(name in names for names in (members, self._modules, self._buffers))
         if "_field_program" in members and not is_own and hasattr(self.module, name):
@@ -753,7 +753,7 @@ class VoronoiRouter(nn.Module):
         coords: Tensor | Labels | None,
         cells: Tensor | None,
     ) -> Any:
-        """Runs one call of a method. A call that is not in the cache breaks a graph of ``torch.compile``."""
+        """Runs one call of a method. A call that is not in the cache causes a graph break in ``torch.compile``."""
         if cells is not None:
             names = self._argument_names.get(method, ())
             if coords is not None and "coords" in names:

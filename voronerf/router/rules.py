@@ -62,7 +62,7 @@ def linear(run: GroupedRun, input: Tensor, weight: Tensor, bias: Tensor | None =
         raise RuntimeError(
             f"VoronoiRouter: a linear layer of the module takes {weight.shape[1]} features, got {list(input.shape)}"
         )
-    # Contiguous, because the layer saves its input, and would copy a strided one again for its gradients.
+    # The input is made contiguous, because the layer saves it, and would copy a strided input again for gradients.
     flat = (input if input.dim() == 2 else input.reshape(-1, input.shape[-1])).contiguous()
     m = run.entries(input) * (flat.shape[0] // input.shape[0])
     is_joint = isinstance(weight, PerCell) and (bias is None or isinstance(bias, PerCell))
@@ -102,7 +102,7 @@ register(torch.Tensor.__rmatmul__, lambda run, other, input: matmul(run, input, 
 
 @rule(torch.addmm, torch.Tensor.addmm)
 def addmm(run: GroupedRun, input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: float = 1, alpha: float = 1) -> Any:
-    """Multiplies rows [n * m, i] by a matrix [i, o] and adds a shift; supports no factors."""
+    """Multiplies rows [n * m, i] by a matrix [i, o] and adds ``input``; supports only beta = alpha = 1."""
     product = matmul(run, mat1, mat2) if beta == alpha == 1 else NotImplemented
     return product if product is NotImplemented else _elementwise(torch.add, run, run.mark(product), input)
 
@@ -154,7 +154,10 @@ def convolution(
     dilation: Any = 1,
     groups: int = 1,
 ) -> Any:
-    """Convolves rows [n * m, i, ...] with kernels of one place; in [i, ...] and [1, i, ...], a later dimension is n."""
+    """Convolves rows [n * m, i, ...] with kernels of size 1.
+
+    The input may also be [i, ...] or [1, i, ...], with the samples in one of the later dimensions.
+    """
     places, channel = weight.dim() - 2, input.dim() - weight.dim() + 1
     if not run.is_rows(input) or set(weight.shape[2:]) != {1} or groups != 1:
         return NotImplemented
@@ -190,7 +193,7 @@ def _elementwise(func: Any, run: GroupedRun, *args: Any, **kwargs: Any) -> Any:
             return value
         shape = value.shape[value.dim() == dim :]
         parameter = run.rows_of(value, m).reshape(-1, *[1] * (dim - 1 - len(shape)), *shape)
-        # A zero-dimensional tensor does not affect the result's dtype, so its repetition must not either.
+        # PyTorch ignores the dtype of a zero-dimensional tensor, so its repeated values get the other tensors' dtype.
         return parameter.to(functools.reduce(torch.promote_types, dtypes)) if value.dim() == 0 and dtypes else parameter
 
     args, kwargs = map_tensors((args, kwargs), expanded)
@@ -273,7 +276,9 @@ def _look_up(run: GroupedRun, table: PerCell, index: Tensor, lowest: int) -> Ten
 
 
 def _gather(run: GroupedRun, table: PerCell, c: int, index: Tensor) -> Tensor:
-    """Gathers entries [m, c] of tables with e * c numbers per cell; indices [m] count through the tables of all cells.
+    """Gathers entries of c numbers, [m, c], from the tables of all cells.
+
+    The indices [m] are entry numbers in the concatenation of these tables.
 
     A field reads a table many times in one forward pass: the eight corners of a voxel, for several levels. The gradient
     of each look-up has the size of the whole table, so all look-ups of one table accumulate in one buffer.
@@ -310,7 +315,7 @@ class _Source(torch.autograd.Function):
 
 
 class _LookUp(torch.autograd.Function):
-    """A look-up of rows of a :class:`_Source`, for indices relative to one of its rows."""
+    """A look-up of rows of a :class:`_Source`; the indices count from the row ``first``."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, first: int, index: Tensor, buffer: list[Tensor]) -> Tensor:

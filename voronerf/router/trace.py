@@ -32,7 +32,10 @@ _TOTALS = find("any all sum", torch, torch.Tensor)  # their scalar results may b
 
 
 def differentiable(value: Tensor) -> Tensor:
-    """Returns a differentiable view or a detached leaf of a tensor; later values are computed from the result."""
+    """Returns a tensor with the same values, by which later results can be differentiated.
+
+    The tensor is a view if ``value`` requires a gradient, else a new leaf.
+    """
     return value.view_as(value) if value.requires_grad else value.detach().requires_grad_()
 
 
@@ -62,12 +65,12 @@ class Trace(TorchFunctionMode):
 
     The ``meta`` of a node has:
 
-    - ``value``: its value;
-    - ``on``: its dependence, one of CONSTANTS, CELLS and SAMPLES;
-    - ``line``: its line in the module;
+    - ``value``: the value of the node;
+    - ``on``: the kind of data on which the value depends: CONSTANTS, CELLS or SAMPLES;
+    - ``line``: the line of the module that called the function;
     - ``grad``: whether gradients were on;
-    - ``inplace``: whether the function writes to its first argument, which is then the value;
-    - ``counts``: whether it holds numbers derived from the number of samples, and no rows, such as
+    - ``inplace``: whether the function writes to its first argument; this argument is then the value;
+    - ``counts``: whether the value holds numbers derived from the number of samples, and no rows, such as
       ``torch.tensor(x.shape)``.
 
     ``tensors`` are rows of the arguments, ``inputs`` are the values that each call looks up, and ``reads`` are the
@@ -243,7 +246,10 @@ class Trace(TorchFunctionMode):
         node.meta["on"] = on
 
     def _separate_gradients(self) -> None:
-        """Inserts a tensor between runs for each variable of a differentiation; the variable's users read it."""
+        """Inserts a `differentiable` node after each tensor by which ``torch.autograd.grad`` differentiates.
+
+        PyTorch computes this node between runs. All functions that used the tensor use the node instead.
+        """
         for node in list(self.graph.nodes):
             if node.target is not torch.autograd.grad:
                 continue

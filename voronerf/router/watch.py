@@ -21,7 +21,9 @@ Source = str | tuple[int, str]
 """An argument by its name, or an attribute by (index of its submodule in ``modules()``, name)."""
 
 NUMBERS = (torch.float64, torch.float32, torch.int64)
-"""The dtypes of inputs, tried in turn: float64 does not round, float32 promotes like a number, int64 can be an index.
+"""The dtypes of inputs, tried in turn.
+
+float64 does not round numbers; float32 promotes other dtypes in the same way as a Python number; int64 can be an index.
 """
 
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module())) - {"training"}
@@ -103,7 +105,7 @@ class Watch:
             self._holders.append((source, value, items))
 
     def note(self, guard: Any) -> None:
-        """Adds the watched values to a guard of `unchanged`."""
+        """Adds the watched values to a guard, which detects their changes (`voronerf.ops._core.unchanged`)."""
         for registry, name in self._dicts:
             guard.entries(registry, [name])
         for tensor in self._tensors:

@@ -1,7 +1,8 @@
 """Replaces sines and cosines of octaves in a program by one step, the frequency encoding.
 
-One step takes less time than separate waves, and concatenations in the step's order need no copy. The step's second
-derivatives run in PyTorch, so the replacement is for programs that are differentiated once.
+A wave is sin(a x) or cos(a x) for a column x and a factor a. One step takes less time than separate waves, and
+concatenations in the step's order need no copy. The step's second derivatives run in PyTorch, so the replacement is for
+programs that are differentiated once.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _CLOSE = 3e-7  # maximum relative error of an octave
 
 
 class _Group(NamedTuple):
-    """Adjacent columns of a value; the frequencies of their waves double from one to the next."""
+    """Adjacent columns of a value whose waves have the same factors; each factor is twice the previous one."""
 
     columns: list[_Column]
     factors: list[float]
@@ -88,7 +89,7 @@ def _by_parts(step: Step, moves: Mapping[int, Step], new: int) -> list[Step]:
 
 
 def _waves(program: Program, steps_by_value: Mapping[int, Step], constants: Mapping[int, Sequence[float]]) -> _Waves:
-    """Finds the waves of each column that is not itself an affine function of another column."""
+    """Finds the sines and cosines of each column that is not itself an affine function of another column."""
     waves: _Waves = {}
     for step in program.steps:
         if step.name != "sine" or step.numbers[0] or len(step.operands) > 1:
@@ -168,7 +169,7 @@ def _elsewhere(c: Columns, places: Mapping[_Column, _Column]) -> Columns:
 
 
 def _moved(step: Step, places: dict[_Column, _Column]) -> Step:
-    """Returns a move with as few pieces as possible, and records the sources of its columns in ``places``."""
+    """Returns a move step that reads as few pieces as possible; records the sources of its columns in ``places``."""
     sources: dict[int, _Column] = {}
     for c, at in zip(step.operands, map(int, step.numbers), strict=True):
         columns = ((c.index, c.start + i) for i in range(c.width))

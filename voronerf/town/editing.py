@@ -50,7 +50,7 @@ class Source:
 
     @classmethod
     def of(cls, run: Path | str) -> Source:
-        """Reads the source from a run directory, with the field as its only network."""
+        """Reads a source from a run directory; an ordinary run becomes one part whose only network is its field."""
         run = Path(run)
         name, record = run.name, run / "scene.json"
         checkpoint = last_checkpoint(run, keep=is_shown)
@@ -80,7 +80,9 @@ class Source:
 
 
 def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Similarity] | None = None) -> Source:
-    """Joins several runs into a new run; where runs overlap, the nearest centre decides.
+    """Joins several runs into a new run.
+
+    Where runs overlap, a point is evaluated by the run that has the nearest cell centre.
 
     Args:
         runs: At least two run directories, which are not changed; the first gives data, background and settings.
@@ -107,12 +109,15 @@ def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Simila
     return _write(join_sources(sources_of_runs, frames or [Similarity()] * len(runs)), Path(out))
 
 
-def cut(run: Path | str, kept: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Source:
-    """Writes a new run with only the contents of a solid, or only some cells, of a run; leaves out all other networks.
+def cut(run: Path | str, keep: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Source:
+    """Writes a part of a run as a new run: the contents of a solid, or some cells.
+
+    The new run has only the networks that it needs. Exception: if a solid is removed from a scene without a box, the
+    new run has all networks.
 
     Args:
         run: The run directory, which is not changed.
-        kept: A solid of the scene, such as ``Solid.box(low, high)``, or numbers of cells.
+        keep: A solid of the scene, such as ``Solid.box(low, high)``, or numbers of cells.
         out: A new directory.
         outside: Whether to keep everything except the solid or the cells instead.
 
@@ -129,19 +134,19 @@ def cut(run: Path | str, kept: Solid | Sequence[int], out: Path | str, *, outsid
         ...     return cut(run, Solid(ball=(0, 0, 0.4, 0.5)), out)
     """
     source = Source.of(run)
-    if isinstance(kept, Solid):
-        return _write(cut_source(source, replace(kept, outside=kept.outside != outside)), Path(out))
+    if isinstance(keep, Solid):
+        return _write(cut_source(source, replace(keep, outside=keep.outside != outside)), Path(out))
     k = source.parts.num_cells
-    if not kept or not 0 <= min(kept) <= max(kept) < k:
-        raise ConfigError(f"--cells must be numbers of 0..{k - 1}, at least one, got {as_typed([*kept][:20])}")
+    if not keep or not 0 <= min(keep) <= max(keep) < k:
+        raise ConfigError(f"--cells must be numbers of 0..{k - 1}, at least one, got {as_typed([*keep][:20])}")
     chosen = torch.full((k,), outside)
-    chosen[list(kept)] = not outside
+    chosen[list(keep)] = not outside
     return _write(cut_source(source, chosen), Path(out))
 
 
 def place(
     run: Path | str,
-    thing: Path | str,
+    object_run: Path | str,
     at: Sequence[float],
     out: Path | str,
     *,
@@ -152,11 +157,11 @@ def place(
 
     Args:
         run: The run directory of the scene, which is not changed.
-        thing: The run directory of the object; the object must be cut out or trained on a white background.
-        at: The position of the bottom centre of the object's box.
+        object_run: The run directory of the object; the object must be cut out or trained on a white background.
+        at: The position in the scene, (x, y, z), of the bottom centre of the object's box.
         out: A new directory.
-        degrees: The rotations about the axes x, y, z, in this order.
-        scale: The factor on the object's size.
+        degrees: The rotations of the object about the axes x, y, z of the scene, in this order.
+        scale: The factor by which the object is enlarged.
 
     Returns:
         The contents of the new run.
@@ -170,7 +175,7 @@ def place(
         >>> def on_the_ground(garden, statue, out):
         ...     return place(garden, statue, (0.2, -0.1, 0), out, scale=0.5)
     """
-    source = Source.of(thing)
+    source = Source.of(object_run)
     box = source.scene.box
     if box is None:
         raise ConfigError(
@@ -178,7 +183,7 @@ def place(
         )
     foot = torch.cat(((box[0] + box[1])[:2] / 2, box[0, 2:]))
     standing = Similarity.of(at, degrees, scale) @ Similarity(translation=-foot.double())
-    scene = source if Path(run) == Path(thing) else Source.of(run)  # a run placed in itself stores its networks once
+    scene = source if Path(run) == Path(object_run) else Source.of(run)  # one source: its networks are stored once
     return _write(join_sources([scene, source], [Similarity(), standing], on_top=True), Path(out))
 
 
@@ -186,7 +191,9 @@ def place(
 
 
 def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_top: bool = False) -> Source:
-    """Joins sources into one source; where sources overlap, the nearest centre decides.
+    """Joins sources into one source.
+
+    Where sources overlap, a point is evaluated by the source that has the nearest cell centre.
 
     Args:
         sources: At least one source. The first gives the settings, the background, and the data.
@@ -212,7 +219,11 @@ def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_
 
 
 def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
-    """Returns the settings of a joined run: the first source's settings, with the shortest strata of all sources."""
+    """Returns the settings of a joined run: the first source's, with stratified sampling and enough samples per ray.
+
+    A ray is divided into strata with one sample each. In a scene with a box, the strata are as short as the shortest
+    strata of the sources, but a ray has at most 32,000 strata.
+    """
     first = sources[0].config
     samples = (first.samples or (64,))[0]
     if scene.box is not None:
@@ -261,7 +272,10 @@ def _corners(box: Tensor | None) -> Tensor:
 
 
 def _join_views(views: Sequence[tuple[str, Split, Similarity]]) -> Split:
-    """Joins the cameras of several splits, without images; if names repeat, all names get their split's number."""
+    """Joins the cameras of several splits, without images.
+
+    If names of images repeat, all names get the number of their split as a prefix.
+    """
     cameras = [moved_cameras(split.cameras, frame) for _, split, frame in views]
     names = [name for _, split, _ in views for name in split.names]
     if len(set(names)) < len(names):
@@ -343,24 +357,27 @@ def _empty_grid(box: Tensor, shape: Sequence[int], threshold: float) -> Occupanc
 # Cutting --------------------------------------------------------------------------------------------------------------
 
 
-def cut_source(source: Source, kept: Solid | Tensor) -> Source:
-    """Returns a source with only the contents of a solid, or only some cells; leaves out all other networks.
+def cut_source(source: Source, keep: Solid | Tensor) -> Source:
+    """Returns a part of a source as a new source: the contents of a solid, or some cells.
+
+    The new source has only the networks that it needs. Exception: if a solid is removed from a scene without a box, the
+    new source has all networks.
 
     A contraction is the identity inside its sphere, so a source cut inside the sphere needs no contraction.
 
     Args:
         source: The source, of any kind.
-        kept: A solid in the scene, or bool [k], a mask of cells.
+        keep: A solid in the scene, or bool [k], a mask of cells.
     """
     parts, box = source.parts, source.scene.box
-    if isinstance(kept, Tensor):
-        parts = keep_cells(parts, kept)
+    if isinstance(keep, Tensor):
+        parts = keep_cells(parts, keep)
     else:
         changed = []
         for part in parts:
-            solid = kept.moved(part.frame.inverse)
+            solid = keep.moved(part.frame.inverse)
             warp = part.contraction
-            if warp is not None and not kept.outside:
+            if warp is not None and not keep.outside:
                 if not _inside_ball(solid, warp):
                     where = [round(x, 3) for x in part.frame.points(warp.centre).tolist()]
                     rule = (
@@ -370,8 +387,8 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
                 warp = None
             changed.append(part.changed(region=(*part.region, solid), contraction=warp))
         parts = Parts(changed, backend=parts.backend)
-        if not kept.outside:
-            around = kept.bounds()
+        if not keep.outside:
+            around = keep.bounds()
             box = around if box is None else torch.stack((box[0].maximum(around[0]), box[1].minimum(around[1])))
             if not bool((box[0] < box[1]).all()):
                 raise ConfigError(f"{source.name}: nothing is left, the cut is outside of the scene's box")
@@ -387,7 +404,7 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
     grid = _trimmed(grid, parts, occupied[near])
     if grid is None:
         raise ConfigError(f"{source.name}: the cut leaves nothing of it")
-    if not isinstance(kept, Tensor):
+    if not isinstance(keep, Tensor):
         occupied, shown = grid.occupied.view(-1).nonzero()[:, 0], torch.zeros(parts.num_cells, dtype=torch.bool)
         for offset in _LATTICE:
             if not bool(shown.all()):
@@ -405,9 +422,9 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
     return Source(source.name, config, scene, parts, grid)
 
 
-def keep_cells(parts: Parts, kept: Tensor) -> Parts:
+def keep_cells(parts: Parts, keep: Tensor) -> Parts:
     """Returns the parts with only the cells of a mask, bool [k]."""
-    pieces = kept.split([part.num_cells for part in parts])
+    pieces = keep.split([part.num_cells for part in parts])
     remaining = [part.keep(piece.nonzero()[:, 0]) for part, piece in zip(parts, pieces, strict=True)]
     shown = [part for part in remaining if part is not None]
     if not shown:

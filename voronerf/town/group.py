@@ -28,7 +28,7 @@ from voronerf.app.scenes import Scene
 PATIENCE = 50
 #: Settings that may differ between ranks.
 MAY_DIFFER = ("data", "device", "lpips")
-#: The (first, second) territory of a part of a message: (sender, receiver), but (receiver, sender) for an answer.
+#: The sending and the receiving territory of a message; for a message sent ``back`` (`Group.send`), in reverse order.
 Key = tuple[int, int]
 
 
@@ -117,17 +117,17 @@ class Group:
     def send(
         self, parts: Mapping[Key, Tensor], counts: Tensor, owner: Sequence[int], width: int, *, back: bool = False
     ) -> dict[Key, Tensor]:
-        """Sends parts of messages between territories; all ranks call it together.
+        """Sends messages between territories; all ranks call it together.
 
         Args:
-            parts: float32 [counts[key], width], the parts that territories of this rank send.
-            counts: int64 [T, T], the number of rows of each part, the same on all ranks; 0 for no part.
+            parts: The messages that territories of this rank send, by key, float32 [counts[key], width].
+            counts: int64 [T, T], the number of rows of each message, the same on all ranks; 0 for no message.
             owner: The rank of each territory.
-            width: Number of columns of a part.
-            back: Whether the parts are answers, from the second territory of a key to the first.
+            width: Number of columns of a message.
+            back: Whether the messages are sent back, from the second territory of a key to the first.
 
         Returns:
-            The parts that territories of this rank receive, by key; keys ascend.
+            The messages that territories of this rank receive, by key; keys ascend.
         """
         ends = {(n, m): (owner[m], owner[n]) if back else (owner[n], owner[m]) for n, m in counts.nonzero().tolist()}
         sent, received = (

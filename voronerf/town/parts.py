@@ -1,11 +1,12 @@
 """Parts: routers that are placed in one scene, each in a frame of its own, and evaluated as one field.
 
-n samples, r rays, k cells of all parts, l leaves of the diagram of one part. Positions, lengths and densities are in
-scene units, or in a part's frame if the text says so; a similarity maps a part's frame to the scene.
+Letters: n samples, r rays, k cells of all parts, l leaves of the diagram of one part. Positions, lengths and densities
+are in scene units, or in a part's frame if the text says so; a similarity maps a part's frame to the scene.
 
-A part covers a point if the point lies in its region and its leaf has a network. If several parts of a layer cover a
-point, the part with the nearest centre is evaluated, in the cell of its own diagram. Layers are superposed: their
-densities add up, and their colours are averaged with the densities as weights, as for two clouds in one place.
+A part covers a point if the point lies in the part's region, and in a leaf that has a network. If several parts of a
+layer cover a point, the part with the nearest centre is evaluated; its own diagram gives the cell. Layers are
+superposed: their densities add up, and their colours are averaged with the densities as weights, as for two clouds in
+one place.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ class Part(nn.Module):
 
     @functools.cached_property
     def centres(self) -> Tensor:
-        """The centres of the cells in the scene, [cells, 3]."""
+        """The centres of the part's cells in scene coordinates, [cells, 3]."""
         centres = self.diagram.leaf_centres
         centres = self.frame.points(centres if self.contraction is None else self.contraction.inverse(centres))
         return centres[self.owner >= 0]
@@ -155,8 +156,8 @@ class Parts(nn.Module):
 
     Attributes:
         parts: The parts.
-        diagram: A flat diagram of the centres of all cells in the scene; for drawings.
-        num_cells: k.
+        diagram: A flat diagram of the centres of all cells, in scene coordinates; for drawings.
+        num_cells: The number of cells of all parts, k.
 
     Args:
         parts: At least one part.
@@ -170,7 +171,7 @@ class Parts(nn.Module):
         self.parts, self.backend = nn.ModuleList(parts), backend
         self.diagram = VoronoiDiagram(torch.cat([part.centres for part in parts]))
         self.num_cells = self.diagram.num_cells
-        #: The numbers of the parts in each layer.
+        #: The indices in ``parts`` of the parts of each layer.
         self.layers = [[i for i, p in enumerate(parts) if p.layer == n] for n in sorted({p.layer for p in parts})]
 
     def __iter__(self) -> Iterator[Part]:

@@ -70,13 +70,14 @@ class Pass:
     """One territory's part of a step: partial sums of its rays [r], then gradients from the merged result.
 
     Attributes:
-        sums: [q, 6], the partial sum of each run of samples.
-        learnt: A list with the segment that has set the gradients of the parameters; empty without samples.
+        sums: [q, 6], the partial sum of each run of samples, see `voronerf.ops.run_sums`.
+        learnt: A list with the `SegmentResult` of :meth:`learn`, which has set the gradients of the parameters; empty
+            before :meth:`learn`, and without samples.
 
     Args:
-        name: The prefix of the segment names.
+        name: The prefix of the segments' names, see `TrainingStep.run_segment`.
         territory: The territory whose networks are evaluated.
-        rays: r rays.
+        rays: The r rays to evaluate, the territory's own or another's.
         near: [r], the distance at which each ray begins.
         far: [r], the distance at which each ray ends.
     """
@@ -93,14 +94,14 @@ class Pass:
         if not len(near):
             return
         inputs = rays.origins, rays.directions, near, far
-        drawn = step.do(f"{name}: samples", self._draw, *inputs)
+        drawn = step.run_segment(f"{name}: samples", self._draw, *inputs)
         positions, ray_index, depths, deltas, cells = drawn.now(drawn.value)
         details = ray_index, depths, deltas, cells, place.own.to(near.device)
-        bent = renderer.contraction is not None
-        own_samples_of_rays: OwnSamples = own_samples(positions, *details, bent=bent, backend=renderer.backend)
+        curved = renderer.contraction is not None
+        own_samples_of_rays: OwnSamples = own_samples(positions, *details, curved=curved, backend=renderer.backend)
         if not len(own_samples_of_rays.depths):
             return
-        self.found = step.do(f"{name}: networks", self._look, rays.directions, *own_samples_of_rays)
+        self.found = step.run_segment(f"{name}: networks", self._look, rays.directions, *own_samples_of_rays)
         self.sums, self.own = self.found.now(self.found.value.sums), own_samples_of_rays
 
     def _draw(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, ...]:
@@ -136,14 +137,14 @@ class Pass:
         """Accumulates gradients of the parameters; returns the output of the step, or None without samples.
 
         Args:
-            answers: [q, 6], the answers to the sums.
-            loss: [], the loss of the rays.
+            answers: [q, 6], the results of `voronerf.ops.compose_runs` for the runs in ``sums``.
+            loss: [], the loss of the rays; 0 for rays that another territory has drawn.
             before: The segments whose gradients are already in the parameters.
         """
         if self.found is None:
             return None
         name = f"{self.name}: gradients beside {len(before)}"
-        segment = self.territory.step.do(name, self._learn, self.found, answers, loss, *before)
+        segment = self.territory.step.run_segment(name, self._learn, self.found, answers, loss, *before)
         for parameter, gradient in segment.value.gradients:
             parameter.grad = gradient
         self.learnt = [segment]
@@ -173,7 +174,10 @@ class Crossing(StepOutput):
         self._sums = sums
 
     def whole(self) -> StepOutput:
-        """Returns the output for the rays through all territories together, with one sample per ray."""
+        """Returns the output of the territory's own rays along their whole lengths, in all territories.
+
+        All samples of a ray are merged into one.
+        """
         batch, sums = self.batch, self._sums[along_rays(self._sums[:, 5].long(), self._sums[:, 4])]
         composed = compose(sums[:, :3], sums[:, 3], sums[:, 5].long(), len(batch.rays))
         behind = torch.zeros_like(batch.target) if batch.background is None else batch.background

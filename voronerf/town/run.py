@@ -152,8 +152,8 @@ def open_run(
         scene: The scene, with the images of the first run or without images; None to load it.
         data: The scene folder of the first run; None for the folder of its training.
         downscale: The factor by which images are reduced; None for the factor of the training.
-        allow_outside: Also read images that lie outside of the scene folder.
-        samples: Samples per ray, one number; None for the number of the run.
+        allow_outside: Whether to read images that lie outside of the scene folder.
+        samples: The number of samples per ray, as a tuple of one number; None for the number of the run.
         device: "cpu", "cuda:0", "auto" or another value of `--device`.
         backend: The backend of the operations.
 
@@ -189,10 +189,10 @@ def open_run(
 
 
 def _in_place(read: Scene, record: Scene) -> Scene:
-    """Replaces the poses of a scene's views by the poses in the run's record.
+    """Replaces the poses of a scene's views by the poses of ``record``, the scene that the run has stored.
 
-    The views must have the names of the first views in the record. Otherwise, the views keep their poses, which are
-    moved into the record's space.
+    If the views have other names than the first views of ``record``, they keep their own poses, moved into the space of
+    ``record``.
     """
     splits = {}
     for name in ("train", "test"):

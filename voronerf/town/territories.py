@@ -1,6 +1,7 @@
 """Territories: the regions of space of a joint training, each with its own views.
 
-T territories, c views, l centres, v voxels. Positions are in the space of the fields: the world, or its contraction.
+Letters: T territories, c views, l centres, v voxels. Positions are in the space of the fields: the world, or its
+contraction.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
 from voronerf.ops.nearest_centre import nearest_centre
 
-#: The number of rays along each side of the lattice that locates a view.
+#: The number of rays along each side of a lattice over an image; the lattice gives the view's place (`cut_space`).
 LATTICE = 7
 #: Number of nearest centres whose bisectors are intersected for the corners of a territory.
 NEIGHBOURS = 16
@@ -58,7 +59,10 @@ class Territories:
         return (self.train == number).nonzero()[:, 0]
 
     def scene(self, whole: Scene, number: int) -> Scene:
-        """Returns the scene of a territory, from which its settings follow: the box, and its cameras without images."""
+        """Returns a scene with the box and the cameras of a territory, without images.
+
+        The settings of the territory are computed from this scene.
+        """
         rows = self.views(number)
         names = tuple(whole.train.names[row] for row in rows.tolist())
         train = replace(whole.train, cameras=whole.train.cameras[rows], names=names, images=whole.train.images[:0])
@@ -96,9 +100,9 @@ class Place:
         return torch.cat(masks)
 
     def bounds(self, grid: OccupancyGrid) -> Tensor:
-        """Returns [2, 3], a box around the occupied voxels; all of space with a contraction, since it bends rays.
+        """Returns [2, 3], a box around the occupied voxels; for an empty grid, the first corner is above the second.
 
-        For an empty grid the first corner is above the second.
+        If the grid has a contraction, the box is all of space, because a contraction bends rays.
         """
         if grid.contraction is not None:
             return torch.tensor([[-torch.inf] * 3, [torch.inf] * 3])

@@ -61,7 +61,8 @@ class Town:
 
     Attributes:
         config: The settings of a territory.
-        render_config: The settings for rendering the whole run, with strata as long as in its territories.
+        render_config: The settings for rendering the whole run; a ray has enough samples to be sampled as densely as in
+            the first territory.
         scene: The whole scene.
         group: The ranks.
         territories: All territories.
@@ -191,15 +192,15 @@ def build_town(
 
 
 class _Saver(Callback):
-    """A callback that writes the checkpoints of a training in one territory."""
+    """A callback that writes the checkpoints of a training whose only territory is the whole scene."""
 
     group = GROUP
 
-    def __init__(self, town: Town, every: float) -> None:
-        self.town, self.every, self.saved_at = town, every, town.first.seconds
+    def __init__(self, town: Town, interval: float) -> None:
+        self.town, self.interval, self.saved_at = town, interval, town.first.seconds
 
     def after_step(self, state: State) -> None:
-        if state.seconds - self.saved_at >= self.every:
+        if state.seconds - self.saved_at >= self.interval:
             save(self.town)
             self.saved_at = state.seconds
 
@@ -394,7 +395,7 @@ def summary_of(town: Town) -> dict[str, Any]:
     """Returns the contents of ``summary.json`` without scores, the same on all ranks; all ranks call it together."""
     sums = torch.zeros(5, dtype=torch.float64)
     for state in town.states.values():
-        counts = state.parameter_count, state.strategy.left, state.skipped, state.rays_done, state.router.num_cells
+        counts = state.parameter_count, state.strategy.remaining, state.skipped, state.rays_done, state.router.num_cells
         sums += torch.tensor(counts, dtype=torch.float64)
     totals = town.group.total(sums)
     parameters, splits_left, skipped, rays, cells = map(int, totals.tolist())

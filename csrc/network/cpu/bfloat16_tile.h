@@ -1,6 +1,7 @@
 // Operands of bfloat16 products, made from float32 rows. A pair of two values has 32 bits, so code that only moves data
 // treats it as one float: blocks broadcast it, and panels are laid out in pairs (gemm_tile.h). A pair joins two
-// neighbours along k: columns of a row (`narrow_row`), or rows of a column if the samples are k (`interleave`).
+// neighbours along k, the inner dimension of the product: two columns of a row (`narrow_row`) or, if k runs over the
+// samples, two rows of a column (`interleave`).
 #pragma once
 
 #include "common/memory_tile.h"

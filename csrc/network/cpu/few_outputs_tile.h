@@ -10,9 +10,9 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-// The depth of each source is a multiple of kLanes, weights are [O][all k], and C is [rows][kGranule], padded with 0.
-// All sums use the same order, so a row's result does not depend on its position. If `rows` is not a multiple of a
-// block's rows, the last row is computed repeatedly.
+// The depth of each source is a multiple of kLanes. Weights are [O][depth], where `depth` is the sum of the sources'
+// depths, and C is [rows][kGranule], padded with 0. All sums use the same order, so a row's result does not depend on
+// its position. If `rows` is not a multiple of a block's rows, the last row is computed repeatedly.
 template <int O>
 void few_outputs(const Source* sources, int64_t count, const float* weights, int64_t depth, const float* bias,
                  bool relu, int64_t rows, float* c) {

@@ -60,8 +60,8 @@ struct Product {
   float* pairs;
   int64_t pairs_stride;
   bool slope_in_pairs;  // in tile registers: slope is [rows][pairs_stride]
-  // In tile registers, for products in parts: the rounding remainders of A, B and C follow their pairs at these
-  // distances in floats. 0: no remainders.
+  // In tile registers, if each float is split into a bfloat16 number and its rounding remainder (ProgramLayout::parts):
+  // the remainders of A, B and C follow their pairs at these distances in floats. 0: no remainders.
   int64_t a_left, b_left, pairs_left;
 };
 

@@ -118,7 +118,8 @@ void clear_strays(const ProgramInputs& in, const ProgramResults& results, const 
   }
 }
 
-// Zeros the entries of kept look-ups that no look-up writes: rows in no cell, and columns after the features.
+// Zeros the part of the caller's memory for a look-up's result, `kept` [n][stride], that the look-up does not write:
+// rows in no cell, and columns after the features.
 void clear_kept(const ProgramInputs& in, int64_t features, int64_t stride, float* kept, int threads) {
   std::fill(kept, kept + in.offsets[0] * stride, 0.0f);
   std::fill(kept + in.offsets[in.k] * stride, kept + in.n * stride, 0.0f);
@@ -128,8 +129,10 @@ void clear_kept(const ProgramInputs& in, int64_t features, int64_t stride, float
 }
 
 // The rows with a non-zero gradient: only they add to sums. For example, samples that no light reaches have gradient 0.
+// rows: their indices in the order of the cells. order: their indices in the caller's order. offsets: [k+1], the start
+// of each cell in `rows`; empty if no list is made, because all rows are used.
 struct Sifted {
-  std::vector<int32_t> rows, order, offsets;  // sorted indices, the caller's indices; [k+1]. Empty: all rows
+  std::vector<int32_t> rows, order, offsets;
 };
 
 // Returns whether all values, float32 or bfloat16 (half), are 0 or -0.
@@ -149,8 +152,8 @@ bool all_zero(const char* values, int64_t count, bool half) {
   return any == 0;
 }
 
-// Lists the rows with a non-zero gradient: blocks of rows make lists, which are then concatenated. The result is also
-// empty if so few rows have zero gradient that compacting does not pay.
+// Lists the rows with a non-zero gradient: blocks of rows make lists, which are then concatenated. All parts of
+// the result, also `offsets`, are empty if so few rows have zero gradient that compacting does not pay.
 Sifted sift(const ProgramTable& table, const ProgramInputs& in, int threads) {
   constexpr int64_t kBlock = 1024;
   const int64_t first = in.offsets[0], row_count = in.offsets[in.k] - first, blocks = ceil_div(row_count, kBlock);
@@ -163,12 +166,12 @@ Sifted sift(const ProgramTable& table, const ProgramInputs& in, int threads) {
     std::fill_n(zero, kBlock, true);
     for (size_t input = static_cast<size_t>(in.gradients); input < table.inputs.size(); ++input) {
       const int64_t width = table.inputs[input].width;
-      const bool half = in.input_types[input] == TableType::bfloat16, turned = in.turned[input] != 0;
+      const bool half = in.input_types[input] == TableType::bfloat16, transposed = in.transposed[input] != 0;
       const auto* from = static_cast<const char*>(in.inputs[input]);
       const int32_t* order = in.order;
       for (int64_t i = begin; i < end; ++i) {
         const int64_t row = order == nullptr ? i : order[i];
-        if (turned) {
+        if (transposed) {
           for (int64_t c = 0; c < width; ++c) zero[i - begin] &= all_zero(from + 4 * (c * in.n + row), 1, false);
         } else {
           zero[i - begin] &= all_zero(from + row * width * (half ? 2 : 4), width, half);
@@ -256,11 +259,11 @@ ProgramRows::ProgramRows(const Program& program, const ProgramInputs& in, Isa is
       isa_(isa),
       tile_(in_tiles(table_) ? table_.tile : std::min<int64_t>(table_.tile, tile_rows())),
       rays_(new bool[table_.inputs.size()]),
-      turned_(new bool[table_.inputs.size()]) {
+      transposed_(new bool[table_.inputs.size()]) {
   for (size_t i = 0; i < table_.inputs.size(); ++i) {
     input_widths_.push_back(table_.inputs[i].width);
     rays_[i] = table_.inputs[i].ray;
-    turned_[i] = in.turned[i] != 0;
+    transposed_[i] = in.transposed[i] != 0;
   }
   for (const ProgramOutput& output : table_.outputs) output_widths_.push_back(output.width);
   for (const HashGrid& grid : table_.grids) {
@@ -274,7 +277,7 @@ int64_t ProgramRows::workspace() const { return aligned(aligned(table_.packed) +
 
 ProgramCall ProgramRows::call(const ProgramInputs& in, const ProgramResults& results, bool* in_place) const {
   for (size_t i = 0; i < table_.inputs.size(); ++i) {
-    const bool plain = in.input_types[i] == TableType::float32 && !turned_[i] && !rays_[i];
+    const bool plain = in.input_types[i] == TableType::float32 && !transposed_[i] && !rays_[i];
     in_place[i] = plain && in.order == nullptr;
   }
   ProgramCall call{};
@@ -282,7 +285,7 @@ ProgramCall ProgramRows::call(const ProgramInputs& in, const ProgramResults& res
   call.inputs = in.inputs;
   call.input_types = in.input_types.data();
   call.input_widths = input_widths_.data();
-  call.turned = turned_.get();
+  call.transposed = transposed_.get();
   call.rays = rays_.get();
   call.in_place = in_place;
   call.parameters = in.parameters;
@@ -330,7 +333,7 @@ void ProgramRows::reduce(const ProgramCall& call, int64_t cell, float* partials,
   VN_FOR_ISA(isa_, program_reduce(call, cell, partials, count))
 }
 
-void ProgramRows::forward(const ProgramInputs& in, const ProgramResults& results, Own& own) const {
+void ProgramRows::forward(const ProgramInputs& in, const ProgramResults& results, WorkerMemory& own) const {
   constexpr size_t kFew = 16;  // limit for inputs and for memories; more would need an allocation per call
   VN_CHECK(table_.inputs.size() <= kFew && table_.memories.size() <= kFew, "a program of rows has at most 16 inputs");
   bool in_place[kFew];
@@ -369,8 +372,8 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& original, 
   call.n = original.n;
   clear_strays(in, results, table);
 
-  // The workspace of the call: the memory of each thread, partials, memories of n rows, and points in the order of the
-  // cells.
+  // The workspace of the call: the working memory of each thread, partial sums, arrays of n rows (see `memories`), and
+  // points in the order of the cells.
   const bool summed = !table.sums.empty();
   const int64_t unit = in_tiles(table) ? kTileUnit : kTaskUnit;
   const RowTasks tasks = split_rows(in.offsets, in.k, in.n, summed ? kSumRows : kRows, unit, table.partial);

@@ -13,7 +13,7 @@ struct ProgramCall {
   const void* const* inputs;
   const TableType* input_types;
   const int32_t* input_widths;
-  const bool *turned, *rays, *in_place;  // properties of the inputs
+  const bool *transposed, *rays, *in_place;  // properties of the inputs
   const void* const* parameters;
   const TableType* parameter_types;
   const int64_t* strides;
@@ -21,9 +21,9 @@ struct ProgramCall {
   const TableType* output_types;
   const int32_t* output_widths;
   float* const* sums;
-  float* const* memories;     // memories of the call, in the order of the cells; null: none
-  const bool* filled;         // memories with finished look-ups
-  bool looked_up;             // all memories of hash grids are filled
+  float* const* memories;     // the call's arrays (program_code.h), in the order of the cells; null: no array
+  const bool* filled;         // for each array: it has the results of a finished look-up
+  bool looked_up;             // the results of all look-ups in hash grids are filled
   const HashEncoding* grids;  // without the pointers of tables
   const int32_t *order, *ray_index;
   int64_t n;     // rows of inputs

@@ -45,14 +45,14 @@ VN_INLINE int64_t padded(int64_t width) { return (width + kGranule - 1) / kGranu
 // registers.
 VN_INLINE int64_t steps_of(int64_t depth) { return VN_HALF == 2 ? pairs_of(depth) : VN_HALF ? (depth + 1) / 2 : depth; }
 
-// A matrix in memory. With `turned`, the outputs of the product are contiguous, otherwise the depth is contiguous.
+// A matrix in memory. With `transposed`, the outputs of the product are contiguous, otherwise the depth is contiguous.
 struct Matrix {
   const float* from;
   int64_t stride;  // from one row in memory to the next
   int64_t outputs, depth;
-  bool turned;
+  bool transposed;
 
-  float at(int64_t o, int64_t k) const { return turned ? from[k * stride + o] : from[o * stride + k]; }
+  float at(int64_t o, int64_t k) const { return transposed ? from[k * stride + o] : from[o * stride + k]; }
 };
 
 // Packs [outputs][depth] as [1 or 4][depth], padded with 0. The depth is a multiple of a vector.
@@ -60,10 +60,10 @@ struct Matrix {
   constexpr int64_t kStep = (VN_HALF ? 2 : 1) * kLanes;
   for (int64_t o = 0; o < (m.outputs == 1 ? 1 : 4); ++o) {
     for (int64_t k = 0; k < m.depth; k += kStep, to += kLanes) {
-      float turned[kStep] = {};
-      const float* values = turned;
-      if (o < m.outputs && !m.turned) values = m.from + o * m.stride + k;
-      for (int64_t i = 0; o < m.outputs && m.turned && i < kStep; ++i) turned[i] = m.at(o, k + i);
+      float transposed[kStep] = {};
+      const float* values = transposed;
+      if (o < m.outputs && !m.transposed) values = m.from + o * m.stride + k;
+      for (int64_t i = 0; o < m.outputs && m.transposed && i < kStep; ++i) transposed[i] = m.at(o, k + i);
 #if VN_HALF
       store(to, joined(load(values), load(values + kLanes)));
 #else
@@ -83,7 +83,7 @@ struct Matrix {
   for (int64_t first = 0; first < all; first += kPanel) {
     const int64_t columns = all - first < kPanel ? all - first : kPanel, left = depth * columns;
     float* const panel = to + (parts ? 2 : 1) * first * depth;
-    if (m.turned) {
+    if (m.transposed) {
       for (int64_t k = 0; k < 2 * depth; k += 2) {
         for (int64_t c = 0; c < columns; c += kLanes) {
           const int64_t count = m.outputs - first - c;
@@ -125,7 +125,7 @@ struct Matrix {
     const int64_t columns = all - first < kPanel ? all - first : kPanel;
     const int64_t count = m.outputs - first < columns ? m.outputs - first : columns;
     float* const panel = to + first * m.depth;
-    if (m.turned) {
+    if (m.transposed) {
       for (int64_t k = 0; k < m.depth; ++k) {
         const float* row = m.from + k * m.stride + first;
         for (int64_t c = 0; c < count; ++c) panel[k * columns + c] = row[c];
@@ -163,9 +163,9 @@ struct Matrix {
       for (int64_t c = pack.width; c < padded(pack.width); ++c) to[c] = 0.0f;
       continue;
     }
-    const bool turned = pack.kind == ProgramPackKind::turned || pack.kind == ProgramPackKind::few_turned;
-    const bool few = pack.kind == ProgramPackKind::few || pack.kind == ProgramPackKind::few_turned;
-    const Matrix matrix{from, pack.i, turned ? pack.width : pack.o, turned ? pack.o : pack.width, turned};
+    const bool transposed = pack.kind == ProgramPackKind::transposed || pack.kind == ProgramPackKind::few_transposed;
+    const bool few = pack.kind == ProgramPackKind::few || pack.kind == ProgramPackKind::few_transposed;
+    const Matrix matrix{from, pack.i, transposed ? pack.width : pack.o, transposed ? pack.o : pack.width, transposed};
     if (few) {
       pack_few(matrix, to);
     } else {

@@ -69,7 +69,8 @@ VN_INLINE void round_row(const float* from, int64_t width, uint16_t* to) {
 #endif
 }
 
-// Returns the stride of rows of pairs, padded to whole vectors, which may be written.
+// Returns the stride in floats of rows that hold `width` values as pairs. Rows are padded to whole vectors, and kernels
+// may write the padding.
 VN_INLINE int64_t pairs_of(int64_t width) { return (width + 31) / 32 * 16; }
 
 #if VN_HALF
@@ -104,7 +105,7 @@ VN_INLINE void interleave_columns(const Rows& x, int64_t columns, int64_t rows, 
 
 #if VN_HALF == 2
 
-constexpr int64_t kTurned = 32;  // rows that are joined to 16 pairs
+constexpr int64_t kTransposed = 32;  // rows that are joined to 16 pairs
 
 // Copies a row of bfloat16 as pairs, padded with 0.
 VN_INLINE void copy_pairs(const uint16_t* from, int64_t width, float* to) {
@@ -120,10 +121,10 @@ VN_INLINE void copy_pairs(const uint16_t* from, int64_t width, float* to) {
   }
 }
 
-// Clears the padding rows of pairs in a slot, from the last row up to a multiple of 32.
+// Clears the padding rows of pairs in a slot: the rows after the last row, up to a multiple of 32.
 VN_INLINE void clear_behind(const Rows& x, int64_t columns, int64_t rows) {
   float* const data = const_cast<float*>(x.data);
-  for (int64_t row = rows; row % kTurned != 0; ++row) {
+  for (int64_t row = rows; row % kTransposed != 0; ++row) {
     for (int64_t i = 0; i < pairs_of(columns); i += kLanes) store(data + row * x.stride + i, splat(0.0f));
   }
 }
@@ -137,10 +138,10 @@ VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* t
 #if VN_ISA == 2
   // Eight columns are transposed at a time. 128-bit lane l of vector i holds the columns of pair i + 4 l, so shuffles
   // within lanes give the right order. Transposing whole vectors would take twice as many shuffles.
-  for (int64_t row = 0; row < rows; row += kTurned) {
+  for (int64_t row = 0; row < rows; row += kTransposed) {
     for (int64_t column = 0; column < columns; column += 8) {
       const float* const from = x.data + row * x.stride + column / 2;
-      float* const turned = to + column * stride + row / 2;
+      float* const transposed = to + column * stride + row / 2;
       const auto lanes = [&](int64_t first) {
         const auto lane = [&](int64_t l) {
           return _mm_loadu_si128(reinterpret_cast<const __m128i*>(from + (first + 8 * l) * x.stride));
@@ -164,15 +165,15 @@ VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* t
         store(out + 2 * stride, (F32)_mm512_maskz_unpacklo_epi64(0xff, b, d));
         store(out + 3 * stride, (F32)_mm512_maskz_unpackhi_epi64(0xff, b, d));
       };
-      turn(left, turned);
-      turn(right, turned + 4 * stride);
+      turn(left, transposed);
+      turn(right, transposed + 4 * stride);
     }
   }
 #else
   for (int64_t column = 0; column < columns; ++column) {
-    auto* const turned = reinterpret_cast<uint16_t*>(to + column * stride);
+    auto* const transposed = reinterpret_cast<uint16_t*>(to + column * stride);
     for (int64_t row = 0; row < 2 * pairs_of(rows); ++row) {
-      __builtin_memcpy(turned + row, reinterpret_cast<const uint16_t*>(x.data + row * x.stride) + column, 2);
+      __builtin_memcpy(transposed + row, reinterpret_cast<const uint16_t*>(x.data + row * x.stride) + column, 2);
     }
   }
 #endif

@@ -110,7 +110,7 @@ struct ProgramTile {
     return step.op != ProgramOp::linear && step.op != ProgramOp::encode;
   }
   bool narrowed_as_read(const ProgramStep& step) const {
-    return step.pairs >= 0 && !call.turned[step.number] && !call.parts;
+    return step.pairs >= 0 && !call.transposed[step.number] && !call.parts;
   }
 
   void run_step(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
@@ -123,8 +123,8 @@ struct ProgramTile {
       case ProgramOp::linear:
         return linear(step, operands, to);
       case ProgramOp::function: {
-        const Rows x = operand(operands[0]), times = step.taken > 1 ? operand(operands[1]) : x;
-        const Rows* by = step.taken > 1 ? &times : nullptr;
+        const Rows x = operand(operands[0]), times = step.operand_count > 1 ? operand(operands[1]) : x;
+        const Rows* by = step.operand_count > 1 ? &times : nullptr;
         switch (step.function) {
 #define VN_CASE(NAME, ...)    \
   case ProgramFunction::NAME: \
@@ -195,7 +195,7 @@ struct ProgramTile {
 #endif
     if (step.in_place && call.in_place[number]) return;
     if (step.points && call.looked_up) return;
-    if (call.turned[number]) return turn(static_cast<const float*>(call.inputs[number]), step, to);
+    if (call.transposed[number]) return turn(static_cast<const float*>(call.inputs[number]), step, to);
     if (call.input_types[number] == TableType::bfloat16) {
       const auto* from = static_cast<const uint16_t*>(call.inputs[number]);
       if (width == stride && call.order == nullptr && !call.rays[number]) {
@@ -268,8 +268,8 @@ struct ProgramTile {
   void linear(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
     const bool slopes = step.finish == ProgramFinish::relu_slope;
     const int32_t count = step.sources;
-    const Rows add = step.taken > count + slopes ? operand(operands[count]) : Rows{kZeros, 0, false};
-    const float* slope = slopes ? operand(operands[step.taken - 1]).data : nullptr;
+    const Rows add = step.operand_count > count + slopes ? operand(operands[count]) : Rows{kZeros, 0, false};
+    const float* slope = slopes ? operand(operands[step.operand_count - 1]).data : nullptr;
     const Finish finish = step.finish == ProgramFinish::none   ? Finish::none
                           : step.finish == ProgramFinish::relu ? Finish::relu
                                                                : Finish::relu_slope;
@@ -289,8 +289,8 @@ struct ProgramTile {
     sources[0].stride = x.stride;
 #endif
 #if VN_HALF == 2
-    if (slopes && operands[step.taken - 1].pairs >= 0) {
-      slope = slot(operands[step.taken - 1].pairs);
+    if (slopes && operands[step.operand_count - 1].pairs >= 0) {
+      slope = slot(operands[step.operand_count - 1].pairs);
       slope_in_pairs = true;
     }
 #endif
@@ -335,8 +335,9 @@ struct ProgramTile {
 #endif
   }
 
-  // stride_of returns the stride of rows of pairs, including the rounding remainders of products in parts. left_of
-  // returns the offset of these remainders (0: none).
+  // stride_of returns the stride of rows of pairs. With call.parts, each float is split into a bfloat16 number and its
+  // rounding remainder, and the remainders' pairs follow the numbers' pairs in each row. left_of returns the offset of
+  // the remainders in a row (0: none).
   int64_t stride_of(int64_t width) const { return (call.parts ? 2 : 1) * pairs_of(width); }
   int64_t left_of(int64_t width) const { return call.parts ? pairs_of(width) : 0; }
 
@@ -376,7 +377,7 @@ struct ProgramTile {
     if (step.order == 0) {  // columns may have several operands, or none
       for (int64_t i = 0; i < rows * step.stride; i += kLanes) store(to + i, splat(0.0f));
     }
-    for (int32_t i = 0; i < step.taken; ++i) {
+    for (int32_t i = 0; i < step.operand_count; ++i) {
       const Rows x = operand(operands[i]);
       const int64_t width = operands[i].width;
       float* into = to + operands[i].place;
@@ -414,8 +415,8 @@ struct ProgramTile {
     return encoding;
   }
 
-  // Looks up the encoding of x or, if the order is 1, computes the gradient of x. Operands: x, the gradient of its
-  // encoding, and the encoding.
+  // Looks up the encoding of x or, if step.order is 1, computes the gradient with respect to x. The operands are x or,
+  // for the gradient, x, the gradient with respect to the encoding, and the encoding.
   void look_up(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
     const Rows x = operand(operands[0]);
     if (step.order == 0) {

@@ -40,12 +40,13 @@ void check_offsets(const std::string& op, const int32_t* offsets, int64_t k, int
 // `partial`, the floats of one partial (0: none), limits the number of tasks.
 RowTasks split_rows(const int32_t* offsets, int64_t k, int64_t n, RowLimits limits, int64_t unit, int64_t partial);
 
-// Returns the rows of a tile, a multiple of all blocks of rows (6, 8, 12). On AMD's Zen 4 and 5, 96 rows are the
-// fastest of 48, 96, 144 and 192; 48 rows take 1.015 times as long. Elsewhere the choice follows from cache sizes, not
-// measurements. On Intel, a layer of width 64 reads and writes 40 KiB with 48 rows, which fits the first-level cache of
-// 48 KiB. With 96 rows every line of C is stored to the second level, and a load 4 KiB apart waits for the store. On
-// AMD without AVX-512 the first-level cache has 32 KiB. With 96 rows, the two operands of a weight gradient have 12
-// lines in each of 16 sets of 8 lines, and miss 3.1 times as often as with 48 rows.
+// Returns the number of rows of a tile, a multiple of all blocks of rows (6, 8, 12). On AMD's Zen 4 and 5, 96 rows are
+// the fastest of 48, 96, 144 and 192; 48 rows take 1.015 times as long. Elsewhere the choice follows from cache sizes,
+// not measurements. On Intel, a layer of width 64 reads and writes 40 KiB with 48 rows, which fits the first-level
+// cache of 48 KiB. With 96 rows, every line of the layer's result is written back to the second-level cache, and a load
+// waits for an earlier store if their addresses differ by a multiple of 4 KiB. On AMD without AVX-512 the first-level
+// cache has 32 KiB. With 96 rows, the two operands of a weight gradient have 12 lines in each of 16 sets of 8 lines,
+// and miss 3.1 times as often as with 48 rows.
 int64_t tile_rows();
 
 // The memory of one call, aligned to a cache line. The calling thread keeps it for later calls until it ends, since the

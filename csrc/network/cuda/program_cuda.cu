@@ -1,11 +1,12 @@
 // The interpreter of programs on CUDA. A task is a range of rows of one cell, and a block runs the tiles of its tasks
 // one after the other. Each warp has 16 or 32 rows of a tile and runs the steps on them independently of the other
-// warps. Only sums over rows are computed by all warps together, for all rows. If the values of only few rows fit, four
-// warps form a team, which has 16 rows and shares the columns.
+// warps. Only sums over rows are computed by all warps together, for all rows. If shared memory has space for the
+// values of few rows only, four warps form a team: they have the same 16 rows and share the columns.
 //
 // Values are in shared memory, for each team [rows][stride] at their slot. They are float32 or, with 16-bit products,
 // words of two 16-bit numbers if only products read them. A value that one product passes to the next stays in
-// registers. If fewer than two teams fit, values are in the workspace instead, with a part for each resident block.
+// registers. If shared memory has space for fewer than two teams, values are in the workspace instead, with a part for
+// each resident block.
 //
 // Layers: weights are packed once per call, in the layout and type of the products (program_cuda_product.h). Sums over
 // rows: a thread has the same entries in every tile and adds to the task's partial in global memory. A second kernel
@@ -33,8 +34,8 @@ constexpr int64_t kPartialBytes = int64_t{1} << 28;
 constexpr int64_t kBlocksPerMultiprocessor = 8;  // for kernels other than the interpreter
 constexpr int kPackPart = 1024;                  // packed words that a block writes at a time
 constexpr int64_t kReservedBytes = 1024;         // shared memory reserved by CUDA for each block
-// The memory of a step in the device's records is the index of a look-up, kNoMemory, or kNoMemory - 1 - index of a
-// scatter.
+// The field `memory` of a step in the device's records: i >= 0 means look-up i, kNoMemory means none, and
+// kNoMemory - 1 - i means scatter i.
 constexpr int kNoMemory = -1;
 
 // Steps ----------------------------------------------------------------------------------------------------------
@@ -55,10 +56,10 @@ __device__ __forceinline__ float derivative(int order, float x, float a, float b
 
 template <typename Tile>
 __device__ __noinline__ void function_step(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
-  const Rows x = tile.operand(operands[0]), times = tile.operand(operands[step.taken - 1]);
+  const Rows x = tile.operand(operands[0]), times = tile.operand(operands[step.operand_count - 1]);
   const float a = step.a, b = step.b;
   const int order = step.order;
-  const bool alone = step.taken == 1;
+  const bool alone = step.operand_count == 1;
   const auto to = tile.target(step);
   switch (step.function) {
 #define VN_CASE(NAME, ...)                                                                           \
@@ -91,7 +92,7 @@ template <typename Tile>
 __device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
   const auto to = tile.target(step);
   if (step.order == 1) {  // one operand writes each column
-    for (int i = 0; i < step.taken; ++i) {
+    for (int i = 0; i < step.operand_count; ++i) {
       const Rows x = tile.operand(operands[i]);
       const int place = operands[i].place;
       for_each_entry<Tile>(tile.rows(), operands[i].width,
@@ -101,7 +102,7 @@ __device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& s
   }
   for_each_entry<Tile>(tile.rows(), step.width, [&](int row, int column) {
     float sum = 0.0f;
-    for (int i = 0; i < step.taken; ++i) {
+    for (int i = 0; i < step.operand_count; ++i) {
       const int within = column - operands[i].place;
       if (within >= 0 && within < operands[i].width) sum += tile.operand(operands[i]).at(row, within);
     }
@@ -230,7 +231,7 @@ __device__ __forceinline__ int sums(const CudaProgram& call, const Tile& tile, i
   return i;
 }
 
-// Returns the rows of a block's tile.
+// Returns the number of rows of a block's tile.
 template <typename Tile>
 __device__ __forceinline__ int tile_height() {
   return static_cast<int>(threads_again() / Tile::kWorkers) * Tile::kRows;
@@ -352,12 +353,12 @@ __device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision
     const int part = static_cast<int>(unit % call.pack_parts);
     const int64_t rest = unit / call.pack_parts, cell = rest / packs;
     const ProgramPack pack = call.code.packs[rest % packs];
-    const bool turned = pack.kind == ProgramPackKind::turned, vector = pack.kind == ProgramPackKind::vector;
-    if (!turned && !vector && pack.kind != ProgramPackKind::matrix) continue;
+    const bool transposed = pack.kind == ProgramPackKind::transposed, vector = pack.kind == ProgramPackKind::vector;
+    if (!transposed && !vector && pack.kind != ProgramPackKind::matrix) continue;
     const float* from =
         static_cast<const float*>(call.parameters[pack.parameter]) + cell * call.strides[pack.parameter] + pack.start;
-    PackedMatrix matrix{from, turned ? pack.i : 1, turned ? 1 : pack.i, turned ? pack.o : pack.width,
-                        turned ? pack.width : pack.o};
+    PackedMatrix matrix{from, transposed ? pack.i : 1, transposed ? 1 : pack.i, transposed ? pack.o : pack.width,
+                        transposed ? pack.width : pack.o};
     if (vector) matrix = {from, 0, 1, 1, pack.width};
     const int outputs = padded(matrix.outputs, kProgramOutputs);
     // For tensor cores, the two bias columns of a lane are stored twice, because a lane has them in two rows.
@@ -371,7 +372,7 @@ __device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision
   }
 }
 
-// Sets outputs and kept look-ups of rows in no cell to 0.
+// Sets the outputs, and the look-up results that the caller keeps, to 0 for rows in no cell.
 __device__ void clear_strays(const CudaProgram& call) {
   const CudaRows& rows = call.rows;
   const int64_t low = cell_begin(rows, 0), last = cell_begin(rows, rows.k), high = last < low ? low : last;
@@ -414,10 +415,10 @@ __global__ void __launch_bounds__(kThreads)
       for (int r = s; r < next; ++r) {
         const ProgramSum& sum = code.sums[r];
         if (sum.kind == ProgramSumKind::none) continue;
-        const bool vector = sum.kind == ProgramSumKind::vector, turned = sum.kind == ProgramSumKind::inputs_outputs;
+        const bool vector = sum.kind == ProgramSumKind::vector, transposed = sum.kind == ProgramSumKind::inputs_outputs;
         const int o = vector ? 0 : i / sum.i, column = i - o * sum.i * !vector - sum.start;
         if (column < 0 || column >= sum.width) continue;
-        const int at = sum.partial + (turned ? column * sum.stride + o : o * sum.stride + column);
+        const int at = sum.partial + (transposed ? column * sum.stride + o : o * sum.stride + column);
         const float* from = call.partials + at;
         int64_t task = first;
         for (; task + 8 <= last; task += 8) {  // eight loads in flight
@@ -439,7 +440,7 @@ __global__ void __launch_bounds__(kThreads)
 struct Device {
   int multiprocessors, shared_bytes;
   int64_t multiprocessor_bytes;
-  int capability;  // 86 for 8.6; at most that of the compiled code
+  int capability;  // 86 for 8.6; at most the capability of the compiled code
 };
 
 // Returns the properties of the current device, cached per thread.
@@ -497,7 +498,7 @@ class Slots {
   int32_t columns_;
 };
 
-// The offsets of a code's parts in bytes, and its size.
+// The byte offset of each array of records in the code of a program, and the code's size.
 struct CodePlaces {
   int64_t packs, steps, operands, sums, scatters, grids, own_steps, bytes;
 };
@@ -517,7 +518,7 @@ CodePlaces code_places(const ProgramTable& table) {
   return at;
 }
 
-// Returns an upper bound of the largest pack's words, from the distances of the packs.
+// Returns an upper bound on the words of a pack: the largest distance from the start of a pack to the next one.
 int32_t largest_pack(const ProgramTable& table) {
   int32_t largest = 1;
   for (size_t i = 0; i < table.packs.size(); ++i) {
@@ -527,8 +528,8 @@ int32_t largest_pack(const ProgramTable& table) {
   return largest;
 }
 
-// Returns a step for the interpreter, from records with the slots of the device. goes_on: the step adds to the sums of
-// the previous step.
+// Returns a step as the interpreter reads it. `step` and `operands` must already have the positions of the slots on the
+// device (class Slots). goes_on: the step adds to the sums of the previous step.
 CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, const std::vector<ProgramPack>& packs,
                    bool goes_on) {
   CudaStep result{};
@@ -545,14 +546,14 @@ CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, cons
   if (step.op == ProgramOp::linear) {
     const ProgramPack& pack = packs[static_cast<size_t>(step.number)];
     result.weights = pack.at;
-    result.turned = pack.kind == ProgramPackKind::turned;
+    result.transposed = pack.kind == ProgramPackKind::transposed;
     result.relu = step.finish == ProgramFinish::relu;
     result.sloped = step.finish == ProgramFinish::relu_slope;
     result.x_held = step.from_registers;
-    result.holds = step.hands == ProgramHands::words;
-    result.carries = step.hands == ProgramHands::sums;
-    if (result.sloped) y = operands + step.taken - 1;
-    if (step.taken > 1 + static_cast<int>(result.sloped) && !goes_on) {
+    result.holds = step.to_registers == ProgramToRegisters::words;
+    result.carries = step.to_registers == ProgramToRegisters::sums;
+    if (result.sloped) y = operands + step.operand_count - 1;
+    if (step.operand_count > 1 + static_cast<int>(result.sloped) && !goes_on) {
       const ProgramOperand& added = operands[1];
       const bool bias = added.parameter && !added.spread;
       if (bias) result.bias = packs[static_cast<size_t>(added.slot)].at;
@@ -629,8 +630,8 @@ LaunchPlan plan_launch(const Program& program, int64_t n, int64_t k) {
            (4 * rows * columns);
   };
   // Warps have 32 rows, and read each weight once for all of them, if cells have enough rows and the values of all
-  // resident warps fit. Otherwise warps have 16 rows, which the warps of a team share unless the values of half the
-  // resident warps fit.
+  // resident warps fit. Otherwise warps have 16 rows. If not even the values of half the resident warps fit, the warps
+  // of a team share their 16 rows.
   const int64_t resident_tall = program_blocks(32) * program_warps(32);
   const bool tall = table.layout == ProgramLayout::tiles && fitting(32) >= resident_tall && n >= 32 * k;
   result.own_rows = tall ? 32 : 16;
@@ -717,8 +718,8 @@ void program_code_cuda(const Program& program, unsigned char* code) {
   const Slots slots(table);
   std::vector<ProgramStep> steps = table.steps;
   std::vector<ProgramOperand> operands = table.operands;
-  // The device's memory index of each memory of the program (see kNoMemory). Outputs have none: only their output steps
-  // write them.
+  // For each array of the program (look-up result, gradient or output), the value of `memory` in the device's records
+  // (see kNoMemory). It is kNoMemory for outputs, since only their output steps write them.
   std::vector<int32_t> memories(table.memories.size(), kNoMemory);
   for (size_t i = 0; i < table.lookups.size(); ++i) {
     memories[static_cast<size_t>(table.lookups[i].memory)] = static_cast<int32_t>(i);
@@ -796,7 +797,7 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
   for (size_t i = 0; i < table.inputs.size(); ++i) {
     call.inputs[i] = in.inputs[i];
     call.input_types[i] = static_cast<uint8_t>(in.input_types[i]);
-    call.turned[i] = in.turned[i] != 0;
+    call.transposed[i] = in.transposed[i] != 0;
     call.rays[i] = table.inputs[i].ray;
   }
   for (int32_t i = 0; i < table.parameters; ++i) {

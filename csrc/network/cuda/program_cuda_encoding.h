@@ -202,8 +202,9 @@ __device__ __noinline__ float2 exact_sine_and_cosine(float value, int octave) {
   return make_float2(sine_of_octave(angle, 0.0f), sine_of_octave(angle, 0.5f));
 }
 
-// Computes sines and cosines of `features` columns of x in octaves. They follow x itself, or they are blurred by the
-// variances in the next columns of x (kBlurred). A thread computes a sine and its cosine.
+// Computes sines and cosines of `features` columns of x in octaves. kBlurred: they are damped by the variances, which
+// are the next `features` columns of x; otherwise the result begins with x itself. A thread computes a sine and its
+// cosine.
 template <bool kBlurred, typename Tile>
 __device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int features, const Rows& x,
                                               const Target<Tile::kBfloat16>& to) {
@@ -275,8 +276,8 @@ __device__ __noinline__ void octaves(Tile tile, const ProgramStep& step, const P
   exact_octaves<kBlurred>(tile, step.depth, features, x, to);
 }
 
-// Computes the gradient of the encoded columns from g and the encoding: the derivative of a sine is the cosine next to
-// it.
+// Computes the gradient with respect to the encoded columns of x, from the encoding and from the gradient g with
+// respect to it. The derivative of a sine is the cosine in the neighbouring column.
 template <typename Tile>
 __device__ __noinline__ void octaves_gradient(Tile tile, const ProgramStep& step, const ProgramOperand* operands,
                                               int features, bool blurred) {
@@ -309,7 +310,8 @@ struct Octaves {
   }
 };
 
-// Runs an encoding step. The operands are x or, for the gradient, x, g and the encoding.
+// Runs an encoding step. The operand is x. The gradient with respect to x has three operands: x, the gradient with
+// respect to the encoding, and the encoding.
 template <typename Tile>
 __device__ __forceinline__ void encode_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
   using namespace device;  // the formulas of encodings

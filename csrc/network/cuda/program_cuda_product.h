@@ -27,7 +27,8 @@ struct PackedMatrix {
   }
 };
 
-// Returns word `word` of the fragments: lane 4 g + m of a tile has the depth indices of member m in column g.
+// Returns word `word` of the fragments. Lane 4 g + m has, for column g of a tile, the depth indices that mma.sync
+// assigns to member m of a group of four lanes.
 template <typename Numbers>
 __device__ __forceinline__ uint32_t packed_word(const PackedMatrix& matrix, int word) {
   const int tiles = padded(matrix.outputs, kProgramOutputs) / 8;
@@ -51,7 +52,7 @@ struct ProductValue {
     return column < columns ? floats[row * stride + column] : 0.0f;
   }
 };
-// Returns a value in its slot of the block's first team (kFirst) or of the thread's team.
+// Returns a value from the slot of the block's first team (kFirst) or from the slot of the thread's team.
 template <bool kFirst, typename Tile>
 __device__ __forceinline__ ProductValue product_value(const Tile& tile, const CudaValue& value, bool words) {
   const float* at = (kFirst ? tile.first_slot(value.slot) : tile.slot(value.slot)) + value.start;
@@ -113,42 +114,43 @@ struct HalfNumbers {
   // on become its depth. kWhole: the value is in words.
   static constexpr int kRows = 16;
   template <bool kShared, bool kWhole>
-  static __device__ __forceinline__ void turned_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
-                                                     int rows, int lane) {
+  static __device__ __forceinline__ void transposed_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
+                                                         int rows, int lane) {
     if (kWhole || a.has_words) {
-      load_turned<kShared, true>(words, a.words + row * a.stride + i / 2, a.stride, lane);
+      load_transposed<kShared, true>(words, a.words + row * a.stride + i / 2, a.stride, lane);
     } else {
 #pragma unroll
-      for (int j = 0; j < 4; ++j) words[j] = turned_pair(a, row + 8 * (j / 2), i + 8 * (j % 2), rows, lane);
+      for (int j = 0; j < 4; ++j) words[j] = transposed_pair(a, row + 8 * (j / 2), i + 8 * (j % 2), rows, lane);
     }
   }
   // Loads columns from j on, two tiles of 8, as right operands.
   template <bool kShared, bool kWhole>
-  static __device__ __forceinline__ void turned_right(uint32_t (&words)[2][2], const ProductValue& b, int j, int row,
-                                                      int rows, bool cut, int lane) {
+  static __device__ __forceinline__ void transposed_right(uint32_t (&words)[2][2], const ProductValue& b, int j,
+                                                          int row, int rows, bool cut, int lane) {
     if (kWhole || b.has_words) {
       uint32_t four[4];
-      load_turned<kShared, false>(four, b.words + row * b.stride + j / 2, b.stride, lane);
+      load_transposed<kShared, false>(four, b.words + row * b.stride + j / 2, b.stride, lane);
 #pragma unroll
       for (int i = 0; i < 4; ++i) words[i / 2][i % 2] = four[i];
     } else {
 #pragma unroll
-      for (int i = 0; i < 4; ++i) words[i / 2][i % 2] = turned_pair(b, row + 8 * (i % 2), j + 8 * (i / 2), rows, lane);
+      for (int i = 0; i < 4; ++i)
+        words[i / 2][i % 2] = transposed_pair(b, row + 8 * (i % 2), j + 8 * (i / 2), rows, lane);
     }
     if (kCuts && cut) {
 #pragma unroll
       for (int i = 0; i < 4; ++i) words[i / 2][i % 2] = clamp_halves(words[i / 2][i % 2]);
     }
   }
-  static __device__ __forceinline__ void multiply_turned(float (&sums)[4], const uint32_t (&left)[4],
-                                                         const uint32_t (&right)[2]) {
+  static __device__ __forceinline__ void multiply_transposed(float (&sums)[4], const uint32_t (&left)[4],
+                                                             const uint32_t (&right)[2]) {
     multiply_halves<kBfloat16>(sums, left, right);
   }
 
  private:
   // Returns two rows of a lane's column as a pair.
-  static __device__ __forceinline__ uint32_t turned_pair(const ProductValue& a, int row, int column, int rows,
-                                                         int lane) {
+  static __device__ __forceinline__ uint32_t transposed_pair(const ProductValue& a, int row, int column, int rows,
+                                                             int lane) {
     const int at = row + 2 * (lane % 4), of = column + lane / 4;
     return pair(at < rows ? a.at(at, of) : 0.0f, at + 1 < rows ? a.at(at + 1, of) : 0.0f);
   }
@@ -188,28 +190,30 @@ struct Tf32Numbers {
     multiply_tf32(sums, left.words[1], second);
   }
 
-  // Member m takes rows 2 m and 2 m + 1, not m and m + 4, so that the 32 lanes of a warp read different banks.
+  // Member m of a group of four lanes takes rows 2 m and 2 m + 1, not m and m + 4, so that the 32 lanes of a warp read
+  // different banks.
   static constexpr int kRows = 8;
   template <bool kShared, bool kWhole>
-  static __device__ __forceinline__ void turned_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
-                                                     int rows, int lane) {
+  static __device__ __forceinline__ void transposed_left(uint32_t (&words)[4], const ProductValue& a, int i, int row,
+                                                         int rows, int lane) {
 #pragma unroll
-    for (int j = 0; j < 4; ++j) words[j] = turned<kWhole>(a, row + j / 2, i + 8 * (j % 2), rows, lane);
+    for (int j = 0; j < 4; ++j) words[j] = transposed<kWhole>(a, row + j / 2, i + 8 * (j % 2), rows, lane);
   }
   template <bool kShared, bool kWhole>
-  static __device__ __forceinline__ void turned_right(uint32_t (&words)[2][2], const ProductValue& b, int j, int row,
-                                                      int rows, bool, int lane) {
+  static __device__ __forceinline__ void transposed_right(uint32_t (&words)[2][2], const ProductValue& b, int j,
+                                                          int row, int rows, bool, int lane) {
 #pragma unroll
-    for (int i = 0; i < 4; ++i) words[i / 2][i % 2] = turned<kWhole>(b, row + i % 2, j + 8 * (i / 2), rows, lane);
+    for (int i = 0; i < 4; ++i) words[i / 2][i % 2] = transposed<kWhole>(b, row + i % 2, j + 8 * (i / 2), rows, lane);
   }
-  static __device__ __forceinline__ void multiply_turned(float (&sums)[4], const uint32_t (&left)[4],
-                                                         const uint32_t (&right)[2]) {
+  static __device__ __forceinline__ void multiply_transposed(float (&sums)[4], const uint32_t (&left)[4],
+                                                             const uint32_t (&right)[2]) {
     multiply_tf32(sums, left, right);
   }
 
  private:
   template <bool kWhole>
-  static __device__ __forceinline__ uint32_t turned(const ProductValue& a, int row, int column, int rows, int lane) {
+  static __device__ __forceinline__ uint32_t transposed(const ProductValue& a, int row, int column, int rows,
+                                                        int lane) {
     const int at = row + 2 * (lane % 4), of = column + lane / 4;
     if (kWhole) return word(a.floats[at * a.stride + of]);
     return word(at < rows ? a.at(at, of) : 0.0f);
@@ -223,7 +227,7 @@ struct Tf32Numbers {
 template <int kTall>
 struct HeldWords {
   uint32_t words[kTall][kProgramWide / 8][2];
-  // Returns the columns from 32 c on as a left operand.
+  // Returns columns 32 c to 32 c + 31 of rows 16 r to 16 r + 15 as a left operand.
   __device__ __forceinline__ LeftFragments left(int r, int c) const {
     LeftFragments result;
 #pragma unroll
@@ -235,8 +239,8 @@ struct HeldWords {
 // The product steps on tensor cores. A team has 16 kTall rows and kTeam warps. kShared: slots are in shared memory.
 //
 // Operands of float16 products are clamped to the largest number, since infinities in a network soon become NaN.
-// Gradients are not clamped, because loss scaling checks them for infinities. An operand of a turned (transposed)
-// matrix is assumed to be a gradient.
+// Gradients are not clamped, because loss scaling checks them for infinities. The operand that is multiplied by a
+// transposed matrix is assumed to be a gradient.
 template <typename Numbers, int kTall, int kTeam, bool kShared>
 struct TensorSteps {
   using Tile = ProgramTile<16 * kTall, kTeam, kShared, Numbers::kKind>;
@@ -330,12 +334,12 @@ struct TensorSteps {
                           step.y.start + j0 + 32 <= step.y.stride;
       if (words && step.bias >= 0 && i0 == 0) {
         float columns[4][4] = {};
-        multiply_turned<true, true>(sums, columns, tile, a, b, i0, j0, swapped, lane);
+        multiply_transposed<true, true>(sums, columns, tile, a, b, i0, j0, swapped, lane);
         add_columns(columns, tile.partial() + step.bias, j0, b.columns, fill, lane);
       } else if (words || floats) {
-        multiply_turned<true, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
+        multiply_transposed<true, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
       } else {
-        multiply_turned<false, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
+        multiply_transposed<false, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
       }
       if (j0 + 32 <= b.columns && i0 + 16 <= a.columns) {
 #pragma unroll
@@ -372,7 +376,8 @@ struct TensorSteps {
     return step.x_held || step.holds || step.carries;
   }
 
-  // Computes 8 kTiles columns from `first` on. kHeld: chunks of the operand in registers; 0: it is in its slot.
+  // Computes 8 kTiles columns from `first` on. kHeld: the number of chunks of an operand in registers, or 0 if the
+  // operand is in its slot.
   template <int kTiles, int kHeld>
   static __device__ __forceinline__ void chained_part(const Tile& tile, const CudaStep& step, int first, Held& held) {
     const int lane = lane_again();
@@ -448,7 +453,7 @@ struct TensorSteps {
                lane % 4),
           across(4 * padded(step.width, kProgramOutputs)),
           lane(lane),
-          cut(!step.turned) {}
+          cut(!step.transposed) {}
     // Sets the sums to the bias.
     template <int kTiles>
     __device__ __forceinline__ void start(float (&sums)[kTall][kTiles][4]) const {
@@ -506,8 +511,9 @@ struct TensorSteps {
     }
   }
 
-  // Calls visit(a, b, row, rows) along the depth of a sum over the block's rows. The operands begin at a team's first
-  // row, `row` is the next row of the team, and `rows` is the number of remaining rows with a sample.
+  // Goes through the block's rows, which are the depth of a sum over rows, and calls visit(a, b, row, rows) for each
+  // piece of Numbers::kRows rows. a and b begin at the first row of the piece's team, and `row` is the piece's first
+  // row within the team. `rows` is the number of rows with a sample in this team and all later ones.
   template <bool kWhole, typename Visit>
   static __device__ __forceinline__ void for_each_depth(const Tile& tile, ProductValue a, ProductValue b,
                                                         const Visit& visit) {
@@ -524,13 +530,14 @@ struct TensorSteps {
   // bounds checks are needed. Both operands are words, padded with 0 in rows and columns, or floats whose rows are long
   // enough and all have a sample. kColumns: also adds the sum of b over rows to `columns`.
   template <bool kWhole, bool kColumns>
-  static __device__ __forceinline__ void multiply_turned(float (&sums)[4][4], float (&columns)[4][4], const Tile& tile,
-                                                         const ProductValue& a, const ProductValue& b, int i0, int j0,
-                                                         bool swapped, int lane) {
+  static __device__ __forceinline__ void multiply_transposed(float (&sums)[4][4], float (&columns)[4][4],
+                                                             const Tile& tile, const ProductValue& a,
+                                                             const ProductValue& b, int i0, int j0, bool swapped,
+                                                             int lane) {
     const int tiles = ceil_div(b.columns - j0, 8);
     for_each_depth<kWhole>(tile, a, b, [&](const ProductValue& x, const ProductValue& y, int row, int rows) {
       uint32_t left[4];
-      Numbers::template turned_left<kShared, kWhole>(left, x, i0, row, rows, lane);
+      Numbers::template transposed_left<kShared, kWhole>(left, x, i0, row, rows, lane);
       if constexpr (Numbers::kCuts) {
         for (uint32_t& word : left) word = swapped ? clamp_halves(word) : word;
       }
@@ -538,9 +545,9 @@ struct TensorSteps {
       for (int pair = 0; pair < 2; ++pair) {
         if (!kWhole && 2 * pair >= tiles) continue;
         uint32_t right[2][2];
-        Numbers::template turned_right<kShared, kWhole>(right, y, j0 + 16 * pair, row, rows, !swapped, lane);
-        Numbers::multiply_turned(sums[2 * pair], left, right[0]);
-        Numbers::multiply_turned(sums[2 * pair + 1], left, right[1]);
+        Numbers::template transposed_right<kShared, kWhole>(right, y, j0 + 16 * pair, row, rows, !swapped, lane);
+        Numbers::multiply_transposed(sums[2 * pair], left, right[0]);
+        Numbers::multiply_transposed(sums[2 * pair + 1], left, right[1]);
         if constexpr (kColumns) {
           add_ones(columns[2 * pair], right[0]);
           add_ones(columns[2 * pair + 1], right[1]);
@@ -558,7 +565,7 @@ struct TensorSteps {
       float sums[2][4] = {};
       for_each_depth<true>(tile, b, b, [&](const ProductValue&, const ProductValue& own, int row, int rows) {
         uint32_t right[2][2];
-        Numbers::template turned_right<kShared, true>(right, own, j0, row, rows, false, lane);
+        Numbers::template transposed_right<kShared, true>(right, own, j0, row, rows, false, lane);
         add_ones(sums[0], right[0]);
         add_ones(sums[1], right[1]);
       });
@@ -568,7 +575,7 @@ struct TensorSteps {
   // Adds sums of columns over the rows, by a product with ones.
   static __device__ __forceinline__ void add_ones(float (&sums)[4], const uint32_t (&right)[2]) {
     const uint32_t one = Numbers::pair(1.0f, 1.0f), ones[4] = {one, one, one, one};
-    Numbers::multiply_turned(sums, ones, right);
+    Numbers::multiply_transposed(sums, ones, right);
   }
   // Adds sums of columns to partial[j], for columns from j0 on: kTiles tiles of eight.
   template <int kTiles>
@@ -581,7 +588,7 @@ struct TensorSteps {
     }
   }
 
-  // Adds a value to the product.
+  // Adds the step's added operand (step.added) to the sums.
   template <int kTiles>
   static __device__ __forceinline__ void add(Sums<kTiles>& sums, const CudaStep& step, const Tile& tile, int first) {
     const int lane = lane_again(), rows = tile.rows();
@@ -642,7 +649,8 @@ struct TensorSteps {
     uint32_t* const to = reinterpret_cast<uint32_t*>(tile.slot(step.pairs)) + lane / 4 * stride + first / 2 + lane % 4;
     for_each_word<kTiles>([&](int r, int t, int h) { to[(16 * r + 8 * h) * stride + 4 * t] = held.words[r][t][h]; });
   }
-  // Clears words without a sample or a column, since products read multiples of 16 rows and columns.
+  // Clears the numbers in rows without a sample and in columns after the last one, since products read multiples of 16
+  // rows and columns.
   template <int kTiles>
   static __device__ __forceinline__ void clear_outside(Held& held, const Tile& tile, int columns, int lane) {
     const int rows = tile.rows();

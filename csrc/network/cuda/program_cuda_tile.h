@@ -48,8 +48,8 @@ struct alignas(16) CudaStep {
   int32_t added;         // index of an added operand, or -1; output: the written operand
   int32_t number;        // input, output: its index. outer, columns: offset in the partial
   CudaOp op;
-  uint32_t keeps : 1;  // the result also goes to memory of the call
-  uint32_t relu : 1, sloped : 1, turned : 1;
+  uint32_t keeps : 1;  // the result is also stored for the caller, or added to the gradient of a table
+  uint32_t relu : 1, sloped : 1, transposed : 1;
   uint32_t x_words : 1, y_words : 1;
   uint32_t swapped : 1;            // outer: y, not x, is the gradient
   uint32_t x_held : 1, holds : 1;  // x is in registers; the result stays in registers
@@ -68,7 +68,7 @@ __device__ __forceinline__ CudaStep load_step(const CudaStep* from) {
   return step;
 }
 
-// The arguments of a call, with pointers to device memory, also in `code`.
+// The arguments of a call. All pointers, including the pointers in `code`, are to device memory.
 struct CudaProgram {
   ProgramCode code;
   const CudaStep* steps;
@@ -84,7 +84,7 @@ struct CudaProgram {
   float* kept[kProgramLookups];   // [n][stride] of each look-up, or null
   int32_t kept_strides[kProgramLookups], output_widths[kProgramMost];
   uint8_t input_types[kProgramMost], parameter_types[kProgramMost], output_types[kProgramMost];
-  bool turned[kProgramMost], rays[kProgramMost];  // inputs
+  bool transposed[kProgramMost], rays[kProgramMost];  // inputs
   int32_t output_count, lookup_count, pack_parts;
   bool ready;  // kept look-ups are filled
 };
@@ -149,12 +149,12 @@ __device__ __forceinline__ InputRow input_row(const CudaProgram& call, int input
     if (rows == 0) return {nullptr, 0, 0, 0};
     row = index_within(call.rows.ray_index[source], rows);
   }
-  const bool turned = call.turned[input];
-  return {data, turned ? row : row * width, turned ? rows : 1, call.input_types[input]};
+  const bool transposed = call.transposed[input];
+  return {data, transposed ? row : row * width, transposed ? rows : 1, call.input_types[input]};
 }
 
-// The layout of a value as 16-bit numbers: pair_words is the words of a row, padded with 0; pair_stride is the words
-// from one row to the next.
+// The layout of a value as 16-bit numbers: pair_words returns the number of words of a row, padded with 0; pair_stride
+// returns the number of words from one row to the next.
 VN_HD constexpr int padded(int width, int to) { return ceil_div(width, to) * to; }
 VN_HD constexpr int pair_words(int width) { return padded(width, 2 * kGranule) / 2; }
 VN_HD constexpr int pair_stride(int width) { return pair_words(width) + kProgramSkew; }
@@ -217,7 +217,7 @@ struct ProgramTile {
   __device__ __forceinline__ int begin() const { return state().begin; }
   __device__ __forceinline__ bool fill() const { return state().fill != 0; }
   __device__ __forceinline__ float* partial() const { return call.partials + state().partial; }
-  // Returns the floats from the slots of a team to the slots of the next team.
+  // Returns the distance in floats from the slots of a team to the slots of the next team.
   __device__ __forceinline__ int pitch() const { return call.code.columns * kRows; }
 
   // `worker` returns the index of a thread in its team, `warp` the index of its warp.
@@ -337,7 +337,7 @@ __device__ __forceinline__ void input_step(const Tile& tile, const CudaStep& ste
   const CudaProgram& call = tile.call;
   const int width = step.width, input = step.number, begin = tile.begin();
   const auto to = tile.target(step);
-  if (width > kFewColumns && !call.turned[input]) {  // neighbouring lanes read neighbouring columns
+  if (width > kFewColumns && !call.transposed[input]) {  // neighbouring lanes read neighbouring columns
     return for_each_entry<Tile>(tile.rows(), width, [&](int row, int column) {
       to.put(row, column, input_row(call, input, width, source_row(call.rows, begin + row)).column(column));
     });

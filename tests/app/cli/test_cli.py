@@ -226,7 +226,7 @@ def test_demo_shows_a_run_and_writes_over_none(tmp_path, capsys, monkeypatch, fa
     for picture in ("turn.png", "placed.png"):
         with Image.open(run / picture) as image:
             assert image.width >= 16
-    # The printed command makes the same run of the same cells.
+    # Running the printed `place` command produces the same run once more.
     (said,) = re.findall("voronerf (place .*), without", output)
     assert main([*shlex.split(said), "--out", "again"]) == 0
     files = [sorted((folder / "checkpoints").iterdir())[-1] for folder in (run / "placed", tmp_path / "again")]

@@ -10,7 +10,10 @@ from voronerf.app.train.callbacks import counted
 
 
 def test_the_loss_is_that_of_the_steps_whose_loss_was_read():
-    """The average starts at the first known loss: on a GPU early losses are NaN, and a run may resume late."""
+    """The displayed running average of the loss starts at the first loss that is not NaN.
+
+    On a GPU the losses of the first steps are not read yet, so they are NaN. A resumed run starts at a late step.
+    """
     display = TrainingDisplay("run")
     router = SimpleNamespace(num_cells=1)
     for step, loss in ((51, math.nan), (52, math.nan), (53, 0.4), (54, 0.2)):

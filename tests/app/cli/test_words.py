@@ -92,8 +92,11 @@ from voronerf.app.train.config import TrainConfig
             "--crop must be 6 numbers or saved, got '1 2 3 4 5'; see voronerf render --help",
         ),
         ("eval", "error: eval needs RUN; see voronerf eval --help"),
-        ("place", "error: place needs RUN, THING, --out PATH and --at FLOAT FLOAT FLOAT; see voronerf place --help"),
-        ("place run --at 0 0 0", "error: place needs THING and --out PATH; see voronerf place --help"),
+        (
+            "place",
+            "error: place needs RUN, OBJECT-RUN, --out PATH and --at FLOAT FLOAT FLOAT; see voronerf place --help",
+        ),
+        ("place run --at 0 0 0", "error: place needs OBJECT-RUN and --out PATH; see voronerf place --help"),
         ("cut run --box 0 0 0 1 1 1", "error: cut needs --out PATH; see voronerf cut --help"),
         ("train --cells 4 4 --split-at 0.5 0.25", "or numbers of steps, got 0.5 0.25\n"),
         ("train --samples 3 4", "--samples must be one number of at least 1, got 3 4\n"),
@@ -183,7 +186,9 @@ def test_a_box_is_one_line_on_every_terminal(fails, monkeypatch, width):
     monkeypatch.setenv("COLUMNS", width)
     fails("--steps must be a whole number, got 'abc'; see voronerf train --help", "train --steps abc")
     fails("Unrecognized options: --bugdet, 5; did you mean --budget?", "train --bugdet 5")
-    fails("error: place needs THING, --out PATH and --at FLOAT FLOAT FLOAT; see voronerf place --help", "place run")
+    fails(
+        "error: place needs OBJECT-RUN, --out PATH and --at FLOAT FLOAT FLOAT; see voronerf place --help", "place run"
+    )
 
 
 def test_the_version_and_the_list_of_commands(capsys):
@@ -197,7 +202,7 @@ def test_the_version_and_the_list_of_commands(capsys):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_is_whole(capsys, monkeypatch, command):
-    """The help describes every option, shows no default of None, and has no line breaks of the source code."""
+    """The help describes every option, shows no default of None, and joins the lines of a docstring's paragraph."""
     monkeypatch.setenv("COLUMNS", "10000")
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])

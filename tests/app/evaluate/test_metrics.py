@@ -74,7 +74,7 @@ def test_shapes(score):
 
 
 def scipy_ssim(image, truth):
-    """Computes SSIM with scipy's Gaussian filter of sigma 1.5, which is also cut off at 5 pixels."""
+    """Computes SSIM with scipy's Gaussian filter of sigma 1.5, truncated to 11 x 11 pixels like SSIM's window."""
     scores = []
     for a, b in zip(np.moveaxis(image.astype(np.float64), -1, 0), np.moveaxis(truth.astype(np.float64), -1, 0)):
         mean_a, mean_b, aa, bb, ab = (

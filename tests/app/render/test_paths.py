@@ -285,7 +285,10 @@ def test_a_path_of_cameras_that_look_outwards_goes_through_them_in_order():
 
 
 def test_a_path_of_people_who_walk_and_look_around_is_theirs():
-    """The path follows the cameras, although the point closest to their axes lies ahead of most cameras by chance."""
+    """The path follows the walk instead of a circle around a focus.
+
+    The point closest to all optical axes happens to lie in front of most cameras, as for cameras around an object.
+    """
     torch.manual_seed(0)
     along = torch.linspace(-2, 2, 12)
     origins = torch.stack((along, 0.3 * torch.rand(12), torch.full((12,), 1.5)), 1)

@@ -14,7 +14,7 @@ from voronerf.app.scenes import SceneError, load_scene
 
 
 def write_models(folder, counts, pictures="images"):
-    """Writes COLMAP models; `counts` maps a model's subfolder to its number of images (the first ones)."""
+    """Writes COLMAP models; a model in the subfolder `place` has the first `counts[place]` images."""
     for place, count in counts.items():
         write_colmap(folder / "made", POSES[:count], [SIZE] * count, POINTS, binary=place.endswith(("0", "2")))
         shutil.copytree(folder / "made/sparse/0", folder / place, dirs_exist_ok=True)
@@ -164,7 +164,7 @@ def test_the_folder_of_a_model_is_known_from_within(tmp_path, monkeypatch, place
 
 
 def test_images_are_reduced_ones_of_the_same_order(tmp_path):
-    """A reduced image is found by its position among all images of the folder, also those not in the model."""
+    """A reduced image is found by its position among all images of the folder, including images not in the model."""
     write_named(tmp_path, "IMG_{}.JPG".format, "IMG_{}.JPG".format)
     write_named(tmp_path, "IMG_{}.JPG".format, "image{:03d}.png".format, "images_2", (6, 5))
     path = tmp_path / "sparse/0/images.txt"
@@ -195,7 +195,7 @@ def test_images_that_may_be_others_are_not_taken(tmp_path, caplog):
 
 
 def test_a_file_is_that_of_one_name_alone(tmp_path, caplog):
-    """3.png replaces a missing 3.jpg only if the model does not list 3.png and no other listed name matches it."""
+    """The file 3.png is read for a missing 3.jpg only if 3.png is not listed and matches no other listed name."""
     for lost in ("3.jpg", "3"):
         write_named(tmp_path / lost, lambda index, lost=lost: lost if index == 4 else f"{index}.png", "{}.png".format)
         scene = load_scene(tmp_path / lost, normalise=False)
@@ -211,7 +211,7 @@ def test_a_file_is_that_of_one_name_alone(tmp_path, caplog):
 
 
 def test_names_of_files_elsewhere_are_those_in_the_folder(tmp_path):
-    """For a listed path outside the scene, the scene's file of this name is read, unless outside files are allowed."""
+    """For a path outside the scene, the scene's file of the same name is read, unless outside files are allowed."""
     elsewhere = tmp_path / "elsewhere"
     write_named(tmp_path / "scene", lambda index: f"{elsewhere}/{index}.png", "{}.png".format)
     elsewhere.mkdir()

@@ -43,7 +43,7 @@ def images(turned=()):
 
 
 def matches():
-    """Returns matches of 200 points: neighbours match all points, other pairs only the 40 points close together."""
+    """Returns matches of 200 points: neighbours match all points, other pairs only the 40 points in the middle."""
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
     points[:40] *= 0.2
     features = {}

@@ -39,7 +39,7 @@ def test_rays_go_where_colmap_and_opencv_see_the_points(model):
 
 
 def test_each_image_of_a_folder_has_its_own_model(tmp_path):
-    """Each image has its own camera model, and a tenth or a twentieth of the size in its COLMAP camera."""
+    """Each image has its own camera model; its file has a tenth or a twentieth of the COLMAP camera's size."""
     names = [name for name, _ in MODELS.values()]
     poses = orbit_cameras(len(names), radius=4, elevation=20, width=1, height=1, focal=1).poses
     write_images(tmp_path, [(64, 48) if index % 3 else (32, 24) for index in range(len(names))])

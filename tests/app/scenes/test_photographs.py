@@ -78,7 +78,7 @@ def test_the_scene_is_normalised_by_a_similarity_that_it_keeps(tmp_path):
 
 
 def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
-    """A quarter of the drawn rays ends at points of the sparse model, for reduced images of two sizes."""
+    """A quarter of the drawn rays end at points of the sparse model, for reduced images of two sizes."""
     write_both(tmp_path, [(48, 40) if index % 2 else (32, 56) for index in range(COUNT)])
     scene = load_scene(tmp_path, downscale=4)
     points = torch.from_numpy(POINTS) @ scene.transform[:3, :3].T + scene.transform[:3, 3]
@@ -128,7 +128,11 @@ def test_space_before_the_rays_of_cameras_stays_empty(tmp_path):
 
 
 def test_rays_from_elsewhere_end_the_sooner_the_more_points_there_are(tmp_path):
-    """Rays from unseen views are drawn around an object with few sparse points; with more points they stop earlier."""
+    """Batches have rays from unseen views in the first part of the training, which is shorter if there are more points.
+
+    No such rays are drawn if the points of the sparse model cover enough of the images, if there are no points, or in
+    other kinds of scenes.
+    """
     write_both(tmp_path)
     scene = load_scene(tmp_path)  # each pixel is a tile
     pixels = torch.arange(len(scene.train) * 120)
@@ -188,7 +192,7 @@ def on_a_sphere(count, turn, climb, generator):
 
 
 def test_people_who_walk_and_look_around_are_inside_out():
-    """A walk is "inside-out" even if the point closest to the camera axes lies ahead of most cameras by chance."""
+    """A walk is "inside-out" even if the point closest to all optical axes happens to lie in front of most cameras."""
     generator = torch.Generator().manual_seed(0)
     ahead = 0
     for _ in range(200):
@@ -224,7 +228,7 @@ def outward(extent):
     ids=["far", "a walk", "on the spot"],
 )
 def test_the_sphere_of_a_walk_goes_through_its_farthest_camera(extent, length):
-    """The unit sphere reaches the farthest camera, but its radius stays within the depths of the points."""
+    """The unit sphere reaches the farthest camera, but its radius is clamped to the range of the points' depths."""
     bounds = torch.tensor((0.5, 20.0), dtype=torch.float64).repeat(24, 1)
     frame = find_frame(outward(extent), "inside-out", bounds)
     assert 1 / frame.scale == pytest.approx(length)
@@ -307,7 +311,7 @@ def test_pictures_all_around_of_instant_ngp(tmp_path, lens):
     ],
 )
 def test_pictures_smaller_than_their_lens_says(tmp_path, lens, size, w, h):
-    """Images of another size than their lens states show points at scaled pixels."""
+    """If images differ in size from the size stated with their lens, points project to proportionally scaled pixels."""
     rig = orbit_cameras(9, radius=2, elevation=5, width=size[0], height=size[1], focal=10)
     for folder, stated in (("small", {"w": w, "h": h}), ("full", {})):
         write_capture(tmp_path / folder, rig, fl_x=0.9 * w, **lens, **stated)
@@ -361,7 +365,7 @@ def test_a_picture_that_is_listed_twice_counts_once(tmp_path):
 @pytest.mark.parametrize("tag", [3, 6, 8])
 @pytest.mark.parametrize("lens", [("OPENCV", (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02)), ("THIN_PRISM_FISHEYE", None)])
 def test_an_orientation_tag_turns_pixels_and_cameras_alike(tmp_path, tag, lens):
-    """A rotated pixel keeps its ray, colour, mask and depth from the stored image, which COLMAP has used."""
+    """The Exif rotation moves pixels, which keep their rays, colours and depths; COLMAP has read unrotated images."""
     lens = lens if lens[1] else (lens[0], (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02, 0.01, 0.002, 0.04, 0.03))
     poses, generator = POSES.numpy(), np.random.default_rng(1)
     exif, turns = Image.Exif(), {3: 2, 6: -1, 8: 1}[tag]
@@ -392,7 +396,7 @@ def test_an_orientation_tag_turns_pixels_and_cameras_alike(tmp_path, tag, lens):
 
 @pytest.mark.parametrize("format", ["colmap", "llff", "transforms"])
 def test_up_is_that_of_the_pictures_which_people_see(tmp_path, format):
-    """Up follows the orientation tag: the stored images of an upright camera, which COLMAP uses, lie on their side."""
+    """Up is found in the images as the orientation tag rotates them; COLMAP sees the stored images, on their side."""
     exif, on_side = Image.Exif(), POSES.clone()
     exif[0x0112] = 6
     on_side[:, :3, 0], on_side[:, :3, 1] = -POSES[:, :3, 1], POSES[:, :3, 0]

@@ -398,7 +398,7 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a process of its own")
 @pytest.mark.parametrize(("count", "reason"), [(2, "must have at least 3 images, got 2"), (3, "COLMAP finds no model")])
 def test_a_process_that_is_killed_in_its_first_moments_goes_on(tmp_path, monkeypatch, count, reason):
-    """`process` can run again after it was killed before a change to a folder, at its start or in its clean-up."""
+    """`process` can run again after it was killed just before it changed a folder, at its start or in its clean-up."""
     models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
     write_images(tmp_path, [(12, 10)] * count)
     for moment in range(1, 40):

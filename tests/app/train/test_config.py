@@ -166,7 +166,7 @@ def test_differences_name_what_cannot_change():
 def test_plan(settings, expected):
     plan = TrainConfig(**settings).plan
     assert [(round(p.at, 9), p.children, p.cells) for p in plan] == expected
-    assert all(p.most == settings.get("max_cells") for p in plan if p.cells == "worst")
+    assert all(p.max_cells == settings.get("max_cells") for p in plan if p.cells == "worst")
 
 
 def test_there_are_at_most_37_settings():

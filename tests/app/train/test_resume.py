@@ -1,4 +1,4 @@
-"""Tests of stopped and resumed runs: they match bit for bit, and other runs' checkpoints are refused."""
+"""Tests of resumed runs: they equal unstopped runs bit for bit, and refuse the checkpoints of other runs."""
 
 import json
 import math
@@ -159,7 +159,8 @@ def test_steps_that_were_left_out_are_counted_on(scene, stopped):
 
 def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
     config = small(tmp_path / "part")
-    run(state := build(config, scene), [Checkpoints(config.out, every=1e-9), Each(lambda s: s.step == 14 and s.stop())])
+    checkpoints = Checkpoints(config.out, interval=1e-9)
+    run(state := build(config, scene), [checkpoints, Each(lambda s: s.step == 14 and s.stop())])
     (partial := config.out / "checkpoints" / ".1-1.partial").write_bytes(b"of a process that died")
     path = checkpoint_path(config.out)
     path.write_bytes(path.read_bytes()[:-1] + b"\x7f")
@@ -217,7 +218,7 @@ def test_training_goes_on_while_a_checkpoint_is_written(tmp_path, scene, monkeyp
             written.set()
 
     monkeypatch.setattr(os, "fsync", slow)
-    checkpoints = Checkpoints(tmp_path, every=1e-9)
+    checkpoints = Checkpoints(tmp_path, interval=1e-9)
     train(build(small(tmp_path), scene), [checkpoints, Each(look)])
     checkpoints.writer.wait()
     assert load_checkpoint(checkpoint_path(tmp_path)).values["step"] >= 1
@@ -232,7 +233,7 @@ def test_a_thread_that_cannot_begin_leaves_no_silence(tmp_path, scene, monkeypat
 def test_turns_leave_checkpoints(tmp_path, scene):
     ticks = iter(range(100_000))
     state = build(small(tmp_path, steps=100_000), scene)
-    checkpoints = Checkpoints(tmp_path, every=0.05)
+    checkpoints = Checkpoints(tmp_path, interval=0.05)
     while state.seconds < 0.15:
         assert state.seconds >= 0.05 or not checkpoint_path(tmp_path).exists()
         train(state, [checkpoints], until=state.seconds + 1e-4, clock=lambda: 0.01 * next(ticks))  # takes one step

@@ -23,7 +23,10 @@ def weights(state):
 
 
 class Clock:
-    """A simulated clock: a step reads it twice and takes 1 s; a view takes `view_seconds` scaled by its pixels."""
+    """A simulated clock: a step reads it twice and takes 1 s, and a view takes `view_seconds`.
+
+    A part of a view takes less time, in proportion to its pixels.
+    """
 
     def __init__(self, monkeypatch, view_seconds):
         self.now, self.read, self.views, pixels = 0.0, 0, [], SIDE**2
@@ -159,7 +162,7 @@ def test_a_diverged_run_ends_with_its_last_checkpoint(tmp_path, scene, harm):
             with torch.no_grad():
                 (parameter if harm == "weights" else state.optimizer.state[parameter]["exp_avg_sq"]).fill_(torch.inf)
 
-    state, checkpoints = build(small(tmp_path, steps=60), scene), Checkpoints(tmp_path, every=1e-9)
+    state, checkpoints = build(small(tmp_path, steps=60), scene), Checkpoints(tmp_path, interval=1e-9)
     said = r"not finite, at step \d+; try a smaller --lr; the last checkpoint is unchanged"
     with pytest.raises(TrainingError, match=said):
         run(state, [Divergence(tmp_path), checkpoints, Each(spoil)])

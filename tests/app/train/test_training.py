@@ -62,7 +62,7 @@ def test_training_learns_and_the_reference_learns_the_same(scene):
 
 
 def test_the_middle_of_a_view_is_that_of_the_whole_view(scene):
-    """The middle of a view has the same score as the same pixels of the whole view, with their truth and mask."""
+    """The score of a view's middle equals the score of the same pixels of the whole picture, its truth and its mask."""
     state = started(scene, 4)
     count, cameras = len(scene.test), scene.test.cameras
     distortion = torch.zeros(count, 8)
@@ -181,7 +181,8 @@ def test_parameters_decide_the_width(scene, field):
 def test_octaves_follow_the_pixels(scene):
     """A 100 x 100 image needs 8 octaves, and halving the pixel size adds one: 10 at 400 x 400, as in the paper.
 
-    Cones need two more: in the middle of the scene the last octave has a visible amplitude, a further one has none.
+    The integrated encoding of cones needs two octaves more. In the middle of the scene the last of them still has a
+    visible amplitude; one more octave would have none.
     """
     some = scene.train.cameras
     for size, octaves in ((50, 7), (100, 8), (200, 9), (400, 10)):

@@ -1,4 +1,4 @@
-"""Tests of every field with every sampling: with one cell, with all kinds of cells, resumed runs, and learning."""
+"""Tests of every field with every sampling: with one cell, flat and nested cells, after a resume, and learning."""
 
 import pytest
 import torch

@@ -18,7 +18,7 @@ struct vec {
   T values[N] = {};
 
   vec() = default;
-  // Concatenates numbers and vectors of N numbers in all, or repeats one number N times.
+  // Concatenates numbers and vectors, N numbers in all, or repeats one number N times.
   template <class... Parts>
   explicit vec(const Parts&... parts) {
     constexpr bool kSplat = sizeof...(parts) == 1 && (std::is_arithmetic_v<Parts> && ...);

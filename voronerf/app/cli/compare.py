@@ -22,7 +22,7 @@ FIGURES = (
     *(("cells", "cells", 0), ("parameters", "parameters", 0), ("steps", "steps", 0), ("seconds", "training [s]", 0)),
     *(("rays_per_second", "rays/s", 0), ("psnr", "PSNR [dB]", 2), ("ssim", "SSIM", 4), ("lpips", "LPIPS", 4)),
 )
-#: Scores of test views, and the mark of scores that belong to the centres of views alone.
+#: Scores of test views, and the mark of scores that were computed only on the central part of each view.
 SCORES, PARTLY = ("psnr", "ssim", "lpips"), "*"
 #: Settings about the location and outputs of a run, which are not compared.
 PLACES = ("out", "resume", "allow_outside", "panels", "tensorboard")
@@ -31,7 +31,8 @@ PLACES = ("out", "resume", "allow_outside", "panels", "tensorboard")
 def compare(runs: tuple[Path, ...], /) -> int:
     """Show the scores of trained runs side by side, and the settings in which they differ.
 
-    A star marks scores of the centres of views, which are not comparable with scores of whole views.
+    A star marks scores that were computed only on the central part of each view. They are not comparable with scores
+    of whole views.
 
     Args:
         runs: The run directories, at least two. An unfinished run shows its last evaluation. A run that was made by

@@ -30,7 +30,7 @@ from voronerf.town import open_run as open_town
 #: Pixels along a side of the images, the pictures and the video.
 SIZE = 400
 FRAMES, FPS = 48, 16
-#: Position of the scene's copy, on top of the globe, and its scale.
+#: Position and scale of the small copy of the scene, which stands on the globe of the built-in scene.
 TOP, SCALE = (0.0, 0.0, 1.0), 0.35
 
 
@@ -101,7 +101,7 @@ def turn(count: int, *, height: float = 0.0, distance: float = 1.0) -> Cameras:
 
 
 def frames(run: Run, cameras: Cameras, numbers: Iterable[int], score: str) -> Iterator[Tensor]:
-    """Yields pictures uint8 [h, w, 3] of some of the cameras: the view, and its cells beside it."""
+    """Yields a picture uint8 [h, w, 3] for each camera index in ``numbers``: the view, and its cells beside it."""
     for number in numbers:
         image = run.render(cameras, number)
         cells = run.diagram.locate(image.heaviest)

@@ -31,7 +31,7 @@ LONGEST_LINE = 900
 BAR = 24
 BESIDE = BAR + len(" 100 %    0:00:00 ")
 
-#: Seconds between lines of a long task without a terminal.
+#: Seconds between two progress lines of a long task if the output is not a terminal.
 EVERY = 20.0
 
 #: rich's global console, so that progress bars of different modules can be shown together.
@@ -58,7 +58,7 @@ def tracked(parts: Sequence[Any], name: str) -> Iterable[Any]:
 
 
 def with_lines(parts: Sequence[Any], name: str) -> Iterator[Any]:
-    """Yields the parts of a task, with a line every `EVERY` seconds without a terminal."""
+    """Yields the parts of a task; if the output is not a terminal, prints a progress line every `EVERY` seconds."""
     last = time.monotonic()
     for number, part in enumerate(parts):
         if not console.is_terminal and time.monotonic() - last >= EVERY:
@@ -146,7 +146,7 @@ class TrainingDisplay(Callback):
         return self
 
     def after_step(self, state: State) -> None:
-        """Shows the state after a step; the loss is smoothed over about three groups of steps."""
+        """Shows the state after a step; the loss is smoothed over about the last three calls."""
         self.loss = state.loss if math.isnan(self.loss) else 0.7 * self.loss + 0.3 * state.loss
         cells = state.router.num_cells
         psnr = self.scores.metrics[-1].get("psnr") if self.scores is not None and self.scores.metrics else None

@@ -30,8 +30,8 @@ def evaluate_run(
         opening: The settings with which the run is opened.
         views: Number of test views, evenly spread; default all.
         panels: Number of views drawn.
-        lpips: LPIPS weights, a file or folder, or "off"; default as in training, else VORONERF_LPIPS, the folder lpips
-            of VORONERF_DATA or beside the scene, the installed lpips package.
+        lpips: LPIPS weights, a file or folder, or "off"; default as in training, else the first of VORONERF_LPIPS, the
+            folder lpips in VORONERF_DATA, the folder lpips beside the scene, and the installed lpips package.
     """
     if panels < 0:
         raise ConfigError(f"--panels must not be negative, got {panels}")

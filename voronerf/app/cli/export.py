@@ -41,7 +41,7 @@ def export(
         cells: The cells of the diagram, clipped to the box, as objects with a colour each, .glb.
         web: A page that draws the scene in any browser with WebGPU, one file that loads nothing from elsewhere, .html.
         count: Greatest number of points.
-        resolution: Cubes of the mesh along the longest side of the box; default 256, or fewer if memory is short.
+        resolution: Grid cubes of the mesh along the longest side of the box; default 256, or fewer if memory is short.
         faces: Greatest number of triangles of the mesh.
         crop: The exported box, x y z of the lowest and of the highest corner, or "saved" for the viewer's crop. Default
             the scene's box. For a scene without a box, the mesh covers the region that the cameras look at; points and

@@ -39,8 +39,8 @@ def info(run: Path | None = None, /, *, ops: bool = False) -> int:
     """Show what this installation can use: build, instruction set, extras, backends, and why something is missing.
 
     Args:
-        run: A run directory. Shows instead how a step of this run's training is computed, and what prevents a faster
-            way.
+        run: A run directory. If given, the command shows instead how a training step of this run is computed, and what
+            prevents a faster implementation.
         ops: Show instead the devices and dtypes of each implementation of each operation.
     """
     if run is not None:

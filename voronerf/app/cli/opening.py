@@ -27,8 +27,8 @@ class Opening:
     """The settings with which a run is opened; None keeps the setting of the training."""
 
     data: str | None = None
-    """Scene folder; default: the folder of the training, if you have named it yourself, or if it lies in the run
-    directory, the working directory or VORONERF_DATA, since a run may be another person's."""
+    """Scene folder; default: the folder of the training, if it lies in the run directory, the working directory or
+    VORONERF_DATA, or if you have passed it to a training yourself. A run of another person could name any folder."""
     downscale: int | None = None
     """Factor by which images and the frames of a camera path are reduced; default as in training, 1 for a path."""
     allow_outside: bool = False

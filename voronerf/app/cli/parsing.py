@@ -93,7 +93,7 @@ def _argument(hint: Any, default: Any) -> Any:
 
 @RULES.struct_rule
 def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """Tells tyro how to show dataclasses: a box per group of training settings, and helps without line breaks."""
+    """Tells tyro how to show dataclasses: a box per group of training settings, and help texts without line breaks."""
     if info.type is TrainConfig:
         defaults = vars(info.default) if isinstance(info.default, TrainConfig) else {}
         groups = {
@@ -115,7 +115,10 @@ def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 @RULES.primitive_rule
 def values(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Tells tyro how to parse numbers, lists of numbers, choices and optional values; errors tell rule and value."""
+    """Tells tyro how to parse numbers, lists of numbers, choices and optional values.
+
+    Error messages state the expected form and the given value.
+    """
     kind, origin, parts = info.type, get_origin(info.type), get_args(info.type)
     if kind in NUMBERS:
         return _spec(1, kind.__name__.upper(), NUMBERS[kind], lambda words: kind(words[0]))
@@ -153,7 +156,7 @@ def _spec(
     read: Callable[[list[str]], Any],
     choices: Sequence[str] = (),
 ) -> PrimitiveConstructorSpec:
-    """Returns tyro's description of a value of ``count`` words; errors say ``rule``."""
+    """Returns tyro's description of a value of ``count`` words; error messages say that it must be ``rule``."""
 
     def value(words: list[str]) -> Any:
         try:

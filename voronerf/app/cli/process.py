@@ -34,10 +34,11 @@ def process(
     """Make a scene from a video or images: COLMAP finds the cameras. The same command continues after a stop.
 
     Args:
-        source: A video, or a folder, also with subfolders, of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC
-            images. Its folder masks may have a mask for each image; pixels that are black in it are ignored.
-        out: The folder to make; it gets images, masks if there are any, sparse/0, transforms.json and colmap, which
-            keeps every stage.
+        source: A video, or a folder of images, also in subfolders: PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif,
+            HEIC. A folder named masks, in or beside the folder of the images, may hold a mask for each image; pixels
+            that are black in the mask are ignored.
+        out: The folder to make; it gets images, masks if there are any, sparse/0, transforms.json, and colmap, which
+            holds the results of each stage so that the command can continue.
         frames: Number of evenly spaced frames to take from a video; all frames if it has fewer.
         matching: The pairs of images that are compared: all pairs (exhaustive), neighbours by name (sequential), or
             images that share their largest features (auto).

@@ -27,7 +27,7 @@ def render(
     crop: Crop = None,
     opening: Opening = AS_IN_TRAINING,
 ) -> int:
-    """Render a video of a trained run: a turntable of an object, else along its cameras, or a camera path.
+    """Render a video of a trained run: along --path, or else around an object or near the training cameras.
 
     Args:
         run: The run directory.

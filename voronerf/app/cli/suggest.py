@@ -29,7 +29,8 @@ def suggest(name: str, command: Callable[..., int], words: list[str], error: str
     rejected = error.removeprefix("Unrecognized options: ")
     if re.fullmatch("help|[0-9.]+|.*=.*", rejected):
         paths = []
-    # A word right after an option is a value given to a switch, not a path.
+    # A rejected word right after an option is probably not a path: it was meant as the value of the option, which takes
+    # no value.
     if paths and rejected in line and not re.match("--[^=]*$", [name, *line][line.index(rejected)]):
         if arguments and len(paths) > 1:
             return f"; did you mean {either([f'--{path}' for path in paths])}?"

@@ -138,7 +138,7 @@ def cut(
 
 def place(
     run: Path,
-    thing: Path,
+    object_run: Path,
     /,
     out: Path,
     at: tuple[float, float, float],
@@ -149,9 +149,9 @@ def place(
 
     Args:
         run: The run directory of the scene.
-        thing: The run directory of the object, cut out with voronerf cut, or trained on white.
+        object_run: The run directory of the object, cut out with voronerf cut, or trained on white.
         out: The new run directory.
-        at: x y z of the object: the centre of the bottom of its box goes there.
+        at: Position x y z in the scene of the bottom centre of the object's box.
         turn: Degrees about the axes x, y, z, in this order.
         scale: Factor on the object's size.
     """
@@ -164,7 +164,7 @@ def place(
     except ValueError:
         raise ConfigError(f"--scale must be 1e-9 to 1e9, got {as_typed(scale)}") from None
     with busy("placing"):
-        written = editing.place(run, thing, at, out, degrees=turn, scale=scale)
+        written = editing.place(run, object_run, at, out, degrees=turn, scale=scale)
     return tell(out, written)
 
 
@@ -177,7 +177,9 @@ def train_territories(
     checkpoint_every: float = CHECKPOINT_EVERY,
     panels: int = 4,
 ) -> int:
-    """Train a large scene in territories, each with its own cells, table, views and rays, which may cross the borders.
+    """Train a large scene in territories, each with its own cells, hash table, views and rays.
+
+    The rays of a territory may cross into other territories.
 
     `torchrun --nproc-per-node 4 -m voronerf train-territories --out RUN` distributes the territories over processes.
     The run is the same bit for bit on any number of processes. The finished run is scored; `eval`, `view`, `join` and

@@ -84,7 +84,7 @@ def train(
     port: int = 8080,
     explain: bool = False,
 ) -> int:
-    """Train a scene: coarse network, balanced Voronoi cells, cells trained further.
+    """Train a scene: first one coarse network, then a network for each Voronoi cell.
 
     With --resume, omitted options keep their value from the run in --out.
 
@@ -99,7 +99,7 @@ def train(
         view: Show the training in a browser, and its result until Ctrl-C.
         host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
         port: Port that --view listens at; 0 is any free port.
-        explain: Only print how a training step is computed, and what prevents a faster way.
+        explain: Only print how a training step is computed, and what prevents a faster implementation.
     """
     present_device(config.device)  # fails before the scene is read
     if panels is not None and panels < 0:

@@ -42,7 +42,7 @@ class ViewScore:
 
 
 def view_numbers(count: int, views: int | None) -> list[int]:
-    """Returns the numbers of ``views`` of ``count`` test views, evenly spread from the first; None means all."""
+    """Returns the indices of ``views`` test views out of ``count``, evenly spaced from the first on; None means all."""
     if views is None or views >= count:
         return list(range(count))
     return [i * count // views for i in range(views)]
@@ -69,7 +69,7 @@ def evaluate(
         lpips: The LPIPS metric, or None.
         middle: The factor by which width and height are reduced: only the centre of each view is rendered and scored.
         stop: Called before each view but the first; True skips this view and the rest.
-        track: Shows progress.
+        track: Function that shows progress: takes a sequence and the task's name, and yields the items.
 
     Examples:
         >>> from voronerf import NeRF
@@ -104,7 +104,10 @@ def evaluate(
 
 
 def _middle_of(cameras: Cameras, view: int, factor: int) -> tuple[Cameras, slice, slice]:
-    """Returns the camera of the centre of a view, `factor` times narrower and lower, and its rows and columns."""
+    """Returns a camera for the central part of a view, and the rows and columns of this part in the view.
+
+    The part has the width and height of the view, both divided by `factor`.
+    """
     (width, height), camera = cameras.size(view), cameras[[view]]
     part = max(width // factor, 1), max(height // factor, 1)
     left, top = (width - part[0]) // 2, (height - part[1]) // 2

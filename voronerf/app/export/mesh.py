@@ -2,10 +2,10 @@
 
 The training views are rendered, which gives each pixel the distance of its surface. These distances are fused into a
 truncated signed distance function: the distance from the surface along the rays, averaged over the views (Curless and
-Levoy 1996), then smoothed a little. The mesh is its zero level; for an object on a plain background, the level is
-shifted by `BEFORE`. The average removes a surface that only one view shows, if other views look through it. A node of
-the grid has a value if a view sees it, or if it lies shortly behind a surface. Only blocks of nodes near a visible
-surface are filled.
+Levoy 1996), then smoothed a little. The mesh is the zero level of this function; for an object on a plain background,
+the level is shifted by `BEFORE`. The average removes a surface that only one view shows, if other views look through
+it. A node of the grid has a value if a view sees it, or if it lies behind a surface by less than the truncation
+distance. Only blocks of nodes near a visible surface are filled.
 """
 
 from __future__ import annotations
@@ -35,16 +35,17 @@ from voronerf.nerf.cameras import Cameras, shared_focus
 from voronerf.ops._core.checks import available_memory
 
 SUFFIXES = (".ply", ".glb", ".obj")
-#: Default numbers of cubes along the longest side of the box, if memory allows, and of triangles.
+#: Default number of grid cubes along the longest side of the box, if memory allows, and default number of triangles.
 RESOLUTION, FACES = 256, 100_000
 #: Greatest number of pixels along the longer side of the rendered views.
 LONGEST = 512
 #: The truncation distance in cubes, in front of and behind a surface. Fewer cubes leave holes where views disagree;
 #: more let the two sides of a thin object meet.
 REACH = 8
-#: Standard deviation in cubes of the Gaussian that smooths the distances, since a learnt surface is rough; and the
-#: fraction of `REACH` to which distances are clamped first. Without the clamp, views that see a surface from the side
-#: would give too long distances in front of it, and move it inwards.
+#: The standard deviation, in grid cubes, of the Gaussian that smooths the distances, since a learnt surface is rough;
+#: and the fraction of `REACH` to which distances are clamped before they are smoothed. Without the clamp, views that
+#: see a surface at a grazing angle would overestimate the distances in front of the surface, which moves the surface
+#: inwards.
 SMOOTH, CUT = 1.0, 0.3
 #: The distance by which the surface of an object on a plain background is moved towards the cameras, as a fraction of
 #: the longest side of the scene's box: rendered depths lie a little inside the object, and smoothing makes it smaller.
@@ -58,7 +59,7 @@ NODE = 16
 #: Constants of :func:`looked_at`: the minimum fraction of the pictures that show a point of the box; the fraction of
 #: outliers at each end of an axis; the factor by which the box is enlarged; and the greatest number of points.
 SHARED, OUTLIERS, LONGER, POINTS = 0.5, 0.02, 1.2, 100_000
-#: The minimum side of that box as a fraction of its longest side, since the box of a wall would be flat.
+#: The minimum side of the box of :func:`looked_at` as a fraction of its longest side: the box of a wall would be flat.
 FLAT = 0.1
 #: Triangles of the smallest connected component that is kept, as a fraction of the largest component.
 SMALLEST = 0.02
@@ -87,7 +88,7 @@ def export_mesh(
     Args:
         run: The run.
         path: File to write, .ply, .glb or .obj.
-        resolution: Cubes along the longest side of the box; default 256, or fewer if memory is short.
+        resolution: Grid cubes along the longest side of the box; default 256, or fewer if memory is short.
         faces: Greatest number of triangles.
         box: [2, 3], the exported region; default the scene's box, or the box of :func:`looked_at`.
         to_files: Write coordinates of the scene's files instead of scene coordinates.
@@ -98,7 +99,7 @@ def export_mesh(
         ConfigError: The resolution does not fit into memory, `faces` is below 4, or the views show no surface in the
             box.
         ImportError: trimesh, scikit-image, scipy or fast-simplification is missing.
-        ValueError: The suffix is none of these.
+        ValueError: The suffix is not .ply, .glb or .obj.
         OSError: The file cannot be written.
 
     Examples:
@@ -117,8 +118,8 @@ def export_mesh(
 def looked_at(views: list[SurfaceView]) -> Tensor | None:
     """Returns the box [2, 3] of the region that the cameras look at, or None if there is none.
 
-    The box is around the surface points that lie in the pictures of at least half of the views, and that are nearer to
-    the cameras' focus than half of the cameras are.
+    The box encloses the surface points that project into the pictures of at least half of the views, and whose distance
+    to the cameras' focus is below the median distance of the cameras. Outliers are left out.
     """
     cameras = Cameras.joined([view.camera for view in views])
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])
@@ -227,7 +228,16 @@ def _resolution(extent: Tensor, resolution: int | None) -> int:
 def _fused(
     low: Tensor, side: float, blocks: Tensor, views: list[SurfaceView], closed: bool, track: Track
 ) -> tuple[Tensor, Tensor]:
-    """Returns the truncated distances of the nodes, positive in front of a surface, and a mask of the seen nodes."""
+    """Returns the truncated distances of the nodes, positive in front of a surface, and a mask of the seen nodes.
+
+    Args:
+        low: [3], the position of the first node.
+        side: The side of a grid cube.
+        blocks: [3], the number of blocks along each axis.
+        views: The rendered views.
+        closed: Whether to also fill the blocks between solid and empty blocks, so that the mesh is closed.
+        track: Shows progress.
+    """
     counts: list[int] = blocks.tolist()
     value, seen = torch.ones(counts), torch.zeros([BLOCK * count for count in counts], dtype=torch.bool)
     near = torch.zeros(counts, dtype=torch.bool)
@@ -255,8 +265,9 @@ def _fused(
 def _distance(points: Tensor, views: list[SurfaceView], reach: float) -> tuple[Tensor, Tensor]:
     """Returns the mean distances [n] from points [n, 3] to the surfaces behind them, and a mask [n] of seen points.
 
-    Distances are in units of `reach`, at most 1. A point is seen if it lies in front of a surface of a view or shortly
-    behind the surface. The distance of an unseen point is -1 behind a surface, and 1 outside of all pictures.
+    Distances are in units of `reach`, at most 1. A point is seen if it lies in front of a surface of a view, or
+    behind the surface by less than `reach`. The distance of an unseen point is -1 behind a surface, and 1 outside of
+    all pictures.
     """
     total, count, inside = (torch.zeros(len(points)) for _ in range(3))
     for view in views:
@@ -286,7 +297,12 @@ def _gap(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
 
 
 def _colours(points: Tensor, normals: Tensor, views: list[SurfaceView], margin: float) -> Tensor:
-    """Returns the colours [n, 3] of points: means over the views, weighted by nearness and frontal direction."""
+    """Returns the colours [n, 3] of points with normals [n, 3], as weighted means over the views.
+
+    A view counts for a point that lies within ``margin`` of the view's surface and faces the camera. The weight of a
+    view is larger the nearer its camera is to the point, and the more frontally the camera sees the surface. A point
+    for which no view counts gets the colour of the nearest point with a colour.
+    """
     from scipy.spatial import cKDTree
 
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))

@@ -90,7 +90,7 @@ class SurfaceView:
 
     @cached_property
     def distance(self) -> Tensor:
-        """The distances [h, w] of the surface points from the camera; infinite for pixels without one."""
+        """The distances [h, w] of the surface points from the camera; infinite for pixels without a surface."""
         return (self.surface - self.camera.origins[0]).norm(dim=-1).nan_to_num(torch.inf)
 
 

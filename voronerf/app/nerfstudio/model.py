@@ -41,8 +41,8 @@ class VoronerfModelConfig(ModelConfig):
     cells: tuple[int, ...] = (16,)
     """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again."""
     split_at: tuple[float, ...] | None = None
-    """When to split, as fractions of max_num_iterations, one per level; default: 0.2, or evenly spaced from 0.15 to
-    0.5."""
+    """When to split, as fractions of max_num_iterations, one per level; default: 0.2 for one level, evenly spaced from
+    0.15 to 0.5 for several levels."""
     sampling: str = "stratified"
     """Samples along a ray: stratified in one pass, or hierarchical, with a second pass where the first pass has large
     weights."""
@@ -53,7 +53,7 @@ class VoronerfModelConfig(ModelConfig):
     """The rendered space: only the scene box (none), or all of space, contracted outside of a sphere into a shell
     (sphere); auto is none if all cameras stand outside of the box, else sphere."""
     occupancy: bool = True
-    """Skip empty space, with stratified samples."""
+    """Skip empty space. It has no effect with hierarchical sampling, or for the field mipnerf."""
 
     def train_config(self, *, contracted: bool) -> TrainConfig:
         """Returns the corresponding settings of ``voronerf train``."""
@@ -80,7 +80,7 @@ class VoronerfModel(Model):
     config: VoronerfModelConfig
 
     def populate_modules(self) -> None:
-        """Builds networks with one cell, grid, renderer and splits from the cameras and the scene box."""
+        """Builds the networks (with one cell), grid, renderer and split strategy from the cameras and the scene box."""
         super().populate_modules()
         metadata, device = self.kwargs["metadata"], self.kwargs["device"]
         cameras, box = metadata["cameras"], self.scene_box.aabb
@@ -165,7 +165,7 @@ class VoronerfModel(Model):
 
     @torch.no_grad()
     def _see(self, rays: Rays, near: Tensor, far: Tensor) -> dict[str, Tensor]:
-        colour, opacity, depth, places = self.renderer.see(rays, near, far)
+        colour, opacity, depth, places = self.renderer.render_colours(rays, near, far)
         background = renderers.BACKGROUND_COLOR_OVERRIDE  # set by the viewer and by ns-render
         background = self.background if background is None else background.to(colour)
         cells = self.routers["field"].diagram.locate(places)
@@ -255,7 +255,7 @@ class VoronerfModel(Model):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores a state of :meth:`get_extra_state`; the cells follow from the parameters."""
+        """Restores a state of :meth:`get_extra_state`; the cells are restored with the parameters and the diagram."""
         self.strategy.load_state_dict(state["strategy"])
         if self.renderer.occupancy is not None and state["occupancy"] is not None:
             self.renderer.occupancy.load_state_dict(state["occupancy"])

@@ -25,8 +25,8 @@ def scene_of(cameras: TheirCameras, box: Tensor, *, contracted: bool) -> Scene:
     Args:
         cameras: The training cameras.
         box: [2, 3], the scene box of nerfstudio's parser.
-        contracted: Whether to render all of space: with a sphere around the cameras' focus instead of a box, and near
-            and far as in ``voronerf train``.
+        contracted: Whether to render all of space. The scene then has a sphere around the cameras' focus instead of a
+            box, and near and far are chosen as in ``voronerf train``.
     """
     poses = torch.eye(4).repeat(len(cameras), 1, 1)
     poses[:, :3] = cameras.camera_to_worlds.cpu()

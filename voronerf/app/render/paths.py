@@ -2,11 +2,11 @@
 
 c cameras, f frames. Poses and pixels as in :mod:`voronerf.nerf.cameras`.
 
-The file is JSON: `render_width`, `render_height`, `camera_type`, `fps`, and a list `camera_path` of frames. The
-`camera_to_world` of a frame has the numbers of a pose row by row, its `fov` is the vertical angle of view in degrees.
-Viewers also store the keyframes: a list `keyframes` with `matrix` and `fov`, and `is_cycle`. The matrix of a keyframe
-is a list, row by row. In files of nerfstudio's viewer before 1.0, its Blender add-on and its Maya plugin, it is a
-string of JSON, column by column.
+The file of a path is JSON: `render_width`, `render_height`, `camera_type`, `fps`, and a list `camera_path` of frames.
+The `camera_to_world` of a frame has the numbers of a pose row by row; its `fov` is the vertical angle of view in
+degrees. Viewers also store the keyframes: a list `keyframes` with `matrix` and `fov`, and `is_cycle`. The matrix of a
+keyframe is a list, row by row. In files of nerfstudio's viewer before 1.0, its Blender add-on and its Maya plugin, this
+matrix is a string of JSON, column by column.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ LONGEST_SIDE = 8192
 FARTHEST = 1e9
 #: Tolerance of a rotation times its transpose against the identity, and of a pose's last row against 0 0 0 1.
 ORTHONORMAL = 2e-3
-#: Length of the mean direction above which cameras look one way.
+#: Minimum length of the mean of the unit viewing directions for a capture to count as forward-facing.
 ONE_WAY = 0.95
-#: Angles around the cameras' focus, in radians: the smallest gap between cameras that a path does not cross, and the
-#: standard deviation of the Gaussian weights by which a path averages the distances and heights of near cameras.
+#: Angles around the cameras' focus, in radians. A path does not cross the widest gap between cameras if this gap is at
+#: least `GAP`. `WINDOW` is the standard deviation of the Gaussian weights by which a path averages the distances and
+#: heights of near cameras.
 GAP, WINDOW = math.radians(60), math.radians(25)
-#: Frames of a path between two of its cameras.
+#: Number of frames for each camera of the capture that a path goes through.
 BETWEEN = 4
 
 
@@ -189,7 +190,7 @@ def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Came
 def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Cameras:
     """Returns a path that stays near the cameras of a capture, so that it shows regions that they have seen.
 
-    For cameras that look one way, the path is the spiral of LLFF (Mildenhall et al. 2019) around their focus, as large
+    For forward-facing cameras, the path is the spiral of LLFF (Mildenhall et al. 2019) around their focus, as large
     as their extent. For cameras around a focus, it is a turn around the focus, at the mean distance and height of the
     nearest cameras; if the cameras leave a gap, the path goes from one end of the gap to the other and back, without
     crossing the gap. For cameras that look outwards, it is a smooth path through some of them, in their order. The

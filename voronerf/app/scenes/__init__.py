@@ -54,7 +54,7 @@ FORMATS = {
 
 
 def _computed(size: int) -> Scene:
-    """Returns the built-in scene; caches it for sides of at least `CACHED`, which take seconds to compute."""
+    """Returns the built-in scene; caches images of at least `CACHED` pixels a side, which take seconds to compute."""
     if size < CACHED:
         return builtin_scene(size)
     try:
@@ -93,7 +93,7 @@ def load_scene(
             `poses_bounds.npy`. The path of such a file, or of a COLMAP model's folder, also names the scene.
         downscale: factor by which images are reduced, >= 1. None is 1 or, for photographs, the smallest factor that
             leaves at most 512 pixels a side. The image side of a built-in scene, 100 pixels by default, is divided by
-            it.
+            this factor.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
             or a link.
         format: the format of a folder, one of `FORMATS` such as "colmap"; "auto" is the first format that the folder

@@ -74,7 +74,10 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
 
 
 def _test_frames(folder: Path, train_frames: Sequence[ListedImage], reading: Reading) -> list[ListedImage]:
-    """Returns the test images of the first file that has test images; leaves out training images, with a warning."""
+    """Returns the test images of `transforms_test.json` or, if it has none, of `transforms_val.json`.
+
+    Training images in these files are left out, with a warning. The list is empty if neither file has test images.
+    """
     training = {frame.path.resolve() for frame in train_frames}
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():

@@ -101,7 +101,10 @@ class _Silhouette:
         return straight
 
     def judge(self, points: Array, radius: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Returns (seen, missed), bool [n]: which balls this view sees, and which of these lie outside its mask."""
+        """Returns (seen, missed), bool [n]: the balls that this view sees, and the seen balls outside its mask.
+
+        The balls have the centres `points` [n, 3] and one radius.
+        """
         x, y, z = (points - self.pose[:3, 3]).T
         local = [self.pose[0, i] * x + self.pose[1, i] * y + self.pose[2, i] * z for i in range(3)]
         depth = -local[2]

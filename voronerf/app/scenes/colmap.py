@@ -71,8 +71,14 @@ class ColmapCamera(NamedTuple):
 
 
 class ColmapImage(NamedTuple):
-    """An image: its file name, its camera, its pose float64 [4, 4] (camera to world, OpenGL's axes), and the numbers
-    of its points, int64 [s]."""
+    """An image of a sparse model.
+
+    Attributes:
+        name: the file name.
+        camera: the camera.
+        pose: float64 [4, 4], camera to world, with OpenGL's axes.
+        points: int64 [s], the numbers of the points that the image shows.
+    """
 
     name: str
     camera: ColmapCamera
@@ -90,8 +96,13 @@ class ColmapModel(NamedTuple):
 
 
 class Models(NamedTuple):
-    """The sparse models of a scene: the scene's folder, the path of its images in this folder, and the models' folders
-    in the order of their numbers."""
+    """The sparse models of a scene.
+
+    Attributes:
+        folder: the scene's folder.
+        images: the path of the image folder in ``folder``.
+        paths: the folders of the models, in the order of the models' numbers.
+    """
 
     folder: Path
     images: str
@@ -99,7 +110,7 @@ class Models(NamedTuple):
 
 
 def find_models(folder: Path) -> Models | None:
-    """Returns the COLMAP models of a scene, or None; ``folder`` holds the scene, one model or several models."""
+    """Returns the COLMAP models in a folder, or None; the folder is a scene or a model, or holds models 0, 1, ..."""
     for place, images in PLACES.items():
         folder = Path(os.path.abspath(folder)) if place == "." else folder
         inside = folder / place
@@ -378,7 +389,10 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
 def _find_masks(
     source: Path, folder: ImageFolder, images: list[tuple[Path, ColmapImage]], allow_outside: bool
 ) -> tuple[list[Path | None], list[str]]:
-    """Returns the masks of images, and a note on them; the mask of 0.jpg is 0.jpg.png (COLMAP's name) or 0.png."""
+    """Returns the mask file of each image, or None, and lines for the user about the masks.
+
+    The mask of 0.jpg is 0.jpg.png (COLMAP's name) or 0.png.
+    """
     masks = folder.masks
     if masks is None:
         return [None] * len(images), []

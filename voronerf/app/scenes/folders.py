@@ -31,8 +31,8 @@ class ImageFolder(NamedTuple):
         path: the folder.
         full: the folder of the same images in full size; None if ``path`` holds images in full size, or if there is no
             such folder.
-        masks: the folder of their masks, or None.
-        factor: the remaining downscale factor; None to choose it by the size of the images.
+        masks: the folder of the images' masks, or None.
+        factor: the factor by which the images in ``path`` must still be downscaled; None to choose it by their size.
         notes: lines for the user.
     """
 
@@ -43,7 +43,7 @@ class ImageFolder(NamedTuple):
     notes: tuple[str, ...]
 
     def reduction(self, headers: Sequence[Header]) -> int:
-        """Returns the remaining downscale factor for images with these headers."""
+        """Returns the factor by which the images with these headers must still be downscaled."""
         return self.factor or least_factor(max(max(header.size) for header in headers))
 
 
@@ -61,8 +61,8 @@ def choose_images(folder: Path, downscale: int | None, images: str = "images") -
     """Returns the image folder that needs the least further reduction.
 
     For `downscale` N, this is `images_N` or, if missing, `images`, whose files are then reduced by N. If `images` is
-    missing too, it is the `images_N` with the smallest N; `downscale` 1 keeps the size of these images. For `downscale`
-    None, images are reduced by `least_factor`. The argument `images` is a path in the scene's folder.
+    missing too, the result is the `images_N` with the smallest N; `downscale` 1 keeps the size of its images. For
+    `downscale` None, images are reduced by `least_factor`. The argument `images` is a path in the scene's folder.
     """
     sizes = image_folders(folder, images)
     if not sizes:
@@ -93,7 +93,7 @@ def stay_inside(path: Path, folder: Path, allow_outside: bool, name: str = "") -
 def named_images(
     source: Path, images: ImageFolder, names: Sequence[str], allow_outside: bool
 ) -> tuple[list[Path | None], tuple[str, ...]]:
-    """Finds the image file of each name by `named_files` or, if no name fits, by the order of files and names.
+    """Finds the image file of each name by `named_files` or, if that finds no file, by the order of files and names.
 
     Warns of missing files.
 
@@ -116,9 +116,15 @@ def named_images(
 def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
     """Finds the file of each name in a folder and its subfolders; None for a missing file.
 
-    A name is compared with a file's path: exactly, then without the file's suffix, then without both suffixes, and
-    finally in the same ways, ignoring case. If no name fits, and the last parts of the names are unique, they are
-    compared with the last parts of the paths.
+    A name is compared with a file's path: exactly, then with the suffix of the path removed, then with the suffixes of
+    the name and the path removed. Names without a file are compared in the same three ways again, ignoring case. If
+    none of the names has a file, and the base names are unique, base names are compared in all these ways.
+
+    Args:
+        source: the file that lists the names, for error messages.
+        folder: the folder of the files.
+        names: the file names, with or without folders.
+        allow_outside: whether the files may lie outside of the scene's folder.
     """
     names = [posixpath.normpath(name.replace("\\", "/")) for name in names]
     found = {
@@ -140,7 +146,11 @@ def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside:
 def _compare(
     source: Path, folder: Path, names: set[str], files: list[Path], found: dict[str, Path], part: Callable[[str], str]
 ) -> None:
-    """Compares ``part`` of names and paths, and adds the matches to ``found``; skips or refuses ambiguous matches."""
+    """Compares names with paths after applying the function ``part`` to both, and adds the matches to ``found``.
+
+    If ``part`` is ``str``, which keeps whole paths, several paths that match one name raise SceneError. All other
+    ambiguous matches are skipped.
+    """
     for fold in (str, str.casefold):
         for cut, cut_file in ((str, str), (str, _without_suffix), (_without_suffix, _without_suffix)):
             by_key = defaultdict(list)
@@ -165,7 +175,8 @@ def _files_in_order(source: Path, images: ImageFolder, names: Sequence[str], all
     """Matches files with names by order; for reduced images, by the order of the images in full size.
 
     No file is matched if the numbers of files and names differ, or if sorting by characters and by numbers gives
-    different orders, as for 10.jpg and 9.jpg: the other program may have used either order.
+    different orders, as for 10.jpg and 9.jpg: the program that wrote the names, or reduced the images, may have used
+    either order.
     """
     files = image_files(images.path)
     ordered: list[Any] = sorted(set(names)) if images.full is None else image_files(images.full)

@@ -1,7 +1,7 @@
 """Checks for images that mislead a mapper: a static background, and an object that looks alike from two sides.
 
-If an object turns in front of a static background, most features lie on the background and show a static camera. A
-model is folded if it places the images of two sides of an object on one side.
+If an object turns in front of a static background, most features lie on the background, and the mapper finds a camera
+at rest. A model is folded if its cameras for images of two sides of an object all lie on one side.
 
 False matches between two sides lie on the object alone, which fills a small part of the images. Matches of neighbouring
 images spread over a large part; such pairs of images are called wide. Wide pairs are trusted, and a model that
@@ -30,34 +30,38 @@ Pair = tuple[str, str]
 #: fraction of the box of all features. For a can with the same print on two sides, 327 of 835 pairs are wide, and one
 #: of these is wrong.
 WIDE_MATCHES, WIDE = 30, 0.12
-#: The minimum number of matches of a strong pair, as a fraction of the largest number of any pair with one of its
-#: images. Weaker pairs may be wrong where patterns repeat: good cameras of bonsai contradict 22 of 593 wide pairs, none
-#: of them with a fraction above 0.2.
+#: A wide pair is strong if it has at least `STRONG` times as many matches as every other pair with one of its images.
+#: Weaker pairs may be wrong where patterns repeat: in the capture bonsai, good cameras contradict 22 of 593 wide pairs,
+#: each of which has at most 0.2 times as many matches as another pair with one of its images.
 STRONG = 0.25
-#: The number of other pairs that are trusted for an image without strong pairs.
+#: The number of pairs that are trusted, in addition to all wide pairs, for each image without strong pairs.
 HOLDING = 2
 #: The median epipolar distance of a pair's matches, in image widths, above which the cameras contradict the pair.
 CONTRADICTED = 0.02
 #: A folded model contradicts at least this number of strong pairs, and more than this fraction of them.
 FOLDED_PAIRS, FOLDED = 3, 0.01
-#: A pair of images is still if more than the fraction `SHIFTED` of its matches have nearly the median shift: they
-#: differ from it by less than `SHIFT`, in units of the longer side of the features' box. At most 2 % of the pairs are
-#: still in bust, beer, fern, fox and mouse, and 57 % for a head on a turntable. The background is static if the
-#: fraction of still pairs exceeds `STILL`.
+#: A pair of images is still if more than the fraction `SHIFTED` of its matches have nearly the same shift: a match
+#: counts if its shift differs from the pair's median shift by less than `SHIFT` times the longer side of the features'
+#: box. The background is static if the fraction of still pairs exceeds `STILL`. In the captures bust, beer, fern, fox
+#: and mouse, at most 2 % of the pairs are still; in images of a head on a turntable, 57 % are.
 SHIFTED, SHIFT, STILL = 0.5, 0.0025, 0.25
 #: The smallest divisor, in place of a length of zero.
 TINY = 1e-12
 
 
 class Matches(NamedTuple):
-    """COLMAP's verified matches, which fit two cameras, by image name."""
+    """COLMAP's geometrically verified matches, by image name; the matches of a pair fit one relative pose."""
 
     features: dict[str, Array]  # float [f, 2], the positions of each image's features
     pairs: dict[Pair, Array]  # int64 [m, 2], the indices of each pair's matching features
 
 
 def spreads(matches: Matches) -> dict[Pair, float]:
-    """Returns for each pair the area of the matches' box over the area of all features' box, in the worse image."""
+    """Returns the spread of each pair's matches.
+
+    The spread in one image is (area of the box of the matches) / (area of the box of all features). A pair has the
+    smaller value of its two images.
+    """
     boxes = {name: max(_box(places), TINY) for name, places in matches.features.items()}
     return {
         pair: min(_box(matches.features[name][indices]) / boxes[name] for name, indices in zip(pair, rows.T))
@@ -89,7 +93,7 @@ def wide_pairs(matches: Matches, spread: dict[Pair, float]) -> list[Pair]:
 
 
 def strong_pairs(matches: Matches, wide: Iterable[Pair]) -> list[Pair]:
-    """Returns the wide pairs with at least `STRONG` times as many matches as the best pair of either image."""
+    """Returns the wide pairs with at least `STRONG` times the matches of every pair that shares an image with them."""
     most = dict.fromkeys(matches.features, 0)
     for pair, rows in matches.pairs.items():
         most.update({name: max(most[name], len(rows)) for name in pair})
@@ -97,7 +101,10 @@ def strong_pairs(matches: Matches, wide: Iterable[Pair]) -> list[Pair]:
 
 
 def trusted_pairs(matches: Matches, spread: dict[Pair, float]) -> set[Pair]:
-    """Returns the wide pairs and, for each image without strong pairs, its best other pairs by matches x spread."""
+    """Returns the wide pairs and, for each image without strong pairs, its `HOLDING` best other pairs.
+
+    Pairs are ranked by (number of matches) * spread.
+    """
     wide = set(wide_pairs(matches, spread))
     covered = {name for pair in strong_pairs(matches, wide) for name in pair}
     others = [pair for pair, rows in matches.pairs.items() if pair not in wide and len(rows) >= WIDE_MATCHES]

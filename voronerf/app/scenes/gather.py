@@ -205,7 +205,16 @@ def _remove_repeats(folder: Path) -> list[str]:
 
 
 def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callable[[str], None]) -> None:
-    """Writes the masks from the folder `masks`, in or beside the images' folder, under COLMAP's names for copies."""
+    """Writes the masks of copied images to ``masks``, under the names that COLMAP expects: `0.jpg.png` for `0.jpg`.
+
+    The masks lie in a folder `masks`, in or beside the folder of the images, or beside an image in a subfolder.
+
+    Args:
+        folder: the folder of the images.
+        copied: the original of each copy.
+        masks: the folder to write.
+        say: called with a line for the user.
+    """
     places = [place for place in (folder / "masks", folder / ".." / "masks") if place.is_dir()]
     count = 0
     for copy, path in copied.items():
@@ -234,14 +243,15 @@ def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callab
 
 
 def _take_frames(video: Path, folder: Path, count: int, say: Callable[[str], None]) -> None:
-    """Writes evenly spaced frames of a video as JPEG without repeats; ffmpeg turns frames of phones upright.
+    """Writes evenly spaced frames of a video as JPEG, none of them twice; ffmpeg turns frames of phones upright.
 
-    Packets are counted first, which is fast, since durations may be missing or wrong. A video that was cut without
-    re-encoding has more packets than frames, and is read a second time.
+    The number of frames is estimated by the number of packets: counting packets is fast, and the duration in the file
+    may be missing or wrong. A video that was cut without re-encoding has more packets than frames, and is read a second
+    time.
     """
     import imageio_ffmpeg
 
-    # Without this, ffmpeg would restart the filters, and their frame count, where the frame size changes.
+    # Without -reinit_filter 0, ffmpeg would restart the filters, and their frame count, where the frame size changes.
     read = ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS, "-reinit_filter", "0"]
     read += ["-i", f"file:{video}"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", *read]

@@ -31,7 +31,7 @@ UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.err
 TURNS = {3: 2, 6: 3, 8: 1}
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_DEPTH = 24  # byte offset of the number of bits per channel
-#: The least alpha of a pixel that counts, if alpha is a mask; other pixels are mixed with the background.
+#: If alpha is used as a mask, pixels with an alpha below this are masked, since their colour is partly background.
 OPAQUE = 250
 #: The largest fraction of the free memory for a scene; the rest is for the networks.
 SHARE = 0.75
@@ -44,8 +44,15 @@ BAND = 2**20
 
 
 class Header(NamedTuple):
-    """The header of an image file: (width, height), whether it has alpha, bytes of a decoded pixel, whether it is
-    JPEG, and the quarter turns anticlockwise by its orientation tag."""
+    """The header of an image file.
+
+    Attributes:
+        size: (width, height) in pixels, as stored.
+        alpha: whether the image has an alpha channel.
+        depth: bytes of a decoded pixel in memory.
+        jpeg: whether the file is JPEG.
+        turns: quarter turns anticlockwise that make the image upright, by the orientation tag.
+    """
 
     size: tuple[int, int]
     alpha: bool
@@ -125,7 +132,7 @@ class Decoded(NamedTuple):
             left corner, padded with zeros.
         sizes: int64 [c, 2], (width, height) of the files.
         on_disk: whether the images are mapped from a file of the cache, and read-only.
-        turns: number of quarter turns anticlockwise of each image.
+        turns: number of quarter turns anticlockwise by which each image has been turned.
     """
 
     images: Tensor
@@ -214,7 +221,7 @@ def read_masks(
     name: str = "images",
     alpha: bool = False,
 ) -> Tensor | None:
-    """Decodes the masks of images. A reduced pixel counts if no pixel of its block is black.
+    """Decodes the masks of images; a pixel of a reduced mask is True if no pixel of its block is black.
 
     Args:
         masks: the mask file of each image, or None if the whole image counts.

@@ -47,7 +47,7 @@ PARALLEL = 0.95
 # In a picture of a cut-out object, at least these fractions of all pixels and of the border pixels are transparent.
 # Masks of people, edges after undistortion and single pixels stay below one of these fractions.
 CLEAR, CLEAR_BORDER = 0.25, 0.5
-# The number of positions along each side of an image that are tried for its field of view if its corners have no rays.
+# If a corner of an image has no ray, a grid with this number of positions a side determines the field of view.
 ACROSS = 65
 # The minimum fraction of an image's pixels that have a ray.
 LEAST_RAYS = 0.25
@@ -63,10 +63,19 @@ KIND_LINES = {
 
 
 class View(NamedTuple):
-    """A photograph: its file, its pose float64 [4, 4] (camera to world), its lens, and the lens's (width, height).
+    """A photograph with its camera.
 
-    The optional fields are the mask's file, the least and largest depth of its points, these points float64 [s, 3], the
-    file's header, and the radius of a fisheye's image circle in pixels of ``size``; pixels outside of it are masked.
+    Attributes:
+        path: the image file.
+        pose: float64 [4, 4], camera to world.
+        lens: the lens.
+        size: (width, height) of the image in the pixels to which ``lens`` refers.
+        mask: the mask file, or None.
+        bounds: the least and the largest depth of the sparse points that the photograph shows, or None if unknown.
+        points: float64 [s, 3], these sparse points, or None.
+        header: the header of the file; None if it has not been read yet.
+        circle: the radius of a fisheye's image circle in pixels of ``size``, outside of which pixels are masked, or
+            None.
     """
 
     path: Path
@@ -151,7 +160,7 @@ def photograph_scene(
     frame = find_frame(upright, kind, bounds if len(bounds) else None, normalise=reading.normalise)
     cameras = _cameras(frame.poses(poses), views, pictures.sizes, source)
     contraction = _contraction(kind, frame, cameras)
-    # The turn follows the reduction, which drops rows and columns of the files as stored.
+    # Cameras are turned after they are downscaled, since downscaling drops rows and columns of the stored images.
     cameras = _turned(cameras.downscaled(factor), pictures.turns)
     try:
         _ = cameras.lenses
@@ -221,8 +230,8 @@ def _read_pictures(
 ) -> tuple[Decoded, Tensor | None, str, tuple[str, ...]]:
     """Reads images and masks of views; returns them, the kind of scene, and a note if alpha was used as a mask.
 
-    An object keeps its alpha. In other scenes transparent pixels are masked, such as passers-by, or pixels without
-    colour after undistortion.
+    An object keeps its alpha. In other scenes transparent pixels are masked, for example erased passers-by, or border
+    pixels without colour after undistortion.
     """
     paths, headers = [view.path for view in views], [view.header for view in views]
     read = functools.partial(read_images, paths, factor, headers=headers, name=name, upright=True)
@@ -266,7 +275,10 @@ def _is_cut_out(alpha: Tensor) -> bool:
 
 
 def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
-    """Returns a note on the views with ``far`` [c] True: one such camera would determine the scale of the scene."""
+    """Returns a note on the views whose cameras lie far from the others (``far``, bool [c]); [] without such views.
+
+    One such camera would determine the scale of the scene. ``kept`` tells whether these views are used.
+    """
     names = [view.path.name for view, is_far in zip(views, far.tolist()) if is_far]
     start = f"{len(names)} of {len(views)} cameras lie far from the others"
     treatment = "and are kept (--keep-far)" if kept else "and are left out (--keep-far keeps them)"
@@ -274,7 +286,10 @@ def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
 
 
 def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:
-    """Returns pixels (inside image and mask) and distances of the points that a split's views see; None if none."""
+    """Returns the pixels that show sparse points, and the points' distances; None if a split's views see no points.
+
+    Pixels that are masked do not count.
+    """
     pixels, distances = [], []
     for index, view in enumerate(views):
         if view.points is None:
@@ -332,9 +347,9 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
     The cameras' common focus, or else their mean position, becomes the origin. Their mean up direction becomes z, and
     for a forward-facing scene their mean viewing direction becomes y. The farthest camera is at distance 1.
 
-    With bounds, two kinds of scenes differ. In a forward-facing scene, the smallest least depth becomes 1. In an
-    inside-out scene, whose cameras may share one place, the camera distance that becomes 1 is first clamped to the
-    range from the median least depth to the median largest depth.
+    With bounds, two kinds of scenes have another unit of length. In a forward-facing scene, it is the minimum of the
+    views' least depths. In an inside-out scene, whose cameras may share one place, it is the distance of the farthest
+    camera, but not below the median of the views' least depths, and not above the median of their largest depths.
 
     Args:
         poses: float64 [c, 4, 4].
@@ -436,7 +451,10 @@ def kind_of(cameras: Cameras) -> str:
 
 
 def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) -> Cameras:
-    """Returns the cameras of image files, with intrinsics scaled from the lens's size to the file's."""
+    """Returns the cameras of image files of ``sizes`` [c, 2].
+
+    The intrinsics are scaled from the image size to which the lens refers, `View.size`, to the size of the file.
+    """
     intrinsics = []
     for view, (width, height) in zip(views, sizes.tolist()):
         scale_x, scale_y = width / view.size[0], height / view.size[1]
@@ -457,7 +475,8 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
 def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
     """Returns cameras of images turned anticlockwise by ``turns`` quarters; the turned pixels keep their rays.
 
-    A quarter turn moves the pixel at (x, y) to (y, width - x), so that u becomes v, and v becomes -u.
+    A quarter turn moves the pixel at (x, y) to (y, width - x). The normalised image coordinates (u, v), which the lens
+    distorts, become (v, -u).
     """
     if not any(turns):
         return cameras

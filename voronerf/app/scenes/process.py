@@ -66,8 +66,8 @@ FEW_IMAGES = 40
 #: Selection of pairs: the number of largest features per image, the maximum number of partners of an image, the minimum
 #: number of matches of these features in a pair, and the number of next images by name that are always partners.
 LARGEST_FEATURES, NEIGHBOURS, LEAST_MATCHES, FOLLOWING = 800, 20, 10, 2
-#: The number of pairs in a part, and of images in a block. Pairs are sorted by blocks, so that a part reads the
-#: features of few images.
+#: The number of pairs that COLMAP matches in one call, and the number of images in a block. Pairs are sorted by the
+#: blocks of their images, so that a call reads the features of few images.
 PART, BLOCK = 256, 16
 #: The number of images on which features are tried without upsampling. If these images have fewer than a quarter of the
 #: requested features, all images are enlarged to twice their width and height, as in the original SIFT. This takes four
@@ -83,7 +83,7 @@ LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
 #: the same number of matches between two images.
 LEAST_HELD = 15
 #: The largest mean reprojection error of a sound model: in pixels, and as a fraction of the longer side, whichever is
-#: larger. With a phone's images of 4,032 pixels, fields are as good at an error of 2.04 as at 1.39.
+#: larger. With a phone's images of 4,032 pixels, trained fields are as good at an error of 2.04 as at 1.39.
 LARGEST_ERROR, ERROR_SHARE = 2.0, 1 / 800
 #: The number of tracks per image that the global mapper uses to place cameras, longest first; triangulation adds the
 #: other tracks.
@@ -120,9 +120,9 @@ class Model:
     Attributes:
         folder: the folder of its files.
         images: the images with a sound camera, sorted by name.
-        lost: the names of the other images, and the faults of their cameras.
+        lost: the fault of each lost camera, by the name of its image.
         error: the mean reprojection error in pixels.
-        faults: the model's faults, as parts of a line.
+        faults: phrases that describe the model's faults, to be joined in one message.
         contradicted: the number of strong pairs that its cameras contradict.
         strong: the number of strong pairs of its images (:mod:`voronerf.app.scenes.folds`).
     """
@@ -175,7 +175,7 @@ def process(
             cameras. If a model contradicts pairs of images, its mapper runs again on trusted pairs alone.
         max_features: the maximum number of features per image.
         size: the longer side in pixels to which images are reduced for finding features. COLMAP's default, 3,200,
-            doubles the time for phones' images without better fields.
+            doubles the time for phones' images, but does not improve the trained fields.
         verbose: show COLMAP's log.
         say: called with a line about each step.
         progress: called with the name of a stage, the number of finished items, and the number of all items, 0 if
@@ -458,7 +458,7 @@ def _find_models(stages: Stages, matches: Matches, mapper: str, count: int, say:
 
 
 def _read_matches(stages: Stages) -> Matches:
-    """Returns the verified matches, which fit two cameras."""
+    """Returns COLMAP's geometrically verified matches."""
     colmap, pairs = stages.colmap, {}
     with colmap.Database.open(stages.work / "database.db") as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
@@ -506,7 +506,7 @@ def _best(models: Sequence[Model], count: int) -> Model:
 
 
 def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Sequence[Pair]) -> Model | None:
-    """Runs the mapper whose name is the start of ``name``; returns its largest model, or None if it finds no model."""
+    """Runs the mapper that ``name`` begins with (before any `_`); returns its largest model, or None for no model."""
     colmap, folder = stages.colmap, stages.work / name
     mapper, _, again = name.partition("_")
     if not folder.is_dir():
@@ -580,7 +580,7 @@ def _described(model: Model | None, images: int) -> str:
 
 
 def _contradiction(model: Model) -> str:
-    """Returns the fault of a folded model, as a part of a line."""
+    """Returns a phrase that describes the fault of a folded model, for a message."""
     what = f"contradicts {model.contradicted} of {model.strong} pairs of images that match well over much of both"
     return f"{what}: something may look alike from several sides"
 

@@ -14,27 +14,27 @@ from voronerf.app.scenes.lenses import Lens
 from voronerf.nerf.lenses import EQUIRECTANGULAR
 
 #: A camera is lost if the distance to its nearest neighbour exceeds `LOST` times the median of these distances, and
-#: is larger than the fraction `EXTENT` of the distances between two cameras. The first condition alone would reject all
+#: exceeds the quantile `EXTENT` of the distances between any two cameras. The first condition alone would reject all
 #: cameras outside a burst of images. The second condition works for bursts of up to 57 % of the cameras, and for up to
 #: 42 % of lost cameras.
 LOST, EXTENT = 8.0, 1 / 3
 #: Two lost cameras may be each other's nearest neighbours. So a camera is also lost if its distance to the median
 #: position exceeds `APART` times the quantile `MOST` of these distances.
 APART, MOST = 10.0, 0.8
-#: The check for a collapse ignores lost cameras if they are at most this fraction of all cameras, or a single camera.
-#: More lost cameras may be the only cameras outside a collapse.
+#: The check for a collapse (see `COLLAPSED`) ignores lost cameras if they are at most this fraction of all cameras, or
+#: a single camera. If more cameras count as lost, they may be the sound ones, and the others may have collapsed.
 FEW = 0.1
 #: The maximum number of cameras whose pairwise distances are measured.
 MOST_CAMERAS = 1000
-#: Cameras have collapsed if (median distance to the nearest neighbour) * (number of cameras) / (mean distance to the
-#: centre) is below this ratio. For evenly spaced cameras on a circle, the ratio is 6.
+#: Cameras have collapsed, most of them to nearly one point, if (median distance to the nearest neighbour) * (number of
+#: cameras) / (mean distance to the centre) is below this ratio. For evenly spaced cameras on a circle, the ratio is 6.
 COLLAPSED = 0.05
 #: The largest plausible ratio of the largest to the least depth of points.
 DEEPEST = 1e4
 #: The plausible range of focal lengths in image widths: fields of view of 4 to 127 degrees.
 FOCAL_LENGTHS = (0.25, 15.0)
-#: The largest plausible relative difference of the two axes' focal lengths, first distortion coefficient, and
-#: tangential distortion coefficients (p1, p2).
+#: The largest plausible magnitudes of three quantities: the relative difference of fx and fy, the first distortion
+#: coefficient, and the tangential distortion coefficients p1 and p2.
 ASPECT, BENT, TILTED = 0.05, 1.0, 0.05
 
 
@@ -56,7 +56,7 @@ def lost_cameras(origins: Tensor) -> Tensor:
 def camera_faults(
     origins: Tensor, bounds: Tensor | None = None, lenses: Iterable[tuple[Lens, float]] = ()
 ) -> list[str]:
-    """Returns the faults of cameras, as parts of a line; empty if the cameras are plausible.
+    """Returns phrases that describe the faults of cameras, for a message; an empty list for plausible cameras.
 
     Args:
         origins: [c, 3], positions of the cameras.
@@ -92,7 +92,7 @@ def camera_faults(
 
 
 def some_of(names: list[str]) -> str:
-    """Returns the first `MOST_NAMED` names in a line, and the number of further names."""
+    """Returns a line with the first `MOST_NAMED` names, and with the number of the other names."""
     more = [f"{len(names) - MOST_NAMED} more"] * (len(names) > MOST_NAMED)
     return ", ".join(names[:MOST_NAMED] + more)
 

@@ -50,7 +50,7 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
 
     Args:
         name: name of the scene, with which the folder's name begins.
-        sources: JSON values that identify the images, such as their paths; each list has a store of its own.
+        sources: JSON values that identify the images, such as their paths; different lists have different stores.
         made_of: JSON value that changes with the images, such as the files' sizes and times; a change rebuilds the
             store.
         shape: shape of the images, [c, h, w, channels].

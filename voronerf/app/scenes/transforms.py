@@ -1,6 +1,7 @@
 """Captures as `transforms.json`, with intrinsics, lens distortion and poses (instant-ngp, nerfstudio).
 
-Blender's `transforms_*.json` have the same frames, poses and numbers. Poses have OpenGL's axes, as everywhere.
+Blender's `transforms_*.json` store frames, poses and numeric entries in the same format. Poses have OpenGL's axes, as
+everywhere in voronerf.
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ log = logging.getLogger(__name__)
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 ORTHONORMAL = 2e-3
-#: The largest number, and the inverse of the smallest positive number: float32 can represent their squares.
+#: The largest magnitude of a number in a file; its inverse is the smallest value of a number that must be positive.
+#: Then float32 can represent the squares of these numbers.
 LARGEST = 1e9
-#: The longest focal length in units of the image's side, and the inverse of the shortest: fields of view of 0.06 to
-#: 179.9 degrees.
+#: The largest focal length in units of the image's side; its inverse is the smallest one. The fields of view are then
+#: 0.06 to 179.9 degrees.
 LONGEST = 1000
 SPLITS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
@@ -44,9 +46,9 @@ OTHER_RAYS = ("orthographic", "from_mitsuba", *(f"ftheta_p{power}" for power in 
 LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "distortion_params", "camera_model", "is_fisheye")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's distortion_params
 UNSUPPORTED = ("k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
-#: The supported distortion coefficients of each lens model, and the model's name in errors.
+#: The supported distortion coefficients of each lens model, and the words that name the model in error messages.
 KNOWN = {
-    # In nerfstudio k4 of a perspective camera is the factor of r^8, in OpenCV it is in the divisor.
+    # In nerfstudio, k4 of a perspective camera is the coefficient of r^8; in OpenCV, k4 belongs to the divisor.
     PERSPECTIVE: (("k1", "k2", "k3", "p1", "p2"), ""),
     FISHEYE: (("k1", "k2", "k3", "k4"), " of a fisheye"),
     EQUIRECTANGULAR: ((), " of an EQUIRECTANGULAR image"),
@@ -54,8 +56,15 @@ KNOWN = {
 
 
 class ListedImage(NamedTuple):
-    """An image of a transforms file: its path, its pose float64 [4, 4], the file that lists it, the entries of its
-    frame or else of the file, and the path of its mask."""
+    """An image of a transforms file.
+
+    Attributes:
+        path: the image file.
+        pose: float64 [4, 4], camera to world.
+        source: the transforms file.
+        values: the entries of the image's frame, and the file's entries that the frame lacks.
+        mask: the mask file, or None.
+    """
 
     path: Path
     pose: Tensor
@@ -339,7 +348,8 @@ def _view(frame: ListedImage, header: Header) -> View:
 def _lens_size(frame: ListedImage, size: tuple[int, int]) -> tuple[float, float]:
     """Returns the (width, height) to which a frame's lens refers, for an image file of ``size``.
 
-    It is ``size``, or ``w`` and ``h`` of the frame if the image was scaled afterwards, with the same aspect ratio.
+    This is ``size`` or, if the image was scaled after its lens was calibrated, ``w`` and ``h`` of the frame, which must
+    have the same aspect ratio.
     """
     stated = [number(frame.values, key, frame.source, positive=True) for key in ("w", "h")]
     # Exporters that scale images may write fractional sizes.

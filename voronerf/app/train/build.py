@@ -41,12 +41,12 @@ PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 #: Scale of the robust loss for photographs, which differ in exposure and highlights; synthetic images have no robust
 #: loss.
 ROBUST = 0.05
-#: Factor of the smoothness loss on depths from places without a camera, for photographs.
+#: Factor of the smoothness loss on the depths of unseen rays (rays from positions without a camera), for photographs.
 SMOOTH_DEPTH = 0.1
 #: Factors of the distortion and orientation losses for photographs, which favour one surface per ray. With three times
 #: the distortion loss, even fewer silhouettes are half transparent, but bonsai loses 0.3 dB.
 DISTORTION, ORIENTATION = 0.003, 0.01
-#: The maximum number of rays along the longer side of a picture that search for voxels in front of its camera.
+#: To find the voxels in front of a camera, at most this number of rays is cast along the longer side of its picture.
 LOOKS = 64
 #: A lower bound of the bytes per sample in a step; the measured values are 100 (kilonerf) to 230 (hashgrid).
 SAMPLE_BYTES = 64
@@ -283,8 +283,11 @@ def ask_everywhere(grid: OccupancyGrid, field: Field, backend: str = "auto") -> 
 
 
 def parameter_shapes(config: TrainConfig, **options: Any) -> dict[str, tuple[torch.Size, bool]]:
-    """Returns (shape, whether all cells share it) for each parameter of a network, without allocating the parameters;
-    ``options`` override the settings' options."""
+    """Returns (shape, whether all cells share it) for each parameter of a network.
+
+    It allocates no memory for the parameters, unless the field computes values in its constructor. ``options`` override
+    options of the field in ``config``.
+    """
     kind = config.field_type
     make, share = functools.partial(kind.build, {**config.network_options, **options}), kind.router_options
     network: nn.Module

@@ -34,9 +34,10 @@ CHECKPOINT_EVERY, KEPT = 30.0, 3
 #: The fraction of the budget for evaluations, half of it for the final evaluation; the maximum number of views in an
 #: intermediate evaluation.
 SHARE, VIEWS = 0.1, 20
-#: Approximate number of pixels rendered to time a view, and the minimum side of a rendered middle part.
+#: Approximate number of pixels that are rendered to time a view. If only the centre of a view is rendered, each side of
+#: it has at least `PROBE_SIDE` pixels.
 PROBE, PROBE_SIDE = 1024, 31
-#: The maximum number of views whose middles are scored, if there is too little time for a whole view.
+#: The maximum number of views whose central parts are scored, if there is too little time for a whole view.
 PARTS = 8
 #: Side of the corner of a view on which LPIPS is timed.
 LPIPS_PROBE = 128
@@ -55,13 +56,13 @@ class Checkpoints(Callback):
 
     Args:
         out: The run directory.
-        every: Seconds of training between two checkpoints.
+        interval: Seconds of training between two checkpoints.
     """
 
     group = GROUP
 
-    def __init__(self, out: Path, every: float = CHECKPOINT_EVERY) -> None:
-        self.out, self.every = out, every
+    def __init__(self, out: Path, interval: float = CHECKPOINT_EVERY) -> None:
+        self.out, self.interval = out, interval
         self.writer = CheckpointWriter(out, KEPT)
         self.saved_at, self.described = 0.0, False
 
@@ -85,7 +86,7 @@ class Checkpoints(Callback):
 
     def after_step(self, state: State) -> None:
         """Starts writing a checkpoint when it is due, unless another one is being written."""
-        if state.seconds - self.saved_at >= self.every and not self.writer.busy:
+        if state.seconds - self.saved_at >= self.interval and not self.writer.busy:
             self.save(state)
 
     def on_end(self, state: State) -> None:
@@ -149,12 +150,12 @@ class Scores(Callback):
     With ``config.budget`` and without ``config.eval_views``, the time of evaluations is limited. Intermediate
     evaluations take at most a twentieth of the elapsed time; if necessary, they score fewer views or none. All
     evaluations together take at most a tenth of the budget. If there is too little time for a view at the end, only the
-    middles of some views are scored.
+    central parts of some views are scored.
 
     Args:
         out: The run directory; None to write no files.
         lpips: The LPIPS network for the final evaluation, or None.
-        track: Function that shows progress: it yields the items of a sequence, and takes the sequence's name.
+        track: Function that shows progress: takes a sequence and the task's name, and yields the items.
         clock: Function that returns the time in seconds.
 
     Attributes:
@@ -197,7 +198,7 @@ class Scores(Callback):
         """Scores the test views of a finished training, and writes the summary."""
         if state.fraction >= 1:
             state.clear_stop()
-            if remaining := state.strategy.left:
+            if remaining := state.strategy.remaining:
                 state.report(f"Run ended before {remaining} of {state.strategy.splits + remaining} planned splits.")
             self._evaluate(state, last=True)
         last = self.metrics[-1] if self.metrics else {}
@@ -209,7 +210,7 @@ class Scores(Callback):
             "rays_per_second": state.rays_done / max(state.seconds, 1e-9),
             "parameters": state.parameter_count,
             "cells": state.router.num_cells,
-            "splits_left": state.strategy.left,
+            "splits_left": state.strategy.remaining,
             "skipped_steps": state.skipped,
             "width": state.config.width,
             "stages": [asdict(stage) for stage in state.stages],
@@ -246,7 +247,10 @@ class Scores(Callback):
             state.count_evaluation(self.clock() - started, min(self.view_seconds * all_views, SHARE / 2 * budget))
 
     def affordable(self, budget: float | None, most: int) -> int:
-        """Returns how many views, 1 to ``most``, fit into a tenth of a budget (seconds), by the last view's time."""
+        """Returns how many views, 1 to ``most``, can be scored in a tenth of a budget (seconds); None is no limit.
+
+        The time of a view is known from the last evaluation.
+        """
         return most if budget is None else max(1, min(most, int(SHARE * budget / max(self.view_seconds, 1e-9))))
 
     def _seconds_of(self, lpips: Lpips, state: State) -> float:
@@ -257,7 +261,7 @@ class Scores(Callback):
         return (self.clock() - started) * truth.numel() / corner.numel()
 
     def _probe(self, state: State, most: int) -> None:
-        """Estimates the seconds for a view by scoring its middle, with at least 1 / ``most`` of the width."""
+        """Estimates the seconds for a view by scoring its central part, at least 1 / ``most`` as wide as the view."""
         width, height = state.scene.test.cameras.size(0)
         factor, started = min(most, max(1, round(math.sqrt(width * height / PROBE)))), self.clock()
         self._score(state, 1, None, factor)
@@ -269,7 +273,10 @@ class Scores(Callback):
             return evaluate(state.renderer, state.scene, views=views, lpips=lpips, middle=middle, **options)
 
     def _record(self, state: State, scores: list[ViewScore], middle: int) -> None:
-        """Adds an evaluation to ``metrics.jsonl``, and reports it and any fault."""
+        """Adds an evaluation to ``metrics.jsonl``, and reports its scores and, if they are poor, the probable cause.
+
+        Width and height of the scored views were divided by ``middle``.
+        """
         entry = {
             "step": state.step,
             "seconds": round(state.seconds, 3),

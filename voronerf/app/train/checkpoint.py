@@ -130,7 +130,7 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
 
     Args:
         run: The run directory.
-        keep: See :func:`load_checkpoint`.
+        keep: Function that selects tensors by name; see :func:`load_checkpoint`.
 
     Raises:
         CheckpointError: If there is no readable checkpoint.
@@ -180,8 +180,8 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
 
     Args:
         path: The file.
-        keep: Function from a tensor's name to whether the tensor is read and verified. The other tensors must exist,
-            too.
+        keep: Function that takes a tensor's name, and returns whether to read and verify the tensor. The other tensors
+            must exist, too.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint")

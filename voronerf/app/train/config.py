@@ -41,8 +41,8 @@ class SceneSettings:
     """Scene folder in a format of --format, the folder of a COLMAP model in it, or a built-in scene: "builtin",
     "builtin:400" with 400 pixels a side, or "builtin-city:4x4", a city of 16 blocks."""
     format: Literal["auto", "blender", "colmap", "transforms", "llff"] = "auto"
-    """Format of the scene folder; auto is the first of these formats that the folder has, but transforms before a
-    COLMAP model in colmap/sparse (nerfstudio's), distorted/sparse or dense/sparse."""
+    """Format of the scene folder; auto takes the first of these formats that the folder has. However, transforms
+    precedes a COLMAP model in colmap/sparse (written by nerfstudio), distorted/sparse or dense/sparse."""
     kind: Literal["auto", "object", "forward", "inside-out", "unbounded"] = "auto"
     """Kind of scene: an object on white; cameras that look the same way; cameras that look outwards; or cameras that
     look at one place with surroundings. auto decides by transparent pixels and by the cameras."""
@@ -92,8 +92,9 @@ class FieldSettings:
     `voronerf.nerf.fields.FIELDS`."""
     field_options: tuple[str, ...] = ()
     """Further options of the field, each as NAME=VALUE, such as density_scale=20, skips=(4,) or view_directions=False.
-    By default, the finest wave of position_octaves spans two pixels of the training views; mipnerf has two more
-    octaves, since its cones filter finer waves out (published: 16)."""
+    By default, position_octaves, the number of octaves of the positional encoding, is the smallest for which the
+    shortest wave spans at most two pixels of the training views. mipnerf has two more octaves, but not the published
+    16, since its cones filter out even shorter waves."""
     width: int | None = None
     """Channels of the networks' hidden layers; default 32, nerf and mipnerf 64."""
     depth: int | None = None
@@ -107,12 +108,14 @@ class CellSettings:
     """The Voronoi diagram."""
 
     cells: tuple[int, ...] = (16,)
-    """Cells per level: `16` is 16 cells, `16 16` splits each of the 16 cells into 16, no number is one network."""
+    """Cells per level: `16` is 16 cells, `16 16` splits each of the 16 cells into 16. `--cells` without a
+    number is one network."""
     split_at: tuple[float, ...] | None = None
-    """Time of the split of each level: below 1 a fraction of the run, otherwise a number of steps; default: 0.2, or
-    evenly spaced from 0.15 to 0.5. With --max-cells, the times of the first and of the last split."""
+    """Time of the split of each level: below 1 a fraction of the run, otherwise a number of steps; default: 0.2 for one
+    split, evenly spaced from 0.15 to 0.5 for several. With --max-cells, the times of the first and of the last split.
+    """
     max_cells: int | None = None
-    """Final number of cells, if each split after the first one divides only the cell with the largest accumulated
+    """Final number of cells. Each split after the first one then divides only the cell with the largest accumulated
     error. The first number of --cells is for the first split, the last number for each later split."""
     centres: Literal["balanced", "random", "uniform", "centroidal"] = "centroidal"
     """Centres of the new cells: balanced by importance (as published), random samples, a uniform grid, or centroids of
@@ -120,7 +123,7 @@ class CellSettings:
     init: Literal["inherit", "random"] = "inherit"
     """Initial parameters of new cells: copies of their parent's parameters, or random parameters."""
     assignment: Literal["nearest", "stochastic"] = "nearest"
-    """Cell of a sample: the nearest cell, or, in training, a random cell, drawn by the distances to the centres."""
+    """Cell of a sample: the nearest cell, or in training a random cell, more often one with a near centre."""
 
 
 @dataclass(frozen=True)
@@ -129,26 +132,27 @@ class SamplingSettings:
 
     rays: int | None = None
     """Rays per training step; default 512, and more on a hash grid in a box for a long --budget. With --occupancy, this
-    number is for the first steps: hashgrid takes up to eight times as many when few samples of a ray remain."""
+    number is for the first steps: hashgrid takes up to eight times as many when most samples of a ray are skipped."""
     sampling: str = "stratified"
     """Samples along a ray: stratified in one pass, or hierarchical, with a second pass concentrated where the first
     pass has large weights (nerf: a coarse and a fine network)."""
     samples: tuple[int, ...] | None = None
-    """Samples per ray of each pass; default 32 and 32 for two passes, 64 for one pass. With --occupancy, contracted
-    space has 128, or 256 in a training of at least 25 seconds, or 384 in one of 90 seconds. An object that is 100
-    pixels wide has 64, and 128 at 400 pixels. On a hash grid, these are doubled, to at most 256, in a training of at
-    least 40 seconds (100 pixels) or 160 seconds (400 pixels). These times are for two cores of an AMD EPYC (Zen 5), and
-    shorter for a CPU that is measured to be faster; with --steps, the machine has no effect."""
+    """Samples per ray of each pass; default 32 and 32 for two passes, 64 for one pass. With --occupancy, the default
+    depends on the scene and on the length of the training. In contracted space, it is 128, or 256 for a training of at
+    least 25 seconds, or 384 for at least 90 seconds. In a box, it grows with the box's size in pixels: for Lego, it is
+    64 for images of 100 x 100 pixels, and 128 for 400 x 400. On a hash grid in a box, it is doubled, up to 256, for a
+    training of at least 40 seconds (100 x 100) or 160 seconds (400 x 400). These times are for two cores of an AMD EPYC
+    (Zen 5), and shorter for a CPU that is measured to be faster; with --steps, the machine has no effect."""
     sparse_depth: float | None = None
-    """Factor of a loss on light that does not come from the points of a sparse model (Deng et al. 2022,
-    "Depth-supervised NeRF"); default 0.0015 for COLMAP's models, and 0, which is off, without points."""
+    """Factor of a loss that makes rays end at the points of a sparse model (Deng et al. 2022, "Depth-supervised
+    NeRF"); 0 is off. Default 0.0015 for COLMAP's models, 0 for scenes without points."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
     """Input space of the networks: unchanged (none); all points outside a sphere mapped into a shell up to twice its
     radius (sphere); or normalised device coordinates, for forward-facing scenes (ndc). auto is none for a scene with a
-    box and for fields without a grid, otherwise ndc for forward-facing cameras and sphere for other cameras."""
+    box and for fields without a hash grid, otherwise ndc for forward-facing cameras and sphere for other cameras."""
     occupancy: bool = True
-    """Skip samples in empty space, in training and in pictures. This works for points in a single pass, in a scene with
-    a box or with a contraction; it is off otherwise."""
+    """Skip samples in empty space, in training and in pictures. This needs a field that takes points (not cones),
+    sampling in a single pass, and a scene with a box or a contraction; it is off otherwise."""
 
 
 @dataclass(frozen=True)
@@ -173,10 +177,12 @@ class OutputSettings:
     """Evaluations during the run, evenly spaced; the last one is at the end."""
     eval_views: int | None = None
     """Test views of every evaluation, evenly spaced; evaluations then do not count for --budget. Default: at most 20
-    during the run, and all at the end, as far as a twentieth of the elapsed time and a tenth of the budget allow."""
+    during the run, and all at the end; with a budget fewer, if evaluations would take more than a twentieth of the
+    elapsed time, or a tenth of the budget in all."""
     lpips: Path | None = None
-    """LPIPS weights for the final evaluation, a file or folder, or "off"; default: VORONERF_LPIPS, the folder lpips of
-    VORONERF_DATA or beside the scene, the installed lpips package."""
+    """LPIPS weights for the final evaluation, a file or folder, or "off". Default: VORONERF_LPIPS if it is set,
+    otherwise the first that exists of these: the folder lpips in VORONERF_DATA, the folder lpips beside the scene's
+    folder, and the installed lpips package."""
 
 
 @dataclass(frozen=True)

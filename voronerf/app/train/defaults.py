@@ -15,24 +15,24 @@ from voronerf.nerf.samplers import SAMPLERS, usual_samples
 from voronerf.nerf.volume import Space
 from voronerf.ops._core import native
 
-#: Factor of the loss on sparse depths, if the loss on colours is robust. The gradients of a robust loss do not exceed
-#: the gradients of the squared loss. With the squared loss, twice this factor gained 0.3 dB on bonsai and 0.7 to 1.4
-#: dB on beer, at equal steps and time.
+#: Factor of the loss on sparse depths, for a robust loss on colours. It is half of the factor for the squared loss on
+#: colours, since the gradients of the robust loss are smaller for large errors. With the squared loss, the loss on
+#: sparse depths gained 0.3 dB on the capture bonsai and 0.7 to 1.4 dB on beer, at equal steps and time.
 SPARSE_DEPTH = 0.0015
-#: Unseen depths are regularised to planes for a longer time if fewer image tiles have points of the sparse model:
-#: always if no tile has points, never if the fraction `COVERED` of the tiles has points. There are `TILES` tiles along
-#: the longer side. The fraction of tiles with points is 0.13 for mouse, 0.31 for beer, 0.35 for bust, and 0.68 for
-#: bonsai, whose scores this loss lowers.
+#: Unseen rays begin at positions without a camera, and have no target colour; a loss draws their depths towards planes.
+#: An image has `TILES` tiles along its longer side. If no tile has points of the sparse model, the loss acts during the
+#: whole training. The more tiles have points, the shorter it acts, linearly; if the fraction `COVERED` of the tiles has
+#: points, it never acts. The fraction of tiles with points is 0.13 for the capture mouse, 0.31 for beer, 0.35 for bust,
+#: and 0.68 for bonsai, whose scores this loss lowers.
 COVERED, TILES = 2 / 3, 12
-#: The offset of unseen rays from a camera, as a fraction of the farthest camera's distance from the point at which all
-#: cameras look.
+#: The maximum offset of an unseen ray's origin from a camera along each axis, as a fraction of the distance between the
+#: farthest camera and the point at which all cameras look.
 BESIDE = 0.2
 #: Samples per ray for one pass, and for each of two passes, without skipping of empty space.
 SAMPLES, EACH_SAMPLES = 64, 32
-#: Rays per step. On a hash grid in a box, a training of four times `SHORT` seconds has twice as many, a training of
-#: sixteen times `SHORT` four times as many, up to `MOST_RAYS`: beyond some 4,000 steps, more rays per step are better.
-#: Steps are slower for images with more than `SHORT_PIXELS` along the box, so that `SHORT` grows with the square root
-#: of this number.
+#: Rays per step. On a hash grid in a box, the number is doubled for a budget of 4 T, doubled again for 16 T, and so on
+#: up to `MOST_RAYS`: beyond some 4,000 steps, more rays per step are better. The time T is `SHORT` seconds. If the box
+#: spans p > `SHORT_PIXELS` pixels of an image, steps are slower, and T is `SHORT` * sqrt(p / `SHORT_PIXELS`) seconds.
 RAYS, MOST_RAYS, SHORT, SHORT_PIXELS = 512, 4096, 10.0, 128
 #: Approximate seconds per step on two cores, for a training whose length is given in steps.
 STEP_SECONDS = 0.01
@@ -71,7 +71,8 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
         passes = SAMPLERS[config.sampling].passes
         per_pass = EACH_SAMPLES if passes > 1 else SAMPLES
         if occupancy:
-            # The rule was measured with hash grids; steps of larger networks take several times as long.
+            # In a box, only a hash grid gets the additional samples of a long training. `usual_samples` was measured
+            # with hash grids; the steps of larger networks take several times as long.
             long = seconds if contracted or kind.scene_options is not None else 0.0
             per_pass = usual_samples(side / pixel, contracted=contracted, seconds=long)
         samples = (per_pass,) * passes
@@ -101,8 +102,9 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
 def unseen_share(scene: Scene, space: Space) -> float:
     """Returns the fraction of a training in which batches have unseen rays; 0 for no unseen rays.
 
-    Only photographs by cameras around a place have unseen rays. The fraction grows as fewer image tiles have points of
-    the sparse model, since surfaces without texture have few points.
+    Unseen rays begin at positions without a camera. Only photographs by cameras around a place, with a sparse model,
+    have them. The fraction is larger if fewer image tiles have points of the sparse model, since surfaces without
+    texture have few points.
     """
     points, cameras = scene.train.sparse_depth, scene.train.cameras
     if scene.background is not None or space.full_gradient is None or points is None:
@@ -116,7 +118,7 @@ def unseen_share(scene: Scene, space: Space) -> float:
 
 
 def unseen_move(scene: Scene, space: Space) -> float:
-    """Returns the offset of the origins of unseen rays from the cameras; 0 for no unseen rays."""
+    """Returns the maximum offset along each axis of an unseen ray's origin from a camera; 0 for no unseen rays."""
     return BESIDE * (space.full_gradient or 0.0) if unseen_share(scene, space) else 0.0
 
 
@@ -139,10 +141,11 @@ def why_no_occupancy(config: TrainConfig) -> str | None:
 
 
 def octaves_for(pixel: float) -> int:
-    """Returns the number of frequencies of positions whose finest wave spans two pixels of the training views.
+    """Returns the number of octaves of the positional encoding that fits the pixels of the training views.
 
-    The wave of octave l has length 2 pi / 2^l. A Blender scene has 8 octaves for images of 100 x 100, and 10, as in the
-    NeRF paper, for 400 x 400. Finer waves would fit noise, and cost time.
+    It is the smallest number for which the shortest wave spans at most two pixels, clamped to 4..14. The wave of octave
+    l has length 2 pi / 2^l. A Blender scene has 8 octaves for images of 100 x 100, and 10, as in the NeRF paper, for
+    400 x 400. Shorter waves would fit noise, and cost time.
 
     Args:
         pixel: Width of a pixel at the middle of the scene, in scene units.

@@ -14,7 +14,7 @@ from voronerf.nerf.split import SplitDone
 from voronerf.nerf.step import StepOutput
 from voronerf.ops._core import backends
 
-#: On a GPU, number of steps between two reads of the loss, for which the host waits for the device.
+#: On a GPU, number of steps between two reads of the loss; for each read, the host waits for the device.
 READ_EVERY = 3 * GROUP
 #: Target duration of a group of steps in seconds, so that a training reacts quickly, for example to Ctrl-C.
 ANSWER = 0.3
@@ -82,7 +82,7 @@ def train(
         with one_thread():
             prepare(state, callbacks)
         group = min((callback.group for callback in callbacks), default=GROUP)
-        steps = min(state.steps_alike(), steps_to_judgement(state), group, quick_steps)
+        steps = min(state.steps_per_update(), steps_to_judgement(state), group, quick_steps)
         output = state.training_step(state.rays, steps, at=state.step - state.began)
         count(state, steps, output)
         judge_start(state, output)
@@ -118,7 +118,7 @@ def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool =
     optimizer.set_learning_rate(state.learning_rate())
     group = state.step - (state.step - state.began) % GROUP  # first step of the group, which may be cut short
     if state.batches.unseen and state.fraction_at(group) >= state.unseen_share:
-        state.batches.end_unseen()
+        state.batches.stop_unseen_rays()
     if not state.router.training:
         state.renderer.train()
 

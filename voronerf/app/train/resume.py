@@ -112,7 +112,7 @@ def load(state: State, checkpoint: Checkpoint) -> None:
 
 
 def _threads(state: State) -> int:
-    """Returns the number of torch's threads, on which sums of torch depend; 0 if native ops compute the networks."""
+    """Returns torch's number of threads, which affects the rounding of its sums; 0 if all networks run natively."""
     return 0 if state.thread_deterministic else torch.get_num_threads()
 
 

@@ -38,8 +38,10 @@ def check_folders(run: Path) -> None:
 
 
 def is_outside(run: Path, path: str | Path) -> bool:
-    """Returns whether a path was never named by the user and lies outside the run directory, the working directory and
-    ``VORONERF_DATA``."""
+    """Returns whether a path lies outside the run directory, the working directory and ``VORONERF_DATA``.
+
+    Paths that the user has named before, see :func:`remember_choice`, do not count as outside.
+    """
     data = os.environ.get("VORONERF_DATA")
     folders = (run, Path.cwd(), *([Path(data)] if data else []))
     with contextlib.suppress(OSError):

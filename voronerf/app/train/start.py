@@ -1,6 +1,6 @@
 """Restarts a coarse stage that has learnt nothing, with another seed. A resumed run makes the same decision.
 
-A batch has r rays.
+A start is the first attempt at the coarse stage, or an attempt after a restart. A batch has r rays.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.step import StepOutput
 from voronerf.nerf.volume import Batch, RenderOutput
 
-#: Steps from the settling of the grid to the check of a start, and the maximum number of restarts of a training.
+#: The number of steps from the first update of the occupancy grid (after `Sampler.settling_steps`) to the check of a
+#: start, and the maximum number of restarts of a training.
 JUDGED, DRAWS = 100, 3
 #: The increment of the networks' seed with each restart.
 STRIDE = 1_000_003

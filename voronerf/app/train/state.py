@@ -36,8 +36,9 @@ HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 class Stage:
     """A period of training on one diagram.
 
-    ``balance_before`` and ``balance_after`` are medians over the split cells of std(W / max W), where W are the
-    importances of a split cell's new cells. They are None for the coarse stage.
+    ``balance_before`` and ``balance_after`` measure the imbalance before and after the centres of new cells are moved:
+    the median over the split cells of std(W / max W), where W are the importances of a split cell's new cells. Both are
+    None for the coarse stage.
     """
 
     cells: int
@@ -73,7 +74,7 @@ class State:
         evaluation_seconds: The time in seconds of evaluations that count for the budget.
         reserved_seconds: The seconds of the budget that are reserved for the last evaluation.
         rays: The number of rays of the next step.
-        unseen_share: The fraction of the training in which batches have unseen rays.
+        unseen_share: The fraction of the training in which batches have unseen rays, from positions without a camera.
         rays_done: The number of rays of all finished steps.
         loss: The loss of the last step that the host has read.
         skipped_in_a_row: The number of consecutive steps, up to the last one, that the guard has skipped.
@@ -166,7 +167,7 @@ class State:
         return native and all(map(self._is_one_program, self.routers.values()))
 
     def _is_one_program(self, router: VoronoiRouter) -> bool:
-        """Returns whether a router always runs as one fused program, whatever its timings."""
+        """Returns whether a router always runs as one fused program, rather than in a way chosen by measured times."""
         if router.fuse and router.way != "fused":  # timings may select another implementation
             return False
         return not isinstance(router.program(*_samples(6 if self.renderer.cones else 3), trace=True), str)
@@ -178,12 +179,12 @@ class State:
         highest, hold = float(self.config.lr or 0), self.config.field_type.lr_hold
         return learning_rate(highest, self.fraction_at(middle), middle, hold=hold, began=self.began)
 
-    def steps_alike(self) -> int:
+    def steps_per_update(self) -> int:
         """Returns the number of next steps that can be made in one call, because no setting changes between them."""
         if any(in_python(self.strategy, hook) for hook in ("is_due", "step_pre_backward")):
             return 1
         age = self.step - self.began
-        most = min(schedule.GROUP - age % schedule.GROUP, self.sampler.steps_alike(age))
+        most = min(schedule.GROUP - age % schedule.GROUP, self.sampler.steps_per_update(age))
         if self.config.steps is not None:
             most = min(most, self.config.steps - self.step)
         due = (n for n in range(1, most) if self.strategy.is_due(self.fraction_at(self.step + n), self.step + n))

@@ -27,7 +27,8 @@ from voronerf.nerf.cameras import Cameras
 if TYPE_CHECKING:
     from voronerf.app.viewer.viewer import Viewer
 
-#: Pixels along the longer side of the sharp picture: the range if it follows the window's size, and the maximum.
+#: Pixels along the longer side of the sharp picture: minimum and maximum if the side follows the window's size, and the
+#: largest number that the user can choose.
 SHARP, FULL, LARGEST = 512, 1536, 2048
 #: Greatest number of training views that are drawn, and pixels along the longer side of their pictures.
 MOST_VIEWS, THUMBNAIL = 200, 96
@@ -128,7 +129,7 @@ class Client:
             self._open(angle_of_view(self.viewer.subject.scene.test.cameras, 0, self.aspect))
 
     def _look_around(self) -> bool:
-        """Reads the browser's camera; if canvas or numbers are invalid, keeps the old camera and returns False."""
+        """Reads the browser's camera; if canvas size or camera is invalid, keeps the old camera and returns False."""
         now = self.handle.camera
         numbers = (*now.wxyz, *now.position, now.fov)
         is_shown = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)

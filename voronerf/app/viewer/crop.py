@@ -66,7 +66,7 @@ class CropBox:
         """Moves the lowest corner, number 0, or the highest corner, number 1.
 
         Raises:
-            ValueError: The place is no valid position, which a page of the viewer never sends.
+            ValueError: The place is not a valid position. The viewer's own page never sends such a place.
         """
         place = np.asarray(place, dtype=np.float64)
         if place.shape != (3,) or not (np.abs(place) < 1e9).all():

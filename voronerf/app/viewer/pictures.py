@@ -61,7 +61,7 @@ class Subject:
         name: The name in titles.
         folder: The run directory.
         scene: The cameras, and the images if they are loaded.
-        router: The diagram of the cells, and the assignment of positions to cells.
+        router: The field with its cells, which has the diagram and assigns positions to cells.
         renderer: The renderer of the run.
         weights: Returns a context in which the networks have the weights to show.
     """
@@ -110,7 +110,10 @@ def groups_of(diagram: VoronoiDiagram, level: int) -> Tensor:
 
 
 def space_from(scene: Scene, camera: Cameras) -> Scene:
-    """Returns the scene with other near and far bounds, for a camera at any place, also inside the scene's box."""
+    """Returns the scene with near and far bounds for a camera at any place, even inside the scene's box.
+
+    A scene without a box is returned unchanged.
+    """
     if scene.box is None:
         return scene
     diagonal = float((scene.box[1] - scene.box[0]).norm())

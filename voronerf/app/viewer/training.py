@@ -12,7 +12,7 @@ from voronerf.app.viewer.pictures import Subject
 from voronerf.app.viewer.viewer import Viewer
 from voronerf.nerf.schedule import GROUP
 
-#: Seconds between updates of the lines and the curve of the training.
+#: Seconds between updates of the training's status text and PSNR curve.
 TELL = 1.0
 
 
@@ -96,12 +96,12 @@ class Training(Callback):
             viewer.serve(lambda: not self.paused or state.stopped)
 
     def on_end(self, state: State) -> None:
-        """Removes the lines and the buttons."""
+        """Removes the training's status text and its buttons from the panel."""
         for part in (self.line, self.button, self.end):
             part.remove()
 
     def tell(self) -> None:
-        """Writes the lines about the training, and its curve."""
+        """Updates the training's status text and PSNR curve."""
         self.told_at, now, metrics = time.perf_counter(), self.state, self.scores.metrics
         speed = now.rays_done / max(now.seconds, 1e-9) / 1000
         self.line.content = (

@@ -231,7 +231,7 @@ class Viewer:
         client.count_picture(camera)
 
     def _draw_sharp(self, client: Client) -> None:
-        """Renders the sharp picture in bands; a movement stops it, and between bands others get coarse pictures."""
+        """Renders the sharp picture in bands, between which other clients get coarse pictures; a movement ends it."""
         version, look, camera = client.version, client.look, client.camera(client.longest)
         started, bands = time.perf_counter(), []
         rows = max(1, int(self.rate * BAND / camera.width))

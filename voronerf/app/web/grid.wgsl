@@ -1,7 +1,8 @@
 
 struct Level { scale: f32, shift: f32, side: u32, entries: u32, offset: u32, hashed: bool, half: u32 }
 
-// Returns the entry of a corner within its level. The last corner of an axis may lie one beyond its stride.
+// Returns the entry of a corner within its level. A level without hashing has the indices 0 to `side` - 1 on each axis.
+// A corner may have the index `side`; its entry may then lie beyond the end of the level, and wraps to the start.
 fn corner_of(level: Level, corner: vec3u) -> u32 {
   if (level.hashed) {
     return (corner.x ^ (corner.y * 2654435761u) ^ (corner.z * 805459861u)) & (level.entries - 1u);

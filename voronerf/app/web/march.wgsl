@@ -5,17 +5,17 @@ struct View {
   right: vec4f, up: vec4f, back: vec4f, origin: vec4f,  // axes and position of the camera
   lens: vec4f,   // focal lengths and principal point in pixels
   size: vec4u,   // width and height of the picture, first row to draw, one past the last row
-  cut: vec4f,    // axis of the cut (3: none), and its coordinate, beyond which nothing is shown
+  cut: vec4f,    // axis of the cut (3: none), and the largest coordinate on this axis that is shown
 }
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> parameters: array<vec4u>;  // float16, cell after cell
 @group(0) @binding(2) var<storage, read> table: array<u32>;         // float16, the hash grid
 @group(0) @binding(3) var<storage, read> occupied: array<u32>;      // a bit per voxel
-@group(0) @binding(4) var<storage, read> centres: array<vec4f>;     // centre; bits of the inner diagram, or -1 - leaf
+@group(0) @binding(4) var<storage, read> centres: array<vec4f>;     // x, y, z; bits of child diagram, or -1 - cell
 @group(0) @binding(5) var<storage, read> diagrams: array<u32>;      // first centre of each diagram, and the end
 @group(0) @binding(6) var<storage, read> hidden: array<u32>;        // a bit per cell
-// Per pixel: float16 colour times opacity, and opacity; 1 + the cell that is seen, or 0; float depth.
+// Four words per pixel: colour times opacity and opacity as four float16; 1 + the visible cell (0: none); float depth.
 @group(0) @binding(7) var<storage, read_write> pixels: array<vec4u>;
 
 const NOTHING = 1e-20;
@@ -37,13 +37,13 @@ fn bias(first: u32, four: u32) -> vec4f {
 
 fn sigmoid(x: vec4f) -> vec4f { return 1.0 / (1.0 + exp(-clamp(x, vec4f(-60), vec4f(60)))); }
 fn softplus(x: vec4f) -> vec4f { return max(x, vec4f()) + log(1.0 + exp(-abs(x))); }
-// Reduces an angle to half a turn around 0, where sine and cosine are exact enough on every GPU.
+// Reduces an angle to -pi..pi, where sine and cosine are accurate enough on every GPU.
 fn turned(angle: vec4f) -> vec4f {
   let turns = round(angle * 0.15915494309189535);
   return (angle - turns * 6.28125) - turns * 0.0019353071795864769;
 }
 
-// Returns the distance at a share of the ray, in equal steps of distance or of 1 / distance.
+// Returns the distance at a fraction of the ray; the fraction is linear in the distance or in 1 / distance.
 fn depth_of(near: f32, far: f32, share: f32) -> f32 {
   if (SPACING == 0u) { return near + (far - near) * share; }
   return near * far / max(far * (1.0 - share) + near * share, 1.17549435e-38);
@@ -103,7 +103,7 @@ fn way_of(origin: vec3f, direction: vec3f) -> vec2f {
   return vec2f(enter, max(enter, clamp(min(last.x, min(last.y, last.z)), NEAR, FAR)));
 }
 
-// Returns the colour of a cut surface, dark to bright by its density.
+// Returns the colour of a cut surface: the higher its opacity, the brighter.
 fn density_colour(opacity: f32) -> vec3f {
   return mix(vec3f(0.16, 0.07, 0.36), vec3f(0.98, 0.86, 0.30), opacity);
 }
@@ -127,7 +127,7 @@ fn draw(@builtin(global_invocation_id) id: vec3u) {
   var most = 0.0;
   var seen = 0u;
 
-  // The shown part of the ray: space beyond the coordinate on the axis is cut away.
+  // The visible part of the ray: a cut (view.cut) hides points with a larger coordinate on its axis.
   var shown = vec2f(near, far);
   let axis = u32(view.cut.x);
   if (axis < 3u && far > near) {

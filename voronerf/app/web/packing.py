@@ -3,9 +3,10 @@
 The bytes have these parts in this order, each aligned to 16 bytes:
 
     parameters  float16, cell after cell in the order of `Layout`: blocks of matrices, and biases
-    table       float16 [e, f], or [k, e, f], of a hash grid
+    table       float16, of a hash grid: [e, f], or [k, e, f] if each cell has its own table
     occupied    a bit per voxel, 32 to a word, least significant bit first
-    centres     float32 [m, 4]: a centre, and as int32 bits the diagram in its cell, or -1 - (cell number) for a leaf
+    centres     float32 [m, 4]: x, y, z, and the bits of an int32: the index of the child diagram, or
+                -1 - (cell number) if the centre is a leaf
     diagrams    uint32 [g + 1]: the first centre of each diagram, and m
     colours     uint8 [k, 4]: the colours of the cells in pictures
 

@@ -44,7 +44,7 @@ function viewOf(camera) {
   return { target: add(origin, back, -distance), yaw, pitch, roll, distance, wide: [width / focal, height / focal] };
 }
 
-// Returns the camera of a view for a picture of a size in pixels; the picture shows at least the area of `wide`.
+// Returns the camera of a view for a picture of width x height pixels, which shows at least the area `view.wide`.
 function cameraOf(view, width, height) {
   const { right, up, back } = axesOf(view);
   const origin = add(view.target, back, view.distance);
@@ -267,7 +267,7 @@ async function play(playing) {
     await new Promise(requestAnimationFrame);
     const now = performance.now();
     const end = scene.cameras.length - 1;
-    // A slow GPU skips views.
+    // The path advances by the elapsed time, so that a slow GPU draws fewer frames.
     if (end > 0 && state.playing) goTo((state.path + Math.min(now - before, 250) / SEGMENT) % end);
     else state.playing = false;
     before = now;
@@ -294,7 +294,7 @@ async function click(x, y) {
   }
 }
 
-// Sets the point to turn around to the surface at a pixel.
+// Makes the surface point at a pixel the centre of rotation.
 async function lookAt(x, y) {
   const { cell, depth } = await pick(x, y);
   if (cell < 0) return;

@@ -1,4 +1,4 @@
-"""Writes a run as one HTML page: its networks, the shader that draws them, and a turntable without WebGPU."""
+"""Writes a run as one HTML page: its networks, their shader, and a turntable for browsers without WebGPU."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 // Draws the scene by WebGPU: march.wgsl renders into a buffer of pixels, screen.wgsl draws the buffer on a canvas.
 //
-// A picture is drawn in strips of rows. Each strip is a submission of its own, and the next one waits for its end. So a
-// slow GPU is never blocked for long, and drawing can be cancelled between two strips.
+// A picture is drawn in strips of rows. A strip is submitted to the GPU after the previous strip is finished. So a slow
+// GPU is never blocked for long, and drawing can be cancelled between two strips.
 "use strict";
 
 const STRIP = 30; // milliseconds that a strip may take

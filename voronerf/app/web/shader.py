@@ -57,11 +57,12 @@ class CannotDraw(ConfigError):
 
 @dataclass
 class Layout:
-    """The offsets of a cell's parameters, in numbers from the cell's first parameter.
+    """The offsets of a cell's parameters, counted in float16 elements from the cell's first parameter.
 
     Attributes:
-        matrices: (parameter, start column, rows o, columns i, offset) of each step that reads a matrix.
-        vectors: (parameter, start, width, offset) of each bias.
+        matrices: For each step that reads a matrix: the number of the parameter, its first column that is read, rows
+            o, columns i, and the offset of the blocks.
+        vectors: For each bias: the number of the parameter, its first element that is read, width, and offset.
         size: Number of parameters of a cell, including padding.
     """
 

@@ -18,15 +18,15 @@ from voronerf.ops._core.layers import MLP, Layer
 HIDDEN_BIAS = 0.3
 
 #: The base-2 logarithm of the number of entries of a level in contracted space, for a short training and for a training
-#: of at least `LONG` seconds. A larger table takes longer to read and to learn; it pays in trainings of at least half a
-#: minute.
+#: of at least `LONG` seconds. A larger table takes longer to read and to train, so it is better only in long trainings.
 CONTRACTED_ENTRIES, LONG_ENTRIES, LONG = 17, 19, 25.0
 
 #: The density scale in contracted space.
 CONTRACTED_DENSITY = 40.0
 
-#: The density scale and the initial density in a box, both multiplied by the longest side of the box. A thinner initial
-#: field learns more slowly: a dark object may get a single colour while the field is still almost transparent.
+#: The density scale and the initial density in a box whose longest side is 1; other boxes divide both by their longest
+#: side. A thinner initial field learns more slowly: a dark object may get a single colour while the field is still
+#: almost transparent.
 BOX_DENSITY, BOX_INITIAL = 200.0, 2.0
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -126,7 +126,7 @@ class HashGridField(RadianceField):
 
     @staticmethod
     def learning_rate(**_: object) -> float:
-        """Returns Adam's initial learning rate: twice the published rate, which was slower on all tested scenes."""
+        """Returns Adam's initial learning rate: twice the published rate, for faster training on all tested scenes."""
         return 0.02
 
     @staticmethod

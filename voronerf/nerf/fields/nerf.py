@@ -163,10 +163,10 @@ class MipNeRF(NeRF):
 
     @staticmethod
     def octaves(finest: int) -> int:
-        """Returns the octaves of the encoding: two more octaves than the images show, at most 16.
+        """Returns the number of octaves of the encoding: ``finest`` + 2, at most 16.
 
-        The cone of a pixel damps the wave of the second additional octave to a thousandth, and the next wave to 1e-11:
-        the published 16 octaves would feed zeros to the network.
+        The images show ``finest`` octaves of detail. The cone of a pixel damps the wave of the second additional octave
+        to a thousandth, and the next wave to 1e-11: the published 16 octaves would feed zeros to the network.
         """
         return min(finest + 2, MIP_OCTAVES)
 

@@ -59,7 +59,7 @@ def reset_layers(
         nn.init.zeros_(layer.bias)
     for head in heads:
         nn.init.xavier_uniform_(head.weight, gain=0.1)
-    # The inverse of softplus: the density is `initial_density` where the head's product is 0.
+    # The inverse of softplus: where the head's weights contribute 0, the bias alone gives `initial_density`.
     nn.init.constant_(heads[0].bias, math.log(math.expm1(initial_density / density_scale)))
 
 

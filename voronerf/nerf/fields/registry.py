@@ -10,8 +10,9 @@ class may have these optional attributes:
     router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
     sparse_parameters        name patterns of sparse tables: a training step reads few of their entries. Entries without
                              a gradient change only by the weight decay of tables; see ``voronerf.ops.adam``
-    ray_growth               the maximum number of rays of a training step, as a multiple of ``--rays``, if space is
-                             empty; default 1, more for a field whose samples are cheap relative to the rest of a step
+    ray_growth               the maximum number of rays of a training step, as a multiple of ``--rays``; a step gets
+                             more rays as more empty space is skipped. Default 1; more for a field whose samples are
+                             cheap relative to the rest of a step
     lr_hold                  fraction of a training for which the learning rate stays constant; default 0
     scene_options(pixel, box, contracted, seconds)
                              static method: defaults of options. Its arguments are the width of a pixel at the middle
@@ -26,8 +27,8 @@ gets the directions [r, 3] of the rays, and as ``ray_index`` the row of each sam
 A class may describe its computation by a method ``program()``, as :class:`voronerf.nerf.fields.NeRF` does by a layer
 table (:func:`voronerf.router.layered_program`). A router then runs the program for all cells in one op and does not
 call ``forward``. Any other module runs its own ``forward``, which ``router_options = {"fuse": True}`` traces to a
-program. If a field is one program, it is fused with colours, loss and gradients, whatever its activations are
-(:class:`voronerf.nerf.RayLoss`).
+program. If a single program computes the whole field, this program is fused with colours, loss and gradients, whatever
+the activations of the field are (:class:`voronerf.nerf.RayLoss`).
 """
 
 from __future__ import annotations
@@ -175,7 +176,7 @@ def register_field(name: str) -> Callable[[Network], Network]:
 
 
 def _options(network: Callable[..., nn.Module]) -> dict[str, Any]:
-    """Returns named parameters and their defaults; ``**options`` adds the parameters of base classes."""
+    """Returns a constructor's named parameters and defaults; ``**options`` adds the parameters of base classes."""
     if not isinstance(network, type):
         return _named_parameters(network)[0]
     options: dict[str, Any] = {}

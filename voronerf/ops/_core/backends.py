@@ -1,16 +1,18 @@
-"""The choice of an op's implementation: one table, in which each op declares its row (``voronerf/ops``), and one
-predicate, which decides the choice and gives the reasons.
+"""The choice of an op's implementation.
+
+Each op of ``voronerf/ops`` declares its implementations in one table. One predicate, `why_not`, decides whether a
+backend can run an op, and gives the reason if it cannot.
 
 An op has up to three implementations, all with the signature of its reference function:
 
     reference   plain PyTorch, any device and dtype: the executable specification
     native      csrc/, C++ and CUDA
-    warp        kernels/, NVIDIA Warp, one source for CPU and CUDA; plain PyTorch if the row is ``PLAIN``
+    warp        kernels/, NVIDIA Warp, one source for CPU and CUDA; a ``PLAIN`` entry runs the reference instead
 
-``backend="auto"`` takes the first entry of the device's order that is available, supports the call and is not plain.
-The choice never depends on timing. The reference is the last entry on CUDA too, so every op runs on every device,
-although not every op has a CUDA kernel. A backend that the caller names has no fallback: if it cannot run, the call
-raises :class:`BackendUnavailable` with the reason and the remedy.
+``backend="auto"`` takes the first entry in the device's order that is available, supports the call and is not
+``PLAIN``. The choice never depends on timing. The reference is the last entry on CUDA too, so every op runs on every
+device, although not every op has a CUDA kernel. A backend that the caller names has no fallback: if it cannot run, the
+call raises :class:`BackendUnavailable` with the reason and the remedy.
 """
 
 from __future__ import annotations
@@ -59,8 +61,8 @@ class Row:
         op: name of the op.
         backend: name of the backend.
         devices: device types on which the backend can run the op here and now.
-        dtypes: names of the supported dtypes; ``("any",)`` for all, ``("plain torch",)`` for the reference in place of
-            a kernel, empty without an implementation.
+        dtypes: names of the supported dtypes; ``("any",)`` for all dtypes; ``("plain torch",)`` if the backend runs the
+            reference instead of a kernel; empty if the backend does not implement the op.
         reason: one line on why the backend cannot run the op on all devices; empty if it can.
     """
 
@@ -139,13 +141,20 @@ def resolve_composed(op: str, *, backend: str, device: torch.device, dtype: torc
     """Resolves an op whose reference calls other ops and takes a ``backend`` for them.
 
     The reference receives "auto" if "auto" falls back to the reference, so that the choice is made for each inner op.
-    It receives the named backend if that backend's implementation is plain.
+    It receives the named backend if that backend's implementation is ``PLAIN``, so that the inner ops run there.
     """
     return function(op, _choose(op, backend, device.type, device.index, dtype), backend, composed=True)
 
 
 def function(op: str, name: str, backend: str, composed: bool) -> Callable[..., Any]:
-    """Returns an op's implementation ``name``, the choice for ``backend``; see `resolve_composed` for ``composed``."""
+    """Returns the implementation of an op by its name, after `chosen` has returned this name.
+
+    Args:
+        op: the name of the op.
+        name: the name of the implementation.
+        backend: the backend that the caller requested.
+        composed: whether the op's reference takes a ``backend`` for the ops it calls; see `resolve_composed`.
+    """
     run = _FUNCTIONS[op, name]
     passed = composed and (_TABLE[op, name].plain or (name == "reference" and backend == "auto"))
     return functools.partial(run, backend=backend) if passed else run
@@ -212,7 +221,7 @@ def automatic(device: torch.device) -> str:
 def _import(module: str) -> ModuleType:
     """Imports a backend's module.
 
-    In a source folder ``voronerf.kernels`` is missing, because the kernels' folder lies beside the package.
+    Without an installation, ``voronerf.kernels`` is missing, because its folder kernels/ lies beside the package.
 
     Raises:
         BackendUnavailable: The backend cannot be used here.

@@ -37,7 +37,7 @@ class Capture:
     """
 
     def __init__(self, device: torch.device, generator: torch.Generator, before: Capture | None = None) -> None:
-        # A memory pool must keep its stream, and needs a live graph until the next graph of the pool exists.
+        # A memory pool belongs to one stream, and one of its graphs must be alive until the next graph is captured.
         self._stream: torch.cuda.Stream = torch.cuda.Stream(device) if before is None else before._stream
         self._pool = None if before is None else before._graph.pool()
         self._graph: torch.cuda.CUDAGraph = torch.cuda.CUDAGraph()
@@ -93,7 +93,7 @@ class Capture:
         return number
 
     def _take_number(self, _: Callable[[], float]) -> Tensor:
-        """Returns the tensor that the warm-up allocated for the same call of ``vary``."""
+        """Returns the tensor that the warm-up allocated for the same number; the order of the calls identifies it."""
         self._taken += 1
         return self._numbers[self._taken - 1][0]
 

@@ -1,8 +1,8 @@
 """The test case of an op: it makes valid arguments of the op, and lists arguments that the op must refuse.
 
-Each op has a case, ``voronerf/ops/<op>/case.py``. The case parametrises the tests of every op, the random calls of the
-attack and the sanitizers, the runs on the emulated and on a real GPU, and the benchmark. n is the number of
-points, samples or rays of a call.
+Each op has a case, ``voronerf/ops/<op>/case.py``. The case parametrises the tests of every op, the random calls of
+``make attack`` (tests/attack), the runs under sanitizers, on the emulated and on a real GPU, and the benchmark. n is
+the number of points, samples or rays of a call.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class Case:
-    """The case of an op.
+    """The test case of an op.
 
     Attributes:
         make: (draw, n) -> valid arguments by name, without ``backend``.
@@ -115,9 +115,9 @@ class Case:
         call: the name of the public function, if it is not the op's name.
         traced: whether torch can trace the op on every backend.
         on_devices: the pinned choices of additional calls on GPUs.
-        device_rows: n of a call under a sanitizer; more than a thread block if a kernel has one thread for each row.
-        hostile: the arguments that, with any values, cannot cause an access out of bounds: "indices"; "numbers" for
-            indices and floating-point numbers; "" for none.
+        device_rows: n of a call under a sanitizer; more than a block has threads if a kernel has a thread for each row.
+        hostile: the arguments that may have invalid values without an access out of bounds: "indices"; "numbers" for
+            indices and floating-point numbers; "" for none. A sanitizer runs the kernels on such values.
     """
 
     make: Callable[[Draw, int], Arguments]

@@ -1,5 +1,5 @@
-"""The custom op of an implementation: one declaration gives its schema, its fake and its gradients. Calls bypass
-torch's dispatcher if nothing observes them."""
+"""The custom op of an implementation: one declaration gives its schema, its fake implementation and its gradients.
+Calls bypass torch's dispatcher if nothing observes them."""
 
 from __future__ import annotations
 
@@ -264,7 +264,13 @@ class Op:
                 )
 
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
-        """Registers the backward, as ``torch.library`` does; inputs and gradients have the arguments' structure."""
+        """Registers the backward pass, as ``torch.library`` does, but with the op's arguments instead of flat ones.
+
+        Args:
+            backward: (ctx, *gradients of the results) -> the gradient of each op argument; it is a named tuple
+                if the argument is one.
+            setup_context: (ctx, the op's arguments, the results) -> None; saves what ``backward`` needs.
+        """
         packed, self._backward, self.set_up = self._fields.packed, backward, setup_context
         self._op.register_autograd(
             self.gradients, setup_context=lambda ctx, inputs, output: setup_context(ctx, packed(inputs), output)
@@ -282,17 +288,20 @@ class Op:
         return tuple(results) if self._listed else results
 
     def arguments(self, entries: Sequence[Any], lengths: Sequence[int]) -> Sequence[Any]:
-        """Returns the arguments of the op from the custom op's arguments with flattened lists."""
+        """Rebuilds the op's arguments from the custom op's arguments with flattened lists, and the lists' lengths."""
         return self._fields.packed(_nested(entries, lengths))
 
 
 class _Differentiable(torch.autograd.Function):
     """An op with gradients for PyTorch's autograd and ``torch.func``.
 
-    Its arguments under ``torch.func`` are the custom op's arguments with flattened lists, the lengths of the lists, the
-    op, and None. Elsewhere the lengths are None, and the op's own arguments take the place of the last None
-    (``torch.func`` would replace their tensors). An op with lists then passes the result of `Op._tensors_of` instead of
-    the flattened arguments.
+    ``forward`` takes flat arguments, then the lengths of lists, the op, and the op's own arguments.
+
+    Under ``torch.func``, the flat arguments are the custom op's arguments with flattened lists. ``torch.func`` replaces
+    the tensors among them, so the op's own arguments are None, and are rebuilt from the flat arguments and the lengths.
+
+    Otherwise, the lengths are None, and the op's own arguments are given. The flat arguments only tell autograd which
+    tensors the op takes: they are the result of `Op._tensors_of` if the op has lists, else the custom op's arguments.
     """
 
     @staticmethod

@@ -242,7 +242,10 @@ class Declaration:
         return [argument for argument in self.arguments if argument.kind is Tensor]
 
     def _letters(self) -> dict[str, Callable[[Any], Any]]:
-        """Returns functions of the arguments: one for each letter, and ``<name>_per_ray`` for tensors of two shapes."""
+        """Returns functions of the op's arguments, by name: one for the size of each letter, and ``<name>_per_ray``.
+
+        ``<name>_per_ray`` returns whether a tensor that may have either of two shapes has one row for each ray.
+        """
         ways, letters = dict[str, list[tuple[int, int, int, int]]](), dict[str, Callable[[Any], Any]]()
         for name, _, _, rule, _ in self._tensors():
             if rule.either:
@@ -256,7 +259,10 @@ class Declaration:
         return {**letters, **{letter: _size_of(sorted(letter_ways)) for letter, letter_ways in ways.items()}}
 
     def _likes(self) -> list[tuple[str, torch.dtype | None]]:
-        """Returns for each result the argument whose device it takes, and its dtype (None: the argument's dtype)."""
+        """Returns for each result the argument whose device the result has, and the dtype of the result.
+
+        The dtype is None if the result also has the argument's dtype.
+        """
         tensors, likes = [arg for arg in self._tensors() if not arg.optional], list[tuple[str, torch.dtype | None]]()
         for result in self.results.values():
             matching = [arg for arg in tensors if {*arg.rule.dtypes} <= {*(result.dtypes or FLOATING)}]
@@ -495,7 +501,11 @@ class Declaration:
         return Source(get, ("structure", [self._source(value, of_results).plan for value in values]))
 
     def _source(self, value: Any, of_results: bool = False) -> Source:
-        """Returns the source of a parameter or a member; ``value`` may be any parameter of `compiled_op`."""
+        """Returns the source of a parameter or a member.
+
+        ``value`` is of one of the kinds that `compiled_op` lists for its parameters. With ``of_results``, a name that
+        is both an argument and a result means the result.
+        """
         if isinstance(value, Source):
             return value
         if isinstance(value, Memory):

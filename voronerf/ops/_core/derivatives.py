@@ -14,17 +14,19 @@ from voronerf.ops._core.custom_op import Op
 def needed_gradients(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
     """Returns for each input of an op whether its gradient will be used; an absent optional input is None.
 
-    ``ctx.needs_input_grad`` says which inputs require a gradient, not which gradients the caller has asked for. In
-    ``torch.autograd.grad(y, x, create_graph=True)`` the weights' gradients, half of the products of an eikonal loss,
-    would be computed and dropped. This function asks the autograd engine, as torch's layers do.
+    ``ctx.needs_input_grad`` says which inputs require a gradient, not which gradients the caller has asked for. If
+    the caller asks only for the gradient of x, as an eikonal loss does with ``create_graph=True``, the gradients of the
+    weights would be computed too, and dropped: half of all products. This function asks the autograd engine, as torch's
+    layers do.
     """
     edges = iter(ctx.next_functions)
     nodes = [None if tensor is None else next(edges)[0] for tensor in inputs]
     if _ask is None:
         return [node is not None for node in nodes]
     answers, sure = list[bool](), False
-    # Parameters are the last inputs, and mostly leaves. If a leaf's gradient is used, the gradients of all leaves
-    # before it count as used. For an input of torch.autograd.grad the engine raises RuntimeError, which takes 10 us.
+    # Parameters are the last inputs, and mostly leaves. Once the gradient of one leaf is needed, all leaves before it
+    # count as needed, without a query. A query for a leaf that is an input of torch.autograd.grad raises RuntimeError:
+    # the leaf's gradient is needed. Such a query takes 10 us.
     for node in reversed(nodes):
         leaf = type(node).__name__ == "AccumulateGrad"
         if node is None or (sure and leaf):
@@ -43,10 +45,12 @@ _ask = getattr(torch._C, "_will_engine_execute_node", None)
 
 
 def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:
-    """Returns the variables of a double backward, and whether its results are differentiated again.
+    """Returns the inputs of a double backward, and whether its results must be differentiable.
 
-    If so, the variables are aliases of the tensors within the caller's graph. If one tensor was computed from another,
-    that graph differentiates the path between them. Call this function before ``torch.enable_grad``.
+    If the results must be differentiable, a tensor that requires a gradient becomes an alias within the caller's graph.
+    Any other tensor becomes a detached leaf. If a tensor y was computed from a tensor x, a derivative with respect to
+    the alias of x does not include the dependence of y on x, because the caller's graph accounts for it. Call this
+    function before ``torch.enable_grad``.
     """
     graph = torch.is_grad_enabled()
     leaves = [

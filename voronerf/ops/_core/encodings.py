@@ -20,9 +20,10 @@ class Encoding(NamedTuple):
         formula: (x [n, d], size) -> the encoding [n, columns] in the dtype of x, in PyTorch. The compiled module has a
             table row with the values and the gradient (csrc/encoding/encodings.h).
         columns: (d, size) -> the number of the encoding's columns.
-        fits: (d, size) -> whether the encoding exists.
-        octaves: the number of columns of x for each angle, if the compiled module computes sines and cosines of
-            octaves; 0 if it applies a formula to each row.
+        fits: (d, size) -> whether rows of d columns can be encoded with this size.
+        octaves: the number of columns of x for one angle, if the encoding has sines and cosines of octaves: 1 for the
+            angle, 2 for its mean and variance. 0 for any other encoding, which the compiled module computes by a
+            formula for each row.
         positions: whether a layer table may use the encoding for positions.
         directions: whether a layer table may use the encoding for directions.
     """

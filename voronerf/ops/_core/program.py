@@ -143,9 +143,9 @@ class Step(NamedTuple):
         out: the index of the computed value; for outer, columns and scatter, the index of the sum.
         width: the number of columns of the value; for a scatter, the columns of g.
         operands: the columns that the step reads. linear: x, an optional addend, and the operand of ``relu_slope``.
-            function: x and an optional factor. encode, scatter: the arguments of F_m, G_m and T_m, all values; G_1 has
-            F_0(x) as a third operand, for the kernels. No gradient flows to this operand, because it depends on x and
-            the table alone.
+            function: x and an optional factor. encode, scatter: the arguments of F_m, G_m or T_m, which are columns of
+            values, not of parameters. G_1 has F_0(x) as a third operand, which kernels reuse. No gradient flows to this
+            operand, because it depends on x and the table alone.
         numbers: input: (index,). linear: (parameter, start, transposed). function: (order, a, b). total: (group size,).
             move: the first target column of each operand. outer, columns: (start,). encode: (size, parameter, m, back):
             the size as in :func:`encoded_columns`, the parameter with the table of "hash" or 0, the order, and back = 0
@@ -220,8 +220,8 @@ _ORDERS = 20  # orders of derivatives are below this
 def _order(step: Step) -> int:
     """Returns the order of derivative of a step.
 
-    The compiled module has F_0, G_1 and T_0 of an encoding. Every higher derivative counts as order `_ORDERS`,
-    which the compiled module has for no function.
+    The compiled module has F_0, G_1 and T_0 of an encoding. Every higher derivative of an encoding counts as order
+    `_ORDERS`, which exceeds every order that the compiled module supports.
     """
     if step.op == "function":
         return int(step.numbers[0])
@@ -258,7 +258,7 @@ def check(program: Program) -> None:
         return inside and (not widths or width in widths) and not (rows and (spread or of != VALUE))
 
     def hashed(x: Columns, grid: int, table: int) -> bool:
-        """Returns whether ``x`` is a whole per-sample input of positions, and the parameter is the grid's table."""
+        """Returns whether ``x`` is an entire per-sample input [n, 3], and the parameter can be the grid's table."""
         maker = values[x.index]
         whole = maker.op == "input" and maker.numbers[0] not in program.rays and x.width == maker.width == 3
         available = whole and grid < len(grids) and table < len(parameters)
@@ -503,7 +503,7 @@ class Builder:
         return self.emit("total", x.width // group, (self.rows(x),), (group,))
 
     def move(self, width: int, parts: Sequence[tuple[Columns, int]]) -> Columns:
-        """Adds a step that places parts in ``width`` zero columns, each from its first column; overlaps are summed."""
+        """Adds a step that places each part in ``width`` zero columns at its target column; overlaps are summed."""
         if len(parts) == 1 and parts[0][0].width == width and not parts[0][0].spread and parts[0][0].of == VALUE:
             return parts[0][0]
         return self.emit("move", width, [columns for columns, _ in parts], [at for _, at in parts])
@@ -546,7 +546,7 @@ class Builder:
         return self.emit("encode", x.width, operands, (size, parameter, len(along) + 1, 1), name)
 
     def rows(self, columns: Columns) -> Columns:
-        """Returns the columns as columns of a value; a step copies columns of a parameter, or a broadcast column."""
+        """Returns the columns, or a copy of them as a value if they belong to a parameter or are a broadcast column."""
         return self.apply("copy", columns) if columns.of == PARAMETER or columns.spread else columns
 
     def add_outer(self, index: int, g: Columns, x: Columns, start: int) -> None:
@@ -562,7 +562,7 @@ class Builder:
     def add_scatter(
         self, index: int, x: Columns, g: Columns, grid: int, parameter: int, along: Sequence[Columns] = ()
     ) -> None:
-        """Adds a scatter step: adds the table's gradient of ``<g, F_m(x; along)>`` to a sum [e, f]."""
+        """Adds a scatter step: adds the table gradient of ``<g, F_m(x; along)>`` (T_m) to a sum [e, f]."""
         operands = tuple(self.rows(each) for each in (x, g, *along))
         self.steps.append(Step("scatter", index, g.width, operands, (grid, parameter, len(along))))
 
@@ -770,7 +770,7 @@ def _differentiate_encode(b: Builder, arriving: _Arriving, step: Step, g: Column
     size, parameter, order, back = map(int, step.numbers)
     x, *along = step.operands
     if back:
-        # With the arriving gradient c, <c, G_m(x, g; h ..)> is <g, F_m(x; h .., c)>. The operand F_0(x) needs none.
+        # With the arriving gradient c, <c, G_m(x, g; h ..)> is <g, F_m(x; h .., c)>. F_0(x) gets no gradient.
         g, along = along[0], [*along[1:order], g]
     _differentiate_product(b, arriving, step.name, size, parameter, x, g, along)
 

@@ -12,7 +12,7 @@ A recording holds the storages of all tensors that its calls take. If one of the
 All values that vary from run to run lie in memory: numbers of rows (rows.py), other numbers
 (:func:`voronerf.ops._core.rows.varying`), random integers, and results of earlier calls. One call of
 :meth:`Recording.replay` can make several runs, in which only random integers and results of calls differ. The
-memory fits a quarter more rows than the recorded run. :meth:`Recording.replay` makes no run with more rows than fit.
+memory has room for a quarter more rows than the recorded run; :meth:`Recording.replay` makes no run with more rows.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class _Held(NamedTuple):
 
 
 class _Computed(NamedTuple):
-    """A torch operation to repeat after the first ``after`` compiled calls; ``result`` is None for an in-place one."""
+    """A torch operation to repeat after the first ``after`` compiled calls; ``result`` is None if it is in place."""
 
     after: int
     function: Any
@@ -82,7 +82,7 @@ class Recording(TorchDispatchMode):
         >>> with Recording() as recording:
         ...     cells = nearest_centre(recording.take(points), centres)
         >>> others = torch.rand(6, 3)
-        >>> recording.obstacle, recording.replay(threads=1, taken=[others])
+        >>> recording.obstacle, recording.replay(threads=1, inputs=[others])
         (None, 1)
         >>> bool((recording.now(cells) == nearest_centre(others, centres)).all())
         True
@@ -182,7 +182,7 @@ class Recording(TorchDispatchMode):
         rows, *columns = shape
         assert isinstance(rows, RowCount)
         with _disable_current_modes():
-            whole = like.new_empty([rows.most + max(rows.more, 0), *columns], dtype=dtype)
+            whole = like.new_empty([rows.capacity + max(rows.offset, 0), *columns], dtype=dtype)
             self._compiled.advise_huge_pages(whole, whole.nbytes)
         self._register(whole, rows.count)
         return whole[: int(rows)]
@@ -196,13 +196,13 @@ class Recording(TorchDispatchMode):
     def _refuse(self, reason: str) -> None:
         self.obstacle = self.obstacle or reason or None
 
-    def replay(self, threads: int, times: int = 1, taken: Sequence[Tensor] = ()) -> int:
+    def replay(self, threads: int, times: int = 1, inputs: Sequence[Tensor] = ()) -> int:
         """Makes the recorded calls again.
 
         Args:
             threads: The number of threads of the calls.
             times: The number of runs.
-            taken: The inputs of these runs, one for each call of :meth:`take`.
+            inputs: The inputs of these runs, one for each call of :meth:`take`.
 
         Returns:
             The number of completed runs: fewer than ``times`` if memory is too small for the rows, 0 if a tensor moved.
@@ -212,15 +212,15 @@ class Recording(TorchDispatchMode):
         """
         if not self._calls.hold():
             return 0
-        self._taken[:] = taken
+        self._taken[:] = inputs
         for count in self._counts:
-            rows = count.given()  # type: ignore[misc]
-            if not 0 < rows <= count.most:
+            rows = count.read()  # type: ignore[misc]
+            if not 0 < rows <= count.capacity:
                 return 0
             count.now = rows
         for number, _, value in self._numbers:
             number.value = value()
-        for memory, tensor in zip(self._inputs, taken, strict=True):
+        for memory, tensor in zip(self._inputs, inputs, strict=True):
             self._tensor_now(memory).copy_(tensor.detach())
         if self._range is None:
             return self._run(threads, times, 0, [], 0)
@@ -235,7 +235,15 @@ class Recording(TorchDispatchMode):
         return completed
 
     def _run(self, threads: int, times: int, drawn: int, places: Sequence[int], size: int) -> int:
-        """Runs the calls and torch operations in order; ``size`` is the bytes of one array of random integers."""
+        """Runs the calls and torch operations in order, and returns the number of completed runs.
+
+        Args:
+            threads: The number of threads of the calls.
+            times: The number of runs.
+            drawn: The address of the random integers for all runs.
+            places: The addresses of the arrays that receive random integers in each run.
+            size: The bytes of one of these arrays.
+        """
         calls, every = self._calls, len(self._calls)
         if not self._computed:
             completed: int = calls.replay(threads, times, 0, every, drawn, places, size)
@@ -278,9 +286,9 @@ class Recording(TorchDispatchMode):
         return held.value
 
     def counted_now(self, recorded: Any) -> Any:
-        """Returns the result of :meth:`now` for another recording, in which numbers of rows stay `RowCount`."""
+        """Returns an object as :meth:`now` does, for use in another recording: numbers of rows remain `RowCount`."""
         if isinstance(recorded, RowCount):
-            return RowCount.of(recorded.count, recorded.more)
+            return RowCount.of(recorded.count, recorded.offset)
         return self._tensor_now(recorded) if isinstance(recorded, Tensor) else mapped(self.counted_now, recorded)
 
     def _counts_of(self, recorded: Any) -> list[Count]:

@@ -22,14 +22,14 @@ class Count:
 
     Attributes:
         memory: The number, int64 [1].
-        most: The largest number for which memory is allocated.
-        given: The function that returns the number before each run; None if a compiled call computes it.
+        capacity: The largest number for which memory is allocated.
+        read: The function that returns the number before each run; None if a compiled call computes it.
     """
 
-    __slots__ = ("_number", "given", "memory", "most")
+    __slots__ = ("_number", "capacity", "memory", "read")
 
-    def __init__(self, memory: Tensor, most: int, given: Callable[[], int] | None) -> None:
-        self.memory, self.most, self.given = memory, most, given
+    def __init__(self, memory: Tensor, capacity: int, read: Callable[[], int] | None) -> None:
+        self.memory, self.capacity, self.read = memory, capacity, read
         self._number = ctypes.c_int64.from_address(memory.data_ptr())
 
     @property
@@ -50,24 +50,24 @@ class RowCount(int):
     """
 
     count: Count
-    more: int
+    offset: int
     address: int
-    most: int
+    capacity: int
 
     @classmethod
-    def of(cls, count: Count, more: int = 0) -> RowCount:
-        """Makes the `RowCount` of a count plus ``more``; as an int, it is the number in this run."""
-        rows = cls(count.now + more)
-        rows.count, rows.more, rows.address, rows.most = count, more, count.memory.data_ptr(), count.most
+    def of(cls, count: Count, offset: int = 0) -> RowCount:
+        """Makes the `RowCount` of a count plus ``offset``; its int value is the number of rows in this run."""
+        rows = cls(count.now + offset)
+        rows.count, rows.offset, rows.address, rows.capacity = count, offset, count.memory.data_ptr(), count.capacity
         return rows
 
     @property
     def now(self) -> int:
         """The number of rows in this run."""
-        return self.count.now + self.more
+        return self.count.now + self.offset
 
-    def __add__(self, more: Any) -> Any:
-        return RowCount.of(self.count, self.more + more) if type(more) is int else int(self) + more
+    def __add__(self, offset: Any) -> Any:
+        return RowCount.of(self.count, self.offset + offset) if type(offset) is int else int(self) + offset
 
     def __sub__(self, less: Any) -> Any:
         return self + -less if type(less) is int else int(self) - less

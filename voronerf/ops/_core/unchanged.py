@@ -11,7 +11,7 @@ class Never:
     """A guard for use without the compiled module; `holds` is always False, so every call checks its dependencies."""
 
     def holds(self) -> bool:
-        """Returns whether all noted objects are unchanged."""
+        """Returns False, since this guard notes no objects."""
         return False
 
     def _note(self, *noted: Any) -> None:

@@ -51,19 +51,19 @@ def adam(
         square  <- b2 square + (1 - b2) g^2
         p       <- p - rate / (1 - b1^s) mean / (sqrt(square) / sqrt(1 - b2^s) + epsilon)
 
-    If a parameter's rule has ``every=False``, entries whose gradient is 0 keep their values and both moments, as in
-    hash grids of tiny-cuda-nn. If an entry gets its first gradient late, its first step is (1 - b1) / sqrt(1 - b2)
-    times the rate.
+    If a parameter's rule has ``dense=False``, entries whose gradient is 0 keep their values and both moments, as in
+    hash grids of tiny-cuda-nn. If an entry gets its first gradient after many steps, this entry moves by about
+    (1 - b1) / sqrt(1 - b2) times the rate. Not differentiable.
 
     Args:
         rules: One rule for each parameter.
-        parameters: float32, any shapes, contiguous.
-        gradients: float32, the shapes of the parameters. Not differentiable.
-        means: float32, the shapes of the parameters, contiguous: the first moments.
-        squares: float32, the shapes of the parameters, contiguous, >= 0: the second moments.
-        guard: The NaN guard, which skips the step if its ``found`` is not 0; None for no guard.
+        parameters: The parameters to update, float32 of any shapes, contiguous.
+        gradients: The gradients of the loss, float32, in the shapes of the parameters.
+        means: The first moments, float32, in the shapes of the parameters, contiguous.
+        squares: The second moments, >= 0, float32, in the shapes of the parameters, contiguous.
+        guard: The NaN guard, which skips the step if its ``skip`` is not 0; None for no guard.
         loss: float32 [], the loss of the step. If there is a loss, the guard first checks this step. It skips and
-            counts the step if the loss, or a gradient whose rule has ``every``, is NaN or not below the limit in
+            counts the step if the loss, or a gradient whose rule has ``dense``, is NaN or not below the limit in
             magnitude.
         backend: "auto", "reference", "native" or "warp".
 
@@ -78,7 +78,7 @@ def adam(
         >>> weight, steps
         (tensor([-0.2500,  0.2500]), tensor(1.))
         >>> table = [torch.zeros(3)]  # only one entry gets a gradient
-        >>> adam([Rule(steps, 0.25, every=False)], table, [torch.tensor([0.0, 1, 0])], [torch.ones(3)], [torch.ones(3)])
+        >>> adam([Rule(steps, 0.25, dense=False)], table, [torch.tensor([0.0, 1, 0])], [torch.ones(3)], [torch.ones(3)])
         >>> (table[0] != 0).tolist()
         [False, True, False]
     """
@@ -94,7 +94,10 @@ def adam(
 
 
 def _makes_step(parameters: Any, backend: str) -> bool:
-    """Returns whether the compiled module checks the arguments and makes the whole step."""
+    """Returns whether the compiled module makes the whole step and also checks the arguments.
+
+    It does so for the native backend outside ``torch.compile``. ``parameters`` is not yet checked.
+    """
     first = parameters[0] if isinstance(parameters, (list, tuple)) and parameters else None
     if not isinstance(first, Tensor) or torch.compiler.is_dynamo_compiling():
         return False
@@ -106,9 +109,11 @@ def average(
 ) -> None:
     """Moves averages towards the parameters, in place: ``averages += share * (parameters - averages)``.
 
+    Not differentiable.
+
     Args:
-        averages: float32, any shapes, contiguous.
-        parameters: float32, the shapes of the averages, contiguous; None for zero. Not differentiable.
+        averages: the moving averages, float32 of any shapes, contiguous.
+        parameters: the parameters, float32, in the shapes of the averages, contiguous; None for zeros.
         share: the fraction of the difference to move by: a number from 0 to 1, or float32 [].
         backend: "auto", "reference", "native" or "warp".
 
@@ -171,7 +176,11 @@ def _check_all(
 
 
 def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Sequence[Any]) -> bool:
-    """Returns whether the lists have elements; raises unless all are as long as ``first``, the list called ``name``."""
+    """Returns False if the lists are empty, else True.
+
+    Raises TypeError for an argument that is not a list, and ValueError unless all of ``lists`` have the length of the
+    list ``first``. ``name`` is the name of ``first`` in the message.
+    """
     for key, tensors in {name: first, **lists}.items():
         if not isinstance(tensors, Sequence):
             raise TypeError(f"{op}: {key} must be a list, got {type(tensors).__name__}")
@@ -183,7 +192,11 @@ def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Se
 def _check_lists(
     op: str, lists: dict[str, Sequence[Tensor]], read: str, scalars: Sequence[tuple[str, Any]] = ()
 ) -> None:
-    """Checks the tensors of all parameters, and scalars []; only the tensors named ``read`` need not be contiguous."""
+    """Checks dtype, shape and device of the tensors of each parameter, and that each scalar has shape [].
+
+    All tensors must be contiguous, except in one list: ``read`` is the name of this list without its plural s, or empty
+    if there is no such list.
+    """
     if alike([*lists.values()], [name[:-1] != read for name in lists], [value for _, value in scalars]):
         return
     for tensors in zip(*lists.values(), strict=True):
@@ -195,7 +208,7 @@ def _check_lists(
 
 
 def _check(op: str, tensors: dict[str, Tensor], read: str) -> None:
-    """Checks the tensors of one parameter."""
+    """Checks the tensors of one parameter; the tensor named ``read`` need not be contiguous."""
     first, *_ = tensors.values()
     for name, tensor in tensors.items():
         check_tensor(op, name, tensor)
@@ -219,7 +232,7 @@ def _check_rule(rule: Rule, parameter: Tensor) -> None:
     else:
         check_number(_OP, "learning_rate", rule.learning_rate)
     check_number(_OP, "epsilon", rule.epsilon)
-    check_flag(_OP, "every", rule.every)
+    check_flag(_OP, "dense", rule.dense)
     betas = rule.betas
     if not isinstance(betas, (tuple, list)) or len(betas) != 2:
         raise TypeError(f"{_OP}: betas must be a pair of numbers, got {betas!r:.60}")

@@ -1,4 +1,4 @@
-"""The cases of ``adam`` and ``average``."""
+"""Draws valid arguments of ``adam`` and ``average`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _make(draw: Draw, n: int) -> Arguments:
         lists["squares"].append(draw.uniform(size, 2).contiguous())
     guard = draw.among("guard", Guard.on("cpu"), None)
     loss = None if guard is None else torch.tensor(draw.among("loss", 0.5, torch.nan))
-    rules = [Rule(torch.tensor(2.0), 0.01), Rule(torch.tensor(0.0), 0.02, every=False)]
+    rules = [Rule(torch.tensor(2.0), 0.01), Rule(torch.tensor(0.0), 0.02, dense=False)]
     return {"rules": rules, **lists, "guard": guard, "loss": loss}
 
 

@@ -1,4 +1,4 @@
-"""``adam`` and ``average`` of the compiled module. Not custom ops, because these cannot take lists of rules."""
+"""``adam`` and ``average`` of the compiled module. They are not custom ops, which cannot take lists of rules."""
 
 from __future__ import annotations
 
@@ -21,16 +21,19 @@ def adam(
     guard: Guard | None,
     loss: Tensor | None,
 ) -> None:
-    """Makes a step for several parameters; see ``voronerf.ops.adam``. On CUDA 36 parameters take two launches."""
+    """Makes a step for several parameters; see ``voronerf.ops.adam``.
+
+    On CUDA, a step takes two kernel launches for each group of up to 36 parameters.
+    """
     compiled, machine = native.compiled, native.machine(parameters[0])
     records = []
-    for step, rate, (first, second), epsilon, every in rules:
+    for step, rate, (first, second), epsilon, dense in rules:
         number, at = (0.0, rate) if isinstance(rate, Tensor) else (rate, None)
-        records.append(compiled.AdamRule(number, at, step, first, second, epsilon, every))
-    found, skipped, in_a_row, scale, limit = guard or (None, None, None, None, 0.0)
+        records.append(compiled.AdamRule(number, at, step, first, second, epsilon, dense))
+    skip, skipped, in_a_row, scale, limit = guard or (None, None, None, None, 0.0)
     if scale is not None and isinstance(machine, compiled.Cpu):
         gradients, scale = [gradient / scale for gradient in gradients], None
-    judged = compiled.AdamGuard(loss, limit, found, skipped, in_a_row, scale)
+    judged = compiled.AdamGuard(loss, limit, skip, skipped, in_a_row, scale)
     arguments = records, parameters, gradients, means, squares, judged, [parameter.numel() for parameter in parameters]
     if isinstance(machine, compiled.Cuda):
         compiled.adam(*arguments, parameters[0].new_empty(compiled.adam_workspace(len(rules), machine)), machine)

@@ -14,15 +14,15 @@ class Rule(NamedTuple):
 
     Attributes:
         step: float32 [], the number of steps done, on the device of the parameter; `adam` increments it.
-        learning_rate: the rate; or float32 [] on the device of the parameter, which a CUDA graph can read.
+        learning_rate: a number; or a tensor float32 [] on the device of the parameter, which a CUDA graph can read.
         betas: the decay rates of the two moments, in [0, 1).
         epsilon: > 0, added to the square root.
-        every: whether entries without a gradient are updated too, as in ``torch.optim.Adam``.
+        dense: whether entries without a gradient are updated too, as in ``torch.optim.Adam``.
 
     Examples:
         >>> import torch
         >>> from voronerf.ops import Rule
-        >>> Rule(torch.tensor(0.0), learning_rate=0.02, every=False).betas
+        >>> Rule(torch.tensor(0.0), learning_rate=0.02, dense=False).betas
         (0.9, 0.999)
     """
 
@@ -30,7 +30,7 @@ class Rule(NamedTuple):
     learning_rate: float | Tensor
     betas: tuple[float, float] = (0.9, 0.999)
     epsilon: float = 1e-8
-    every: bool = True
+    dense: bool = True
 
 
 class Guard(NamedTuple):
@@ -39,11 +39,11 @@ class Guard(NamedTuple):
     All tensors are float32 [] on the device of the parameters, so the host reads none of them.
 
     Attributes:
-        found: not 0 if the step is to be skipped; `adam` writes it if it gets a loss.
-        skipped: the number of skipped steps; `adam` increments it if it gets a loss.
+        skip: not 0 if the step is to be skipped; a call of `adam` with a loss sets this flag.
+        skipped: the number of skipped steps, counted by calls of `adam` with a loss.
         in_a_row: the number of steps skipped since the last completed step; counted like ``skipped``.
         scale: the loss scale by which the gradients are divided; None for 1.
-        limit: the limit on the magnitudes of the loss, and of the gradients whose rule has ``every``.
+        limit: the limit on the magnitudes of the loss, and of the gradients whose rule has ``dense``.
 
     Examples:
         >>> from voronerf.ops import Guard
@@ -51,7 +51,7 @@ class Guard(NamedTuple):
         tensor(0.)
     """
 
-    found: Tensor
+    skip: Tensor
     skipped: Tensor
     in_a_row: Tensor
     scale: Tensor | None = None
@@ -60,8 +60,8 @@ class Guard(NamedTuple):
     @staticmethod
     def on(device: torch.device | str) -> Guard:
         """Returns a guard that has skipped no steps."""
-        found, skipped, in_a_row = (torch.zeros((), device=device) for _ in range(3))
-        return Guard(found, skipped, in_a_row)
+        skip, skipped, in_a_row = (torch.zeros((), device=device) for _ in range(3))
+        return Guard(skip, skipped, in_a_row)
 
     def begin(self, skipped: int) -> None:
         """Resets the guard and sets its number of skipped steps."""
@@ -73,16 +73,16 @@ class Guard(NamedTuple):
 
         Args:
             loss: [], the loss of the step; None leaves the guard as it is.
-            gradients: The gradients, of any shapes.
+            gradients: The gradients to check, of any shapes.
         """
         if loss is None:
             return
         beyond = ~torch.stack(
             [(tensor.abs() < self.limit).all() for tensor in (loss, *gradients)]
         )  # NaN counts as beyond the limit
-        self.found.copy_(beyond.any())
-        self.skipped.add_(self.found)
-        self.in_a_row.add_(1).mul_(self.found)
+        self.skip.copy_(beyond.any())
+        self.skipped.add_(self.skip)
+        self.in_a_row.add_(1).mul_(self.skip)
 
 
 @torch.no_grad()
@@ -98,8 +98,8 @@ def adam(
     """Makes a step for several parameters; see ``voronerf.ops.adam``."""
     left_out = torch.zeros((), dtype=torch.bool, device=parameters[0].device)
     if guard is not None:
-        guard.judge(loss, [gradient for rule, gradient in zip(rules, gradients) if rule.every])
-        left_out = guard.found != 0
+        guard.judge(loss, [gradient for rule, gradient in zip(rules, gradients) if rule.dense])
+        left_out = guard.skip != 0
         if guard.scale is not None:
             gradients = [gradient / guard.scale for gradient in gradients]
     for rule, parameter, gradient, mean, square in zip(rules, parameters, gradients, means, squares, strict=True):
@@ -112,7 +112,7 @@ def adam(
         new_mean = first * mean + (1 - first) * gradient
         new_square = second * square + (1 - second) * gradient.square()
         moved = parameter - rate * (new_mean / (new_square.sqrt() + epsilon))
-        moves = ~left_out if rule.every else (gradient != 0) & ~left_out
+        moves = ~left_out if rule.dense else (gradient != 0) & ~left_out
         for tensor, new in ((parameter, moved), (mean, new_mean), (square, new_square)):
             tensor.copy_(torch.where(moves, new, tensor))
         rule.step.add_(~left_out)

@@ -31,9 +31,9 @@ def balance_centres(
     """Moves all centres `steps` times, towards cells of equal mass; see ``voronerf.diagram.balance``.
 
     ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i`` (Elsner et al. 2023, section 3.2). N(i)
-    are the `neighbours` closest centres, or all others if there are fewer; ties go to the lowest index. norm_i is the
-    largest W of i and N(i). Updates are computed in float64 and stored in float32. The result is deterministic. Not
-    differentiable.
+    are the `neighbours` closest centres, or all others if there are fewer; ties go to the lowest index. W_i is the mass
+    of the samples in cell i, and norm_i the largest mass among cell i and its neighbours N(i). Updates are computed in
+    float64 and stored in float32. The result is deterministic. Not differentiable.
 
     Args:
         samples: the positions of the samples, finite.

@@ -1,4 +1,4 @@
-"""The case of ``balance_centres``."""
+"""Draws valid arguments of ``balance_centres`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ _inputs = _OP.inputs(
 
 @_OP.custom_op("balance_centres_native", devices=("cpu",))
 def balance_centres(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
-    """Repeats the published update; see ``voronerf.ops.balance_centres``."""
+    """Repeats the update of Elsner et al. 2023; see ``voronerf.ops.balance_centres``."""
     moved, weights = results
     cells = moved.new_empty(arguments.m, dtype=torch.int32)
     workspace = weights.new_empty(native.compiled.balance_centres_workspace(arguments.k))

@@ -12,7 +12,7 @@ from voronerf.ops.nearest_centre.reference import nearest_centre
 def balance_centres(
     samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int
 ) -> tuple[Tensor, Tensor]:
-    """Repeats the published update; see ``voronerf.ops.balance_centres``."""
+    """Repeats the update of Elsner et al. 2023; see ``voronerf.ops.balance_centres``."""
     weights = cell_masses(samples, masses, centres)
     for _ in range(steps if centres.shape[0] > 1 else 0):
         centres = published_step(centres, weights, alpha=alpha, neighbours=neighbours)

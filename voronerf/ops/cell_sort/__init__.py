@@ -21,7 +21,7 @@ def cell_sort(
     sorting. The result is bitwise the same on every backend. Cells may be empty.
 
     Args:
-        cells: values 0 to k - 1, n < 2**31.
+        cells: the cell of each sample, 0 to k - 1; n < 2**31.
         k: the number of cells, 1 to 2**27.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The case of ``cell_sort``."""
+"""Draws valid arguments of ``cell_sort`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The case of ``composite``."""
+"""Draws valid arguments of ``composite`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 _OPAQUE = 1e30
-"""The finite value for infinite density: every sample is opaque, but at length 0 the product is 0, not NaN."""
+"""The finite value that replaces infinite density: a sample of any usual length is opaque, and a sample of length 0 has
+optical depth 0, not NaN."""
 
 
 class Composite(NamedTuple):
@@ -113,7 +114,8 @@ def packed_light(optical: Tensor, ray_offsets: Tensor) -> tuple[Tensor, Tensor]:
 def _in_front(optical: Tensor) -> Tensor:
     """Returns the transmittance in front of each sample, [r, s]: exp of minus the optical depth in front.
 
-    The terms are shifted before the sum: subtracting each afterwards would give inf - inf for an opaque sample.
+    The terms are shifted before the cumulative sum, to exclude each sample's own term: subtracting it afterwards would
+    give inf - inf for an opaque sample.
     """
     before = torch.nn.functional.pad(optical[:, :-1], (1, 0))
     return torch.exp(-before.cumsum(dim=1))
@@ -131,11 +133,12 @@ def _packed_in_front(optical: Tensor, first: Tensor, last: Tensor) -> Tensor:
 
 
 class _RaySum(torch.autograd.Function):
-    """For each sample, the sum over the samples in front of it on its ray, or behind it with ``behind``.
+    """The sum over the samples in front of each sample on its ray or, if ``behind``, over the samples behind it.
 
     The two sums are each other's adjoints. One running sum over all rays, minus its value at the ray's start or end, is
-    precise enough in float64 for millions of samples. Values that are not finite are excluded from the running sum.
-    They make only the later sums of their own ray NaN, in the forward and the backward pass.
+    precise enough in float64 for millions of samples. A value that is not finite is excluded from the running sum;
+    instead, the results that contain this value are set to NaN, so other rays stay finite. The same holds for the
+    gradients.
     """
 
     @staticmethod

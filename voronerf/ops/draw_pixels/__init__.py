@@ -10,7 +10,7 @@ from torch import Tensor
 from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
 from voronerf.ops._core.checks import INDEX, Row, check_integer, check_rows
 from voronerf.ops._core.declare import declare
-from voronerf.ops.draw_pixels.reference import Known, Runs
+from voronerf.ops.draw_pixels.reference import KnownPixels, PixelRuns
 
 _SEED = Row("seed", INDEX, (1,))
 
@@ -25,12 +25,12 @@ def _of_runs() -> list[Row]:
 
 
 def _prepare(arguments: Any) -> Any:
-    runs, below, known = arguments.runs, arguments.below, arguments.known
+    runs, below, known = arguments.runs, arguments.below, arguments.known_pixels
     if known is not None:
         sizes = check_rows("draw_pixels", _of_known, [arguments.seed, known.pixels, known.distances], smooth=False)
         if not sizes["p"]:
-            raise ValueError("draw_pixels: known must hold at least one pixel, got none")
-        check_integer("draw_pixels", "several", known.several, 0, arguments.count)
+            raise ValueError("draw_pixels: known_pixels must hold at least one pixel, got none")
+        check_integer("draw_pixels", "draws", known.draws, 0, arguments.count)
     if runs is not None:
         sizes = check_rows("draw_pixels", _of_runs, [arguments.seed, runs.ends, runs.shift, runs.first], smooth=False)
         if not (sizes["n"] and sizes["p"]):
@@ -45,7 +45,7 @@ def _prepare(arguments: Any) -> Any:
 @declare(
     native=Implementation(EVERYWHERE, (torch.int32,)),
     warp=PLAIN,
-    sizes={"several": lambda arguments: 0 if arguments.known is None else arguments.known.several},
+    sizes={"draws": lambda arguments: 0 if arguments.known_pixels is None else arguments.known_pixels.draws},
     prepare=_prepare,
 )
 def draw_pixels(
@@ -53,13 +53,13 @@ def draw_pixels(
     count: Annotated[int, "1..134217728"],
     below: Annotated[int, "1..281474976710656"],
     *,
-    runs: Runs | None = None,
-    known: Known | None = None,
+    runs: PixelRuns | None = None,
+    known_pixels: KnownPixels | None = None,
     backend: str = "auto",
 ) -> tuple[
     Annotated[Tensor, "int64 [count]"],
     Annotated[Tensor, "float32 [count, 3]"],
-    Annotated[Tensor, "float32 [several]"],
+    Annotated[Tensor, "float32 [draws]"],
 ]:
     """Draws pixels with replacement, and three uniform numbers for each pixel.
 
@@ -71,11 +71,11 @@ def draw_pixels(
         count: the number of pixels to draw, b, 1 to 2**27.
         below: the number of pixels to draw from, 1 to 2**48; with ``runs``, it equals ``runs.total``.
         runs: the pixels to draw from; None for 0 to ``below`` - 1.
-        known: pixels of known distance, from which the first pixels of the batch are drawn; None for none.
+        known_pixels: pixels of known distance, from which the first pixels of the batch are drawn; None for none.
 
     Returns:
-        int64 [b], the pixels; float32 [b, 3], uniform in [0, 1); and float32 [known.several], the known distances of
-        the first pixels of the batch (shape [0] without ``known``).
+        int64 [b], the pixels; float32 [b, 3], uniform in [0, 1); and float32 [known_pixels.draws], the known distances
+        of the first pixels of the batch (shape [0] without ``known_pixels``).
 
     Examples:
         >>> import torch

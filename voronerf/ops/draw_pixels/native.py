@@ -24,8 +24,9 @@ _inputs = _OP.inputs(
     places=lambda arguments: 0 if arguments.runs is None else len(arguments.runs.first),
     bits=lambda arguments: 0 if arguments.runs is None else arguments.runs.bits,
     b="count",
-    known=_of("known", "pixels"),
-    distances=_of("known", "distances"),
-    p=lambda arguments: 0 if arguments.known is None else len(arguments.known.pixels),
+    known_pixels=_of("known_pixels", "pixels"),
+    distances=_of("known_pixels", "distances"),
+    known_count="draws",
+    p=lambda arguments: 0 if arguments.known_pixels is None else len(arguments.known_pixels.pixels),
 )
 draw_pixels = _OP.compiled_op("draw_pixels_native", "draw_pixels", _inputs, "result0", "result1", "result2")

@@ -1,4 +1,4 @@
-"""The case of ``draw_points``."""
+"""Draws valid arguments of ``draw_points`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

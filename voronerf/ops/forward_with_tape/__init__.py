@@ -17,13 +17,13 @@ _NEEDED = ("program", "inputs", "parameters")
 def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> Tape:
     """Evaluates networks and returns a tape; its ``backward`` takes a loss and the gradient of the outputs.
 
-    ``tape.backward(loss, gradient)`` equals the backward pass of a loss on ``routed_program(**network)``; the caller
-    computes ``gradient``. Only first derivatives exist.
+    If a loss is a function of the outputs of ``routed_program(**network)``, and ``gradient`` its gradient with respect
+    to the outputs, ``tape.backward(loss, gradient)`` equals ``loss.backward()``. Only first derivatives exist.
 
     Args:
-        network: the arguments of `routed_program` by name, except ``backend``: ``program``, with one output, ``inputs``
-            and ``parameters``; optionally ``ray_index`` and the arguments that locate the samples. Gradients go to all
-            parameters and inputs with ``requires_grad``.
+        network: the arguments of `routed_program` by name, except ``backend``. ``program`` (with one output),
+            ``inputs`` and ``parameters`` are required; ``ray_index`` and the arguments that locate the samples are
+            optional. Gradients go to all parameters and inputs with ``requires_grad``.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

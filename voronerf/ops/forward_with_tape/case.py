@@ -1,4 +1,4 @@
-"""The case of ``forward_with_tape``."""
+"""Draws valid arguments of ``forward_with_tape`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class Tape(ABC):
     raw: Tensor
 
     def backward(self, loss: Tensor, gradient: Tensor, *, defer: bool = False) -> Tensor:
-        """Adds the gradients of a loss to ``.grad`` of the parameters. It may be called once.
+        """Adds the gradients of a loss to ``.grad`` of the inputs and parameters. Call ``backward`` only once.
 
         Args:
             loss: [], the loss.

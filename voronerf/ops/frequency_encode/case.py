@@ -1,4 +1,4 @@
-"""The case of ``frequency_encode``."""
+"""Draws valid arguments of ``frequency_encode`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

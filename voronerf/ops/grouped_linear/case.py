@@ -1,4 +1,4 @@
-"""The case of ``grouped_linear``."""
+"""Draws valid arguments of ``grouped_linear`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

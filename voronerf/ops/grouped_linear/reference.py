@@ -53,7 +53,10 @@ def check_offsets(op: str, offsets: Tensor, n: int) -> list[int]:
 
 
 def _pieces(offsets: Tensor, n: int) -> Iterator[tuple[int, slice]]:
-    """Yields the rows of each cell in short pieces, whose sums round little and whose operands stay in the cache."""
+    """Yields pairs of a cell and a slice of its rows; a slice has at most ``_PIECE`` rows.
+
+    Sums over a short slice have small rounding errors, and the operands of a product stay in the cache.
+    """
     for cell, (low, high) in enumerate(itertools.pairwise(check_offsets("grouped_linear", offsets, n))):
         for start in range(low, high, _PIECE):
             yield cell, slice(start, min(start + _PIECE, high))

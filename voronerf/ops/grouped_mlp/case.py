@@ -1,4 +1,4 @@
-"""The case of ``grouped_mlp``."""
+"""Draws valid arguments of ``grouped_mlp`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

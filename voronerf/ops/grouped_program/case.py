@@ -1,4 +1,4 @@
-"""The case of ``grouped_program``."""
+"""Draws valid arguments of ``grouped_program`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

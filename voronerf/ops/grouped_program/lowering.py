@@ -1,5 +1,10 @@
 """The lowering of programs to the records of the compiled module (csrc/network/program_code.h), once for each program.
 
+A pair is two 16-bit numbers in the space of one float; kernels read the operands of 16-bit products as pairs. A pack is
+data that kernels prepare once for each cell: a part of a parameter in their layout, or the table of an encoding. The
+workspace of a tile has slots for its values. A value may instead be in a buffer of the call, which holds the value for
+all rows, in the order of the cells. The variables called ``memory`` are indices of such buffers.
+
 Letters: n rows, k cells, w columns of a value.
 """
 
@@ -50,8 +55,8 @@ class Lowered:
     """A lowered program, ready to run.
 
     Attributes:
-        program: the compiled module's program.
-        lookups: the lookups whose features may be kept, [n, width] each, sorted by cell.
+        program: the program object of the C++ extension.
+        lookups: the hash-grid lookups whose features, [n, width] each, sorted by cell, can be kept for the gradient.
         widths: the number of floats in a row of the features, for each lookup.
         sizes: the number of entries of each parameter for one cell.
         tables: the indices of the parameters that are tables of hash grids.
@@ -68,7 +73,7 @@ class Lowered:
 
 @functools.lru_cache(maxsize=1024)
 def compiled_runs(text: str) -> bool:
-    """Returns whether the compiled module has all derivatives of a program."""
+    """Returns whether the compiled module can run a program and all its derivatives."""
     program = Program.parse(text)
     sums = [step.out for step in program.steps if step.op == "scatter"]
     return program.orders <= _ORDERS and len(sums) == len(set(sums))
@@ -81,9 +86,9 @@ def lower(text: str, layout: str = "floats", cuda: bool = False) -> Lowered:
     Args:
         text: the text of the program.
         layout: the layout of the operands of products: "floats"; "pairs" of bfloat16; "tiles", pairs for tile
-            registers; or "parts", floats in two parts for tile registers.
-        cuda: whether the program is for CUDA, where products have one source and the layout is "floats" or "tiles" (of
-            any 16-bit type).
+            registers; or "parts", floats split into a high and a low part for tile registers.
+        cuda: whether the program is for CUDA. There a linear step multiplies only one operand, and the layout is
+            "floats" or "tiles" (of any 16-bit type).
     """
     return _Lowering(merged(Program.parse(text)), layout, cuda).lowered()
 
@@ -115,7 +120,10 @@ class _Slots:
 
 @dataclass
 class _Value:
-    """The locations of a value: a slot with rows of ``stride`` floats, memory of the call, an input, and pairs."""
+    """The places of a value, -1 for none: the slots of its floats and pairs, a buffer of the call, or an input.
+
+    A row of floats has ``stride`` entries, including padding.
+    """
 
     width: int
     stride: int
@@ -143,7 +151,7 @@ class _Lowering:
         self.memories: list[int] = []
         self.lookups: list[tuple[Lookup, int]] = []
         self.scatters: list[tuple[Lookup, int, int]] = []
-        self.output_memories: dict[int, int] = {}  # memory of outputs into which steps write their values directly
+        self.output_memories: dict[int, int] = {}  # output -> its buffer, if a step writes the output directly
         self.work = self._in_order()
         if cuda and self.half:
             self.work = _delayed(self.work)
@@ -190,7 +198,7 @@ class _Lowering:
         return [*steps, *written]
 
     def _whole(self, g: Columns) -> bool:
-        """Returns whether ``g`` is the whole value of a step, so that the value can be kept in memory of the call."""
+        """Returns whether ``g`` is the whole value of a step, so that a buffer of the call can hold the value."""
         makers = {step.out: step for step in self.program.steps if not _sums(step)}
         scattered = [step.operands[1].index for step in self.program.steps if step.op == "scatter"]
         step = makers[g.index]
@@ -198,7 +206,10 @@ class _Lowering:
         return alone and g.start == 0 and g.width == step.width and not g.spread
 
     def _scratch(self) -> int:
-        """Returns the number of columns of each part of the scratch memory of steps."""
+        """Returns the number of columns of each part of the scratch memory; 0 if no step needs it.
+
+        A step copies its operands into the parts, in the layout that its kernel reads.
+        """
         widths = [0]
         for step in [] if self.cuda else self.work:
             if step.op == "encode" and step.name == HASH:
@@ -220,7 +231,7 @@ class _Lowering:
     # Records ----------------------------------------------------------------------------------------------------------
 
     def pack(self, kind: str, parameter: int, start: int, width: int, floats: int, shape: tuple[int, int]) -> int:
-        """Returns the index of the pack with a part of a parameter; adds the pack if it is new."""
+        """Returns the index of the pack for a part of a parameter, ``floats`` in size; adds the pack if it is new."""
         key = (kind, parameter, *shape, start, width)
         if key not in self.packs:
             self.packs[key] = len(self.packs), self.packed
@@ -235,8 +246,11 @@ class _Lowering:
     def operand(self, c: Columns, place: int = 0, *, product: bool = False) -> Any:
         """Returns the record of an operand.
 
-        ``product``: whether the step reads pairs if they exist. This holds for x of a linear step and, with tile
-        registers, for its slope and the operands of sums.
+        Args:
+            c: the columns of the operand.
+            place: the first target column of the operand of a move; 0 for other steps.
+            product: whether the record also refers to the pairs of the value, if it has them. Kernels read the x of a
+                linear step as pairs. With tile registers they also read pairs for ``relu_slope`` and for sums.
         """
         fields: dict[str, Any] = dict.fromkeys(("memory", "input", "pairs"), _NONE)
         fields |= {"start": c.start, "width": c.width, "place": place, "spread": c.spread}
@@ -255,7 +269,7 @@ class _Lowering:
         """Appends the record of a step."""
         operands = list(operands)
         fields: dict[str, Any] = {"function": "copy", "binary": "add", "encoding": "frequency", "finish": "none"}
-        fields |= {"hands": "nothing", "from_registers": False}
+        fields |= {"to_registers": "nothing", "from_registers": False}
         fields |= {
             "order": 0,
             "width": 0,
@@ -271,12 +285,12 @@ class _Lowering:
         if value is not None:
             fields |= {"width": value.width, "slot": max(value.slot, 0), "stride": value.stride}
             fields |= {"memory": value.memory, "pairs": value.pairs, "floats": value.floats}
-        fields |= {"first": len(self.operands), "taken": len(operands)}
+        fields |= {"first": len(self.operands), "operand_count": len(operands)}
         self.steps.append(self.compiled.ProgramStep(op=op, **(fields | members)))
         self.operands += operands
 
     def memory(self, width: int) -> int:
-        """Adds a memory of the call, [n][width], and returns its index."""
+        """Adds a buffer of the call, [n, width], and returns its index."""
         self.memories.append(width)
         return len(self.memories) - 1
 
@@ -346,7 +360,7 @@ class _Lowering:
     def _multipliers(self, step: Step) -> list[Step]:
         """Returns the later steps that can read a linear step's packed values from registers, on CUDA."""
         steps = list[Step]()
-        # A scattered value does not stay in registers, because the warp scatters it in between.
+        # A scattered value does not stay in registers, because the warp scatters it before the next step.
         scattered = any(reader.op == "scatter" for reader, _ in self.readers.get(step.out, []))
         if not (self.half and self.cuda) or step.op != "linear" or scattered or self._carries(self.at):
             return steps
@@ -361,7 +375,10 @@ class _Lowering:
         return steps
 
     def _slope_of(self, step: Step, dying: set[int]) -> int | None:
-        """Returns the slot of a ReLU's pairs, which gate the gradient, if this is their last use; else None."""
+        """Returns the slot with the pairs of a ReLU's output, if a ``relu_slope`` step can overwrite them; else None.
+
+        The step masks its gradient with the ReLU's output, which no later step may read.
+        """
         if step.name != "relu_slope" or step.operands[0][:2] == step.operands[-1][:2]:
             return None
         location = self.values[step.operands[-1].index]
@@ -371,7 +388,7 @@ class _Lowering:
         return place
 
     def _own_output(self, step: Step) -> int:
-        """Returns the output memory into which a step can write its value directly, else -1.
+        """Returns the buffer of an output into which a step can write its value directly, else -1.
 
         The output must be the whole value, and its rows must have no padding.
         """
@@ -398,7 +415,7 @@ class _Lowering:
         self.emit("input", value=value, number=number, points=points, in_place=value.input != _NONE)
 
     def _within(self, step: Step, stride: int) -> bool:
-        """Returns whether vector loads of a value stay within its rows; the tensor may end after the last row."""
+        """Returns whether vector loads stay within a value's rows of ``stride`` columns, and so within its tensor."""
         columns = [r.operands[p] for r, p in self.readers.get(step.out, []) if r.op not in ("move", "total", "output")]
         return all(c.spread or c.start + _padded(c.width) <= stride for c in columns)
 
@@ -421,8 +438,8 @@ class _Lowering:
         few = few and not self.cuda
         few = few and all(c.of == PARAMETER for c in added)
         order = 0 if not few else 1 if step.width == 1 else _FEW
-        kind, width = ("turned", step.width) if transposed else ("matrix", depth)
-        kind = f"few{'_turned' * transposed}" if few else kind
+        kind, width = ("transposed", step.width) if transposed else ("matrix", depth)
+        kind = f"few{'_transposed' * transposed}" if few else kind
         deep = self.pairs_of(depth) if self.tiles else -(-depth // 2) if self.half else depth
         deep = _padded(depth) if self.cuda and not self.half else deep
         number = self.pack(kind, matrix, start, width, deep * (order or self.padded_outputs(step.width)), (o, i))
@@ -441,9 +458,10 @@ class _Lowering:
         members = {"order": order, "number": number, "depth": depth, "sources": count, "finish": step.name or "none"}
         held = sources[0][:2] == (VALUE, self.in_registers)
         members["from_registers"] = held and _all_of(sources[0], self.values[self.in_registers].width)
-        members["hands"] = "sums" if self._carries(self.at) else "words" if self._multipliers(step) else "nothing"
-        if members["hands"] != "sums":
-            self.in_registers = step.out if members["hands"] == "words" else _NONE
+        kept = "sums" if self._carries(self.at) else "words" if self._multipliers(step) else "nothing"
+        members["to_registers"] = kept
+        if kept != "sums":
+            self.in_registers = step.out if kept == "words" else _NONE
         self.emit("linear", records, value, **members)
 
     def _as_pairs(self, step: Step) -> list[bool]:
@@ -510,7 +528,7 @@ class _Lowering:
         self.emit("output", [self.operand(step.operands[0])], width=step.width, number=number, depth=first)
 
     def _by_outputs(self, step: Step) -> bool:
-        """Returns whether the partial sum is stored as [outputs, inputs], which needs less padding for few outputs."""
+        """Returns whether an outer step stores its partial sum as [outputs, inputs]: the order with less padding."""
         o, i = step.operands[0].width, step.operands[1].width
         return o * _padded(i) < i * _padded(o)
 
@@ -605,7 +623,7 @@ class _Lowering:
 def _sum_records(parts: list[tuple[int, str, int, int, int, int, int, int, int]]) -> list[Any]:
     """Returns the records of the parts of sums, in order.
 
-    Parts that cover their sum without overlap are written; other parts are added.
+    If the parts of a sum cover it without overlap, they overwrite its memory. Otherwise they are added to it.
     """
     spans: dict[int, list[tuple[int, int]]] = {}
     for out, _, _, _, _, start, width, _, _ in parts:
@@ -629,12 +647,12 @@ def _sums(step: Step) -> bool:
 
 
 def _by_octaves(step: Step) -> int:
-    """Returns the number of columns of x for each angle if a step encodes octaves of sines and cosines, else 0."""
+    """Returns `Encoding.octaves` of a step: the columns of x for one angle; 0 if it encodes no sines and cosines."""
     return ENCODINGS[step.name].octaves if step.name in ENCODINGS else 0
 
 
 def _sources(step: Step) -> int:
-    """Returns the number of operands that a linear step multiplies; they are concatenated along the depth."""
+    """Returns the number of operands that a linear step concatenates and multiplies by its weights."""
     return int(step.numbers[3]) if len(step.numbers) > 3 else 1
 
 
@@ -657,9 +675,10 @@ def _delayed(steps: list[Step]) -> list[Step]:
 
 
 def _joined(steps: list[Step]) -> list[Step]:
-    """Returns the steps; joins a layer's products with several sources, adjacent in the weights, into one product.
+    """Joins the linear steps of a layer that reads several sources into one linear step; returns the steps.
 
-    The number of sources becomes the fourth number of the step. The sums stay in registers from source to source.
+    The columns of the sources must be adjacent in the weights. The number of sources becomes the fourth number of the
+    step. The sums stay in registers from source to source.
     """
     uses = [c.index for step in steps for c in step.operands if c.of == VALUE]
     makers = {step.out: step for step in steps if not _sums(step) and step.op != "output"}

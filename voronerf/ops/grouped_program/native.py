@@ -1,4 +1,6 @@
-"""Programs in the compiled module. They run every op on networks of cells. n rows, r rays, k cells, w columns.
+"""Programs in the compiled module. Every op that evaluates a network per cell runs as a program.
+
+n rows, r rays, k cells, w columns.
 
 The gradient of a program and its higher derivatives are programs too, which the same op runs. A program with
 derivatives that the compiled module lacks runs in PyTorch.
@@ -300,16 +302,16 @@ def program_inputs(
     """
     inputs, parameters, offsets, order, ray_index, _ = rows
     samples = -1 if ray_index is not None and n == r else n  # rows of per-sample inputs; -1 if n and r are equal
-    turned = [0 if x.is_contiguous() else int(_is_column_major(x, samples)) for x in inputs]
-    if 1 in turned:
-        inputs = [x.t() if turn else x for x, turn in zip(inputs, turned)]
+    transposed = [0 if x.is_contiguous() else int(_is_column_major(x, samples)) for x in inputs]
+    if 1 in transposed:
+        inputs = [x.t() if turn else x for x, turn in zip(inputs, transposed)]
     kind, kinds = _NAMES[inputs[0].dtype], ["float32"] * len(parameters)
     for table in lowered.tables:
         kinds[table] = _NAMES[parameters[table].dtype]
     return native.compiled.ProgramInputs(
         inputs=inputs,
         input_types=[kind] * len(inputs),
-        turned=turned,
+        transposed=transposed,
         parameters=[native.aligned(p) for p in parameters] if native.on_cuda(offsets) else parameters,
         parameter_types=kinds,
         strides=[size if p.shape[0] > 1 else 0 for p, size in zip(parameters, lowered.sizes)],
@@ -348,7 +350,8 @@ _LAYOUTS = {
 def _layout(products: str, tensor: Tensor) -> str:
     """Returns the layout of values: "floats", or one for 16-bit products if they are requested and the device has them.
 
-    For float32 on the CPU, ``torch.set_float32_matmul_precision`` decides; "high" means products in two parts.
+    For float32 on the CPU, ``torch.set_float32_matmul_precision`` decides. For "high", each operand is split into
+    two bfloat16 parts.
     """
     if native.on_cuda(tensor):
         return "tiles" if products != "float32" and _multiplies_halves(products, tensor.device) else "floats"
@@ -403,7 +406,7 @@ def run_gradient(
     Args:
         rows: the tensors of the program, with the kept features.
         options: the options with which the program ran.
-        arriving: the gradient to each result of the program, or None.
+        arriving: the gradient of each result of the program, or None.
         wanted: whether to return the gradient, for each input, then for each parameter.
     """
     program, count = Program.parse(options.text), len(rows.inputs)

@@ -236,7 +236,7 @@ def cells_of(offsets: Tensor, rows: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def recording() -> Iterator[None]:
-    """Enables autograd within a custom op, where it usually records nothing, so that gradients would be 0.
+    """Enables autograd within a custom op, where PyTorch disables it and gradients would be 0.
 
     PyTorch has no public function for this.
     """
@@ -256,8 +256,8 @@ def along(encode: Callable[[Tensor], Tensor], directions: Sequence[Tensor]) -> C
 
 def _slope(encode: Callable[[Tensor], Tensor], direction: Tensor, x: Tensor) -> Tensor:
     y, back, *_ = torch.func.vjp(encode, x)
-    # Two backward passes give the forward derivative: the gradient of <direction, back(v)> to v. PyTorch's own forward
-    # mode compiles TorchScript.
+    # Two backward passes give the forward derivative: the gradient of <direction, back(v)> with respect to v. PyTorch's
+    # own forward mode compiles TorchScript.
     return torch.func.vjp(lambda v: back(v)[0], torch.zeros_like(y))[1](direction)[0]
 
 

@@ -15,9 +15,9 @@ from voronerf.ops.hash_encode.reference import interpolate
 
 
 class Hashed(NamedTuple):
-    """The arguments of the encoding. With a direction [n, 3], the result is the derivative along it.
+    """The arguments of the encoding. With directions [n, 3], the result is the features' directional derivatives.
 
-    Positions are float32, and the grid is given as its text.
+    Positions are float32, and ``grid`` is the text of a `HashGrid`.
     """
 
     positions: Tensor
@@ -53,9 +53,13 @@ class HashDerivatives:
     """Registers the derivatives of the hash encoding, from a backend's two ops.
 
     ``encode`` takes the fields of `Hashed` and returns the features or, with a direction, their derivatives along it.
-    ``backward`` takes the fields of `HashedGradient` and returns the gradients of positions and table. The derivative
-    of ``backward`` needs only these two ops: with the gradient g of the features and the cotangents p and t of the two
-    results, it is the gradient of ``g * encode(t as the table) + g * encode(along p)``.
+    ``backward`` takes the fields of `HashedGradient` and returns the gradients of positions and table.
+
+    Without a direction, the derivative of ``backward`` needs only these two ops. Let g be the gradient of the features,
+    and p and t the cotangents of the two results of ``backward``: p for the gradient of the positions, t for the
+    gradient of the table. The vector-Jacobian product of ``backward`` is then the gradient, with respect to g,
+    positions and table, of ``sum(g * encode(positions, t)) + sum(g * encode(positions, table, direction=p))``. With a
+    direction, this product is computed by the reference formula.
     """
 
     def __init__(self, encode: Op, backward: Op) -> None:
@@ -91,7 +95,7 @@ class HashDerivatives:
         ctx.save_for_backward(gradient, *tensors)
 
     def backward(self, ctx: Any, cotangents: list[Tensor]) -> tuple[Any, ...]:
-        """Returns the gradients of the incoming gradient, positions, table and direction."""
+        """Returns the gradients of the inputs of ``backward``: the features' gradient, positions, table, direction."""
         saved = gradient, *tensors = ctx.saved_tensors
         arguments = Hashed._make([*tensors, ctx.grid])
         p, t = (part if want else None for part, want in zip(cotangents, (ctx.to_positions, ctx.to_table)))
@@ -124,7 +128,7 @@ class HashDerivatives:
     def _by_the_reference(
         self, gradient: Tensor, arguments: Hashed, p: Tensor | None, t: Tensor | None
     ) -> list[Tensor | None]:
-        """Returns the gradients of a derivative along a direction, by the reference formula."""
+        """Returns the gradients for `backward` if there is a direction, by the reference formula."""
         leaves, graph = aliases([gradient, arguments.positions, arguments.table, arguments.direction])
         with torch.enable_grad():
             arriving, positions, table, direction = leaves

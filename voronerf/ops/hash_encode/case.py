@@ -1,4 +1,4 @@
-"""The case of ``hash_encode``."""
+"""Draws valid arguments of ``hash_encode`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

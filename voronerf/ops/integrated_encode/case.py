@@ -1,4 +1,4 @@
-"""The case of ``integrated_encode``."""
+"""Draws valid arguments of ``integrated_encode`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def keep_heaviest(
 
     Args:
         kept_points: the points of the kept samples, contiguous.
-        kept_importance: the importances of the kept samples, contiguous; at least one slot.
+        kept_importance: the importances of the kept samples, contiguous; b >= 1 and q >= 1.
         added: the number of batches that were added so far.
         points: the points of the batch.
         weights: the weights of the samples.

@@ -1,4 +1,4 @@
-"""The case of ``keep_heaviest``."""
+"""Draws valid arguments of ``keep_heaviest`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

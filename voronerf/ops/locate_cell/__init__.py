@@ -45,13 +45,13 @@ def locate_cell(
     as in ``nearest_centre``; a point that is not finite takes the first centre on every level. Trees may be uneven. Not
     differentiable.
 
-    The CPU refuses tables that are not a tree of this depth: a diagram without centres, a child that is not a diagram,
-    a path longer than ``depth``. CUDA does not check the tables, to avoid a host read, but reads nothing outside them.
-    On CUDA, a point whose path leaves the tables or ends at no leaf gets a negative number.
+    The CPU refuses tables with a diagram without centres or with a child that is not a diagram, and refuses points that
+    reach no leaf within ``depth`` levels. CUDA does not check the tables, to avoid a host read, but reads nothing
+    outside them. On CUDA, a point whose path leaves the tables or ends at no leaf gets a negative number.
 
     Args:
-        points: n < 2**31. float16 and bfloat16 are compared in float32.
-        centres: finite, m >= 1; every diagram has at least one centre.
+        points: the points to locate, n < 2**31. float16 and bfloat16 are compared in float32.
+        centres: the centres of all diagrams, finite, m >= 1; every diagram has at least one centre.
         child_offsets: the first row of each diagram, followed by m; g >= 1.
         child: if ``child[c] >= 0``, diagram ``child[c]`` refines centre c; if ``child[c] < 0``, centre c is leaf
             ``-child[c] - 1``.
@@ -61,7 +61,8 @@ def locate_cell(
         int32 [n], the leaf of each point.
 
     Raises:
-        ValueError: the tables are not a tree of this depth (checked on the CPU only).
+        ValueError: the tables are not a tree, or a point reaches no leaf within ``depth`` levels (checked on the CPU
+            only).
 
     Examples:
         >>> import torch

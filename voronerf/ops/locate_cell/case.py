@@ -1,4 +1,4 @@
-"""The case of ``locate_cell``."""
+"""Draws valid arguments of ``locate_cell`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

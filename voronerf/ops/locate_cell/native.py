@@ -27,10 +27,11 @@ def find(
     caller: str,
     rows: Tensor | None = None,
 ) -> None:
-    """Fills ``leaves``, int32 [n]; on CUDA, all rows from number ``rows`` (int32 [1]) on get -1.
+    """Fills ``leaves``, int32 [n], the leaf of each point.
 
-    Points and centres have one dtype. ``tree`` is child_offsets, child and depth; ``caller`` is the op's name for error
-    messages.
+    ``rows``, int32 [1], is used on CUDA only: the number of leading points to locate. The other points get -1. If
+    ``rows`` is None, all points are located. Points and centres have one dtype. ``tree`` is child_offsets, child and
+    depth; ``caller`` is the op's name for error messages.
     """
     child_offsets, child, depth = tree
     compiled, machine = native.compiled, native.machine(points)

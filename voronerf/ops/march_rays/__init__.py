@@ -41,7 +41,7 @@ def march_rays(
     seed: Annotated[Tensor | None, "int32 [1]"] = None,
     spacing: Annotated[str, "linear|disparity"] = "linear",
     start: Annotated[Tensor | None, "int32 [r]"] = None,
-    most: Annotated[int | None, "1.."] = None,
+    max_samples: Annotated[int | None, "1.."] = None,
     capacity: Annotated[int | None, "1..134217728"] = None,
     contraction: Annotated[Tensor | None, "same [4] or [5, 3]"] = None,
     backend: str = "auto",
@@ -55,7 +55,7 @@ def march_rays(
     With a ``contraction``, rays and distances are in world space; the grid, its box and the positions are in contracted
     space (Barron et al. 2022, "Mip-NeRF 360", equation 10; or Mildenhall et al. 2020, "NeRF", appendix C).
 
-    To stop at opaque surfaces, march in pieces: limit each call to ``most`` samples per ray, and pass its ``stop`` as
+    To stop at opaque surfaces, march in pieces: limit each call to ``max_samples`` per ray, and pass its ``stop`` as
     ``start`` to the next call.
 
     The number of samples depends on values on the device. Without ``capacity`` the host waits for this number. With
@@ -76,10 +76,11 @@ def march_rays(
             every backend.
         spacing: the spacing of the strata, "linear" or "disparity" (equal steps of 1 / distance).
         start: the first stratum to consider, >= 0; None for 0.
-        most: the largest number of samples of a ray, at least 1; None for all.
+        max_samples: the largest number of samples of a ray, at least 1; None for all.
         capacity: the number of rows of the result, at least 1; None for the number of samples.
-        contraction: the centre and radius of a sphere; or centre, right, up, ahead and (near, a, b) of normalised
-            device coordinates. See ``voronerf.nerf.Contraction`` and ``Perspective``.
+        contraction: [4], the centre and radius of the sphere of a ``voronerf.nerf.Contraction``; or [5, 3], the rows of
+            a ``voronerf.nerf.Perspective``: the camera's centre, its right, up and forward axes, and (depth of the near
+            plane, half the width and half the height of the view at depth 1). None for a grid in world space.
 
     Returns:
         March(ray_offsets, ray_index, depths, deltas, positions, stop). Depths, deltas and positions have the dtype of

@@ -1,4 +1,4 @@
-"""The case of ``march_rays``."""
+"""Draws valid arguments of ``march_rays`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _make(draw: Draw, n: int) -> Arguments:
     elif jitter == "seed":
         call["seed"] = draw.integers(-(2**31), 2**31 - 1, 1)
     if draw.among("pieces", True, False):
-        call |= {"start": draw.integers(0, 3, n), "most": draw.number("most", 5, 1, 9)}
+        call |= {"start": draw.integers(0, 3, n), "max_samples": draw.number("max_samples", 5, 1, 9)}
         call["capacity"] = draw.number("capacity", 40, 1, 200)
     sphere, frustum = draw.uniform(4, dtype=dtype) + 0.1, draw.uniform(5, 3, dtype=dtype) + 0.1
     spacing = draw.among("spacing", *SPACINGS)

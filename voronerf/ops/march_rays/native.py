@@ -18,7 +18,7 @@ from voronerf.ops.march_rays.reference import March, fake, memory
 
 
 def space_of(arguments: Any) -> native.compiled.MarchSpace:
-    """Returns the struct of the grid's space, from the ``contraction`` of an op."""
+    """Returns the struct of the grid's space, from the argument ``contraction`` of an op."""
     contracted = 0 if arguments.contraction is None else arguments.contraction.dim()
     return native.compiled.MarchSpace(
         sphere=arguments.contraction if contracted == 1 else None,
@@ -29,10 +29,11 @@ def space_of(arguments: Any) -> native.compiled.MarchSpace:
 _OP = declared("march_rays")
 INPUTS: dict[str, Any] = {
     "s": "samples",
-    "most": lambda arguments: arguments.samples if arguments.most is None else arguments.most,
+    "max_samples": lambda arguments: arguments.samples if arguments.max_samples is None else arguments.max_samples,
     "space": space_of,
 }
-"""The members of the struct that are not arguments of the op, by name."""
+"""The sources of members of ``MarchInputs``; any other member is the argument of the same name. A source is the name of
+an argument, or a function that computes the member from the arguments."""
 inputs_of = _OP.inputs(native.compiled.MarchInputs, **INPUTS)
 
 

@@ -24,7 +24,7 @@ class March(NamedTuple):
         depths: [m], the distance of each sample along its ray, ascending.
         deltas: [m], the length of the stratum of each sample.
         positions: [m, 3], the positions of the samples in the space of the grid.
-        stop: int32 [r], the stratum at which each ray continues; s at the end of the ray.
+        stop: int32 [r], the stratum from which the next call continues each ray; s for a finished ray.
 
     Examples:
         >>> import torch
@@ -62,11 +62,11 @@ def fake(arguments: Any) -> March:
 def march_rays(*arguments: Any) -> March:
     """Samples each stratum and keeps the samples in occupied cells; see ``voronerf.ops.march_rays``."""
     origins, directions, near, far, occupied, box, samples, *options = arguments
-    uniforms, seed, spacing, start, most, capacity, contraction = options
-    most = samples if most is None else most
+    uniforms, seed, spacing, start, max_samples, capacity, contraction = options
+    max_samples = samples if max_samples is None else max_samples
     r, device = len(near), near.device
     stratum = torch.arange(samples + 1, device=device)
-    # Divisions are by tensors, because PyTorch may replace a division by a number by a product, which rounds
+    # The divisor is a tensor: if it were a Python number, PyTorch might multiply by its reciprocal, which rounds
     # differently.
     count = near.new_full((), samples)
     edges = depth_of(near[:, None], far[:, None], stratum.to(near.dtype) / count, spacing)
@@ -90,8 +90,8 @@ def march_rays(*arguments: Any) -> March:
     if start is not None:
         mask = mask & (stratum[:-1] >= start[:, None])
     rank = mask.cumsum(dim=1)
-    # A ray wants at most `most` samples, and gets fewer if the capacity is exhausted.
-    wanted = rank[:, -1].clamp(max=most)
+    # A ray wants at most `max_samples` samples, and gets fewer if the capacity is exhausted.
+    wanted = rank[:, -1].clamp(max=max_samples)
     offsets = torch.nn.functional.pad(wanted.cumsum(dim=0), (1, 0))
     if capacity is not None:
         offsets = offsets.clamp(max=capacity)
@@ -112,8 +112,8 @@ def march_rays(*arguments: Any) -> March:
         positions = torch.where(used[:, None], torch.stack(contracted(points, contraction), dim=-1), 0)
     last = torch.where(written, stratum[:-1], -1).amax(dim=1)
     waiting = torch.where(mask & ~written, stratum[:-1], samples).amin(dim=1)
-    # A ray with `most` samples continues after its last sample, a cut ray at the first sample that did not fit.
-    full = (counts == wanted) & (wanted == most)
+    # A ray with `max_samples` samples continues after its last sample, a cut ray at the first sample that did not fit.
+    full = (counts == wanted) & (wanted == max_samples)
     stop = torch.where(counts < wanted, waiting, torch.where(full, last + 1, samples))
     return March(offsets.to(torch.int32), ray_index, depths, deltas, positions, stop.to(torch.int32))
 

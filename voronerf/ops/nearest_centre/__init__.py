@@ -33,8 +33,8 @@ def nearest_centre(
     to cell 0. Not differentiable.
 
     Args:
-        points: n < 2**31, d = 1 to 4. float16 and bfloat16 are compared in float32.
-        centres: finite, k >= 1.
+        points: the points to locate, n < 2**31, d = 1 to 4. float16 and bfloat16 are compared in float32.
+        centres: the centres of the cells, finite, k >= 1.
         index: the result of `index_centres` for these centres. The time then grows with log k, and the cells are the
             same. Without an index, the CPU makes one for the call if there are at least 2,048 centres and 1,024 points.
             The reference and Warp backends ignore the index.
@@ -59,9 +59,9 @@ def nearest_centre(
 def index_centres(centres: Tensor) -> Tensor | None:
     """Returns an index of centres for `nearest_centre`: a tree of boxes, each with 16 boxes or up to 16 centres.
 
-    The index pays off from some thousand centres on if several calls use it. It has 18 to 36 bytes per centre for three
-    float32 coordinates. Its construction takes about 0.1 us per centre on one core; for a GPU it is made on the CPU and
-    copied.
+    The index pays off if several calls use it and there are at least a few thousand centres. It takes 18 to 36 bytes
+    per centre for three float32 coordinates. Its construction takes about 0.1 us per centre on one core; for a GPU it
+    is made on the CPU and copied.
 
     Args:
         centres: floating [k, d], d = 1 to 4, finite.

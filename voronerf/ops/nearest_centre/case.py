@@ -1,4 +1,7 @@
-"""The case of ``nearest_centre``. n points, k centres, d coordinates."""
+"""Draws valid arguments of ``nearest_centre`` for the tests, and lists invalid arguments.
+
+n points, k centres, d coordinates.
+"""
 
 from __future__ import annotations
 

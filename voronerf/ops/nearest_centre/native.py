@@ -18,7 +18,7 @@ def _check(centres: Tensor, index: Tensor | None) -> None:
 
 
 def check_index(op: str, centres: Tensor, index: Tensor) -> None:
-    """Raises ValueError unless the index fits the number, the number of coordinates and the dtype of the centres."""
+    """Raises ValueError unless the index was made for the shape and the dtype of the centres."""
     (k, d), size, got = centres.shape, centres.itemsize, f"int32 {list(index.shape)}"
     if len(index) == native.compiled.centre_index_words(k, d, size):
         if index.is_cuda or (head := index[:3].tolist()) == [k, d, size]:
@@ -39,7 +39,11 @@ nearest_centre = declared("nearest_centre").compiled_op(
 def find(
     cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None, index: Tensor | None = None
 ) -> None:
-    """Fills ``cells``, int32 [n], for points and centres of one dtype; on CUDA, rows from number ``rows`` on get -1."""
+    """Fills ``cells``, int32 [n], the cell of each point, for points and centres of one dtype.
+
+    ``rows``, int32 [1], is used on CUDA only: the number of leading points to locate. The other points get -1. If
+    ``rows`` is None, all points are located.
+    """
     compiled, machine = native.compiled, native.machine(points)
     n, (k, d), words = rows_of(points), centres.shape, 0 if index is None else len(index)
     if isinstance(machine, compiled.Cuda):

@@ -45,12 +45,14 @@ def observe_occupancy(
 ) -> None:
     """Updates the cells of an occupancy grid that contain rendered samples, in place.
 
-    A cell with samples gets the largest of their densities and ``decay`` times its old density (Mueller et al. 2022,
-    appendix C). If at most the fraction ``hidden`` of the light reaches a sample, its density counts as 0:
-    ``weights <= hidden * (1 - exp(-sigma * deltas))``. Cells without samples keep their density. Not differentiable.
+    The new density of a cell with samples is the maximum of two values: ``decay`` times its old density, and the
+    largest density of its samples (Mueller et al. 2022, appendix C). If at most the fraction ``hidden`` of the light
+    reaches a sample (``weights <= hidden * (1 - exp(-sigma * deltas))``), its density counts as 0. Cells without
+    samples keep their density. Not differentiable.
 
     With a ``contraction``, the grid, its box and the positions are in contracted space, ``sigma`` and ``deltas`` in
-    world space. The density of a cell is then per unit of contracted length along rays from the centre.
+    world space. The density of a cell is then per unit of contracted length along rays from the centre of the sphere or
+    of the camera.
 
     Args:
         density: the density of each cell, >= 0, contiguous.

@@ -1,4 +1,4 @@
-"""The case of ``observe_occupancy``."""
+"""Draws valid arguments of ``observe_occupancy`` for the tests."""
 
 from __future__ import annotations
 

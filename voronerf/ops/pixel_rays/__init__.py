@@ -55,8 +55,8 @@ def pixel_rays(
         box: the lowest and the highest corner; None for all of space.
         lens: the index of each camera's table, or an index out of range, such as -1, for a camera without distortion.
             Requires ``tables``.
-        tables: the directions (x, y, z) of each lens's pixels in camera axes, as stereographic projections (x, -y) / (1
-            - z), see `voronerf.nerf.lenses.LensTables`; None for no distortion.
+        tables: the directions (x, y, z) of each lens's pixels in camera axes, as stereographic projections
+            ``(x, -y) / (1 - z)``; see `voronerf.nerf.lenses.LensTables`. None for no distortion.
         background: the colour behind images with an alpha channel; None to ignore alpha.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The case of ``pixel_rays``."""
+"""Draws valid arguments of ``pixel_rays`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

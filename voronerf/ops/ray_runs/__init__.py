@@ -1,9 +1,10 @@
 """Rays through the cells of several ranks. n known samples, m of them in a rank's own cells, q runs, r rays, k cells.
 
-Each rank evaluates the samples in its own cells and sums them over runs (`own_samples`, `run_sums`). A run is a piece
-of a ray without samples of other ranks in between. The process with the runs of all ranks composes the rays and returns
-to each run the totals of its ray (`compose_runs`), from which each rank computes its gradients (`run_gradients`).
-Together the operations equal `render_loss` (Li et al. 2024, NeRF-XL). Nothing is differentiable.
+Each rank evaluates the samples in its own cells and sums them over runs (`own_samples`, `run_sums`). A run is a
+sequence of a rank's samples on one ray, with no samples of other ranks between them. The process with the runs of all
+ranks composes the rays and returns to each run the totals of its ray (`compose_runs`), from which each rank computes
+its gradients (`run_gradients`). Together the operations equal `render_loss` (Li et al. 2024, NeRF-XL). Nothing is
+differentiable.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _REFERENCE = Implementation(file="ray_runs")
 
 
 def _check_cells(arguments: Any) -> Any:
-    check_range("own_samples", "cells", arguments.cells, len(arguments.own))
+    check_range("own_samples", "cells", arguments.cells, len(arguments.local_cells))
     return arguments
 
 
@@ -35,16 +36,17 @@ def own_samples(
     depths: Annotated[Tensor, "same [n]"],
     deltas: Annotated[Tensor, "same [n]"],
     cells: Annotated[Tensor, "int32 [n]"],
-    own: Annotated[Tensor, "int32 [k]"],
+    local_cells: Annotated[Tensor, "int32 [k]"],
     *,
-    bent: bool = False,
+    curved: bool = False,
     backend: str = "auto",
 ) -> OwnSamples:
     """Selects the samples in this rank's own cells, and finds their runs.
 
     Other ranks may hold samples that this rank does not know. A run therefore also ends between two samples that are in
-    different cells and at least one stratum apart, since an unknown sample may lie between them. Between two samples of
-    one convex cell none can, unless rays are ``bent``: then the run ends there too.
+    different cells and at least one stratum apart, since an unknown sample may lie between them. On a straight ray, no
+    unknown sample can lie between two samples in the same cell, because cells are convex. On a ``curved`` ray this is
+    possible, so a run ends between any two samples that are at least one stratum apart.
 
     Args:
         positions: the positions of all samples that this rank knows, ray after ray, near to far.
@@ -52,8 +54,8 @@ def own_samples(
         depths: the distance of each sample along its ray.
         deltas: the length of the stratum of each sample.
         cells: the cell of each sample, 0 to k - 1.
-        own: the local number of each cell on this rank, or -1 for cells of other ranks.
-        bent: whether rays are curved by a contraction, and may leave a cell and come back.
+        local_cells: the local number of each cell on this rank, or -1 for cells of other ranks.
+        curved: whether rays are curved by a contraction, and may leave a cell and come back.
 
     Returns:
         OwnSamples(positions, ray_index, depths, deltas, cells, run_offsets).
@@ -65,8 +67,9 @@ def own_samples(
         >>> import torch
         >>> from voronerf.ops import own_samples
         >>> depths = torch.tensor([0.1, 0.5, 0.9])
-        >>> cells, own = torch.tensor([0, 1, 0]).int(), torch.tensor([0, -1]).int()
-        >>> mine = own_samples(torch.rand(3, 3), torch.zeros(3).int(), depths, torch.full((3,), 0.4), cells, own)
+        >>> cells, local_cells = torch.tensor([0, 1, 0]).int(), torch.tensor([0, -1]).int()
+        >>> samples = torch.rand(3, 3), torch.zeros(3).int(), depths, torch.full((3,), 0.4)
+        >>> mine = own_samples(*samples, cells, local_cells)
         >>> mine.depths, mine.run_offsets
         (tensor([0.1000, 0.9000]), tensor([0, 1, 2], dtype=torch.int32))
     """
@@ -129,8 +132,8 @@ def compose_runs(
 
     Returns:
         Answers [q, 6]: the gradient of the loss with respect to the ray's colour, the loss due to light from behind the
-        run, the optical depth in front, and the squared error of the ray; and the part [] of the loss due to the r
-        rays.
+        run, the optical depth in front, and the squared error of the ray; and the contribution [] of the r rays to the
+        loss.
 
     Raises:
         ValueError: a run's ray is outside ``first`` to ``first + r - 1`` (checked on the CPU only).

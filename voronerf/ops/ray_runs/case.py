@@ -1,4 +1,7 @@
-"""The cases of ``own_samples``, ``run_sums``, ``compose_runs`` and ``run_gradients``."""
+"""Draws valid arguments of the ops on runs of samples for the tests, and lists invalid arguments.
+
+The ops are ``own_samples``, ``run_sums``, ``compose_runs`` and ``run_gradients``.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,11 @@ def _make_known(draw: Draw, n: int) -> Arguments:
     cells = draw.integers(0, 4, n)
     call = {"positions": draw.uniform(n, 3), "ray_index": draw.integers(0, 3, n).sort()[0].int(), "cells": cells}
     depths = torch.linspace(1, 3, n) if n else torch.zeros(0)
-    call |= {"depths": depths, "deltas": draw.uniform(n), "own": torch.tensor([0, -1, 1, -1], dtype=torch.int32)}
+    local_cells = torch.tensor([0, -1, 1, -1], dtype=torch.int32)
+    call |= {"depths": depths, "deltas": draw.uniform(n), "local_cells": local_cells}
     if n > 100:  # short strata, so light reaches the end of a long ray
         call["deltas"] = 0.02 * call["deltas"]
-    return {**call, "bent": draw.among("bent", False, True)}
+    return {**call, "curved": draw.among("curved", False, True)}
 
 
 def _make_outputs(draw: Draw, n: int) -> Arguments:

@@ -46,7 +46,10 @@ def run_sums(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
 
 @_COMPOSE.custom_op("compose_runs_native", devices=("cpu",))
 def compose_runs(arguments: Any, results: tuple[Tensor, Tensor]) -> None:
-    """Fills answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
+    """Fills the argument ``answers`` [q, 6] of `run_gradients`, and the contribution [] of the r rays to the loss.
+
+    See ``voronerf.ops.compose_runs``.
+    """
     answers, loss = results
     loss.fill_(native.compiled.compose_runs(_runs(arguments), answers, native.cpu()))
 

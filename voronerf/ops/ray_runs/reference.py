@@ -1,8 +1,8 @@
 """Partial sums of rays through the cells of several ranks, and their composition to colours.
 
-r rays, n known samples, m of them in a rank's own cells (packed), q runs, c colours. A run is a piece of a ray without
-samples of other ranks in between. With the optical depth tau in front of each run, the colour of a ray is
-``sum exp(-tau) * colour of run`` (NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
+r rays, n known samples, m of them in a rank's own cells (packed), q runs, c colours. A run is a sequence of a rank's
+samples on one ray, with no samples of other ranks between them. With the optical depth tau in front of each run, the
+colour of a ray is ``sum exp(-tau) * colour of run`` (NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
 """
 
 from __future__ import annotations
@@ -75,15 +75,15 @@ def own_samples(
     depths: Tensor,
     deltas: Tensor,
     cells: Tensor,
-    own: Tensor,
-    bent: bool,
+    local_cells: Tensor,
+    curved: bool,
 ) -> OwnSamples:
     """Selects the samples in this rank's own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
-    numbers = own[cells.long()]
+    numbers = local_cells[cells.long()]
     kept = (numbers >= 0).nonzero()[:, 0]
     ray, at, length, cell = ray_index[kept], depths[kept], deltas[kept], numbers[kept]
     near = at.diff() < torch.minimum(length[1:], length[:-1])  # no stratum fits in between
-    begins = (kept.diff() != 1) | (ray.diff() != 0) | (~near if bent else (cell.diff() != 0) & ~near)
+    begins = (kept.diff() != 1) | (ray.diff() != 0) | (~near if curved else (cell.diff() != 0) & ~near)
     first = 1 + begins.nonzero()[:, 0]
     ends = torch.tensor([len(kept)], device=kept.device)
     offsets = torch.cat((ends.new_zeros(min(len(kept), 1)), first, ends)).to(torch.int32)
@@ -111,7 +111,10 @@ def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Te
 def compose_runs(
     sums: Tensor, target: Tensor, background: Tensor | None, first: int, rays: int, robust: float
 ) -> tuple[Tensor, Tensor]:
-    """Returns answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
+    """Returns the argument ``answers`` [q, 6] of `run_gradients`, and the contribution [] of the r rays to the loss.
+
+    See ``voronerf.ops.compose_runs``.
+    """
     number = sums[:, 5].double()
     wrong = number[~((number >= first) & (number < first + len(target)))]
     if len(wrong):
@@ -126,8 +129,8 @@ def compose_runs(
     error = off.square().sum(-1)
     slope = robust / (error + robust**2).sqrt() if robust else torch.ones_like(error)
     slopes, loss = off * (2 / (3 * rays) * slope)[:, None], robust_error(error, robust).sum() / (3 * rays)
-    behind_runs = whole.behind(part, ray, slopes, behind)
-    answers = torch.cat((slopes[ray], torch.stack((behind_runs, whole.before, error[ray]), 1)), 1)
+    behind_runs = whole.loss_behind(part, ray, slopes, behind)
+    answers = torch.cat((slopes[ray], torch.stack((behind_runs, whole.optical_in_front, error[ray]), 1)), 1)
     return torch.empty_like(answers).index_copy(0, order, answers), loss
 
 

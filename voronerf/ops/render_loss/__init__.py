@@ -44,9 +44,9 @@ def render_loss(
     The colour of a sample is ``sigmoid(raw[:, :3])``, its density ``density_scale * softplus(raw[:, 3])``. With
     ``activated``, colour and density are ``raw`` itself, for networks with other activations. `composite` renders the
     samples to the colours of rays. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020, equations
-    3 and 6). With ``robust`` s it is a third of the mean of ``2 s ((e + s^2).sqrt() - s)`` over the rays (Charbonnier
-    et al. 1994), where e is the squared error of a ray, summed over its channels. It is quadratic for small errors and
-    linear beyond s. The native backend computes loss and gradient in one pass over each ray.
+    3 and 6). With ``robust`` s the loss is a third of the mean of ``2 s ((e + s^2).sqrt() - s)`` over the rays
+    (Charbonnier et al. 1994), where e is the squared error of a ray, summed over its channels. It is quadratic for
+    small errors and linear beyond s. The native backend computes loss and gradient in one pass over each ray.
 
     Args:
         raw: colour and density, before their activations unless ``activated``.
@@ -61,9 +61,9 @@ def render_loss(
         hidden: the transmittance, in [0, 1), up to which a sample counts as hidden. Hidden samples have no gradient,
             but they contribute to the gradients of the samples in front of them.
         robust: the scale s of errors beyond which the loss is linear, in [0, 1); 0 for the squared error.
-        triples: the number of triples of `unseen_rays`, at most r / 3. Their rays are the last ``3 triples`` rays,
-            which have no target: their errors and the gradients of their samples are 0, but the loss is divided by the
-            number of all rays.
+        triples: the number of triples of `unseen_rays`, at most r / 3. The last ``3 triples`` rays have no target:
+            the errors of these rays and the gradients of their samples are 0, but the loss is divided by the number of
+            all rays.
 
     ``deltas``, ``target``, ``background`` and the results are float32, or float64 if ``raw`` is. The loss has
     derivatives of every order in ``raw``. Nothing else has gradients.

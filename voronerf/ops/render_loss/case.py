@@ -1,4 +1,4 @@
-"""The case of ``render_loss``."""
+"""Draws valid arguments of ``render_loss`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
-from voronerf.ops.formulas import RaysSeen
+from voronerf.ops.formulas import RenderedRays
 from voronerf.ops.render_loss.reference import scaled
 from voronerf.ops.routed_program import check_network
 
@@ -63,7 +63,7 @@ def render_opaque(
     background: Annotated[Tensor | None, "same [3] or [r, 3]"] = None,
     heaviest: bool = True,
     backend: str = "auto",
-) -> RaysSeen:
+) -> RenderedRays:
     """Renders rays without gradients or randomness; each ray ends when it is opaque.
 
     Equivalent to ``march_rays``, ``routed_program``, activations as in ``render_loss``, and ``composite``, on waves of
@@ -72,7 +72,7 @@ def render_opaque(
 
     Args:
         origins: the origins of the rays.
-        directions: the directions of the rays, unit vectors; the layers may read them.
+        directions: the directions of the rays, unit vectors; the networks may read them.
         near: the start of the first stratum.
         far: the end of the last stratum; a ray with far <= near has no samples.
         occupied: whether each cell of the box is occupied.
@@ -90,10 +90,11 @@ def render_opaque(
         spacing: the spacing of the strata, "linear" or "disparity".
         contraction: the contraction of the grid's space, as in ``march_rays``.
         background: the colour behind everything; None is black.
-        heaviest: whether to find the heaviest sample of each ray; if not, the result's ``heaviest`` is the far end.
+        heaviest: whether to find the sample with the largest weight on each ray; if not, the result's ``heaviest`` is
+            the far end.
 
     Returns:
-        RaysSeen(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]).
+        RenderedRays(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]).
 
     Raises:
         ValueError: both or neither of ``density_scale`` and ``activated``.

@@ -1,4 +1,4 @@
-"""The case of ``render_opaque``."""
+"""Draws valid arguments of ``render_opaque`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

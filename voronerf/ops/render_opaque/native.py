@@ -1,6 +1,8 @@
-"""``render_opaque`` of the compiled module: waves of some thousand samples stay in the cache from grid to colours.
+"""``render_opaque`` of the compiled module.
 
-It is not a custom op, because custom ops cannot take the dictionary ``network``.
+Each thread takes one wave of samples at a time through all steps, from marching to compositing, so that each thread
+stores the intermediate values of only one wave. The function is not a custom op, because custom ops cannot take the
+dictionary ``network``.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import torch
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
-from voronerf.ops.formulas import RaysSeen
+from voronerf.ops.formulas import RenderedRays
 from voronerf.ops.grouped_program.lowering import lower
 from voronerf.ops.grouped_program.native import Network, program_inputs
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
@@ -23,14 +25,14 @@ from voronerf.ops.routed_program.reference import count_cells
 
 _OP = declared("render_opaque")
 _rays = _OP.inputs(
-    native.compiled.MarchInputs, **{**INPUTS, "uniforms": None, "seed": None, "start": None, "most": "samples"}
+    native.compiled.MarchInputs, **{**INPUTS, "uniforms": None, "seed": None, "start": None, "max_samples": "samples"}
 )
 _rule = _OP.inputs(native.compiled.SeeRule)
 _outputs = _OP.outputs(native.compiled.SeeOutputs)
 
 
 @torch.no_grad()
-def render_opaque(*flat: Any) -> RaysSeen:
+def render_opaque(*flat: Any) -> RenderedRays:
     """Renders every ray until it is opaque, in float32; see ``voronerf.ops.render_opaque``."""
     arguments = _OP.Inputs._make(flat)
     routed = arguments.network
@@ -42,7 +44,7 @@ def render_opaque(*flat: Any) -> RaysSeen:
     tensors = (*routed.inputs, *routed.parameters, centres)
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in tensors)
     if not plain or torch.is_autocast_enabled("cpu"):
-        composed: RaysSeen = partial(reference.render_opaque, backend="native")(*arguments)
+        composed: RenderedRays = partial(reference.render_opaque, backend="native")(*arguments)
         return composed
     rows = network.rows(torch.zeros(k + 1, dtype=torch.int32))
     lowered = lower(network.options.text)
@@ -52,7 +54,7 @@ def render_opaque(*flat: Any) -> RaysSeen:
         check_tree(child_offsets, child, len(centres), "render_opaque")
     if index is not None:
         check_index("render_opaque", centres, index)
-    seen: RaysSeen = _OP.allocate(arguments)
+    seen: RenderedRays = _OP.allocate(arguments)
     outputs, compiled = _outputs(seen), native.compiled
     sound = compiled.render_opaque(
         lowered.program,

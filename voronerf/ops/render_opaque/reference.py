@@ -9,13 +9,13 @@ from torch import Tensor
 
 from voronerf.ops._core.declare import declared
 from voronerf.ops.composite import composite
-from voronerf.ops.formulas import RaysSeen, Wave, activate, walk
+from voronerf.ops.formulas import RenderedRays, Wave, activate, walk
 from voronerf.ops.march_rays import march_rays
 from voronerf.ops.routed_program import run
 
 
 @torch.no_grad()
-def render_opaque(*flat: Any, backend: str = "reference") -> RaysSeen:
+def render_opaque(*flat: Any, backend: str = "reference") -> RenderedRays:
     """Renders every ray until it is opaque; see ``voronerf.ops.render_opaque``.
 
     ``backend`` is the backend of the operations that this function calls.
@@ -23,7 +23,7 @@ def render_opaque(*flat: Any, backend: str = "reference") -> RaysSeen:
     arguments = declared("render_opaque").Inputs._make(flat)
     routed, wave = arguments.network, arguments.wave
     (origins, *seen), routing = routed.inputs, routed.routing
-    space: dict[str, Any] = {"spacing": arguments.spacing, "most": wave, "contraction": arguments.contraction}
+    space: dict[str, Any] = {"spacing": arguments.spacing, "max_samples": wave, "contraction": arguments.contraction}
 
     def look(live: Tensor, start: Tensor | None) -> Wave:
         of_rays = arguments.origins[live], arguments.directions[live], arguments.near[live], arguments.far[live]

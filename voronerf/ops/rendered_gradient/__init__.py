@@ -44,15 +44,16 @@ def rendered_gradient(
     activated: bool = False,
     backend: str = "auto",
 ) -> None:
-    """Computes a loss's gradient of ``raw`` from its gradients of rendered values, and adds it to ``gradient``.
+    """Adds the gradient of a loss with respect to ``raw`` to ``gradient``, in place.
 
-    `composite` renders the samples, with weights w and transmittance T, to the colour
-    ``sum w_i c_i + (1 - sum w_i) background``, the opacity ``sum w_i`` and the depth ``sum w_i d_i``, which is not
-    divided by the opacity. Let v_i be the derivative of the loss with respect to w_i, through these three values and
-    the weights themselves, ``of_weights_i + of_opacity + of_depth d_i + of_colour (c_i - background)``. Then the
-    gradient of the density of a sample is ``of_density_i + delta_i (T_{i+1} v_i - sum over j > i of w_j v_j)``, and the
-    gradient of its colour is ``of_rgb_i + w_i of_colour`` (Max 1995; Mildenhall et al. 2020, equation 3). The chain
-    rule through the activations gives the gradient of ``raw``. Not differentiable.
+    The arguments ``of_...`` are the gradients of the loss with respect to the values of rays and samples. `composite`
+    renders the samples, with weights w and transmittance T, to the colour ``sum w_i c_i + (1 - sum w_i) background``,
+    the opacity ``sum w_i`` and the depth ``sum w_i d_i``, which is not divided by the opacity. Let
+    ``v_i = of_weights_i + of_opacity + of_depth d_i + of_colour (c_i - background)`` be the derivative of the loss with
+    respect to w_i, both directly and through these three values. Then the gradient of the density of a sample is
+    ``of_density_i + delta_i (T_{i+1} v_i - sum over j > i of w_j v_j)``, and the gradient of its colour is
+    ``of_rgb_i + w_i of_colour`` (Max 1995; Mildenhall et al. 2020, equation 3). The chain rule through the activations
+    gives the gradient of ``raw``. Not differentiable.
 
     Args:
         gradient: the gradient of the loss with respect to the networks' outputs, contiguous, updated in place.

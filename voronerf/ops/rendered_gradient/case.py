@@ -1,4 +1,4 @@
-"""The case of ``rendered_gradient``."""
+"""Draws valid arguments of ``rendered_gradient`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from voronerf.ops.composite.reference import check_ray_offsets, composite, optic
 @torch.inference_mode(False)
 @torch.enable_grad()
 def rendered_gradient(gradient: Tensor, *arguments: Any) -> None:
-    """Adds the gradient; see ``voronerf.ops.rendered_gradient``."""
+    """Adds the gradient of a loss with respect to ``raw``; see ``voronerf.ops.rendered_gradient``."""
     *tensors, hidden, density_scale, activated = (saveable(value) for value in arguments)
     raw, density, depths, deltas, _, ray_offsets, background, *slopes = tensors
     check_ray_offsets("rendered_gradient", ray_offsets, len(density))

@@ -1,4 +1,4 @@
-"""The case of ``resample``."""
+"""Draws valid arguments of ``resample`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

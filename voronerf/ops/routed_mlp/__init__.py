@@ -42,8 +42,8 @@ def routed_mlp(
     The native CPU implementation gathers and scatters rows inside the tiles of the network. It makes no permuted copy,
     and for the backward pass keeps only the order (int32) and the features of hashed positions. Positions,
     directions, features, weights and biases have gradients of every order; the choice of the cell has none. A sample
-    whose coordinates are not finite goes to the first cell, as in ``locate_cell``. A network of one cell (k = 1) needs
-    no tables, and its samples are neither located nor sorted.
+    whose coordinates are not finite goes to the first cell, as in ``locate_cell``. With one cell
+    (k = 1), neither ``centres`` nor ``cells`` is needed, and the samples are neither located nor sorted.
 
     Args:
         positions: [n, p] floating point, n < 2**31: the input of the layers, as in ``grouped_mlp``.
@@ -55,8 +55,8 @@ def routed_mlp(
         child_offsets: int32 [g + 1], or None for a flat diagram.
         child: int32 [m], or None for a flat diagram. The leaves are the cells, 0 to k - 1.
         depth: the number of levels of the tree.
-        cells: int32 [n], the cell of each sample, 0 to k - 1, in place of the tables; for example a stochastic or a
-            reused assignment.
+        cells: int32 [n], the cell of each sample, 0 to k - 1, for example a stochastic or a reused assignment; given
+            instead of ``centres``, ``child_offsets`` and ``child``.
         coords: [n, 3] floating point, the locations of the samples; None uses the first three features of the
             positions.
         directions: [n, q], or [r, q] with ``direction_index``; None if no layer reads directions.
@@ -75,8 +75,8 @@ def routed_mlp(
         int32 [n].
 
     Raises:
-        ValueError: the tables are not a tree, a cell is outside 0 to k - 1, or a direction_index is outside 0 to r - 1
-            (checked on the CPU only).
+        ValueError: ``child_offsets`` and ``child`` do not form a tree, a cell is outside 0 to k - 1, or a
+            direction_index is outside 0 to r - 1 (checked on the CPU only).
 
     Examples:
         >>> import torch

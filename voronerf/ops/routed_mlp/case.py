@@ -1,4 +1,4 @@
-"""The case of ``routed_mlp``."""
+"""Draws valid arguments of ``routed_mlp`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

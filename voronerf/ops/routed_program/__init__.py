@@ -52,10 +52,11 @@ def routed_program(
         child_offsets: int32 [g + 1], or None for a flat diagram.
         child: int32 [m], or None for a flat diagram.
         depth: the number of levels of the tree.
-        cells: int32 [n], the cell of each sample, 0 to k - 1, instead of the tables.
+        cells: int32 [n], the cell of each sample, 0 to k - 1; given instead of ``centres``, ``child_offsets`` and
+            ``child``.
         coords: [n, 3], the locations of the samples.
         frozen: bool [k], the frozen cells, whose samples have no gradients; or None.
-        rows: int32 [1], the number of samples that count; None for all.
+        rows: int32 [1], the number of valid leading samples; None for all.
         centre_index: the index of the centres of a flat diagram by `index_centres`, or None.
         backend: "auto", "reference", "native" or "warp".
 
@@ -110,7 +111,7 @@ class Routed(NamedTuple):
 
 
 def check_network(op: str, network: Mapping[str, Any]) -> Routed:
-    """Checks named arguments of `routed_program` without a backend; the program must have one output."""
+    """Checks arguments of `routed_program`, by name and without ``backend``; the program must have one output."""
     routing = {name: network[name] for name in Routing._fields if name in network}
     rest = {name: value for name, value in network.items() if name not in routing}
     if unknown := rest.keys() - {"program", "inputs", "parameters", "ray_index"}:

@@ -1,4 +1,4 @@
-"""The case of ``routed_program``."""
+"""Draws valid arguments of ``routed_program`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

@@ -35,13 +35,16 @@ def routed_program(arguments: ProgramArguments, routing: Routing) -> tuple[list[
     network, routing = Network.of(arguments), normalise_routing(routing, count_cells(arguments.parameters))
     route = find(network.inputs[0], routing, count_cells(arguments.parameters), arguments.caller)
     outputs = network.run(route.offsets, route.order)
-    if routing.rows is None or native.on_cuda(route.offsets):  # on CUDA rows that do not count have no cell
+    if routing.rows is None or native.on_cuda(route.offsets):  # on CUDA, invalid samples have no cell
         return outputs, route.cells
     return mask_rows(outputs, route.cells, routing.rows)
 
 
 def normalise_routing(routing: Routing, k: int) -> Routing:
-    """Returns the routing, without tables if there is one cell; on CUDA, uncounted samples have cell -1."""
+    """Returns the routing, without centres if there is one cell.
+
+    On CUDA, if the caller gives cells, the cells of the samples after the first ``rows`` become -1 (no cell).
+    """
     cells, rows = routing.cells, routing.rows
     if rows is not None and cells is not None and native.on_cuda(cells):
         return routing._replace(cells=torch.where(torch.arange(cells.shape[0], device=cells.device) < rows, cells, -1))
@@ -57,7 +60,16 @@ def run_checked(
     frozen: Tensor | None,
     **places: Any,
 ) -> list[Tensor]:
-    """Returns the outputs for float32 inputs and parameters [k, ...] or [1, ...], which the router has checked."""
+    """Returns the outputs for float32 inputs and parameters [k, ...] or [1, ...], which the router has checked.
+
+    Args:
+        options: the options with which the program runs.
+        inputs: the inputs of the program.
+        parameters: the parameters of the program.
+        k: the number of cells.
+        frozen: bool [k], the frozen cells, or None.
+        places: the arguments of `Routing` that the router gives, by name.
+    """
     first, centres = inputs[0], places.get("centres")
     if centres is not None and "child" not in places and centres.is_cpu and not _is_observed(first):
         cells, order, offsets = _in_two_calls(places["coords"], centres, places.get("centre_index"), k)

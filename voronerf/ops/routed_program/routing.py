@@ -1,4 +1,4 @@
-"""The arguments that route samples to cells: centres, the tables of a tree, or the cells themselves.
+"""The arguments that route samples to cells: centres, perhaps with the tables of a tree, or the cells themselves.
 
 n samples, k cells, m centres of all diagrams together, g diagrams.
 """
@@ -26,7 +26,7 @@ _ROWS_OF_A_TREE = {**_ROWS, "centres": Row("centres", FLOATING, ("m", 3))}
 
 
 class Routing(NamedTuple):
-    """The arguments of `routed_mlp` for the cells of samples, the frozen cells and the number of samples that count."""
+    """The arguments of `routed_mlp` for the cells of samples, the frozen cells and the number of valid samples."""
 
     centres: Tensor | None = None
     child_offsets: Tensor | None = None

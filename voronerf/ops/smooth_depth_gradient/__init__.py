@@ -45,16 +45,19 @@ def smooth_depth_gradient(
     """Adds a loss on the curvature of unseen rays' disparities, and its gradient, in place.
 
     The last rays are the triples of `unseen_rays`: ray ``r - 3 triples + i`` lies between rays ``r - 2 triples + i``
-    and ``r - triples + i``. The disparity D of a ray is the sum of its weights divided by their depths; the remaining
-    transmittance counts as a weight at depth ``far``. Along a line of an image, the disparity of a plane is linear. The
-    loss is ``factor`` times the mean over the triples of the robust error of ``log((D' + D'') / 2 D)``, where D is the
-    disparity of the middle ray and D', D'' are its neighbours' disparities. The robust error is as in `render_loss`,
-    with scale 0.05, so that edges of surfaces count less. (Distances along rays differ from depths by the cosine of the
-    angle between rays: by 0.5 % for 0.1 radians.) The gradient goes to the last column of ``gradient``. The derivative
-    of D with respect to the density of a sample is ``delta (T / depth - S)``, where T is the transmittance behind the
-    sample and S the disparity of everything behind the sample. The loss favours smooth surfaces over fog that only fits
-    single views (after Niemeyer et al. 2022, "RegNeRF", section 4.1, whose loss favours equal depths of neighbours).
-    Not differentiable.
+    and ``r - triples + i``. The disparity D of a ray is the sum of ``weight / depth`` over its samples, plus the
+    remaining transmittance divided by ``far``. The loss is ``factor`` times the mean over the triples of the robust
+    error of ``log((D' + D'') / (2 D))``, where D is the disparity of the middle ray and D', D'' are its neighbours'
+    disparities. The robust error is as in `render_loss`, with scale 0.05, so that edges of surfaces count less.
+
+    The loss is almost 0 on a plane, since the disparity of a plane is linear along a line of an image. (Distances along
+    rays differ from depths by the cosine of the angle between rays: by 0.5 % for 0.1 radians.) The loss favours smooth
+    surfaces over fog that only fits single views (after Niemeyer et al. 2022, "RegNeRF", section 4.1, whose loss
+    favours equal depths of neighbours).
+
+    The gradient is added to the last column of ``gradient``. The derivative of D with respect to the density of a
+    sample is ``delta (T / depth - S)``, where T is the transmittance behind the sample, and S the part of D that is due
+    to everything behind the sample. Not differentiable.
 
     Args:
         loss: the loss, updated in place.
@@ -66,7 +69,7 @@ def smooth_depth_gradient(
         ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
         far: the far ends of the rays, > 0.
         triples: the number of triples, at most r / 3.
-        factor: the factor on the mean.
+        factor: the factor on the mean of the robust errors.
         hidden: the transmittance up to which a sample counts as hidden. Hidden samples have no gradient, as for
             `render_loss`.
         density_scale: the factor on the density after its softplus, as for `render_loss`; None with ``activated``.

@@ -1,4 +1,4 @@
-"""The case of ``smooth_depth_gradient``."""
+"""Draws valid arguments of ``smooth_depth_gradient`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

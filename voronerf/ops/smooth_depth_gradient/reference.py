@@ -1,4 +1,4 @@
-"""A loss on depths of neighbouring unseen rays that do not lie on a plane, and its gradient. r rays, m samples."""
+"""A loss on the curvature of unseen rays' disparities, and its gradient. r rays, m samples."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from torch import Tensor
 from voronerf.ops.composite.reference import check_ray_offsets, composite, optical_depth, packed_light, saveable
 from voronerf.ops.render_loss.reference import robust_error
 
-#: The scale of the logarithms beyond which the loss is linear, as at edges of surfaces.
+#: The scale of the robust error. For larger log ratios of disparities, which occur at edges of surfaces, the loss is
+#: linear.
 EDGE = 0.05
 
 

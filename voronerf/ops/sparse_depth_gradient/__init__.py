@@ -45,14 +45,14 @@ def sparse_depth_gradient(
 ) -> None:
     """Adds a loss on rays that end at known points, and its gradient, in place.
 
-    A sample is near the point if its distance from the point is at most 0.03 times the distance of the point, plus the
-    sample's length. The loss of a ray is ``-log`` of the sum of the weights of these samples, clamped to at least
-    0.001. It is the likelihood of Deng et al. 2022, "Depth-supervised NeRF", with a box in place of their Gaussian. Fog
-    in front of the point reduces this sum. The derivative of the sum with respect to the density of a sample is
-    ``delta (T near - S)``, where T is the transmittance behind the sample, S the part of the sum that is due to samples
-    behind it, and ``near`` is 1 if the sample is near the point, otherwise 0. The mean of the s losses times ``factor``
-    is added to ``loss``, and its gradient to the last column of ``gradient``. If the weight of a sample near the point
-    is NaN, the loss is NaN, and the ray has no gradient. Not differentiable.
+    A sample of length ``delta`` at depth d is near the point at distance p on its ray if ``|d - p| <= 0.03 p + delta``.
+    The loss of a ray is ``-log`` of the sum of the weights of its samples near the point; the sum is clamped to at
+    least 0.001. This loss is the likelihood of Deng et al. 2022, "Depth-supervised NeRF", with a box in place of their
+    Gaussian. Fog in front of the point reduces the sum. The derivative of the sum with respect to the density of a
+    sample is ``delta (T near - S)``, where T is the transmittance behind the sample, S the part of the sum that is due
+    to samples behind it, and ``near`` is 1 if the sample is near the point, otherwise 0. The mean of the s losses times
+    ``factor`` is added to ``loss``, and its gradient to the last column of ``gradient``. If the weight of a sample near
+    the point is NaN, the loss is NaN, and the ray has no gradient. Not differentiable.
 
     Args:
         loss: the loss, updated in place.

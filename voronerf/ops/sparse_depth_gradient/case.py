@@ -1,4 +1,4 @@
-"""The case of ``sparse_depth_gradient``."""
+"""Draws valid arguments of ``sparse_depth_gradient`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

@@ -21,10 +21,11 @@ def spherical_harmonics(
 ) -> Annotated[Tensor, "same [n, w]"]:
     """Returns the real spherical harmonics of bands 0 to degree - 1, an orthonormal basis of functions on the sphere.
 
-    Order, signs and constants agree with tiny-cuda-nn's ``SphericalHarmonics`` and torch-ngp's ``SHEncoder`` (Müller et
-    al. 2022 encode view directions with them): band after band, orders -l to l, with the Condon-Shortley phase. As in
-    torch-ngp the input is the direction itself; tiny-cuda-nn takes ``(direction + 1) / 2`` instead. The result is a
-    polynomial in x, y and z, for vectors of any length. It has gradients of every order.
+    Müller et al. 2022 use this encoding for view directions. Values are sorted by band l, then by order from -l to l,
+    and include the Condon-Shortley phase. Order, signs and constants agree with tiny-cuda-nn's ``SphericalHarmonics``
+    and torch-ngp's ``SHEncoder``. As in torch-ngp the input is the direction itself; tiny-cuda-nn takes
+    ``(direction + 1) / 2`` instead. The result is a polynomial in x, y and z, for vectors of any length. It has
+    gradients of every order.
 
     Args:
         directions: unit vectors, n < 2**31.

@@ -1,4 +1,4 @@
-"""The case of ``spherical_harmonics``."""
+"""Draws valid arguments of ``spherical_harmonics`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

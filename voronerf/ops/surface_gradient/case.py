@@ -1,4 +1,4 @@
-"""The case of ``surface_gradient``."""
+"""Draws valid arguments of ``surface_gradient`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

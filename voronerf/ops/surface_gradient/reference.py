@@ -23,8 +23,8 @@ def surface_losses(
 ) -> tuple[Tensor, Tensor]:
     """Returns the distortion and the orientation loss [r] of rays, differentiable in weights and opacities [m].
 
-    See ``voronerf.ops.surface_gradient`` for the formulas and the arguments. Only samples that are ``lit`` [m] count.
-    Samples outside all rays must be finite.
+    See ``voronerf.ops.surface_gradient`` for the formulas and the arguments. ``lit`` [m] marks the samples that are not
+    hidden; other samples are ignored. Samples outside all rays must be finite.
     """
     r, m = len(near), len(weights)
     # Samples outside all rays go to two additional rays, so the host does not read the offsets.
@@ -55,7 +55,7 @@ def surface_gradient(loss: Tensor, gradient: Tensor, *arguments: Any) -> None:
     density, depths, deltas, _, ray_offsets, near, far = (saveable(tensor.detach()) for tensor in tensors)
     check_ray_offsets("surface_gradient", ray_offsets, len(density))
     light, ray = packed_light(optical_depth(density, deltas), ray_offsets)
-    # Samples outside all rays are uninitialised, for example the unused rows of a captured step.
+    # Samples outside all rays may be uninitialised memory: the unused rows of a batch with a fixed number of rows.
     inside = (ray > 0) & (ray <= len(near))
     density, deltas = (torch.where(inside, tensor, 0) for tensor in (density, deltas))
     depths = torch.where(inside, depths, 1)

@@ -1,4 +1,4 @@
-"""The case of ``unseen_rays``."""
+"""Draws valid arguments of ``unseen_rays`` for the tests, and lists invalid arguments."""
 
 from __future__ import annotations
 

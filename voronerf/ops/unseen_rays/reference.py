@@ -7,13 +7,14 @@ from torch import Tensor
 
 from voronerf.ops.march_rays.reference import hashed_uniforms
 
-#: The number of hashes per ray that `draw_pixels` makes from the same seed; the octaves of the neighbours' angles.
+#: BEFORE: the number of hashes per ray that `draw_pixels` computes from the same seed. This op uses later hashes.
+#: OCTAVES: the number of octaves over which the angles to the neighbours are distributed.
 BEFORE, OCTAVES = 5, 4.0
 
 
 @torch.no_grad()
 def unseen_rays(origins: Tensor, directions: Tensor, seed: Tensor, triples: int, move: float, tilt: float) -> None:
-    """Replaces the last rays; see ``voronerf.ops.unseen_rays``."""
+    """Replaces the last rays by triples of neighbouring rays; see ``voronerf.ops.unseen_rays``."""
     begin = len(origins) - 3 * triples
     middle, one, other = (slice(begin + i * triples, begin + (i + 1) * triples) for i in range(3))
     numbers = hashed_uniforms(seed, len(origins), BEFORE + 7)[middle, BEFORE:].to(origins)

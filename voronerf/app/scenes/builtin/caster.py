@@ -1,8 +1,9 @@
 """Ray casting: finds the first solid on each ray, among a few candidates per ray.
 
 Sizes: r rays, m solids, e candidates. A candidate is a solid and a range of consecutive rays that might hit it. Camera
-rays lie in pixel order; their candidates are the rows of the bounding rectangle of each projected solid. Shadow rays
-are parallel; they are sorted into the squares of a grid perpendicular to the light. The candidates include every hit.
+rays lie in pixel order: each row of a projected solid's bounding rectangle gives a candidate. Shadow rays are parallel,
+and sorted by the squares of a grid perpendicular to the light: each row of squares that a solid shades gives a
+candidate. The candidates of a ray include every solid that it hits.
 """
 
 from __future__ import annotations
@@ -67,8 +68,8 @@ class Caster:
             (distance [r], infinite for a miss; number of the solid [r], 0 for a miss).
         """
         count = np.broadcast_shapes(origins.shape, directions.shape)[1]
-        # In a key, the bits of the distance are above the solid's number; positive floats sort in the order of their
-        # bits.
+        # A key has the bits of the distance above the number of the solid. Keys sort by distance, since positive floats
+        # sort in the order of their bits.
         keys = np.full(count, MISS)
         depth = keys.view(np.float32)[1::2]
         order = np.argsort(near, kind="stable")
@@ -86,7 +87,15 @@ class Caster:
         return depth, (keys & np.uint64(2**32 - 1)).astype(np.int64)
 
     def _test(self, origins: Array, directions: Array, rays: Rows, numbers: Rows, keys: NDArray[np.uint64]) -> None:
-        """Intersects pairs of a ray and a solid, and lowers `keys` [r] in place for nearer hits."""
+        """Intersects pairs of a ray and a solid, and lowers `keys` [r] in place for nearer hits.
+
+        Args:
+            origins: ray origins, as in :meth:`first`.
+            directions: unit ray directions, as in :meth:`first`.
+            rays: index of each pair's ray.
+            numbers: number of each pair's solid.
+            keys: distance and solid number of each ray's nearest hit so far, in the bits of one integer, or `MISS`.
+        """
         kinds = self._kind[numbers]
         for kind, (solid, is_turned) in enumerate(self._kinds):
             selected = (kinds == kind).nonzero()[0]
@@ -111,7 +120,8 @@ class Caster:
 
         Args:
             poses: camera-to-world matrices [v, 4, 4].
-            scale: focal length, principal column and principal row of each picture [v, 3], in rays.
+            scale: focal length, and column and row of the principal point, of each picture [v, 3], in rays (a pixel
+                may have several).
             size: width w and height h of each picture, in rays.
             origins: ray origins [3, v * h * w].
             directions: unit ray directions [3, v * h * w].

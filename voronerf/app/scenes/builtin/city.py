@@ -79,7 +79,7 @@ def city_scene(
 
 
 def city_of(size: int, text: str, images: str) -> Scene:
-    """Computes a city of `text` blocks, such as "4x8"; caches its images if there are several blocks."""
+    """Computes a city whose blocks are given as `text`, such as "4x8"; caches the images of several blocks."""
     match = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)
     if match is None or max(int(match[1]), int(match[2])) > MOST:
         raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {text!r:.60}")
@@ -117,7 +117,7 @@ def _in_the_street(random: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _above(random: np.random.Generator) -> tuple[Array, Array]:
-    """Draws a camera position above all roofs and a target below it."""
+    """Draws a camera position above all roofs and a target inside the block."""
     aim = np.array((*random.uniform(-0.4, 0.4, size=2), 0.12))
     azimuth, climb, distance = random.uniform(0, 2 * np.pi), random.uniform(0.5, 1.25), random.uniform(1.5, 2.3)
     away = np.array((np.cos(climb) * np.cos(azimuth), np.cos(climb) * np.sin(azimuth), np.sin(climb)))

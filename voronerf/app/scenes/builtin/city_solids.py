@@ -40,7 +40,7 @@ CARS: tuple[Colour, ...] = (
 
 
 def _noise(x: Array, y: Array, salt: float) -> Array:
-    """Hashes pairs of integers to pseudo-random numbers in 0..1 by a shader's sine hash: [n], [n] -> [n]."""
+    """Hashes pairs of integers to pseudo-random numbers in 0..1 by the sine hash of many shaders: [n], [n] -> [n]."""
     wave = np.sin(x.astype(np.float64) * 12.9898 + y * 78.233 + salt * 37.719) * 43758.5453
     return (wave - np.floor(wave)).astype(np.float32)
 
@@ -196,7 +196,10 @@ def _building(x: float, y: float, half: tuple[float, float], height: float, rand
 
 
 def block(column: int, row: int) -> list[Solid]:
-    """Returns the solids of one block, centred at the origin; the streets' centre lines are at x, y = -0.5, 0.5."""
+    """Returns the solids of one block, centred at the origin.
+
+    The centre lines of the four streets around it are at x = -0.5, x = 0.5, y = -0.5 and y = 0.5.
+    """
     random = np.random.default_rng((column, row))
     inner = 0.5 - STREET
     parts: list[Solid] = [Box((0, 0, KERB / 2), _paving, 0.05, 10, half=(inner, inner, KERB / 2))]
@@ -231,7 +234,7 @@ def block(column: int, row: int) -> list[Solid]:
 
 
 def city(blocks: tuple[int, int]) -> list[Solid]:
-    """Returns the solids of `blocks` (along x, along y): first the ground, then block by block."""
+    """Returns the solids of a city with `blocks` (along x, along y): first the ground, then block by block."""
     across, along = blocks[0] / 2, blocks[1] / 2
     corner = np.array((across, along, 0), dtype=np.float32)
     half = (across, along, DEPTH / 2)

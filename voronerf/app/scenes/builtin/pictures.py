@@ -40,6 +40,12 @@ def keep_in_store(name: str, sources: Sequence[Any], formula: int, images: str) 
     """Returns a function that stores images in the cache directory, or None if `images` is "memory".
 
     For "disk" the function returns the memory-mapped images, for "cached" a copy in memory.
+
+    Args:
+        name: name of the scene and split, with which the store's folder begins.
+        sources: numbers that determine the images, such as their size; different lists have different stores.
+        formula: version of the scene's content; a change computes the images anew.
+        images: "memory", "cached" or "disk".
     """
 
     def keep(shape: tuple[int, int, int, int], make: Make) -> Tensor:
@@ -72,7 +78,10 @@ def render_views(cameras: Cameras, name: str, caster: Caster, keep: Keep | None 
 
 
 def _images(cameras: Cameras, indices: Sequence[int], caster: Caster) -> NDArray[np.uint8]:
-    """Renders the images `indices` in bands of rows; averages premultiplied colour and opacity over a pixel."""
+    """Renders the images `indices` in bands of rows; the images have straight alpha.
+
+    A pixel's opacity is the mean over its rays; its colour is their mean premultiplied colour, divided by this opacity.
+    """
     size = cameras.width
     fine = SUPERSAMPLES if size <= LARGE else 2
     images = np.zeros((len(indices), size, size, 4), dtype=np.uint8)

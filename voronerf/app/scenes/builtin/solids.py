@@ -56,7 +56,7 @@ class Solid(ABC):
 
     Attributes:
         centre: origin of the solid's frame, in the world.
-        texture: colour of the surface.
+        texture: function that returns the colours of surface points.
         gloss: strength of the highlight, 0..1.
         sharpness: Phong exponent of the highlight.
         turn: rotation from the solid's frame to the world, [3, 3]; None for no rotation.
@@ -74,7 +74,7 @@ class Solid(ABC):
 
     @abstractmethod
     def measures(self) -> tuple[float, ...]:
-        """Returns the argument `measures` of `distance` for this solid: at most three numbers."""
+        """Returns the solid's dimensions as `distance` takes them: at most three numbers, such as a squared radius."""
 
     @staticmethod
     @abstractmethod
@@ -168,7 +168,8 @@ class Cylinder(Solid):
 
     @staticmethod
     def distance(origins: Axes, directions: Axes, measures: Array) -> Array:  # noqa: D102
-        # The ray is inside from the later of its entries into tube and slab to the earlier of its exits.
+        # A cylinder is the intersection of an infinite tube and a slab. The ray enters it at the larger of its two
+        # entry distances, and leaves it at the smaller of its two exit distances.
         (ox, oy, oz), (dx, dy, dz), (square, half_height, _) = origins, directions, measures
         a = np.maximum(dx * dx + dy * dy, np.float32(1e-12))
         b, c = ox * dx + oy * dy, ox * ox + oy * oy - square

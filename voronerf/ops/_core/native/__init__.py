@@ -3,9 +3,9 @@
 Importing this package raises ``BackendUnavailable`` if the extension is missing or was built from other sources.
 
 OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch
-has loaded. Linking libgomp would not work, because torch's wheels include a libgomp. The dynamic linker shares that one
-if it is named ``libgomp.so.1`` (CPU wheels). If its name has a hash, such as ``libgomp-a34b3233.so.1``, the dynamic
-linker would load the system's libgomp too, whose thread pool competes with torch's, or fail if the system has none.
+has loaded. Linking libgomp would not work, because torch's wheels include a libgomp. The dynamic linker shares torch's
+libgomp only if it is named ``libgomp.so.1`` (CPU wheels). If the name has a hash, such as ``libgomp-a34b3233.so.1``,
+the linker would load the system's libgomp too, whose thread pool competes with torch's, or fail if the system has none.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ signature, Rules, alike, adam_step = compiled.signature, compiled.Rules, compile
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
 LEAST_GAIN = 1.25
-"""The least speed-up at which networks use bfloat16 instead of float32 products, as rounding and pairing cost time."""
+"""The smallest speed-up for which networks use bfloat16 products, since rounding and packing operands takes time."""
 _bfloat16_gain = compiled.bfloat16_gain()
 
 

@@ -1,4 +1,4 @@
-"""Fields that declare their program: routers follow changes, and equal a loop also for fields without a program."""
+"""Tests of fields that declare their program: routers equal a loop over cells, and follow changes of the field."""
 
 from __future__ import annotations
 
