@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import seeded
+from helpers import refuses, seeded
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from voronerf import HashGridField, VoronoiRouter
@@ -74,3 +74,7 @@ def test_a_step_computes_in_ops_alone(contracted):
         output = step(SETTLING_STEPS + GROUP)
     assert len(output.weights) and len(strategy.reservoir) and not bool(sampler.grid.occupied.flatten()[empty].any())
     assert calls.names <= SEEDS_MEMORY_VIEWS, calls.names - SEEDS_MEMORY_VIEWS
+
+
+def test_a_limit_of_cells_needs_the_worst_cell():
+    refuses("PlannedSplit: max_cells needs cells='worst', got cells='all' and 8", PlannedSplit, 1, 4, max_cells=8)

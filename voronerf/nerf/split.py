@@ -53,6 +53,10 @@ class PlannedSplit:
     cells: Literal["all", "worst"] = "all"
     max_cells: int | None = None
 
+    def __post_init__(self) -> None:
+        if self.cells == "all" and self.max_cells is not None:
+            raise ValueError(f"PlannedSplit: max_cells needs cells='worst', got cells='all' and {self.max_cells}")
+
 
 def plan_splits(
     cells: Sequence[int], times: Sequence[float] | None = None, max_cells: int | None = None
