@@ -1,4 +1,4 @@
-"""Draws the figures of docs/method.md into docs/images/method with the library, and the chart of the first page.
+"""Draws the figures of docs/method.md with the library, and the chart of README.md, into docs/images.
 
 python docs/scripts/figures.py
 """
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def samples() -> tuple[Tensor, Tensor]:
-    """Draws samples in the plane z = 0 and their importance: a disc with a detail that weighs more."""
+    """Returns random samples in the plane z = 0, and their importance: a disc, and a small cluster that weighs more."""
     generator = torch.Generator().manual_seed(1)
     disc = torch.rand(8000, 2, generator=generator) * 2 - 1
     disc = disc[disc.norm(dim=1) < 0.85][:2000]
@@ -65,7 +65,7 @@ def show_cells(axes: plt.Axes, colours: Tensor, cells: Tensor, *, lines: float =
 
 
 def palette(count: int) -> Tensor:
-    """Returns distinct colours [count, 3]."""
+    """Returns colours [count, 3], which repeat after `COLOURS`."""
     return torch.tensor([COLOURS[i % len(COLOURS)] for i in range(count)])
 
 
@@ -91,7 +91,7 @@ def draw_balance(points: Tensor, importance: Tensor) -> None:
 
 
 def draw_nested(points: Tensor, importance: Tensor) -> None:
-    """Draws a diagram of four cells, and its refinement with four cells in each."""
+    """Draws a diagram of four cells, and a nested diagram with four cells in each of these cells."""
     figure, axes = plt.subplots(1, 2, figsize=(8, 4.2), constrained_layout=True)
     diagram = VoronoiDiagram(torch.zeros(1, 3))
     for axis, title in zip(axes, ("4 cells", "4 x 4 cells")):
@@ -133,7 +133,7 @@ def draw_sort() -> None:
 
 
 def draw_loops() -> None:
-    """Plots the times of many cells' networks, with the library and in PyTorch's fastest loop over cells."""
+    """Plots the time of running all cells' networks, for the library and for PyTorch's fastest loop over cells."""
     measured = json.loads((DOCS.parent / "benchmarks" / "results" / "throughput.json").read_text())
     rows = {
         (row["case"], row["dtype"], row["direction"]): row

@@ -1,4 +1,4 @@
-"""Hooks of the site: generates pages from the code, cleans up docstring markup, converts formulas, and adds a scene."""
+"""Hooks of the site: generates pages from the code, cleans docstring markup, converts formulas, and adds scene.html."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
-    """Replaces a marker by the tables of options."""
+    """Replaces `MARKER` in docs/options.md by the tables of options."""
     if page.file.src_uri == "options.md":
         assert MARKER in markdown, f"docs/options.md must hold {MARKER}"
         return markdown.replace(MARKER, options.markdown())

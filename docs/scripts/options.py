@@ -17,7 +17,7 @@ HEADER = ["| option | values | default | |", "|---|---|---|---|"]
 
 
 def markdown() -> str:
-    """Returns the page's tables, with a section for each command."""
+    """Returns the tables of docs/options.md, with a section for each command."""
     lines = []
     for name, function in COMMANDS.items():
         summary, _, arguments = inspect.cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")

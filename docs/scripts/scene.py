@@ -10,7 +10,7 @@ from voronerf.app.cli import main
 FOLDER = Path(__file__).resolve().parents[2] / "build" / "docs"
 STEPS = 1000
 LOWEST = 25.0
-"""The least PSNR in dB of a published page; 1,000 steps reach 31 dB."""
+"""The minimum PSNR in dB of a scene whose page is published; 1,000 steps reach 31 dB."""
 
 
 def scene_page() -> Path:

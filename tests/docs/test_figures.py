@@ -102,7 +102,8 @@ def test_the_claims_of_the_first_page() -> None:
     calls = {row["row"]: row["microseconds"] for row in results("calls.json")["results"]}
     few, many = (calls[f"{rows} rows, with backward"] for rows in (4096, 65536))
     ratios = [f"{row['router'] / row['nn.Sequential']:.1f} times" for row in (few, many)]
-    assert f"{ratios[0]} as long as PyTorch takes for one of them with 4,096 points, and {ratios[1]}" in text
+    assert f"For 4,096 points, sixteen networks of width 64 take {ratios[0]} the time of one such network" in text
+    assert f"for 65,536 points, {ratios[1]}" in text
     small = [calls[f"{rows} rows, with backward"] for rows in (16, 256)]
     losses = sorted(row["router"] / row["nn.Sequential"] for row in small)
     assert f"{losses[0]:.1f} to {losses[1]:.1f} times as much for 16 to 256 points with a backward pass" in text
