@@ -137,7 +137,7 @@ FAULTS = (
     ),
     _kernel(
         "own_samples",
-        "runs of bent rays go on across cells",
+        "runs of curved rays go on across cells",
         "rays/ray_runs.cpp",
         "(in.curved || cell != out.cells[count - 1])",
         "cell != out.cells[count - 1]",
