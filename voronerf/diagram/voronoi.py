@@ -251,11 +251,13 @@ class VoronoiDiagram(nn.Module):
         GPU, only the version counter and the address are compared, to avoid a wait for the device.
 
         Returns:
-            int32 [w]; None for a nested diagram, fewer than `MANY_CELLS` cells, or centres that torch traces or
-            transforms.
+            int32 [w]; None without the compiled module, for a nested diagram, fewer than `MANY_CELLS` cells, or centres
+            that torch traces or transforms.
         """
         centres = self.centres
         if self.depth > 1 or self.num_cells < MANY_CELLS or centres.shape[1] == 0 or torch.compiler.is_compiling():
+            return None
+        if backends.compiled() is None:
             return None
         if type(centres) is not Tensor or centres.is_meta or torch._C._are_functorch_transforms_active():
             return None
@@ -436,15 +438,13 @@ class VoronoiDiagram(nn.Module):
 def _is_unchanged(seen: Tensor, centres: Tensor) -> bool:
     """Returns whether ``centres`` are the same as ``seen``, the centres from which an index was built.
 
-    On the CPU, the values are compared; on a GPU, only the addresses. Without the compiled module there is no index,
-    and the result does not matter.
+    On the CPU, the values are compared; on a GPU, only the addresses.
     """
     if seen.device != centres.device or seen.shape != centres.shape:
         return False
-    native = backends.compiled()
-    if seen.is_cuda or native is None:
+    if seen.is_cuda:
         return seen.data_ptr() == centres.data_ptr()
-    same: bool = native.compiled.same_bits(seen, centres, seen.numel())
+    same: bool = backends.compiled().compiled.same_bits(seen, centres, seen.numel())
     return same
 
 
