@@ -178,7 +178,7 @@ LAYERS = [
     Case("weight_norm by parametrization", parametrized, one(3), by_parameters=False),
     Case("weight_norm that fuses", normed, fuses=True, by_parameters=False),
     Case("layer norm", lambda: Residual(lambda: nn.LayerNorm(8))),
-    Case("raw weights, transposed", lambda: RawWeights("transposed"), way="cell by cell"),
+    Case("raw weights, transposed", lambda: RawWeights("transposed")),
     Case("raw weights, linear", lambda: RawWeights("linear"), fuses=True),
     *(Case(f"raw weights, {way}", lambda way=way: RawWeights(way)) for way in ("matmul", "einsum")),
     Case("tied", Tied),

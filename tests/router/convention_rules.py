@@ -139,7 +139,7 @@ scale_rows = seen("scale_rows")
 register(scale_rows, lambda run, rows, factor: rows * run.rows_of(factor).exp())
 
 SHARED = {"coords": "first3", "share": ["encoder.*", "table.weight"]}
-BY_CELL = {0, 1, 2, 4, 13, 15, 18, 20, 21, 27, 28, 33}
+BY_CELL = {2, 4, 13, 15, 18, 21, 33}
 RULES = [
     Case("corners", Corners, one(3)),
     Case("planes", Planes, one(3)),

@@ -1,8 +1,8 @@
 """Tests of VoronoiRouter on fields of other codebases: every case against a loop over masks.
 
 The cases: `convention_listed.py` has the codebases of examples/. `convention_layers.py`, `convention_calls.py` and
-`convention_arguments.py` have other fields, `convention_rules.py` single steps, and `convention_shared.py` encoders
-that cells share. Each case that can be fused is also tested with ``fuse=True``.
+`convention_arguments.py` have other fields, `convention_rules.py` single steps, `convention_shared.py` encoders that
+cells share, and `convention_sizes.py` fields with other axes than samples and features. Each case that can be fused is also tested with ``fuse=True``.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ from convention_layers import LAYERS
 from convention_listed import LISTED
 from convention_rules import RULES
 from convention_shared import ENCODERS
+from convention_sizes import SIZES
 from torch import Tensor
 
 from voronerf import VoronoiDiagram, VoronoiRouter
 
-CASES = [*LISTED, *LAYERS, *CALLS, *ARGUMENTS, *RULES, *ENCODERS]
+CASES = [*LISTED, *LAYERS, *CALLS, *ARGUMENTS, *RULES, *ENCODERS, *SIZES]
 CASES += [case.fused() for case in CASES if case.fuses]
 every_case = pytest.mark.parametrize("case", CASES, ids=str)
 
@@ -124,6 +125,21 @@ def test_few_samples_and_none(case: Case, centres: Tensor) -> None:
             assert none[key].dtype == value.dtype, key
     if scalar(none).requires_grad:
         assert all(not gradient.any() for gradient in gradients(router, scalar(none), inputs).values())
+
+
+@every_case
+def test_numbers_of_samples_that_equal_other_sizes(case: Case, centres: Tensor) -> None:
+    """A batch may have as many samples as a tensor of the module has rows, or columns, or a part of them."""
+    modules = case.modules(torch.float64)
+    router = routed(case, modules, centres)
+    sizes = {size for tensor in modules[0].state_dict().values() for size in tensor.shape if size < 70}
+    sizes |= {1, 2, 53, *(size // 2 for size in sizes if size > 1)}
+    for n in (61, *sorted(sizes)):
+        lead = (n, *case.lead[1:])
+        args, kwargs, _ = prepared(case, torch.float64, lead)
+        sized = dataclasses.replace(case, lead=lead)
+        expected = loop(sized, modules, nearest(case, centres, args, kwargs), args, kwargs)
+        close(tensors(case.call(router, args, kwargs)), expected, rtol=1e-9, atol=1e-10)
 
 
 @pytest.mark.parametrize("case", [*LISTED, *ENCODERS], ids=str)

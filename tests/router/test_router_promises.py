@@ -187,13 +187,13 @@ def test_explain_names_each_method_and_the_step_in_the_way() -> None:
     class Both(nn.Module):
         def __init__(self) -> None:
             super().__init__()
-            self.fc, self.mix = nn.Linear(3, 4), nn.Bilinear(3, 3, 2)
+            self.fc, self.places = nn.Linear(3, 4), nn.Parameter(torch.randn(2, 3))
 
         def density(self, x: Tensor) -> Tensor:
             return F.softplus(self.fc(x)) * math.pi + self.fc.weight.sum()
 
         def forward(self, x: Tensor) -> Tensor:
-            return self.mix(x, x)
+            return torch.cdist(x, self.places)
 
     alone = VoronoiRouter(Both(), centres(1), coords="first3", methods=["density"])
     alone.density(uniform((40,)))
@@ -201,14 +201,12 @@ def test_explain_names_each_method_and_the_step_in_the_way() -> None:
     router = VoronoiRouter(Both(), centres(), coords="first3", methods=["density"])
     assert router.explain() == "forward: not called yet\ndensity: not called yet"
     router.density(uniform((40,)))
-    with pytest.warns(
-        UserWarning, match=r"Both.forward runs cell by cell: torch.nn.functional.bilinear takes param"
-    ) as said:
+    with pytest.warns(UserWarning, match=r"Both.forward runs cell by cell: torch.functional.cdist takes param") as said:
         router(uniform((40,)))
     forward, density = router.explain().split("\n")
     assert density == "density: grouped"
-    assert forward.startswith("forward: cell by cell: torch.nn.functional.bilinear takes parameters, and has no rule")
-    assert "test_router_promises.py:" in forward and "return self.mix(x, x)" in forward
+    assert forward.startswith("forward: cell by cell: torch.functional.cdist takes parameters, and has no rule")
+    assert "test_router_promises.py:" in forward and "return torch.cdist(x, self.places)" in forward
     assert forward.partition("cell by cell: ")[2] in str(said[0].message)
     with pytest.raises(AttributeError, match=r"colour"):
         router.colour  # noqa: B018

@@ -212,8 +212,7 @@ class Dispatch:
             return plan
         if not layout.n:
             return CallPlan([Loop("no samples yet")])
-        generators = [grouping.device] if grouping.device.type == "cuda" else []
-        with self._lock, torch.random.fork_rng(generators), aside(call) as copied:
+        with self._lock, _own_randomness(grouping), aside(call) as copied:
             probe = Probe(copied, grouping)
             if plan is not None and not probe.is_groupable():
                 plan.postpone()
@@ -321,7 +320,7 @@ class Dispatch:
         latest, warns = self._latest_ways.setdefault(call.method, {}), len(plan.ways) == 1
         if isinstance(way, Grouped):
             try:
-                results, plan.wait = way.run(call, grouping), 0
+                results, plan.wait = self._run_grouped(way, call, grouping), 0
                 latest[way.name] = why
                 return results
             except Exception as error:
@@ -350,6 +349,17 @@ class Dispatch:
         if why and warns and grouping.k > 1 and layout.n >= FEWEST:
             self.warn_once(f"cells {call.method}", f"{call.name} runs cell by cell: {why}")
         return results
+
+    def _run_grouped(self, way: Grouped, call: Call, grouping: Grouping) -> Results:
+        """Runs a call for all cells at once; if the module does something new, its steps are recorded again."""
+        try:
+            return way.run(call, grouping)
+        except Ungroupable as error:
+            if not error.is_new or recorded():
+                raise
+        with self._lock, _own_randomness(grouping), aside(call) as copied:
+            way.records[:] = [*way.records[1 - _TRACES :], Probe(copied, grouping).steps()]
+        return way.run(call, grouping)
 
     def _run_apart(self, plan: CallPlan, call: Call, grouping: Grouping, frozen: Tensor) -> Results:
         """Runs a call without gradients for samples in frozen cells, bool [k], and with gradients for other samples."""
@@ -381,6 +391,11 @@ class Dispatch:
             level = next((i for i, file in enumerate(files) if not file.startswith(_LIBRARY_FOLDERS)), len(files))
             warnings.warn(f"{_OP}: {message}", stacklevel=level + 1)
         self._warned.add(topic)
+
+
+def _own_randomness(grouping: Grouping) -> Any:
+    """Returns a context that restores the random generators of torch and of the grouping's device."""
+    return torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else [])
 
 
 def _misfit(error: Exception, call: Call) -> Exception | None:

@@ -22,11 +22,12 @@ from torch.fx.node import map_arg
 
 from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step
 from voronerf.ops.grouped_program import grouped_program
+from voronerf.router.axes import Count
 from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable, name_of
 from voronerf.router.grouping import Grouping, owned_parameters, parts_of
 from voronerf.router.layout import Call, Results, map_tensors, recordable, tensors_of
 from voronerf.router.lower import Entries, Lowering, NotAStep
-from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable
+from voronerf.router.trace import CELLS, SAMPLES, Unfusable, differentiable, trace
 from voronerf.router.watch import Inputs, lookup
 from voronerf.router.waves import with_encodings
 
@@ -89,8 +90,8 @@ class WholeProgram(NamedTuple):
 class Fused:
     """A call of the routed module as runs of programs with PyTorch functions between them.
 
-    The call is traced on rows of its arguments, for as many samples as ``rows_for`` returns. Raises :class:`Unfusable`
-    if nothing can be fused, or if a step cannot be repeated for other samples.
+    The call is traced on rows of its arguments (:func:`voronerf.router.trace.trace`). Raises :class:`Unfusable` if
+    nothing can be fused, or if a step cannot be repeated for other samples.
 
     Attributes:
         inputs: The numbers and buffers that are looked up in each call.
@@ -99,24 +100,29 @@ class Fused:
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
         self.module, self.inputs = call.module, inputs
-        trace = Trace(self._with_inputs(call, tensors[0].device), tensors, inputs)
-        parts, self.reads = list(parts_of(call.module).values()), trace.reads
-        self._places = [(parts[i], i, name) for i, name in trace.places]
-        self._n, self._inputs, self._shared, self._parameters = trace.n, trace.inputs, trace.shared, trace.parameters
-        self.result, self._outputs = trace.result, trace.outputs
+        traced = trace(self._with_inputs(call, tensors[0].device), tensors, inputs)
+        parts, self.reads = list(parts_of(call.module).values()), traced.reads
+        self._places = [(parts[i], i, name) for i, name in traced.places]
+        self._n, self._inputs, self._shared, self._parameters = (
+            traced.n,
+            traced.inputs,
+            traced.shared,
+            traced.parameters,
+        )
+        self.result, self._outputs = traced.result, traced.outputs
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         if not all(isinstance(value, fx.Node) and value.meta["on"] == SAMPLES for value in self._outputs):
             raise Unfusable("a result depends on no sample")
-        self._recorded = torch.is_grad_enabled() or any(node.meta.get("grad") for node in trace.graph.nodes)
-        self._differentiates = any(node.target is torch.autograd.grad for node in trace.graph.nodes)
-        self._lowering = Lowering(trace.rows)
+        self._recorded = torch.is_grad_enabled() or any(node.meta.get("grad") for node in traced.graph.nodes)
+        self._differentiates = any(node.target is torch.autograd.grad for node in traced.graph.nodes)
+        self._lowering = Lowering(traced.rows)
         self._entries: dict[fx.Node, Entries] = {}  # entries of each value that steps compute or move
         self._ready: dict[fx.Node, int] = {}  # the first run that can read each value from PyTorch
         self._reasons: dict[fx.Node, str] = {}
-        for node in trace.graph.nodes:
+        for node in traced.graph.nodes:
             self._add(node)
         needed = self._needed()
-        nodes = [node for node in trace.graph.nodes if node in needed and node.op == "call_function"]
+        nodes = [node for node in traced.graph.nodes if node in needed and node.op == "call_function"]
         self._weights = [node for node in nodes if node.meta["on"] != SAMPLES]
         self._between = [node for node in nodes if node.meta["on"] == SAMPLES]
         for node in self._between:
@@ -140,7 +146,7 @@ class Fused:
         self.why = (
             f"{len(self._runs)} run{'s' * (len(self._runs) > 1)}, between them {'; '.join(texts)}" if texts else ""
         )
-        for node in trace.graph.nodes:
+        for node in traced.graph.nodes:
             if isinstance(node.meta.get("value"), Tensor):
                 node.meta["dtype"] = node.meta.pop("value").dtype
         del self._lowering, self._entries
@@ -191,7 +197,7 @@ class Fused:
             if not value.is_floating_point():
                 raise NotAStep(f"a tensor of {value.dtype}")
             self._entries[node] = (
-                self._lowering.input(node, value.shape, self._ready[node])
+                self._lowering.input(node, value.shape, node.meta["axis"], self._ready[node])
                 if node.meta["on"] == SAMPLES
                 else Entries(torch.arange(value.numel()).reshape(value.shape), node)
             )
@@ -265,12 +271,11 @@ class Fused:
 
     def _columns_of(self, node: fx.Node) -> Columns:
         """Returns the columns of a node's value, and stores their layout in the node."""
-        codes = self._entries[node].codes
-        shape, at = codes.shape, _sample_dimension(codes.shape, self._lowering.rows)
-        turned = codes.movedim(at, 0).reshape(self._lowering.rows, -1)
-        if not torch.equal(turned >> 32, torch.arange(self._lowering.rows)[:, None].expand_as(turned)):
+        codes, axis = self._entries[node].codes, node.meta["axis"]
+        turned = codes if axis is None else codes.movedim(axis.dim, 0).reshape(self._lowering.rows, -1)
+        if axis is None or not torch.equal(turned >> 32, torch.arange(self._lowering.rows)[:, None].expand_as(turned)):
             raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} mixes samples")
-        node.meta["layout"] = [*shape[:at], *shape[at + 1 :]], at, shape[at] // self._lowering.rows
+        node.meta["layout"] = [*codes.shape[: axis.dim], *codes.shape[axis.dim + 1 :]], *axis
         columns = self._lowering.operand(turned[0] & ((1 << 32) - 1))
         return columns if columns.index not in self._lowering.sources else self._lowering.builder.apply("copy", columns)
 
@@ -403,7 +408,7 @@ class Fused:
 
     def _compute_run(self, run: Segment, values: dict[Any, Any], grouping: Grouping, order: Tensor | None) -> None:
         n = values[self._n]
-        rows = [_flat(values[source], n) for source in run.inputs]
+        rows = [_flat(values[source], n, source) for source in run.inputs]
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
         half = torch.is_autocast_enabled(grouping.device.type) or any(x.dtype in HALF for x in rows)
         parameters = [recordable(entries.select(values).to(dtype)) for entries in run.parameters]
@@ -469,12 +474,14 @@ def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None
     meets_cells = _meets_cells(node)
 
     def argument(source: fx.Node) -> Any:
+        value = values[source]
         if meets_cells and source.meta["on"] == CELLS:
-            return map_tensors(values[source], PerCell)
+            return map_tensors(value, PerCell)
         if meets_cells and source.meta["on"] == SAMPLES:
-            for tensor in tensors_of(values[source]):
-                grouped.mark(tensor)
-        return values[source]
+            if isinstance(value, Tensor):
+                grouped.mark(value, source.meta["axis"])
+            return Count(value) if type(value) is int else value
+        return value
 
     args, kwargs = map_arg((node.args, node.kwargs), argument)
     is_recorded = torch.is_grad_enabled() and node.meta.get("grad", True)
@@ -488,18 +495,13 @@ def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None
     values[node] = map_tensors(written, lambda item: item.stacked if isinstance(item, PerCell) else item)
 
 
-def _flat(value: Tensor, n: int) -> Tensor:
-    """Reshapes a tensor with n * m rows, or with n in another dimension, to [n, w]."""
-    if value.shape[:1] != (n,) and (not value.shape or n == 0 or value.shape[0] % n):
-        dim = next(d for d, size in enumerate(value.shape) if size == n)
-        value = value.movedim(dim, 0)
+def _flat(value: Tensor, n: int, source: Any) -> Tensor:
+    """Reshapes the value of a node, or of an earlier run, to [n, w]."""
+    dim = source.meta["axis"].dim if isinstance(source, fx.Node) else 0
+    value = value.movedim(dim, 0) if dim else value
     return value.reshape(n, -1) if n else value.reshape(0, max(value.shape[1:].numel(), 1))
 
 
 def _is_custom(node: fx.Node) -> bool:
     """Returns whether a node is a ``torch.autograd.Function`` of the module."""
     return getattr(node.target, "__name__", "") == "apply"
-
-
-def _sample_dimension(shape: torch.Size, rows: int) -> int:
-    return next(d for d, size in enumerate(shape) if size and size % rows == 0)

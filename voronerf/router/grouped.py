@@ -2,11 +2,11 @@
 
 The rows are sorted by cell, and :class:`PerCell` tensors replace the module's parameters. :class:`GroupedRun`
 intercepts every PyTorch function. A function of rows and parameters runs by a rule (:func:`register`), a function of
-parameters alone is mapped over cells, and any other function runs unchanged. Tensors that depend on the samples are
-marked. The marks tell rows from constants, and reveal host reads of samples' values. If a step has no rule,
-:class:`Ungroupable` names the step, and the call becomes a loop over cells.
+parameters alone is mapped over cells, and any other function runs unchanged. a :class:`Step` tells which axis of each
+argument has the samples. Tensors that depend on the samples are marked; the marks reveal host reads of samples' values.
+If a step has no rule, :class:`Ungroupable` names the step, and the call becomes a loop over cells.
 
-Letters: n samples, k cells; a tensor of rows is [n * m, ...], with the m entries of each sample next to each other.
+Letters: n samples, k cells; a tensor of rows has n * m entries in one dimension, the m entries of each sample adjacent.
 """
 
 from __future__ import annotations
@@ -14,18 +14,19 @@ from __future__ import annotations
 import inspect
 import linecache
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
+from voronerf.router.axes import Axis, Count, axis_of, multiple
 from voronerf.router.double import Double
 from voronerf.router.grouping import Grouping, cell_parameters, cells_of
-from voronerf.router.layout import Call, Results, map_tensors, split_rows, tensors_of
+from voronerf.router.layout import Call, Results, map_tensors, map_tree, split_rows, tensors_of
 from voronerf.router.norms import EXACT
 
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
@@ -67,8 +68,8 @@ RANDOM = find(
     torch.nn.functional,
 )
 """The functions that draw random numbers."""
-CREATE = find("zeros ones full empty rand randn randint", torch)
-"""The functions that make tensors from sizes; if the first size is n, the tensors are rows."""
+_BY_TYPE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
+_BY_FIRST = find("to type_as expand_as view_as reshape_as", torch.Tensor)
 
 
 class Exact(TorchFunctionMode):
@@ -130,11 +131,16 @@ def register(function: Any, rule: Rule) -> None:
 
 
 class Ungroupable(Exception):
-    """An error for a module that cannot run on the samples of all cells at once; the message gives the reason."""
+    """An error for a module that cannot run on the samples of all cells at once; the message gives the reason.
 
-    def __init__(self, reason: str, of_batch: bool = False) -> None:
+    Attributes:
+        of_batch: Whether another batch may be groupable.
+        is_new: Whether the module did what no :class:`Step` tells, so that a new record may help.
+    """
+
+    def __init__(self, reason: str, of_batch: bool = False, is_new: bool = False) -> None:
         super().__init__(reason)
-        self.of_batch = of_batch  # whether another batch may be groupable
+        self.of_batch, self.is_new = of_batch, is_new
 
 
 class PerCell(torch.Tensor):
@@ -236,37 +242,128 @@ def line_of(frame: FrameType | None) -> str:
     return f" ({os.path.basename(file)}:{frame.f_lineno}{f': {code}' if code else ''})"
 
 
+class Step(NamedTuple):
+    """One function that a module calls: the axis of each tensor among its arguments, and its integers' multiples of n.
+
+    ``counts`` is empty if no integer counts samples.
+    """
+
+    function: Any
+    axes: tuple[Axis | None, ...]
+    counts: tuple[int, ...]
+
+
+def integers_of(value: Any) -> list[int]:
+    """Lists the integers of a structure."""
+    integers: list[int] = []
+
+    def note(name: str, leaf: Any, nested: bool) -> Any:
+        integers.extend([leaf] * (type(leaf) is int))
+        return leaf
+
+    map_tree(value, note)
+    return integers
+
+
+def has_counts(value: Any) -> bool:
+    """Returns whether a structure has a :class:`Count`."""
+    counts: list[Any] = []
+
+    def note(name: str, leaf: Any, nested: bool) -> Any:
+        counts.extend([leaf] * isinstance(leaf, Count))
+        return leaf
+
+    map_tree(value, note)
+    return bool(counts)
+
+
+def with_counts(value: Any, counts: Sequence[int]) -> Any:
+    """Returns a structure in which the integers with a multiple in ``counts`` are a :class:`Count`."""
+    following = iter(counts)
+    return map_tree(value, lambda _, leaf, nested: Count(leaf) if type(leaf) is int and next(following, 0) else leaf)
+
+
+class Recorder(TorchFunctionMode):
+    """A mode that notes each PyTorch function, the shapes of its tensor arguments, and its integers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[Any, list[torch.Size], list[int]]] = []
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func not in METADATA:
+            shapes = [tensor.shape for tensor in tensors_of((args, kwargs))]
+            self.calls.append((func, shapes, integers_of((args, kwargs))))
+        return func(*args, **kwargs)
+
+
+def steps_of(runs: Sequence[Recorder], n: Sequence[int]) -> list[Step]:
+    """Returns the steps of a module from two runs with different numbers of samples ``n``.
+
+    Raises :class:`Ungroupable` if the runs call different functions.
+    """
+    steps = []
+    for (function, shapes, integers), (other, *others) in zip(*(run.calls for run in runs), strict=False):
+        if other != function or [len(shapes), len(integers)] != [*map(len, others)]:
+            break
+        axes = tuple(axis_of(*pair, n) for pair in zip(shapes, others[0], strict=True))
+        counts = tuple(multiple(pair, n) for pair in zip(integers, others[1], strict=True))
+        steps.append(Step(function, axes, counts if any(counts) else ()))
+    if len(steps) != len(runs[0].calls) or len(steps) != len(runs[1].calls):
+        raise Ungroupable("its forward calls other functions for another number of samples", of_batch=True)
+    return steps
+
+
 class GroupedRun(TorchFunctionMode):
     """A mode that is active while a module runs on the n sorted rows of all cells; rules get it as ``run``.
 
-    Attributes:
+    Args:
+        grouping: The samples by cell.
         tables: The look-up tables that the call has read, with buffers for their gradients. If the rows of the call are
             run in parts, all parts share this dict.
+        records: The known sequences of the module's functions; the latest is tried first. None if the caller itself
+            marks all rows with their axis.
+        quiet: Whether random numbers are 0.
+
+    Attributes:
         failed: The reason why the results are invalid, even if the module caught the error; None if they are valid.
         widest: The size in bytes of the largest tensor of rows in the run.
     """
 
-    def __init__(self, grouping: Grouping, tables: dict[Any, Any], quiet: bool = False) -> None:
+    def __init__(
+        self,
+        grouping: Grouping,
+        tables: dict[Any, Any],
+        records: Sequence[list[Step]] | None = None,
+        quiet: bool = False,
+    ) -> None:
         super().__init__()
-        self.quiet = quiet  # whether random numbers are 0
-        self.grouping, self.n, self.tables = grouping, grouping.n, tables
+        self.quiet, self.grouping, self.n, self.tables = quiet, grouping, grouping.n, tables
         self.failed: Ungroupable | None = None
         self.widest = 1
         self._token = object()
+        self._records, self._steps, self._at = records, records[-1] if records else [], 0
 
     # For rules --------------------------------------------------------------------------------------------------------
 
     def is_rows(self, value: Any) -> bool:
-        """Returns whether a value is a tensor that depends on the samples."""
+        """Returns whether a value is a tensor with rows of samples, or a tensor that depends on samples."""
         return isinstance(value, Tensor) and getattr(value, _MARK, (None,))[0] is self._token
+
+    def axis(self, rows: Tensor) -> Axis:
+        """Returns the axis of samples of a tensor among the arguments of a rule."""
+        axis: Axis | None = getattr(rows, _MARK)[2]
+        if axis is None:
+            raise self.fail(f"parameters meet a tensor of shape {list(rows.shape)}, which has no row for each sample")
+        return axis
 
     def entries(self, rows: Tensor) -> int:
         """Returns m, the number of entries per sample, of a tensor of rows [n * m, ...]."""
-        if rows.dim() == 0 or not rows.shape[0] or rows.shape[0] % self.n:
-            shape = list(rows.shape)
-            reason = f"parameters meet a tensor of shape {shape}, which has no row for each of {self.n} samples"
-            raise self.fail(reason, of_batch=True)
-        return rows.shape[0] // self.n
+        axis = self.axis(rows)
+        if axis.dim:
+            raise self.fail(f"a tensor of shape {list(rows.shape)} has its samples in dimension {axis.dim}, not 0")
+        return axis.m
 
     def rows_of(self, parameter: PerCell, m: int = 1) -> Tensor:
         """Returns the parameter of each row's cell, [n * m, ...]."""
@@ -274,46 +371,60 @@ class GroupedRun(TorchFunctionMode):
 
     # Marks ------------------------------------------------------------------------------------------------------------
 
-    def mark(self, tensor: Tensor, tag: str = "") -> Tensor:
-        """Marks a tensor as dependent on samples; ``tag`` is "any" or "all" for the result of that reduction."""
-        setattr(tensor, _MARK, (self._token, tag))
+    def mark(self, tensor: Tensor, axis: Axis | None = None, tag: str = "") -> Tensor:
+        """Marks a tensor as dependent on samples, with the axis of its samples if this is known.
+
+        ``tag`` is "any" or "all" for the result of that reduction.
+        """
+        setattr(tensor, _MARK, (self._token, tag, axis))
         self.widest = max(self.widest, tensor.numel() * tensor.element_size())
         return tensor
 
-    def fail(self, reason: str, of_batch: bool = False) -> Ungroupable:
-        """Records why the run cannot continue, and returns the error to raise.
-
-        ``of_batch`` tells whether another batch may run grouped.
-        """
-        self.failed = self.failed or Ungroupable(reason + line_of(user_frame()), of_batch)
+    def fail(self, reason: str, of_batch: bool = False, is_new: bool = False) -> Ungroupable:
+        """Records why the run cannot continue, and returns the error to raise; see :class:`Ungroupable`."""
+        self.failed = self.failed or Ungroupable(reason + line_of(user_frame()), of_batch, is_new)
         return self.failed
 
     # Functions --------------------------------------------------------------------------------------------------------
+
+    def _step(self, func: Any) -> Step | None:
+        """Returns the step of the next function, in a known sequence that begins like this run."""
+        if self._records is None:
+            return None
+        at, self._at = self._at, self._at + 1
+        if at >= len(self._steps) or self._steps[at].function != func:
+            begun = [step.function for step in self._steps[:at]]
+            for steps in self._records:
+                if [step.function for step in steps[: at + 1]] == [*begun, func]:
+                    self._steps = steps
+                    break
+            else:
+                raise self.fail("its forward calls other functions than before", of_batch=True, is_new=True)
+        return self._steps[at]
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Runs one PyTorch function of the module."""
         kwargs = kwargs or {}
         if func in METADATA:
             return func(*args, **kwargs)
-        operands = tensors_of((args, kwargs))
-        marked = [tensor for tensor in operands if self.is_rows(tensor)]
+        step, operands = self._step(func), tensors_of((args, kwargs))
         if any(type(tensor) is PerCell for tensor in operands):
-            return self._with_parameters(func, args, kwargs, operands, marked)
+            return self._with_parameters(func, args, kwargs, operands, step)
         exact = EXACT.get(func, func)
         result = without_randomness(exact, args, kwargs) if self.quiet else exact(*args, **kwargs)
-        outputs = tensors_of(result)
+        read = [] if func in _BY_TYPE else operands[:1] if func in _BY_FIRST else operands
+        marked, outputs = [tensor for tensor in read if self.is_rows(tensor)], tensors_of(result)
         if marked:
             if writes_in_place(func):
                 self.mark(operands[0])
             name = getattr(func, "__name__", "")
             for tensor in outputs:
-                self.mark(tensor, name if name in ("any", "all") else "")
+                self.mark(tensor, tag=name if name in ("any", "all") else "")
             if not outputs:
                 self._check_read(func, result, marked[0])
-        elif func in CREATE:
+        elif step is not None and step.counts:  # such as torch.zeros(n, 4)
             for tensor in outputs:
-                if tensor.shape[:1] == (self.n,):
-                    self.mark(tensor)
+                self.mark(tensor)
         return result
 
     def _check_read(self, func: Any, result: Any, source: Tensor) -> None:
@@ -325,20 +436,28 @@ class GroupedRun(TorchFunctionMode):
             return
         raise self.fail(f"{name_of(func)} reads values of the samples", of_batch=True)
 
-    def _with_parameters(self, func: Any, args: Any, kwargs: Any, operands: list[Tensor], marked: list[Tensor]) -> Any:
-        for tensor in operands:
-            is_unmarked = type(tensor) is not PerCell and not hasattr(tensor, _MARK) and tensor.shape[:1] == (self.n,)
-            if is_unmarked and not isinstance(tensor, torch.nn.Parameter):
-                raise self.fail(f"{name_of(func)} takes rows that were not computed by a recorded PyTorch function")
+    def _with_parameters(self, func: Any, args: Any, kwargs: Any, operands: list[Tensor], step: Step | None) -> Any:
+        if step is not None:
+            for tensor, axis in zip(operands, step.axes, strict=False):
+                if axis is not None and tensor.shape[axis.dim : axis.dim + 1] != (self.n * axis.m,):
+                    raise self.fail("a tensor has other axes than before", of_batch=True, is_new=True)
+                if self.is_rows(tensor):
+                    self.mark(tensor, axis)
+                elif axis is not None and type(tensor) is not PerCell:
+                    raise self.fail(f"{name_of(func)} takes rows that were not computed by a recorded PyTorch function")
+            args, kwargs = with_counts((args, kwargs), step.counts) if step.counts else (args, kwargs)
         rule = _RULES.get(func)
         result = NotImplemented if rule is None else rule(self, *args, **kwargs)
         if result is NotImplemented:
-            if marked:
-                raise self.fail(f"{name_of(func)} takes parameters, and has no rule for all cells at once")
+            if any(self.is_rows(tensor) for tensor in operands) or has_counts((args, kwargs)):
+                raise self.fail(
+                    f"{name_of(func)} takes parameters, and has no rule for all cells at once; "
+                    "voronerf.router.register adds a rule"
+                )
             return for_all_cells(func, args, kwargs, self.fail)
         for tensor in tensors_of(result):
             if type(tensor) is not PerCell:
-                self.mark(tensor)
+                self.mark(tensor, getattr(tensor, _MARK, (None, "", None))[2])
         return result
 
 
@@ -365,6 +484,7 @@ class Grouped:
     On a CPU, ``forward`` runs on pieces of the rows, so that its tensors fit in the cache.
     """
 
+    records: list[list[Step]]  # the known sequences of the module's functions, the latest last
     piece: int = 1 << 16  # maximum number of rows in a piece
     name: str = "grouped"
     why: str = ""
@@ -383,9 +503,9 @@ class Grouped:
             pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
         values, widest, tables, double = [], 1, dict[Any, Any](), Double(call.module)
         for part, rows in zip(parts, split_rows(arguments, [part.n for part in parts]), strict=True):
-            run = GroupedRun(part, tables, self.quiet)
+            run = GroupedRun(part, tables, self.records, self.quiet)
             for tensor in rows:
-                run.mark(tensor)
+                run.mark(tensor, Axis(0))
             origin = part.start
             stand_ins = {id(p): PerCell(piece[origin], (p, origin)) for p, piece in pieces}
             with run:

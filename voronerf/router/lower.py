@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from voronerf.ops._core.program import PARAMETER, VALUE, Builder, Columns
+from voronerf.router.axes import Axis
 from voronerf.router.grouped import find
 from voronerf.router.layout import map_tensors, tensors_of
 
@@ -243,18 +244,14 @@ class Lowering:
 
     # Values -----------------------------------------------------------------------------------------------------------
 
-    def input(self, node: Any, shape: Sequence[int], level: int) -> Entries:
-        """Adds the rows of a node as an input of the program, [rows * m, ...] for m entries per sample."""
-        if not shape or shape[0] % self.rows or math.prod(shape) == 0:
-            at = next((d for d, size in enumerate(shape) if size == self.rows), None)
-            if at is None or math.prod(shape) == 0:
-                raise NotAStep(f"a tensor of shape {list(shape)} has no row for each sample")
-            moved = [shape[at], *shape[:at], *shape[at + 1 :]]
-            return Entries(self.input(node, moved, level).codes.movedim(0, at))
-        width = math.prod(shape) // self.rows
-        x = self.builder.input(width)
+    def input(self, node: Any, shape: Sequence[int], axis: Axis | None, level: int) -> Entries:
+        """Adds the rows of a node as an input of the program; ``axis`` is the axis of its samples."""
+        if axis is None or math.prod(shape) == 0 or (axis.dim and axis.m > 1):
+            raise NotAStep(f"a tensor of shape {list(shape)} has no row for each sample")
+        moved = [shape[axis.dim], *shape[: axis.dim], *shape[axis.dim + 1 :]]
+        x = self.builder.input(math.prod(shape) // self.rows)
         self.sources[x.index], self.levels[x.index] = node, level
-        return Entries(self._codes(x).reshape(list(shape)))
+        return Entries(self._codes(x).reshape(moved).movedim(0, axis.dim))
 
     def _codes(self, x: Columns) -> Tensor:
         """Returns the codes of columns, [rows, w]."""

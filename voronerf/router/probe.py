@@ -18,15 +18,16 @@ from voronerf.ops._core.tolerances import agree, agree_gradients
 from voronerf.router.cells import clone_module
 from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
-from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Way
+from voronerf.router.grouped import Grouped, Loop, NoRandomness, Recorder, Step, Ungroupable, Way, steps_of
 from voronerf.router.grouping import Grouping, cell_parameters
 from voronerf.router.layout import BROADCAST, RAY, Call, Results, as_plain, map_tensors, tensors_of
-from voronerf.router.trace import Unfusable, rows_for
+from voronerf.router.trace import Unfusable
 from voronerf.router.watch import Inputs
 
 _OP = "VoronoiRouter"
 FEWEST = 8  # minimum number of samples in a probe; a smaller batch is extended by similar samples
-_SAMPLES, _CELLS = (41, 43, 47, 53), 3  # candidate numbers of samples of a probe, and its number of cells
+_SAMPLES, _CELLS = 41, 3  # numbers of samples and cells of a probe
+_OTHER = 37  # another number of samples, by which sizes that count samples differ from other sizes
 _FEW = 8  # rows for the check whether a module needs a subclass of tensors
 _PIECE = 8 << 20  # bytes of the largest tensor in a piece of rows on a CPU; larger tensors outgrow the cache
 
@@ -51,10 +52,9 @@ class Probe:
         self.refused = ""  # why a changed value cannot be an input
         device, generator = grouping.device, torch.Generator().manual_seed(0)
         call = _widened(call, generator) if call.layout.n < FEWEST else call
-        self._n = n = rows_for(call.module, tensors_of((call.args, call.kwargs)), _SAMPLES)
-        picked = torch.arange(n, device=device) * call.layout.n // n
-        cells = (torch.arange(n, device=device) * 7 % 5 // 2).int()
-        self._entries = Grouping(cells, n, _CELLS, device, grouping.backend, rows=picked)
+        picked = torch.arange(_SAMPLES, device=device) * call.layout.n // _SAMPLES
+        cells = (torch.arange(_SAMPLES, device=device) * 7 % 5 // 2).int()
+        self._entries = Grouping(cells, _SAMPLES, _CELLS, device, grouping.backend, rows=picked)
         self._entries.source, self._entries.occupied  # noqa: B018  cached, since a mode would import torch's compiler
         memo = {id(p): _perturbed(p, generator) for p in cell_parameters(call.module)}
         module = clone_module(call.module, memo).to(dtype)
@@ -109,10 +109,10 @@ class Probe:
                 warn_once(f"fuse {call.method}", message)
         if options.way in ("fastest", "grouped") or (options.way == "fused" and not ways):
             try:
-                grouped = Grouped(quiet=True)
+                grouped = Grouped([self.steps()], quiet=True)
                 if self._agrees(grouped, loop, expected):
-                    piece = min(max(_PIECE * self._n // grouped.widest, 1 << 10), 1 << 16)
-                    ways.append(Grouped(piece, why=unfused))
+                    piece = min(max(_PIECE * _SAMPLES // grouped.widest, 1 << 10), 1 << 16)
+                    ways.append(Grouped(grouped.records, piece, why=unfused))
                 else:
                     loop.why = "its forward on the samples of all cells gives other results than the loop over cells"
             except BackendUnavailable:
@@ -127,11 +127,20 @@ class Probe:
             ways = ways[:1]  # no timing, since some checkpoints refuse torch.autograd.grad
         return [*ways, loop], may_group and not ways
 
+    def steps(self) -> list[Step]:
+        """Runs the first cell's module with two numbers of samples, and returns its steps."""
+        rows, runs = self._call.arranged(self._entries), (Recorder(), Recorder())
+        cell = {id(parameter): parameter[0] for parameter in cell_parameters(self._call.module)}
+        with NoRandomness():
+            for count, recorder in zip((_SAMPLES, _OTHER), runs, strict=True):
+                Double(self._call.module).run(self._call, [tensor[:count] for tensor in rows], cell, recorder)
+        return steps_of(runs, (_SAMPLES, _OTHER))
+
     def is_groupable(self) -> bool:
         """Returns whether the module runs without error for all cells at once on this batch."""
         try:
             with torch.no_grad():
-                self._run(Grouped(quiet=True))
+                self._run(Grouped([self.steps()], quiet=True))
         except Exception:
             return False
         return True
@@ -184,9 +193,8 @@ class Probe:
         for candidate in inputs:
             try:
                 with NoRandomness():
-                    module, tensors = self._source[0].module, self._call.arranged(self._entries)
-                    count = rows_for(module, tensors)
-                    way = Fused(replace(self._call, module=module), [rows[:count] for rows in tensors], candidate)
+                    call = replace(self._call, module=self._source[0].module)
+                    way = Fused(call, self._call.arranged(self._entries), candidate)
                 if not self._agrees(way, loop, expected):
                     raise Unfusable("the traced network gives other results than its forward")
                 return way

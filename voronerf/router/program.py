@@ -21,6 +21,7 @@ from voronerf.ops._core.tolerances import agree
 from voronerf.ops._core.unchanged import Never, unchanged
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.routed_program import routed_program
+from voronerf.router.axes import Axis
 from voronerf.router.double import Double
 from voronerf.router.grouping import cell_parameters, parts_of
 from voronerf.router.labels import Labels
@@ -100,7 +101,7 @@ def _steps_of(function: Callable[..., Any], width: int) -> tuple[Program, tuple[
     rows = next(rows for rows in _ROWS if width % rows)
     x = torch.linspace(-2, 2, rows * width).reshape(width, rows).t().contiguous()
     lowering = Lowering(rows)
-    entries = lowering.input(None, x.shape, 0)
+    entries = lowering.input(None, x.shape, Axis(0), 0)
     result, _, entries_of = lowering.run(function, (x,), {}, lambda tensor: entries if tensor is x else None)
     columns = [lowering.order(entries_of(tensor).codes)[1] for tensor in tensors_of(result)]
     program = lowering.builder.program([lowering.operand(numbers) for numbers in columns])

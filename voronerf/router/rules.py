@@ -18,6 +18,7 @@ from torch import Tensor
 
 from voronerf.ops import grouped_linear
 from voronerf.ops._core.memory import on_huge_pages
+from voronerf.router.axes import Axis, Count
 from voronerf.router.grouped import GroupedRun, PerCell, find, register, writes_in_place
 from voronerf.router.grouping import cells_of
 from voronerf.router.layout import map_tensors, tensors_of
@@ -55,16 +56,20 @@ def _spellings(names: str) -> frozenset[Any]:
 
 @rule(F.linear)
 def linear(run: GroupedRun, input: Tensor, weight: Tensor, bias: Tensor | None = None) -> Any:
-    """Multiplies rows [n * m, ..., i] by a weight [o, i]."""
-    if not run.is_rows(input) or input.dim() < 2 or weight.dim() != 2 or run.is_rows(bias) or run.is_rows(weight):
+    """Multiplies rows [..., n * m, ..., i] by a weight [o, i]."""
+    if not run.is_rows(input) or weight.dim() != 2 or run.is_rows(bias) or run.is_rows(weight):
+        return NotImplemented
+    dim, entries = run.axis(input)
+    if dim == input.dim() - 1:
         return NotImplemented
     if input.shape[-1] != weight.shape[1]:
         raise RuntimeError(
             f"VoronoiRouter: a linear layer of the module takes {weight.shape[1]} features, got {list(input.shape)}"
         )
+    rows = input.movedim(dim, 0) if dim else input
     # The input is made contiguous, because the layer saves it, and would copy a strided input again for gradients.
-    flat = (input if input.dim() == 2 else input.reshape(-1, input.shape[-1])).contiguous()
-    m = run.entries(input) * (flat.shape[0] // input.shape[0])
+    flat = (rows if rows.dim() == 2 else rows.reshape(-1, rows.shape[-1])).contiguous()
+    m = entries * (flat.shape[0] // rows.shape[0])
     is_joint = isinstance(weight, PerCell) and (bias is None or isinstance(bias, PerCell))
     if isinstance(weight, PerCell):
         y = _product(run, flat, m, weight.stacked, bias.stacked if isinstance(bias, PerCell) else None)
@@ -73,7 +78,8 @@ def linear(run: GroupedRun, input: Tensor, weight: Tensor, bias: Tensor | None =
     if bias is not None and not is_joint:
         y = y + (run.rows_of(bias, m) if isinstance(bias, PerCell) else bias)
     # No view if the shape is already right, because writes into a view make the backward slow.
-    return y if input.dim() == 2 else y.reshape(*input.shape[:-1], weight.shape[0])
+    y = y if rows.dim() == 2 else y.reshape(*rows.shape[:-1], weight.shape[0])
+    return run.mark(y.movedim(0, dim) if dim else y, Axis(dim, entries))
 
 
 def _product(run: GroupedRun, x: Tensor, m: int, weight: Tensor, bias: Tensor | None) -> Tensor:
@@ -89,30 +95,12 @@ def _product(run: GroupedRun, x: Tensor, m: int, weight: Tensor, bias: Tensor | 
     return torch.complex(*y.chunk(2, 1))
 
 
-@rule(torch.matmul, torch.Tensor.matmul, torch.mm, torch.Tensor.mm, torch.Tensor.__matmul__)
-def matmul(run: GroupedRun, input: Tensor, other: Tensor) -> Any:
-    """Multiplies rows [n * m, ..., i] by a matrix [i, o]."""
-    if not isinstance(other, PerCell) or other.dim() != 2:
-        return NotImplemented
-    return linear(run, input, PerCell(other.stacked.transpose(1, 2)))
-
-
-register(torch.Tensor.__rmatmul__, lambda run, other, input: matmul(run, input, other))
-
-
-@rule(torch.addmm, torch.Tensor.addmm)
-def addmm(run: GroupedRun, input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: float = 1, alpha: float = 1) -> Any:
-    """Multiplies rows [n * m, i] by a matrix [i, o] and adds ``input``; supports only beta = alpha = 1."""
-    product = matmul(run, mat1, mat2) if beta == alpha == 1 else NotImplemented
-    return product if product is NotImplemented else _elementwise(torch.add, run, run.mark(product), input)
-
-
 _PAIR = re.compile(r"(\w+),(\w+)->(\w+)")
 
 
 @rule(torch.einsum)
 def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
-    """Multiplies rows by a parameter; sums all or none of their common letters: ``"bid,iod->bo"``, ``"bi,oi->bio"``."""
+    """Multiplies rows by a parameter, such as ``"bid,iod->bo"``, ``"bhi,hio->bho"`` or ``"bi,oi->bio"``."""
     operands = tuple(operands[0]) if isinstance(operands[0], (list, tuple)) else operands
     match = _PAIR.fullmatch(equation.replace(" ", ""))
     if match is None or len(operands) != 2:
@@ -120,27 +108,96 @@ def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
     (x, weight), (of_x, of_weight, out) = operands, match.groups()
     if isinstance(x, PerCell):
         x, weight, of_x, of_weight = weight, x, of_weight, of_x
-    summed = "".join(letter for letter in of_x if letter not in out)
-    unshared = set(of_x) ^ set(of_weight)
     repeats = any(len(set(letters)) != len(letters) for letters in (of_x, of_weight, out))
-    if not run.is_rows(x) or repeats or not unshared <= set(out) or out[0] in of_weight:
+    if not isinstance(weight, PerCell) or not run.is_rows(x) or repeats or not set(of_x) ^ set(of_weight) <= set(out):
         return NotImplemented
+    dim, m = run.axis(x)
+    sample, both = of_x[dim], [letter for letter in of_x if letter in of_weight]
+    if sample in of_weight:
+        return NotImplemented
+    for letter in both:  # a dimension of size 1 is repeated
+        if x.shape[of_x.index(letter)] == weight.shape[of_weight.index(letter)]:
+            continue
+        if x.shape[of_x.index(letter)] == 1:
+            x, of_x = x.squeeze(of_x.index(letter)), of_x.replace(letter, "")
+        else:
+            stacked = weight.stacked.squeeze(1 + of_weight.index(letter))
+            weight, of_weight = PerCell(stacked), of_weight.replace(letter, "")
+    both, sizes = [letter for letter in of_x if letter in of_weight], dict(zip(of_weight, weight.shape, strict=True))
+    summed = [letter for letter in both if letter not in out]
     if not summed:
 
         def spread(tensor: Tensor, letters: str) -> Tensor:
-            tensor = tensor.permute([letters.index(letter) for letter in out if letter in letters])
-            return tensor[tuple(slice(None) if letter in letters else None for letter in out)]
+            tensor = tensor.permute([letters.index(letter) for letter in order if letter in letters])
+            return tensor[tuple(slice(None) if letter in letters else None for letter in order)]
 
-        factor = PerCell(spread(weight.stacked, out[0] + of_weight))  # cells come first, like samples
-        return _elementwise(torch.mul, run, run.mark(spread(x, of_x)), factor)
-    if set(of_x) & set(of_weight) != set(summed):
+        order = sample + out.replace(sample, "")
+        factor = PerCell(spread(weight.stacked, sample + of_weight))  # cells come first, like samples
+        y = _elementwise(torch.mul, run, run.mark(spread(x, of_x), Axis(0, m)), factor)
+        return run.mark(y.permute([order.index(letter) for letter in out]), Axis(out.index(sample), m))
+    kept = [sample, *(letter for letter in of_x if letter not in of_weight + sample)]
+    batch, new = [letter for letter in both if letter in out], [letter for letter in of_weight if letter not in of_x]
+    rows = x.permute([of_x.index(letter) for letter in (*kept, *batch, *summed)]).flatten(-len(summed))
+    stacked = weight.stacked.permute([0, *(1 + of_weight.index(letter) for letter in (*batch, *new, *summed))])
+    stacked = stacked.reshape(len(stacked), math.prod(sizes[letter] for letter in batch), -1, rows.shape[-1])
+    rows = rows.reshape(*rows.shape[: len(kept)], stacked.shape[1], rows.shape[-1])
+    parts = [
+        linear(run, run.mark(part, Axis(0, m)), PerCell(weights))
+        for part, weights in zip(rows.unbind(-2), stacked.unbind(1), strict=True)
+    ]
+    y = torch.stack(parts, -2) if len(parts) > 1 else parts[0]
+    y = y.reshape(*rows.shape[: len(kept)], *(sizes[letter] for letter in (*batch, *new)))
+    y = y.permute([(*kept, *batch, *new).index(letter) for letter in out])
+    return run.mark(y, Axis(out.index(sample), m))
+
+
+@rule(*find("matmul mm bmm mv __matmul__", torch, torch.Tensor))
+def matmul(run: GroupedRun, input: Tensor, other: Tensor) -> Any:
+    """Multiplies rows by a parameter, or a parameter by rows; dimensions before the last two are a batch."""
+    if not input.dim() or not other.dim():
         return NotImplemented
-    kept, new = "".join(filter(of_x.count, out)), "".join(filter(of_weight.count, out))
-    rows = x.permute([of_x.index(letter) for letter in kept + summed]).flatten(len(kept))
-    stacked = weight.stacked.permute([0, *(1 + of_weight.index(letter) for letter in new + summed)])
-    y = linear(run, run.mark(rows), PerCell(stacked.reshape(len(stacked), -1, rows.shape[-1])))
-    y = y.reshape(*rows.shape[:-1], *stacked.shape[1 : 1 + len(new)])
-    return y if kept + new == out else y.permute([(kept + new).index(letter) for letter in out])
+    batch = "abcdefgh"[: max(input.dim(), other.dim(), 2) - 2]
+
+    def letters(tensor: Tensor, inner: str) -> str:
+        return batch[len(batch) + 2 - max(tensor.dim(), 2) :] + inner
+
+    a = letters(input, "xz"[-input.dim() :])
+    b = letters(other, "zy"[: other.dim()])
+    out = "".join(letter for letter in (*batch, "x", "y") if letter in a + b)
+    return einsum(run, f"{a},{b}->{out}", input, other)
+
+
+register(torch.Tensor.__rmatmul__, lambda run, other, input: matmul(run, input, other))
+
+
+@rule(torch.tensordot)
+def tensordot(run: GroupedRun, a: Tensor, b: Tensor, dims: Any = 2, out: Any = None) -> Any:
+    """Sums over pairs of dimensions of rows and a parameter."""
+    if out is not None or isinstance(dims, Tensor):
+        return NotImplemented
+    of_a, of_b = "abcdefgh"[: a.dim()], list("ijklmnop"[: b.dim()])
+    pairs = dims if not isinstance(dims, int) else (range(a.dim() - dims, a.dim()), range(dims))
+    for i, j in zip(*((each,) if isinstance(each, int) else each for each in pairs), strict=True):
+        of_b[j] = of_a[i]
+    summed = set(of_a) & set(of_b)
+    kept = "".join(letter for letter in (*of_a, *of_b) if letter not in summed)
+    return einsum(run, f"{of_a},{''.join(of_b)}->{kept}", a, b)
+
+
+@rule(F.bilinear)
+def bilinear(run: GroupedRun, input1: Tensor, input2: Tensor, weight: Tensor, bias: Tensor | None = None) -> Any:
+    """Multiplies the outer products of rows [n * m, i] and [n * m, j] by a weight [o, i, j]."""
+    if not run.is_rows(input1) or not run.is_rows(input2) or not isinstance(weight, PerCell):
+        return NotImplemented
+    pairs = run.mark((input1.unsqueeze(-1) * input2.unsqueeze(-2)).flatten(-2), run.axis(input1))
+    return linear(run, pairs, PerCell(weight.stacked.flatten(2)), bias)
+
+
+@rule(*find("addmm baddbmm", torch, torch.Tensor))
+def addmm(run: GroupedRun, input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: float = 1, alpha: float = 1) -> Any:
+    """Multiplies rows and a parameter and adds ``input``; supports only beta = alpha = 1."""
+    product = matmul(run, mat1, mat2) if beta == alpha == 1 else NotImplemented
+    return product if product is NotImplemented else _elementwise(torch.add, run, product, input)
 
 
 @rule(F.conv1d, F.conv2d, F.conv3d)
@@ -154,50 +211,69 @@ def convolution(
     dilation: Any = 1,
     groups: int = 1,
 ) -> Any:
-    """Convolves rows [n * m, i, ...] with kernels of size 1.
-
-    The input may also be [i, ...] or [1, i, ...], with the samples in one of the later dimensions.
-    """
+    """Convolves rows with kernels of size 1; the samples may be in any dimension but the channels'."""
     places, channel = weight.dim() - 2, input.dim() - weight.dim() + 1
     if not run.is_rows(input) or set(weight.shape[2:]) != {1} or groups != 1:
         return NotImplemented
     if stride not in (1, (1,) * places) or padding not in (0, (0,) * places):
         return NotImplemented
-    sample_dims = [d for d in range(channel + 1, input.dim()) if input.shape[d] == run.n]
-    sample_dims = sample_dims if channel == 0 or input.shape[0] % run.n else [0]
-    if len(sample_dims) != 1:
+    dim, m = run.axis(input)
+    if dim == channel:
         return NotImplemented
     flat = PerCell(weight.stacked.flatten(2)) if isinstance(weight, PerCell) else weight.flatten(1)
-    y = linear(run, run.mark(input.movedim((sample_dims[0], channel), (0, -1))), flat, bias)
-    return y if y is NotImplemented else y.movedim((0, -1), (sample_dims[0], channel))
+    y = linear(run, run.mark(input.movedim((dim, channel), (0, -1)), Axis(0, m)), flat, bias)
+    return y if y is NotImplemented else run.mark(y.movedim((0, -1), (dim, channel)), Axis(dim, m))
 
 
 # Scales and shifts ----------------------------------------------------------------------------------------------------
 
 
+def _spread(run: GroupedRun, parameter: PerCell, after: int, m: int) -> Tensor | None:
+    """Repeats a parameter for each row, with the rows before its last ``after`` dimensions; returns None if it varies.
+
+    A parameter with a dimension of another size than 1 at the place of the rows differs between samples.
+    """
+    shape, stacked = parameter.shape, parameter.stacked
+    before = max(len(shape) - after - 1, 0)
+    if len(shape) > after:
+        if shape[before] != 1:
+            return None
+        stacked = stacked.squeeze(1 + before)
+    rows = run.rows_of(PerCell(stacked), m)
+    rows = rows.reshape(-1, *shape[:before], *[1] * (after - len(shape)), *shape[len(shape) - min(after, len(shape)) :])
+    return rows.movedim(0, before) if before else rows
+
+
 def _elementwise(func: Any, run: GroupedRun, *args: Any, **kwargs: Any) -> Any:
-    """Runs an elementwise function on rows [n * m, ...] and parameters that broadcast to them."""
+    """Runs an elementwise function on rows and on parameters that broadcast to them."""
     tensors = tensors_of((args, kwargs))
     rows = [tensor for tensor in tensors if run.is_rows(tensor)]
     if not rows or (isinstance(args[0], PerCell) and writes_in_place(func)):  # no writes into a parameter
         return NotImplemented
-    dim, m = max(tensor.dim() for tensor in rows), run.entries(rows[0])
-    if any(tensor.dim() != dim or run.entries(tensor) != m for tensor in rows):
+    places = {(tensor.dim() - 1 - run.axis(tensor).dim, run.axis(tensor).m) for tensor in rows}
+    if len(places) > 1:
         return NotImplemented
-    if any(t.dim() > dim or (t.dim() == dim and t.shape[0] != 1) for t in tensors if not run.is_rows(t)):
+    ((after, m),) = places
+    spread = {id(t): _spread(run, t, after, m) for t in tensors if isinstance(t, PerCell)}
+    if any(parameter is None for parameter in spread.values()):
         return NotImplemented
     dtypes = [tensor.dtype for tensor in tensors if tensor.dim() > 0 and tensor.is_floating_point()]
 
-    def expanded(value: Tensor) -> Tensor:
+    def expanded(value: Tensor) -> Any:
         if not isinstance(value, PerCell):
             return value
-        shape = value.shape[value.dim() == dim :]
-        parameter = run.rows_of(value, m).reshape(-1, *[1] * (dim - 1 - len(shape)), *shape)
         # PyTorch ignores the dtype of a zero-dimensional tensor, so its repeated values get the other tensors' dtype.
-        return parameter.to(functools.reduce(torch.promote_types, dtypes)) if value.dim() == 0 and dtypes else parameter
+        typed = value.dim() == 0 and dtypes
+        parameter = spread[id(value)]
+        return (
+            parameter.to(functools.reduce(torch.promote_types, dtypes))
+            if typed and parameter is not None
+            else parameter
+        )
 
     args, kwargs = map_tensors((args, kwargs), expanded)
-    return func(*args, **kwargs)
+    result = func(*args, **kwargs)
+    return run.mark(result, Axis(result.dim() - 1 - after, m))
 
 
 for _function in _spellings(_ELEMENTWISE):
@@ -208,19 +284,21 @@ for _function in _spellings(_ELEMENTWISE):
 def expand(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
     """Repeats a parameter once per sample, ``p.expand(n, -1)``."""
     sizes = tuple(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes
-    if not isinstance(source, PerCell) or len(sizes) <= 1 or sizes[0] != run.n:
+    dims = [dim for dim, size in enumerate(sizes) if isinstance(size, Count)]
+    if not isinstance(source, PerCell) or len(dims) != 1:
         return NotImplemented
-    added = len(sizes) - source.dim()
-    if added < 0 or (added == 0 and source.shape[0] != 1):
-        return NotImplemented
-    inner = (*[1] * (added - 1), *source.shape) if added else source.shape[1:]
-    return run.rows_of(PerCell(source.stacked.reshape(-1, *inner))).expand(run.n, *sizes[1:])
+    m = sizes[dims[0]] // run.n
+    rows = _spread(run, source, len(sizes) - 1 - dims[0], m)
+    return NotImplemented if rows is None else run.mark(rows.expand(sizes), Axis(dims[0], m))
 
 
 @rule(torch.Tensor.expand_as)
 def expand_as(run: GroupedRun, source: Tensor, other: Tensor) -> Any:
     """Repeats a parameter once for each row, ``p.expand_as(x)``."""
-    return expand(run, source, *other.shape) if run.is_rows(other) else NotImplemented
+    if not run.is_rows(other):
+        return NotImplemented
+    dim = run.axis(other).dim
+    return expand(run, source, *other.shape[:dim], Count(other.shape[dim]), *other.shape[dim + 1 :])
 
 
 @rule(torch.Tensor.data.__get__)  # type: ignore[attr-defined]
@@ -233,30 +311,160 @@ def data(run: GroupedRun, source: Tensor) -> Any:
 def repeat(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
     """Repeats a parameter once per sample, ``p.repeat(n, 1)``."""
     counts = tuple(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes
-    rows = expand(run, source, *counts[:1], *[-1] * (len(counts) - 1))
-    return rows if rows is NotImplemented else rows.repeat(1, *counts[1:])
+    dims = [dim for dim, count in enumerate(counts) if isinstance(count, Count)]
+    if not isinstance(source, PerCell) or len(dims) != 1:
+        return NotImplemented
+    m = counts[dims[0]] // run.n
+    rows = _spread(run, source, len(counts) - 1 - dims[0], m)
+    if rows is None:
+        return NotImplemented
+    return run.mark(rows.repeat([1 if isinstance(count, Count) else count for count in counts]), Axis(dims[0], m))
 
 
 # Norms ----------------------------------------------------------------------------------------------------------------
+
+
+def _scaled(run: GroupedRun, x: Any, axis: Axis, weight: Any, bias: Any, after: int = 0) -> Any:
+    """Multiplies rows by a weight and adds a bias, which have their channel before the last ``after`` dimensions."""
+    x = run.mark(x, axis)
+    for parameter, join in ((weight, torch.mul), (bias, torch.add)):
+        if isinstance(parameter, PerCell):
+            stacked = parameter.stacked.reshape(*parameter.stacked.shape, *[1] * after)
+            x = _elementwise(join, run, x, PerCell(stacked))
+        elif parameter is not None:
+            x = join(x, parameter.reshape(*parameter.shape, *[1] * after))
+    return x
 
 
 def _norm(
     func: Any, run: GroupedRun, input: Tensor, normalized_shape: Any, weight: Any = None, bias: Any = None, **more: Any
 ) -> Any:
     """Normalises over the last dimensions without parameters, then applies weight and bias."""
-    if not run.is_rows(input):
+    if not run.is_rows(input) or run.axis(input).dim >= input.dim() - len(normalized_shape):
         return NotImplemented
-    x = func(input, normalized_shape, **more)
-    for parameter, join in ((weight, torch.mul), (bias, torch.add)):
-        if isinstance(parameter, PerCell):
-            x = _elementwise(join, run, run.mark(x), parameter)
-        elif parameter is not None:
-            x = join(x, parameter)
-    return x
+    return _scaled(run, func(input, normalized_shape, **more), run.axis(input), weight, bias)
 
 
 for _function in (F.layer_norm, F.rms_norm):
     register(_function, functools.partial(_norm, EXACT.get(_function, _function)))
+
+
+@rule(F.group_norm)
+def group_norm(
+    run: GroupedRun, input: Tensor, num_groups: int, weight: Any = None, bias: Any = None, eps: float = 1e-5
+) -> Any:
+    """Normalises groups of channels [n, c, ...], then applies weight and bias."""
+    if not run.is_rows(input) or run.axis(input).dim:
+        return NotImplemented
+    x = F.group_norm(input, num_groups, eps=eps)
+    return _scaled(run, x, run.axis(input), weight, bias, input.dim() - 2)
+
+
+@rule(F.batch_norm)
+def batch_norm(
+    run: GroupedRun,
+    input: Tensor,
+    running_mean: Tensor | None,
+    running_var: Tensor | None,
+    weight: Any = None,
+    bias: Any = None,
+    training: bool = False,
+    momentum: float = 0.1,
+    eps: float = 1e-5,
+) -> Any:
+    """Normalises channels [n, c, ...] by statistics that all cells share; supports only evaluation mode."""
+    if not run.is_rows(input) or run.axis(input).dim == 1 or training:
+        return NotImplemented
+    x = F.batch_norm(input, running_mean, running_var, eps=eps)
+    return _scaled(run, x, run.axis(input), weight, bias, input.dim() - 2)
+
+
+@rule(F.prelu, torch.prelu, torch.Tensor.prelu)
+def prelu(run: GroupedRun, input: Tensor, weight: Tensor) -> Any:
+    """Scales negative rows by one slope, or by a slope for each channel [n, c, ...]."""
+    if not isinstance(weight, PerCell) or not run.is_rows(input):
+        return NotImplemented
+    after = 0 if weight.numel() == 1 else max(input.dim() - 2, 0)
+    slopes = PerCell(weight.stacked.reshape(*weight.stacked.shape, *[1] * after))
+    return _elementwise(lambda x, slope: torch.where(x > 0, x, slope * x), run, input, slopes)
+
+
+# Recurrent layers -----------------------------------------------------------------------------------------------------
+
+
+def _gru(x: Tensor, h: Tensor, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    (r, z, n), (hr, hz, hn) = x.chunk(3, -1), h.chunk(3, -1)
+    n = torch.tanh(n + torch.sigmoid(r + hr) * hn)
+    return (n + torch.sigmoid(z + hz) * (state[0] - n),)
+
+
+def _lstm(x: Tensor, h: Tensor, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    i, f, g, o = (x + h).chunk(4, -1)
+    cell = torch.sigmoid(f) * state[1] + torch.sigmoid(i) * torch.tanh(g)
+    return torch.sigmoid(o) * torch.tanh(cell), cell
+
+
+_CELLS: dict[str, Callable[..., tuple[Tensor, ...]]] = {
+    "gru": _gru,
+    "lstm": _lstm,
+    "rnn_tanh": lambda x, h, state: (torch.tanh(x + h),),
+    "rnn_relu": lambda x, h, state: (torch.relu(x + h),),
+}
+"""The next state of a recurrent cell, from the products of its input and of its state, and from the state."""
+
+
+def _recurrent_cell(
+    cell: Any, run: GroupedRun, x: Tensor, hx: Any, w_ih: Tensor, w_hh: Tensor, b_ih: Any = None, b_hh: Any = None
+) -> Any:
+    """Computes one step of a cell for rows [n * m, i]; ``hx`` is the state [n * m, h], or a pair (LSTM)."""
+    state = (hx,) if isinstance(hx, Tensor) else tuple(hx)
+    if not run.is_rows(x) or run.axis(x).dim or not all(map(run.is_rows, state)):
+        return NotImplemented
+    y = cell(linear(run, x, w_ih, b_ih), linear(run, run.mark(state[0], run.axis(x)), w_hh, b_hh), state)
+    return y if len(y) > 1 else y[0]
+
+
+def _recurrent(
+    cell: Any,
+    run: GroupedRun,
+    x: Tensor,
+    hx: Any,
+    parameters: Any,
+    has_biases: bool,
+    num_layers: int,
+    dropout: float,
+    training: bool,
+    bidirectional: bool,
+    batch_first: bool,
+) -> Any:
+    """Runs layers of a cell along sequences [n, t, i], or [t, n, i]; supports neither packing nor projections."""
+    is_packed, directions = isinstance(hx, Tensor) and isinstance(parameters, Tensor), 1 + bidirectional
+    if is_packed or not run.is_rows(x) or x.dim() != 3 or (dropout and training and num_layers > 1):
+        return NotImplemented
+    states, count = (hx,) if isinstance(hx, Tensor) else tuple(hx), 4 if has_biases else 2
+    if run.axis(x) != (0 if batch_first else 1, 1) or len(parameters) != count * directions * num_layers:
+        return NotImplemented
+    x, last = x if batch_first else x.transpose(0, 1), []
+    for layer in range(num_layers):
+        outputs = []
+        for direction in range(directions):
+            at = layer * directions + direction
+            w_ih, w_hh, *biases = parameters[count * at : count * (at + 1)]
+            b_ih, b_hh = biases or (None, None)
+            steps = linear(run, run.mark(x, Axis(0)), w_ih, b_ih).unbind(1)
+            state, along = tuple(each[at] for each in states), []
+            for step in reversed(steps) if direction else steps:
+                state = cell(step, linear(run, run.mark(state[0], Axis(0)), w_hh, b_hh), state)
+                along.append(state[0])
+            outputs.append(torch.stack(along[::-1] if direction else along, 1))
+            last.append(state)
+        x = torch.cat(outputs, -1) if directions > 1 else outputs[0]
+    return x if batch_first else x.transpose(0, 1), *(torch.stack(each) for each in zip(*last, strict=True))
+
+
+for _name, _cell in _CELLS.items():
+    register(getattr(torch, _name), functools.partial(_recurrent, _cell))
+    register(getattr(torch, f"{_name}_cell"), functools.partial(_recurrent_cell, _cell))
 
 
 # Look-ups -------------------------------------------------------------------------------------------------------------
@@ -369,19 +577,21 @@ def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) ->
     Large batches are sampled cell by cell. For small batches, one look-up for all cells reads and writes only the
     corners around the points.
     """
-    sample_dims = [d for d in range(1, grid.dim() - 1) if grid.shape[d] == run.n]
-    if not isinstance(input, PerCell) or not run.is_rows(grid) or len(sample_dims) != 1 or len(grid) != len(input):
+    if not isinstance(input, PerCell) or not run.is_rows(grid) or len(grid) != len(input):
+        return NotImplemented
+    dim, m = run.axis(grid)
+    if not 0 < dim < grid.dim() - 1 or m > 1:
         return NotImplemented
     is_bilinear = options["mode"] == "bilinear" and options["padding_mode"] in ("zeros", "border") and input.dim() == 4
     is_small = grid[..., 0].numel() * input.shape[1] <= _FEW * run.grouping.k
     if is_bilinear and is_small and input.origin[0].numel() < 1 << 31:
-        cells = run.grouping.sorted_cells.reshape(-1, *[1] * (2 - sample_dims[0])).expand(grid.shape[1:3])
+        cells = run.grouping.sorted_cells.reshape(-1, *[1] * (2 - dim)).expand(grid.shape[1:3])
         zeros, corners = options["padding_mode"] == "zeros", bool(options["align_corners"])
         return torch.cat([_bilinear(run, input, i, grid[i], cells, zeros, corners) for i in range(len(input))])
     occupied, planes = run.grouping.occupied, cells_of(input.stacked)
-    points = grid.split([last - first for _, first, last in occupied], sample_dims[0])
+    points = grid.split([last - first for _, first, last in occupied], dim)
     sampled = [F.grid_sample(planes[cell], at, **options) for (cell, _, _), at in zip(occupied, points, strict=True)]
-    return torch.cat(sampled, sample_dims[0] + 1) if len(sampled) > 1 else sampled[0]
+    return torch.cat(sampled, dim + 1) if len(sampled) > 1 else sampled[0]
 
 
 def _bilinear(

@@ -1,7 +1,8 @@
 """Traces one call of a module as a graph of functions.
 
-The number of samples is chosen such that no other size is a multiple of it. A function mode records every PyTorch
-function with the line that called it. A profile function of the thread records custom autograd functions.
+A function mode records every PyTorch function with the line that called it. A profile function of the thread records
+custom autograd functions. Two traces with different numbers of samples (:func:`trace`) tell sizes that count samples
+from sizes of the module.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, fx, nn
+from torch import Tensor, fx
 from torch.fx.node import map_aggregate, map_arg
 from torch.overrides import TorchFunctionMode
 
+from voronerf.router.axes import axis_of, multiple
 from voronerf.router.double import Double
 from voronerf.router.grouped import METADATA, RANDOM, find, line_of, name_of, user_frame, writes_in_place
 from voronerf.router.grouping import cell_parameters, owned_parameters, parts_of
@@ -26,7 +28,7 @@ from voronerf.router.layout import Call, rebuild, tensors_of
 from voronerf.router.watch import Inputs, lookup
 
 CONSTANTS, CELLS, SAMPLES = range(3)  # dependence of a value: the maximum over its operands
-_PRIMES = (37, 31, 29, 23)  # numbers of samples of a trace, see `rows_for`
+_PAIRS = ((37, 31), (29, 23), (19, 17))  # numbers of samples of two traces, tried in turn
 _LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
 _TOTALS = find("any all sum", torch, torch.Tensor)  # their scalar results may be used for a gradient only
 
@@ -53,11 +55,57 @@ class _Begun(NamedTuple):
     operands: list[Tensor]
 
 
-def rows_for(module: nn.Module, tensors: list[Tensor], primes: tuple[int, ...] = _PRIMES) -> int:
-    """Returns a prime number of samples that divides no size of the module or its arguments."""
-    sizes = {size for tensor in (*module.parameters(), *module.buffers()) for size in tensor.shape}
-    sizes.update(size for tensor in tensors for size in tensor.shape[1:])
-    return next((rows for rows in primes if all(size % rows or not size for size in sizes)), primes[0])
+def trace(call: Call, tensors: list[Tensor], inputs: Inputs) -> Trace:
+    """Traces a call on rows of its arguments, at least 37 of each.
+
+    The ``meta`` of each node with a tensor gets ``axis``, the :class:`Axis` of its samples or None. Raises
+    :class:`Unfusable`.
+    """
+    error: Unfusable | None = None
+    for pair in _PAIRS:
+        try:
+            first, second = (Trace(call, [tensor[:rows] for tensor in tensors], inputs) for rows in pair)
+            _compare(first, second)
+            return first
+        except Unfusable as caught:
+            error = error or caught
+    assert error is not None
+    raise error
+
+
+def _compare(first: Trace, second: Trace) -> None:
+    """Stores the axis of each value; raises Unfusable if the traces differ, or if another size is a multiple of n."""
+    counts, nodes = (first.rows, second.rows), (list(first.graph.nodes), list(second.graph.nodes))
+    if len(nodes[0]) != len(nodes[1]):
+        raise Unfusable("its forward calls other functions for another number of samples")
+    for node, other in zip(*nodes, strict=True):
+        (arguments, shapes), (other_arguments, other_shapes) = _sizes(node), _sizes(other)
+        pairs = [pair for a, b in zip(shapes, other_shapes) for pair in zip(a, b)]
+        same = node.target == other.target and arguments == other_arguments
+        same = same and list(map(len, shapes)) == list(map(len, other_shapes))
+        if not same or any(a != b and not multiple((a, b), counts) for a, b in pairs):
+            line = node.meta.get("line", "")
+            raise Unfusable(f"{name_of(node.target)}{line} gets or gives other sizes for another number of samples")
+        if any(a == b and a and not (a % counts[0] and a % counts[1]) for a, b in pairs):
+            raise Unfusable(f"a size of the module is a multiple of {counts[0]} or {counts[1]}")
+        if isinstance(node.meta.get("value"), Tensor):
+            node.meta["axis"] = axis_of(shapes[0], other_shapes[0], counts)
+
+
+def _sizes(node: fx.Node) -> tuple[list[str], list[list[int]]]:
+    """Returns the names of the nodes in a node's arguments, and the sizes of its value and of other arguments."""
+    names: list[str] = []
+    shapes = [list(value.shape)] if isinstance(value := node.meta.get("value"), Tensor) else []
+
+    def note(leaf: Any) -> Any:
+        if isinstance(leaf, fx.Node):
+            names.append(leaf.name)
+        elif isinstance(leaf, Tensor) or type(leaf) is int:
+            shapes.append(list(leaf.shape) if isinstance(leaf, Tensor) else [leaf])
+        return leaf
+
+    map_aggregate((node.args, node.kwargs), note)
+    return names, shapes
 
 
 class Trace(TorchFunctionMode):
@@ -88,7 +136,7 @@ class Trace(TorchFunctionMode):
         self._running, self._line = False, ""
         self._code: tuple[tuple[str, ...], dict[str, Any]] = (), {}  # the line's code: its names and its globals
         self._nodes: dict[int, fx.Node] = {}  # by the id of the node's tensor, which ``meta`` keeps alive
-        self.rows = rows_for(module, tensors)
+        self.rows = len(tensors[0])
         self.n = self._new(self.rows)
         self.inputs = [self._new(tensor) for tensor in tensors]
         self.shared = [self._new(tensor, on=CONSTANTS) for tensor in call.shared()]
@@ -204,7 +252,7 @@ class Trace(TorchFunctionMode):
         self._line = line = line_of(frame)
         self._code = (frame.f_code.co_names, frame.f_globals) if frame else ((), {})
         operands = tensors_of((args, kwargs))
-        if func is torch.Tensor.type_as:
+        if func in (torch.Tensor.type_as, torch.Tensor.to) and isinstance(args[-1], Tensor):
             func, args = torch.Tensor.to, (args[0], args[1].device, args[1].dtype)
         if func is torch.autograd.grad:  # all cells have one graph; in a loop, each has its own
             kwargs = {**kwargs, "retain_graph": True}
