@@ -2,7 +2,8 @@
 
 The cases: `convention_listed.py` has the codebases of examples/. `convention_layers.py`, `convention_calls.py` and
 `convention_arguments.py` have other fields, `convention_rules.py` single steps, `convention_shared.py` encoders that
-cells share, and `convention_sizes.py` fields with other axes than samples and features. Each case that can be fused is also tested with ``fuse=True``.
+cells share, and `convention_sizes.py` fields with samples in other axes. Each case that can be fused is also tested
+with ``fuse=True``.
 """
 
 from __future__ import annotations
