@@ -1,11 +1,20 @@
 """Times one network per label on one thread, computed by a router, by ``vmap``, by ``baddbmm``, and by a loop.
 
+Also compares optimisers for many labels of which a batch holds few.
+
     python benchmarks/groups.py --json benchmarks/results/groups.json
 
 The networks are SIRENs with three layers of width 32. Rows are sorted by label, with the same number per label, so that
 the alternatives need neither a sort nor padding. The benchmark first checks that all methods compute the same values. A
 call runs forward and backward. The last row is a step with Adam on 1,000 images; then the router trains for ``--steps``
 steps, and its PSNR is stored. Times are median processor times in milliseconds; the methods take turns.
+
+The optimisers update `KEYS` networks with the layers 8, 16, 1; a batch has `BATCH` rows with random labels. Each
+optimiser also trains a tenth of that number of networks to ``tanh(a[label] @ x)``, for each seed and each learning rate
+of `RATES`. Every tenth network is silent: it gets samples in the first `HEARD` steps only, and none in the next
+`SILENT` steps. For the rate with the smallest error, two figures are stored, both means over the seeds: the mean
+squared error of the other networks on new samples, and the relative change of the silent networks in the `SILENT`
+steps, ``|after - before| / |before|`` in percent.
 """
 
 from __future__ import annotations
@@ -24,10 +33,20 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from voronerf import VoronoiRouter
 from voronerf.app.files import json_text, write_text
+from voronerf.nerf import Adam
 
 SIZES = ((64, 8), (64, 1024), (1024, 64), (1024, 256), (4096, 16))
 IMAGES, PIXELS, SIDE = 1000, 256, 32
+KEYS, BATCH, HEARD, SILENT, SEEDS = 20_000, 256, 100, 1000, 3
+RATES = (0.003, 0.01, 0.03, 0.1)
 Run = Callable[[Tensor], Tensor]
+Parameters = list[nn.Parameter]
+OPTIMIZERS: dict[str, Callable[[Parameters, float], torch.optim.Optimizer]] = {
+    "torch.optim.Adam": lambda parameters, rate: torch.optim.Adam(parameters, lr=rate),
+    "torch.optim.Adam, fused=True": lambda parameters, rate: torch.optim.Adam(parameters, lr=rate, fused=True),
+    "torch.optim.AdamW": lambda parameters, rate: torch.optim.AdamW(parameters, lr=rate),
+    "voronerf.nerf.Adam, sparse=True": lambda parameters, rate: Adam([{"params": parameters, "sparse": True}], lr=rate),
+}
 
 
 @dataclass(frozen=True)
@@ -58,7 +77,7 @@ class Siren(nn.Module):
         return self.last(x)
 
 
-def ways(k: int) -> dict[str, tuple[list[nn.Parameter], Run]]:
+def ways(k: int) -> dict[str, tuple[Parameters, Run]]:
     """Returns {method: (parameters, function [k, rows, 2] -> [k, rows, 3])}; all methods have the same k networks."""
     modules = [Siren() for _ in range(k)]
     router = VoronoiRouter.from_modules(modules, fuse=True, way="fused")
@@ -102,7 +121,7 @@ def grid() -> Tensor:
     return torch.cartesian_prod(line, line)
 
 
-def step(run: Run, parameters: list[nn.Parameter], images: Tensor) -> Callable[[int], None]:
+def step(run: Run, parameters: Parameters, images: Tensor) -> Callable[[int], None]:
     """Returns a function that runs a step of Adam on random pixels of each image; its argument is the step's number."""
     optimizer, places = torch.optim.Adam(parameters, lr=1e-2, fused=True), grid()
 
@@ -116,7 +135,7 @@ def step(run: Run, parameters: list[nn.Parameter], images: Tensor) -> Callable[[
     return once
 
 
-def call(run: Run, parameters: list[nn.Parameter], x: Tensor) -> Callable[[int], None]:
+def call(run: Run, parameters: Parameters, x: Tensor) -> Callable[[int], None]:
     """Returns a function that runs forward and backward."""
 
     def once(_: int) -> None:
@@ -152,6 +171,84 @@ def row(options: Options, k: int, rows: int, images: Tensor | None = None) -> di
     return {"networks": k, "rows": rows, "step": images is not None, **result}
 
 
+def network() -> nn.Module:
+    """Returns the module of one label for the comparison of optimisers."""
+    return nn.Sequential(nn.Linear(8, 16), nn.Tanh(), nn.Linear(16, 1))
+
+
+def step_times(options: Options) -> dict[str, float]:
+    """Measures forward and backward of `KEYS` networks with a batch, and the step of each optimiser."""
+    router = VoronoiRouter(network(), KEYS, fuse=True, way="fused")
+    batches = [(torch.randn(BATCH, 8), torch.randint(KEYS, (BATCH,))) for _ in range(4)]
+
+    def differentiate(number: int) -> None:
+        x, labels = batches[number % len(batches)]
+        router.zero_grad()
+        router(x, cells=labels).square().mean().backward()
+
+    gradients = []
+    for number in range(len(batches)):
+        differentiate(number)
+        gradients.append([parameter.grad for parameter in router.parameters()])
+
+    def stepper(name: str) -> Callable[[int], None]:
+        parameters = [nn.Parameter(parameter.detach().clone()) for parameter in router.parameters()]
+        optimizer = OPTIMIZERS[name](parameters, 0.001)
+
+        def step(number: int) -> None:
+            for parameter, gradient in zip(parameters, gradients[number % len(gradients)]):
+                parameter.grad = gradient
+            optimizer.step()
+
+        return step
+
+    runs = {"forward and backward": differentiate, **{name: stepper(name) for name in OPTIMIZERS}}
+    for run in runs.values():
+        run(0)
+    timings = measure(runs, dict.fromkeys(runs, options.seconds), Stopwatch(torch.device("cpu"), time.process_time))
+    return {name: round(timing.median_ms, 2) for name, timing in timings.items()}
+
+
+def learn(name: str, rate: float, seed: int) -> tuple[float, float]:
+    """Trains networks; returns the error of the others and the relative change of the silent ones in percent."""
+    torch.manual_seed(seed)
+    labels = torch.arange(KEYS // 10)
+    silent, others = labels[labels % 10 == 0], labels[labels % 10 > 0]
+    directions = torch.randn(len(labels), 8)
+    router = VoronoiRouter(network(), len(labels), fuse=True, way="fused")
+    optimizer = OPTIMIZERS[name](list(router.parameters()), rate)
+
+    def error(allowed: Tensor, rows: int = BATCH) -> Tensor:
+        cells, x = allowed[torch.randint(len(allowed), (rows,))], torch.randn(rows, 8)
+        target = (directions[cells] * x).sum(-1, keepdim=True).tanh()
+        return (router(x, cells=cells) - target).square().mean()
+
+    def train(allowed: Tensor, steps: int) -> Tensor:
+        for _ in range(steps):
+            optimizer.zero_grad()
+            error(allowed).backward()
+            optimizer.step()
+        return torch.cat([parameter.detach()[silent].flatten(1) for parameter in router.parameters()], 1)
+
+    before, after = train(labels, HEARD), train(others, SILENT)
+    change = (after - before).norm(dim=1) / before.norm(dim=1)
+    with torch.no_grad():
+        return float(error(others, 20_000)), 100 * float(change.mean())
+
+
+def optimizers(options: Options) -> list[dict[str, Any]]:
+    """Measures the steps of all optimisers, and trains networks by each of them."""
+    common, times = {"keys": KEYS, "batch": BATCH}, step_times(options)
+    results: list[dict[str, Any]] = [{"optimizer": name, **common, "ms": ms} for name, ms in times.items()]
+    for result in results[1:]:
+        outcomes = {rate: [learn(result["optimizer"], rate, seed) for seed in range(SEEDS)] for rate in RATES}
+        means = {rate: [round(sum(column) / SEEDS, 4) for column in zip(*pairs)] for rate, pairs in outcomes.items()}
+        rate = min(means, key=lambda rate: means[rate][0])
+        result |= {"rate": rate, "error": means[rate][0], "silent_change_percent": means[rate][1], "seeds": SEEDS}
+        result |= {"errors_by_rate": {str(rate): mean[0] for rate, mean in means.items()}}
+    return results
+
+
 def main(options: Options) -> None:
     """Prints a line for each row and writes the results."""
     torch.manual_seed(0)
@@ -162,6 +259,9 @@ def main(options: Options) -> None:
             print(results[-1], flush=True)
         results.append(row(options, IMAGES, PIXELS, pictures()))
         print(results[-1], flush=True)
+        for result in optimizers(options):
+            results.append(result)
+            print(result, flush=True)
         if options.json is not None:
             write_text(options.json, json_text(metadata(benchmark="groups", results=results)))
 

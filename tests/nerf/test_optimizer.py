@@ -58,6 +58,34 @@ def test_tables_move_where_they_have_a_gradient_and_keep_it():
     assert float(optimizer.state[table]["step"]) == 2 and bool((other < 1).all())
 
 
+def test_cells_without_samples_keep_their_bits():
+    """Cells of the batch take the first step of ``torch.optim.Adam``; other cells keep parameters and moments."""
+    generator, options = torch.Generator().manual_seed(0), {"lr": 0.01, "betas": (0.9, 0.999), "eps": 1e-8}
+    routers = [VoronoiRouter(torch.nn.Linear(8, 3), 50, way="fused", fuse=True) for _ in range(2)]
+    routers[1].load_state_dict(routers[0].state_dict())
+    optimizers = [
+        Adam([{"params": routers[0].parameters(), "sparse": True}], **options),
+        torch.optim.Adam(routers[1].parameters(), **options),
+    ]
+    for step in range(4):
+        present = torch.tensor([0, 7, 8, 49] if step == 0 else [7, 30])
+        absent = torch.ones(50, dtype=torch.bool).index_fill(0, present, False)
+        x = torch.rand(32, 8, generator=generator)
+        cells = present[torch.randint(len(present), (32,), generator=generator)]
+        moments = [state[name].clone() for state in optimizers[0].state.values() for name in ("exp_avg", "exp_avg_sq")]
+        before = [parameter.detach().clone() for parameter in routers[0].parameters()]
+        for router, optimizer in zip(routers, optimizers):
+            optimizer.zero_grad()
+            router(x, cells=cells).square().mean().backward()
+            optimizer.step()
+        for old, new, torchs in zip(before, *(router.parameters() for router in routers), strict=True):
+            assert torch.equal(new[absent], old[absent]) and not torch.equal(new, old)
+            if step == 0:
+                torch.testing.assert_close(new, torchs)
+        states = [state[name] for state in optimizers[0].state.values() for name in ("exp_avg", "exp_avg_sq")]
+        assert all(torch.equal(new[absent], old[absent]) for new, old in zip(states, moments))
+
+
 def test_tables_shrink_by_the_rate_of_their_group_where_they_learn():
     table, asleep, other = (torch.nn.Parameter(torch.ones(6, 2)) for _ in range(3))
     groups = [{"params": [other]}, {"params": [table, asleep], "sparse": True, "shrink": 0.01}]

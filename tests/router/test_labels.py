@@ -150,6 +150,38 @@ def test_one_row_for_all_members_of_an_ensemble(way: str, generator: torch.Gener
 
 
 @pytest.mark.parametrize("way", WAYS)
+def test_an_argument_per_ray_may_come_first(way: str, generator: torch.Generator) -> None:
+    class Shifted(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = nn.Linear(3, 2)
+
+        def forward(self, shift: Tensor, x: Tensor) -> Tensor:
+            return self.layer(x) + shift[..., :2].reshape(*x.shape[:-1], 2)
+
+    router, x, cells = routed(Shifted(), way), torch.rand(9, 6, 3, generator=generator), drawn(generator, 9, 6)
+    shift = torch.rand(9, 3, generator=generator)
+    expected, _ = masked_loop(router, cells.flatten(), [shift.repeat_interleave(6, 0), x.flatten(0, 1)])
+    torch.testing.assert_close(router(shift, x, cells=cells).flatten(0, 1), expected[0])
+
+
+@pytest.mark.parametrize("way", ["grouped", "loop"])
+def test_a_vector_for_each_label(way: str, generator: torch.Generator) -> None:
+    class Vector(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.vector = nn.Parameter(torch.zeros(4))
+
+        def forward(self, x: Tensor) -> Tensor:
+            return self.vector.expand(len(x), -1)
+
+    router, cells = routed(Vector(), way), drawn(generator, 20)
+    result, vectors = router(cells, cells=cells), router.module.vector
+    torch.testing.assert_close(result, vectors[cells])
+    torch.testing.assert_close(gradients([result], [vectors]), gradients([vectors[cells]], [vectors]))
+
+
+@pytest.mark.parametrize("way", WAYS)
 def test_frozen_networks_learn_nothing(way: str, generator: torch.Generator) -> None:
     router, x, cells = routed(Sine(), way), torch.rand(40, 3, generator=generator), drawn(generator, 40)
     before, values = gradients([router(x, cells=cells)], list(router.parameters())), router(x, cells=cells)
@@ -164,7 +196,7 @@ def test_frozen_networks_learn_nothing(way: str, generator: torch.Generator) -> 
 def test_labels_are_checked(way: str) -> None:
     router, x = routed(Sine(), way), torch.rand(20, 3)
     router(x, cells=torch.zeros(20, dtype=torch.int64))
-    few = torch.zeros(20, dtype=torch.int64)
+    few, rule = torch.zeros(20, dtype=torch.int64), "cells must have the leading shape of the samples, such as [n]"
     for cells, kind, message in (
         (few - 1, ValueError, "cells must lie in 0 to 4, got values from -1 to -1"),
         (few.int() + K, ValueError, "cells must lie in 0 to 4, got values from 5 to 5"),
@@ -176,9 +208,11 @@ def test_labels_are_checked(way: str) -> None:
         (few.float(), TypeError, "cells must be an int32 or int64 tensor, got torch.float32"),
         (few.bool(), TypeError, "cells must be an int32 or int64 tensor, got torch.bool"),
         (3, TypeError, "cells must be an int32 or int64 tensor, got int"),
-        (few[0], ValueError, "cells must have the leading shape of the samples, such as [n], got []"),
+        (few[0], ValueError, f"{rule}, got []"),
         (few.to("meta"), ValueError, "cells must be on the device of the parameters, cpu, got meta"),
-        (few[:7], ValueError, "cells must have the leading shape of the samples, got [7] beside [20, 3]"),
+        (few[:7], ValueError, f"{rule} for [n, f], got [7] beside [20, 3]"),
+        (few[:, None], ValueError, f"{rule} for [n, f], got [20, 1] beside [20, 3]"),
+        (few[None], ValueError, f"{rule} for [n, f], got [1, 20] beside [20, 3]"),
         (None, ValueError, "cells must be given to each call of a router without centres"),
     ):
         with pytest.raises(kind, match=re.escape(f"VoronoiRouter: {message}")):
@@ -187,6 +221,9 @@ def test_labels_are_checked(way: str) -> None:
         router(x, coords=x, cells=few)
     with pytest.raises(ValueError, match="cells must be given"):
         router(x, coords=x)
+    for arguments, got in (((), "no argument"), ((x.numpy(),), "ndarray"), ((x.tolist(),), "list")):
+        with pytest.raises(TypeError, match=f"must include a tensor with a row for each sample, got {got}; pass torch"):
+            router(*arguments, cells=few)
 
 
 def test_what_needs_centres_is_refused() -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_range
-from voronerf.router.layout import as_plain
+from voronerf.router.layout import AS_TENSOR, as_plain, tensors_of
 from voronerf.router.transforms import outside, unwrapped
 
 _RULE = "VoronoiRouter: cells must"
@@ -59,21 +59,37 @@ class Labels(NamedTuple):
         if not self.checked:
             _check_values(self.cells, k)
 
-    def widen(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
+    def widen(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
         """Returns the arguments; if the first one has a single row, it is expanded to one row for each label.
 
         Raises:
-            ValueError: If the shape of the labels does not fit the first argument.
+            TypeError: If no argument is or holds a tensor.
+            ValueError: If the labels do not have the leading shape of any tensor among the arguments.
         """
-        first, lead = args[0] if args else None, self.cells.shape[:-1]
-        if not isinstance(first, Tensor) or first.dim() < len(lead):
+        first: Any = args[0] if args else None
+        lead = self.cells.shape[:-1]
+        if not _fits(first, lead):
+            tensors = tensors_of((args, kwargs))
+            if not tensors:
+                got = ", ".join(type(value).__name__ for value in (*args, *kwargs.values())) or "no argument"
+                raise TypeError(
+                    "VoronoiRouter: the arguments of a call with cells must include a tensor with a row for each "
+                    f"sample, got {got}; {AS_TENSOR}"
+                )
+            if not any(_fits(tensor, lead) for tensor in tensors):
+                got = f"{list(lead)} beside {list(tensors[0].shape)}"
+                raise ValueError(f"{_RULE} have the leading shape of the samples, such as [n] for [n, f], got {got}")
             return args
-        if any(1 != a != b != 1 for a, b in zip(lead, first.shape)):
-            got = f"{list(lead)} beside {list(first.shape)}"
-            raise ValueError(f"{_RULE} have the leading shape of the samples, got {got}")
         if any(size != 1 for size in first.shape[: len(lead)]) or all(size == 1 for size in lead):
             return args
         return (first.expand(*lead, *first.shape[len(lead) :]), *args[1:])
+
+
+def _fits(value: Any, lead: torch.Size) -> bool:
+    """Returns whether a tensor has a row, or a single row, for each label."""
+    if not isinstance(value, Tensor) or value.dim() < len(lead):
+        return False
+    return all(size in (1, labels) for size, labels in zip(value.shape, lead))
 
 
 def _check_values(cells: Tensor, k: int) -> None:

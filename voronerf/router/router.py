@@ -764,7 +764,7 @@ class VoronoiRouter(nn.Module):
                 raise ValueError("VoronoiRouter: coords must be None where cells are given, got both")
             else:
                 coords = Labels.of(cells, self.num_cells, self.diagram.centres.device)
-                args = args if self.shared or self.per_ray else coords.widen(args)
+                args = args if self.shared or self.per_ray else coords.widen(args, kwargs)
         if self._resized and not torch.compiler.is_compiling():
             self._check_wrapper()
         if method == "forward" and self._field_program is not None:
