@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -150,6 +151,39 @@ class Cells(nn.Module):
         return self.rnn(x, h) * c
 
 
+class Series(nn.Module):
+    """A forecast from the last state of a recurrent layer along 4 steps of 3 features."""
+
+    def __init__(self, kind: type[nn.RNNBase], **options: Any) -> None:
+        super().__init__()
+        self.layer = kind(3, 5, batch_first=True, **options)
+        self.out = nn.Linear(5 * (1 + self.layer.bidirectional), 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(self.layer(x.reshape(len(x), 4, 3))[0][:, -1])
+
+
+class Normalised(nn.Module):
+    """Batch norms in evaluation mode, of features and of channels [n, c, places]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner, self.outer, self.layer, self.out = (
+            nn.BatchNorm1d(8),
+            nn.BatchNorm1d(4),
+            nn.Linear(3, 8),
+            nn.Linear(8, 2),
+        )
+        for norm in (self.inner, self.outer):
+            norm.running_mean.copy_(torch.linspace(-1, 1, len(norm.running_mean)))
+            norm.running_var.copy_(torch.linspace(0.5, 2, len(norm.running_var)))
+        self.eval()
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = F.relu(self.inner(self.layer(x)))
+        return self.out(self.outer(h.view(-1, 4, 2)).flatten(1))
+
+
 SIZES = [
     Case("heads in front", HeadsInFront, one(12), fuses=True),
     Case("heads in front, cosh", lambda: HeadsInFront(True), one(12), fuses=True),
@@ -165,4 +199,9 @@ SIZES = [
     ),
     Case("bilinear", Products, one(3), fuses=True),
     Case("recurrent cells", Cells, one(3), fuses=True),
+    Case("LSTM", lambda: Series(nn.LSTM), one(12)),
+    Case("LSTM of two layers in both directions", lambda: Series(nn.LSTM, num_layers=2, bidirectional=True), one(12)),
+    Case("GRU", lambda: Series(nn.GRU), one(12)),
+    Case("RNN without biases", lambda: Series(nn.RNN, bias=False, nonlinearity="relu"), one(12)),
+    Case("batch norms in evaluation mode", Normalised, one(3), fuses=True),
 ]

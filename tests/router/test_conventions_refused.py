@@ -108,7 +108,7 @@ def single(module: Any) -> VoronoiRouter:
 
 def listed() -> nn.Module:
     module = nn.Linear(3, 2)
-    module.extra = [{"bias": module.bias}]
+    module.extra = [{"bias": nn.Parameter(torch.zeros(2))}]
     return module
 
 
@@ -145,11 +145,23 @@ SPECTRAL = nn.utils.parametrizations.spectral_norm
 Errors = list[tuple[Callable[[], Any], type[Exception], str]]
 MODULES: Errors = [
     (lambda: single(3), TypeError, "module must be an nn.Module, got int"),
-    (lambda: single(nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4))), TypeError, "`1`, a BatchNorm1d, mixes"),
-    (lambda: single(nn.Sequential(nn.Linear(3, 4), nn.SyncBatchNorm(4))), TypeError, "`1`, a SyncBatchNorm, mixes"),
-    (lambda: single(nn.LSTM(3, 4)), TypeError, "a LSTM is recurrent"),
+    (
+        lambda: single(nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4)))(X, coords=X[:, :3]),
+        TypeError,
+        "a BatchNorm1d mixes the samples of a batch in training .use LayerNorm, or call router.eval",
+    ),
+    (
+        lambda: single(nn.BatchNorm1d(7, track_running_stats=False)).eval()(X, coords=X[:, :3]),
+        TypeError,
+        "a BatchNorm1d mixes",
+    ),
     (lambda: single(SPECTRAL(nn.Linear(3, 4))), TypeError, "keeps a state for each weight"),
-    (lambda: single(listed()), TypeError, "keeps parameters in the plain list `extra`"),
+    (lambda: single(listed()), TypeError, "keeps parameters in `extra`, a list, where"),
+    (
+        lambda: single(holding({"inner": nn.Linear(3, 3)})),
+        TypeError,
+        "keeps a Linear in `held`, a dict, where parameters.. does not find them",
+    ),
     (
         lambda: single(holding([threading.Lock()])),
         TypeError,

@@ -476,3 +476,28 @@ def test_what_cannot_be_fused_is_said(make: Any, message: str) -> None:
     router = VoronoiRouter(make(lambda net, h: h), torch.randn(4, 3), coords="first3", fuse=True)
     with pytest.raises(ValueError, match=message):
         router(uniform((90,)))
+
+
+class FastAttention(nn.Module):
+    """The attention of nanoGPT. PyTorch's results have the layout [n, tokens, heads, width], which `contiguous` keeps."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.attend, self.project = nn.Linear(4, 12), nn.Linear(4, 4)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x.view(len(x), -1, 4)
+        size, tokens, width = x.size()
+        q, k, v = (p.view(size, tokens, 2, 2).transpose(1, 2) for p in self.attend(x).split(width, dim=2))
+        y = F.scaled_dot_product_attention(q, k, v, is_causal=True)
+        return self.project(y.transpose(1, 2).contiguous().view(size, tokens, width)).flatten(1)
+
+
+@pytest.mark.parametrize("tokens", [1, 3, 33])
+def test_attention_over_the_tokens_of_a_sample(tokens: int) -> None:
+    torch.manual_seed(0)
+    router = perturb(VoronoiRouter(FastAttention(), uniform((4,)), coords="first3", fuse=True, way="fused"))
+    for n in (50, 1, 33):
+        x = uniform((n,), 4 * tokens)
+        (expected,), _ = masked_loop(router, router.assign(x[:, :3]), [x])
+        torch.testing.assert_close(router(x), expected, rtol=1e-4, atol=1e-5)

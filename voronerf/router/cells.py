@@ -9,17 +9,22 @@ from __future__ import annotations
 import contextlib
 import copy
 import fnmatch
+import functools
 import types
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from numbers import Number
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
-from voronerf.router.grouping import SHARED, cell_parameters, owned_parameters, parts_of
-from voronerf.router.layout import DEEPEST, contents, tensors_of
+from voronerf.router.double import moved
+from voronerf.router.grouping import HIDDEN, SHARED, cell_parameters, owned_parameters, parts_of
+from voronerf.router.layout import DEEPEST, reachable
 
 _OP = "VoronoiRouter"
+_REGISTRIES = ("_parameters", "_buffers", "_modules")
+_PRIVATE = {*vars(nn.Module()), SHARED, HIDDEN, "_flat_weight_refs"}
 
 
 def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
@@ -32,7 +37,7 @@ def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
     except Exception as error:
         for name, part in module.named_modules():
             for attribute, value in vars(part).items():
-                if attribute not in ("_parameters", "_buffers", "_modules") and not _is_copied(value, dict(initial)):
+                if attribute not in _REGISTRIES and not _is_copied(value, dict(initial)):
                     raise TypeError(
                         f"{_OP}: module must support copy.deepcopy, but {_named(name, part)} keeps in "
                         f"`{attribute}` a {type(value).__name__}, which cannot be copied ({error}); make it outside of "
@@ -56,9 +61,9 @@ def _named(name: str, part: nn.Module) -> str:
 def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
     """Adds detached copies of the results that a module keeps to the memo of ``copy.deepcopy``."""
     for part in module.modules():
-        for value in vars(part).values():
-            if isinstance(value, Tensor) and not value.is_leaf:
-                memo[id(value)] = value.detach().clone()
+        for item in reachable(vars(part)):
+            if isinstance(item, Tensor) and not item.is_leaf:
+                memo[id(item)] = item.detach().clone()
 
 
 def check_module(module: nn.Module) -> None:
@@ -71,26 +76,43 @@ def check_module(module: nn.Module) -> None:
                 f"{_OP}: module must be hashable, as torch requires, but a {type(part).__name__} is not; "
                 "define it by @dataclass(eq=False), or with __hash__ beside __eq__"
             )
+    registered = set(map(id, module.parameters()))
     for name, part in module.named_modules():
-        reason = _refusal(part)
+        reason = _refusal(part, registered)
         if reason:
             raise TypeError(f"{_OP}: module must treat samples one by one, but {_named(name, part)} {reason}")
-    _check_reach(module)
+    _check_reach(module, registered)
 
 
-def _check_reach(module: nn.Module) -> None:
+def hide_parts(module: nn.Module) -> None:
+    """Notes the submodules that only lists, dicts or objects hold, if their parameters are registered elsewhere."""
+    registered = set(map(id, module.parameters()))
+    for part in list(parts_of(module).values()):
+        known = parts_of(module)
+        items = {id(item): item for item in _held(part) if isinstance(item, nn.Module) and id(item) not in known}
+        hidden = [item for item in items.values() if any(id(p) in registered for p in item.parameters())]
+        if hidden:
+            vars(part)[HIDDEN] = hidden
+            for item in hidden:
+                hide_parts(item)
+
+
+def _held(part: nn.Module) -> Iterator[Any]:
+    """Yields the modules, tensors and functions in the attributes of a submodule, without registered ones."""
+    return reachable({name: value for name, value in vars(part).items() if name not in _REGISTRIES})
+
+
+def _check_reach(module: nn.Module, registered: set[int]) -> None:
     """Raises TypeError if code accesses parameters other than by name, since calls replace parameters by name."""
     owner = {address: name for name, p in module.named_parameters() if (address := _address(p))}
     objects = {id(p): f"parameter `{name}`" for name, p in module.named_parameters()}
     objects |= {id(part): f"part `{name}`" if name else "module" for name, part in module.named_modules()}
     for name, part in module.named_modules():
-        members = {
-            key: value for key, value in vars(part).items() if key not in ("_parameters", "_buffers", "_modules")
-        }
+        members = {key: value for key, value in vars(part).items() if key not in _REGISTRIES}
         for attribute, value in (members | dict(part.named_buffers(recurse=False))).items():
-            for leaf in _leaves(value):
+            for leaf in reachable(value):
                 reason = ""
-                if isinstance(leaf, Tensor) and _address(leaf) in owner:
+                if isinstance(leaf, Tensor) and id(leaf) not in registered and _address(leaf) in owner:
                     reason = (
                         f"a view of the parameter `{owner[_address(leaf)]}`, which cells replace (make it in forward)"
                     )
@@ -109,18 +131,6 @@ def _address(tensor: Tensor) -> int:
         return tensor.untyped_storage().data_ptr()
     except (RuntimeError, NotImplementedError):  # sparse, or without values
         return 0
-
-
-def _leaves(value: Any) -> list[Any]:
-    """Lists the leaves of a nested value that are not modules, such as tensors and functions."""
-    leaves, seen, level = [], set[int](), [value]
-    for _ in range(DEEPEST):
-        items = [item for item in level if id(item) not in seen and not isinstance(item, nn.Module)]
-        seen.update(map(id, items))
-        held = [contents(item) for item in items]
-        leaves += [item for item, inner in zip(items, held, strict=True) if inner is None]
-        level = [item for inner in held for item in (inner or {}).values()]
-    return leaves
 
 
 def _held_by(function: types.FunctionType, objects: dict[int, str]) -> str:
@@ -146,24 +156,37 @@ def _held_by(function: types.FunctionType, objects: dict[int, str]) -> str:
     return ""
 
 
-def _refusal(part: nn.Module) -> str:
-    if isinstance(part, nn.modules.batchnorm._BatchNorm):
-        return "mixes the samples of a batch (use LayerNorm)"
-    if isinstance(part, nn.RNNBase):
-        return "is recurrent, and its weights cannot be stacked, one set for each cell"
+def _refusal(part: nn.Module, registered: set[int]) -> str:
+    """Returns why a submodule cannot be in a network for each cell, or ""; ``registered`` are ids of parameters."""
     if isinstance(part, torch.jit.ScriptModule) and next(part.parameters(), None) is not None:
         return "is compiled by torch.jit, and cannot take the parameters of a cell (wrap the Python module)"
     if any(type(one).__name__.endswith("SpectralNorm") for one in (part, *part._forward_pre_hooks.values())):
         return "keeps a state for each weight (spectral norm) that cells cannot share"
     for name, value in vars(part).items():
-        plain = isinstance(value, (list, tuple, dict)) and name != "_parameters"
-        if plain and any(isinstance(item, nn.Parameter) for item in tensors_of(value)):
-            return f"keeps parameters in the plain {type(value).__name__} `{name}` (use nn.ParameterList)"
+        for item in () if name in _REGISTRIES else reachable(value):
+            own = [item] if isinstance(item, nn.Parameter) else item.parameters() if isinstance(item, nn.Module) else ()
+            if any(p.requires_grad and id(p) not in registered for p in own):
+                kind = "parameters" if isinstance(item, nn.Parameter) else f"a {type(item).__name__}"
+                return (
+                    f"keeps {kind} in `{name}`, a {type(value).__name__}, where parameters() does not find them (use "
+                    "nn.ParameterList or nn.ModuleList, or requires_grad_(False) if they are constants)"
+                )
     return ""
+
+
+def refuse_statistics(parts: Sequence[nn.Module]) -> None:
+    """Raises TypeError for normalisation layers that use statistics of the batch."""
+    for part in parts:
+        if part.training or getattr(part, "running_mean", None) is None:
+            raise TypeError(
+                f"{_OP}: module must treat samples one by one, but a {type(part).__name__} mixes the samples of a "
+                "batch in training (use LayerNorm, or call router.eval() if it is not trained)"
+            )
 
 
 def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
     """Replaces every parameter of a module by a stack of k copies, except parameters that match ``share``."""
+    hide_parts(module)
     named = list(module.named_parameters(remove_duplicate=False))
     for pattern in share:
         if not any(fnmatch.fnmatchcase(name, pattern) for name, _ in named):
@@ -181,11 +204,15 @@ def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
             values = parameter.detach().expand(k, *parameter.shape).clone()
             stacked[id(parameter)] = nn.Parameter(values, requires_grad=parameter.requires_grad)
         owner.register_parameter(name, stacked[id(parameter)])
+    for part in parts_of(module).values():
+        for name, value in list(vars(part).items()):
+            if name not in _REGISTRIES and any(id(item) in stacked for item in reachable(value)):
+                vars(part)[name] = moved(value, stacked)
 
 
 @torch.no_grad()
 def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None:
-    """Copies a plain module's parameters into one cell; raises ValueError if names, shapes or buffers differ."""
+    """Copies a plain module's parameters into one cell; raises ValueError if the modules differ in anything else."""
     stacked = {id(parameter) for parameter in cell_parameters(routed)}
     ours, theirs = routed.state_dict(keep_vars=True), module.state_dict()
     odd = sorted(ours.keys() ^ theirs.keys())
@@ -197,9 +224,67 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
             raise ValueError(f"{op}: module's {name} must have shape {list(shape)}, got {list(value.shape)}")
         if id(tensor) not in stacked and not torch.equal(value.to(tensor), tensor):
             raise ValueError(f"{op}: module's {name} must equal the router's, since all cells share it")
+    if other := _difference(routed, module):
+        raise ValueError(f"{op}: module's {other} must equal the router's, since all cells share it")
     for name, tensor in ours.items():
         if id(tensor) in stacked:
             tensor[index] = theirs[name].to(tensor)
+
+
+def _difference(ours: nn.Module, theirs: nn.Module) -> str:
+    """Returns the name of a submodule of another class, or of an attribute of another value; "" if there is none."""
+    others = dict(theirs.named_modules())
+    for name, part in ours.named_modules():
+        other, prefix = cast(nn.Module, others.get(name)), f"{name}." if name else ""
+        if _class_of(other) != _class_of(part):
+            return f"{name or 'class'}, a {type(other).__name__} instead of a {type(part).__name__},"
+        ours_by_name, theirs_by_name = _attributes(part), _attributes(other)
+        for key in sorted(ours_by_name.keys() | theirs_by_name.keys()):
+            if not _same(ours_by_name.get(key), theirs_by_name.get(key)):
+                return f"{prefix}{key}"
+    return ""
+
+
+def _class_of(value: Any) -> tuple[str, str]:
+    """Returns the name of a class; torch and factories make classes of one name anew for each object."""
+    return type(value).__module__, type(value).__qualname__
+
+
+def _attributes(part: nn.Module) -> dict[str, Any]:
+    """Returns the attributes of a submodule by which its results may differ, without parameters, buffers and parts."""
+    members = {name: value for name, value in vars(part).items() if name not in _PRIVATE}
+    return members | {name: [*vars(part)[name].values()] for name in ("_forward_hooks", "_forward_pre_hooks")}
+
+
+def _same(a: Any, b: Any, depth: int = 0) -> bool:
+    """Returns whether two attributes are equal; parameters, and tensors that a call has left there, equal any value."""
+    if a is b or depth > DEEPEST or any(isinstance(x, Tensor) and (x.requires_grad or not x.is_leaf) for x in (a, b)):
+        return True
+    if isinstance(a, Number) and isinstance(b, Number):
+        return bool(a == b or (a != a and b != b))  # NaN
+    if _class_of(a) != _class_of(b):
+        return False
+    if isinstance(a, Tensor):
+        return torch.equal(a, b.to(a.device))
+    if isinstance(a, types.FunctionType):
+        cells = [[cell.cell_contents for cell in f.__closure__ or ()] for f in (a, b)]
+        return a.__code__ == b.__code__ and _same([a.__defaults__, *cells[0]], [b.__defaults__, *cells[1]], depth + 1)
+    if isinstance(a, types.MethodType):
+        return a.__func__ is b.__func__
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(_same(x, y, depth + 1) for x, y in zip(a, b, strict=True))
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(_same(a[key], b[key], depth + 1) for key in a)
+    if isinstance(a, nn.Module):
+        return not _difference(a, b)
+    if hasattr(a, "__array__"):
+        return bool((a == b).all()) if a.shape == b.shape else False
+    if isinstance(a, functools.partial):
+        return _same([a.func, a.args, a.keywords], [b.func, b.args, b.keywords], depth + 1)
+    if hasattr(a, "__dict__") and not isinstance(a, type):
+        return _same(vars(a), vars(b), depth + 1)
+    is_comparable = callable(a) or isinstance(a, (str, bytes, set, frozenset, torch.dtype, torch.device))
+    return bool(a == b) if is_comparable else True
 
 
 def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:

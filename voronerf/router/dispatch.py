@@ -26,11 +26,12 @@ from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.ops._core.unchanged import unchanged
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.call_cache import CachedCall
+from voronerf.router.cells import refuse_statistics
 from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
-from voronerf.router.layout import Call, Results, map_tensors, tensors_of
+from voronerf.router.layout import Call, Results, map_tensors, map_tree, tensors_of
 from voronerf.router.plan import SLICE, CallPlan, measured_samples
 from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import CellProgram
@@ -70,6 +71,7 @@ class Dispatch:
         self._parts: Any = unchanged()  # guard of the parameters and parts at the last call
         self._k = 0  # number of cells at the last call
         self._cell_shapes: list[Any] = []  # names, shapes and dtypes of one cell's parameters
+        self._statistics: list[nn.Module] = []  # submodules that mix the samples of a batch in training
         self._subclasses: set[Any] = set()  # (method, tensor types) that work with plain tensors
         self._warned: set[str] = set()
         self._latest_ways: dict[str, dict[str, str]] = {}
@@ -123,13 +125,22 @@ class Dispatch:
             frozen: The mask of frozen cells, bool [k], which are evaluated without gradients; None for no cells.
         """
         self._check_parameters(call, grouping.k, options.names)
+        refuse_statistics(self._statistics)
         call = self._plain(call)
         plan = self._plan(call, grouping, options)
         if frozen is None or not torch.is_grad_enabled() or not call.layout.n:
             results = self._run(plan, call, grouping)
         else:
             results = self._run_apart(plan, call, grouping, frozen)
-        if call.key is not None and not is_watched() and (cached := CachedCall.of(plan, call, grouping)):
+        if plan.counts:
+            n, counts = call.layout.n, plan.counts
+            results.value = map_tree(results.value, lambda name, leaf, _: n * counts[name] if name in counts else leaf)
+        if (
+            call.key is not None
+            and not plan.counts
+            and not is_watched()
+            and (cached := CachedCall.of(plan, call, grouping))
+        ):
             if len(self.cached) >= _PLANS:
                 self.cached = {}
             self._guard(cached)
@@ -200,6 +211,7 @@ class Dispatch:
         if cell_shapes != self._cell_shapes:
             self.forget()
         self._cell_shapes, self._k, self._parts = cell_shapes, k, unchanged()
+        self._statistics = [p for p in parts_of(call.module).values() if isinstance(p, nn.modules.batchnorm._BatchNorm)]
         self._note_parts(self._parts, call.module)
 
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
@@ -234,7 +246,7 @@ class Dispatch:
                 ways[0].why = f"first calls of fewer than {FEWEST} samples"
         if len(self.plans) >= _PLANS:
             self.plans, self.cached = {}, {}
-        new_plan = CallPlan(ways, options.way == "fastest", may_group, few, constants=constants)
+        new_plan = CallPlan(ways, options.way == "fastest", may_group, few, constants=constants, counts=probe.counts)
         if new_plan.fused is not None:
             new_plan.watch = Watch.of(call.module, new_plan.fused.reads, new_plan.fused.inputs)
         if probe.refused and new_plan.fused is not None:

@@ -6,8 +6,10 @@ The module itself never changes, so other threads may save, copy or call it at a
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import operator
+import sys
 import types
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -17,13 +19,13 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.router.grouping import parts_of
-from voronerf.router.layout import Call, map_tree
+from voronerf.router.layout import Call, map_tree, reachable
 
 _OP = "VoronoiRouter"
 _PLAIN = {type(None), bool, int, float, str, type, torch.dtype, torch.device, torch.Size, types.FunctionType, Tensor}
 _LAYERS = "torch.nn.modules."  # modules from this package assign no attributes in ``forward``
 _REGISTRIES, _OF_HOOKS = ("_parameters", "_buffers", "_modules"), (OrderedDict, dict, set)
-_SEARCHED = 1000  # maximum number of objects in an attribute that are searched for submodules
+_OWN = frozenset(vars(nn.Module()))  # attributes that every module has
 
 
 class Forbidden(TypeError):
@@ -33,37 +35,53 @@ class Forbidden(TypeError):
 class Double:
     """A copy of a module tree that shares its buffers and has its own registries of parameters.
 
-    Each run starts with the module's attributes; attributes assigned by ``forward`` are dropped after the run.
+    Each run starts with the module's attributes; attributes that ``forward`` assigns, and items that it puts into
+    lists, dicts and sets, are dropped after the run. Parameters and submodules in other attributes are replaced, too.
 
     Args:
         module: The routed module, or a field.
         reads: A set to which each run adds (index of the submodule in ``modules()``, name) for every attribute that it
             reads; None to record nothing.
+
+    Attributes:
+        assigned: The numbers among the attributes that runs have assigned, with the values that were dropped.
+        writes: With ``reads``, the file and line of the first assignment to each attribute that was read before.
     """
 
     def __init__(self, module: nn.Module, reads: set[tuple[int, str]] | None = None) -> None:
-        parts = parts_of(module)
-        twins = {key: _twin(part, place, reads) for place, (key, part) in enumerate(parts.items())}
+        parts, self.writes = parts_of(module), dict[tuple[int, str], tuple[str, int]]()
+        twins = {key: _twin(part, place, reads, self.writes) for place, (key, part) in enumerate(parts.items())}
         for key, part in parts.items():  # a compiled submodule is replaced by its original
             twins[key] = twins.get(id(getattr(part, "_orig_mod", None)), twins[key])
         self.module, self.parts = twins[id(module)], list(twins.values())  # in the order of ``modules()``
         self._places: list[tuple[dict[str, Any], str, int]] = []
-        self._assignable: list[tuple[nn.Module, dict[str, Any]]] = []  # submodules that may assign attributes
+        self._assignable: list[tuple[int, nn.Module, dict[str, Any]]] = []  # submodules that may assign attributes
         self._registries: list[tuple[nn.Module, dict[str, Any], set[str]]] = []
-        for key, part in parts.items():
+        self._containers: list[tuple[dict[str, Any], str]] = []  # attributes of which each run gets a copy
+        self._held: list[tuple[dict[str, Any], dict[str, Any], str, Any]] = []  # attributes that hold parameters
+        self.assigned: dict[tuple[int, str], Any] = {}
+        parameters = {id(p) for part in parts.values() for p in part._parameters.values()}
+        for place, (key, part) in enumerate(parts.items()):
             twin, members = twins[key], dict(vars(part))
             if twin is part:
                 continue
             registry = members["_parameters"] = dict(part._parameters)
             members["_buffers"] = dict(part._buffers)
             members["_modules"] = {name: twins.get(id(child), child) for name, child in part._modules.items()}
-            rest = [item for item in members.items() if type(item[1]) not in _PLAIN]
+            rest = [item for item in members.items() if type(item[1]) not in _PLAIN and item[0] not in _REGISTRIES]
             for name, value in rest:  # nearly all are empty dicts of hooks
-                if (type(value) not in _OF_HOOKS or value) and name not in _REGISTRIES and _reaches(value, parts):
-                    members[name] = _moved(value, twins)
+                held = () if type(value) in _OF_HOOKS and not value else [*map(id, reachable(value))]
+                if any(key in parts for key in held):
+                    members[name] = moved(value, twins)
+                if any(key in parameters for key in held):
+                    self._held.append((vars(twin), members, name, members[name]))
+                if name not in _OWN and isinstance(value, (dict, list, set)):
+                    self._containers.append((vars(twin), name))
+            if isinstance(part, nn.RNNBase):  # it would move the weights of cells to other memory
+                members["flatten_parameters"] = _nothing
             vars(twin).update(members)
-            if not type(part).__module__.startswith(_LAYERS) or part._forward_pre_hooks:
-                self._assignable.append((twin, members))
+            if not type(part).__module__.startswith(_LAYERS) or part._forward_pre_hooks or isinstance(part, nn.RNNBase):
+                self._assignable.append((place, twin, members))
             self._places += [(registry, name, id(p)) for name, p in registry.items() if p is not None]
             self._registries.append((twin, registry, set(registry)))
 
@@ -76,6 +94,8 @@ class Double:
             Forbidden: If the method adds, removes or replaces parameters, or writes into them.
         """
         placed = self.fill(values)
+        for attributes, name in self._containers:
+            attributes[name] = _copied(attributes[name])
         versions = _versions(placed)
         copied = Call(self.module, call.method, call.layout, call.names, call.args, call.kwargs, call.kinds)
         try:
@@ -99,9 +119,13 @@ class Double:
 
     def _restore_attributes(self) -> None:
         """Gives the submodules the attributes that they had before the run."""
-        for twin, members in self._assignable:
+        for place, twin, members in self._assignable:
             attributes = vars(twin)
             if attributes.keys() != members.keys() or not all(map(operator.is_, attributes.values(), members.values())):
+                for name, value in members.items():
+                    new = attributes.get(name)
+                    if type(value) in (int, float) and type(new) in (int, float) and new != value:
+                        self.assigned[place, name] = new
                 attributes.clear()
                 attributes.update(members)
 
@@ -110,6 +134,8 @@ class Double:
         placed = [(registry, name, values[key]) for registry, name, key in self._places if key in values]
         for registry, name, value in placed:
             registry[name] = value
+        for attributes, members, name, value in self._held:
+            attributes[name] = members[name] = moved(value, values)
         return placed
 
     def own_buffers(self) -> None:
@@ -123,13 +149,14 @@ class Double:
             registry.clear()
 
 
-def _twin(part: nn.Module, place: int, reads: set[tuple[int, str]] | None) -> nn.Module:
+def _twin(part: nn.Module, place: int, reads: set[tuple[int, str]] | None, writes: dict[Any, Any]) -> nn.Module:
     """Returns an empty object of a submodule's class, or the submodule itself if it holds nothing that changes."""
     empty = not (part._parameters or part._modules or part._buffers)
     plain = empty and type(part).__module__.startswith(_LAYERS) and reads is None
     if plain or isinstance(part, torch.jit.ScriptModule):
         return part
-    twin: nn.Module = object.__new__(type(part) if reads is None else _recording_class(type(part), place, reads))
+    kind = type(part) if reads is None else _recording_class(type(part), place, reads, writes)
+    twin: nn.Module = object.__new__(kind)
     return twin
 
 
@@ -146,14 +173,23 @@ class _Unregistered:
         pass
 
 
-def _recording_class(kind: type[nn.Module], place: int, reads: set[tuple[int, str]]) -> type[nn.Module]:
-    """Makes a subclass that adds (``place``, name) of each accessed attribute to ``reads``."""
+def _recording_class(
+    kind: type[nn.Module], place: int, reads: set[tuple[int, str]], writes: dict[Any, Any]
+) -> type[nn.Module]:
+    """Makes a subclass that records accesses to attributes; see :class:`Double`."""
 
     def getattribute(self: nn.Module, name: str) -> Any:
         reads.add((place, name))
         return kind.__getattribute__(self, name)
 
-    names = {"__module__": kind.__module__, "__qualname__": kind.__qualname__, "__getattribute__": getattribute}
+    def set_attribute(self: nn.Module, name: str, value: Any) -> None:
+        if (place, name) in reads:
+            frame = sys._getframe(1)
+            writes.setdefault((place, name), (frame.f_code.co_filename, frame.f_lineno))
+        kind.__setattr__(self, name, value)
+
+    names: dict[str, Any] = {"__module__": kind.__module__, "__qualname__": kind.__qualname__}
+    names |= {"__getattribute__": getattribute, "__setattr__": set_attribute}
     metaclass: Any = type(kind)
     recording: type[nn.Module] = metaclass(kind.__name__, (_Unregistered, kind), names)
     return recording
@@ -167,48 +203,35 @@ def _versions(placed: list[tuple[dict[str, Any], str, Any]]) -> list[int]:
         return [0] * len(placed)
 
 
-def _reaches(value: Any, parts: Mapping[int, nn.Module]) -> bool:
-    """Returns whether a value holds a submodule of the module."""
-    pending, seen = [value], set[int]()
-    while pending and len(seen) < _SEARCHED:
-        item = pending.pop()
-        if type(item) in _PLAIN or id(item) in seen:
-            continue
-        seen.add(id(item))
-        if isinstance(item, nn.Module):
-            if id(item) in parts:
-                return True
-        elif isinstance(item, types.MethodType):
-            pending.append(item.__self__)
-        elif isinstance(item, functools.partial):
-            pending += [item.func, *item.args, *item.keywords.values()]
-        elif isinstance(item, dict):
-            pending += item.values()
-        elif isinstance(item, (list, tuple, set, frozenset)):
-            pending += item
-        elif not isinstance(item, (Tensor, type, types.ModuleType)):
-            pending += getattr(item, "__dict__", {}).values()
-    return False
+def _nothing() -> None:
+    """Does nothing."""
 
 
-def _moved(value: Any, twins: Mapping[int, nn.Module]) -> Any:
-    """Returns the value with its submodules replaced by their twins."""
+def _copied(value: Any) -> Any:
+    """Copies a container and the containers in it, but no other items."""
+    if type(value) is dict:
+        return {key: _copied(item) for key, item in value.items()}
+    if type(value) is list:
+        return [_copied(item) for item in value]
+    return copy.copy(value) if isinstance(value, (dict, list, set)) else value
+
+
+def moved(value: Any, twins: Mapping[int, Any]) -> Any:
+    """Returns the value with its submodules and tensors replaced by their twins, by id."""
 
     def change(name: str, leaf: Any, nested: bool) -> Any:
-        if isinstance(leaf, nn.Module):
+        if isinstance(leaf, (nn.Module, Tensor)):
             return twins.get(id(leaf), leaf)
         if isinstance(leaf, types.MethodType):
-            return types.MethodType(leaf.__func__, _moved(leaf.__self__, twins))
+            return types.MethodType(leaf.__func__, moved(leaf.__self__, twins))
         if isinstance(leaf, functools.partial):
-            return functools.partial(
-                _moved(leaf.func, twins), *_moved(leaf.args, twins), **_moved(leaf.keywords, twins)
-            )
+            return functools.partial(moved(leaf.func, twins), *moved(leaf.args, twins), **moved(leaf.keywords, twins))
         if isinstance(leaf, (set, frozenset)):
-            return type(leaf)(_moved(item, twins) for item in leaf)
+            return type(leaf)(moved(item, twins) for item in leaf)
         if callable(leaf) and type(leaf) not in _PLAIN and not isinstance(leaf, type) and hasattr(leaf, "__dict__"):
-            moved: Any = object.__new__(type(leaf))
-            vars(moved).update({name: _moved(item, twins) for name, item in vars(leaf).items()})
-            return moved
+            new: Any = object.__new__(type(leaf))
+            vars(new).update({name: moved(item, twins) for name, item in vars(leaf).items()})
+            return new
         return leaf
 
     return map_tree(value, change)

@@ -235,11 +235,13 @@ def user_frame() -> FrameType | None:
 
 def line_of(frame: FrameType | None) -> str:
     """Returns file, line and code of a frame, or an empty text."""
-    if frame is None:
-        return ""
-    file = frame.f_code.co_filename
-    code = linecache.getline(file, frame.f_lineno).strip()
-    return f" ({os.path.basename(file)}:{frame.f_lineno}{f': {code}' if code else ''})"
+    return "" if frame is None else text_of_line(frame.f_code.co_filename, frame.f_lineno)
+
+
+def text_of_line(file: str, number: int) -> str:
+    """Returns file, number and code of a line."""
+    code = linecache.getline(file, number).strip()
+    return f" ({os.path.basename(file)}:{number}{f': {code}' if code else ''})"
 
 
 class Step(NamedTuple):

@@ -12,7 +12,7 @@ import functools
 import inspect
 import math
 import types
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -22,6 +22,7 @@ from voronerf.router.grouping import Grouping
 
 _OP = "VoronoiRouter"
 DEEPEST = 6  # maximum depth to which nested objects are searched for tensors
+_SEARCHED = 1000  # maximum number of objects in an attribute that are searched for modules, tensors and functions
 _LEAVES = {type(None), type(...), bool, int, float, str, torch.Size, torch.dtype, torch.device}
 AS_TENSOR = "pass torch.as_tensor(points, dtype=torch.float32)"
 SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
@@ -56,6 +57,28 @@ def contents(value: Any) -> dict[Any, Any] | None:
     if dataclasses.is_dataclass(value) and not hasattr(value, "__dict__"):
         return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
     return dict(vars(value)) if hasattr(value, "__dict__") else None
+
+
+def reachable(value: Any) -> Iterator[Any]:
+    """Yields the modules, tensors and functions that a value holds, through containers and objects but not modules."""
+    pending, seen = [value], dict[int, Any]()
+    while pending and len(seen) < _SEARCHED:
+        item = pending.pop()
+        if type(item) in _LEAVES or id(item) in seen:
+            continue
+        seen[id(item)] = item  # keeps the item alive, and so its id
+        if isinstance(item, (nn.Module, Tensor, types.FunctionType)):
+            yield item
+        elif isinstance(item, types.MethodType):
+            pending.append(item.__self__)
+        elif isinstance(item, functools.partial):
+            pending += [item.func, *item.args, *item.keywords.values()]
+        elif isinstance(item, dict):
+            pending += item.values()
+        elif isinstance(item, (list, tuple, set, frozenset)):
+            pending += item
+        elif not isinstance(item, (type, types.ModuleType)):
+            pending += getattr(item, "__dict__", {}).values()
 
 
 def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:

@@ -31,6 +31,7 @@ class CallPlan:
             of the next timing, in seconds of ``time.monotonic``; and an explanation.
         constants: The arguments of the traced call that are not tensors, by name; only for the fused way.
         watch: The values of the module that the trace has read.
+        counts: For each number in the results that counts samples, by name, its multiple of n.
         skip: The number of calls that run cell by cell before another way is tried again.
         wait: The value of ``skip`` after the next batch that cannot be grouped.
     """
@@ -43,6 +44,7 @@ class CallPlan:
     lost_timings: dict[tuple[int, int], tuple[int, float, str]] = field(default_factory=dict)
     constants: dict[str, Any] = field(default_factory=dict)
     watch: Watch = field(default_factory=Watch)
+    counts: dict[str, int] = field(default_factory=dict)
     skip: int = 0
     wait: int = 0
 

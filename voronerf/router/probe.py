@@ -7,27 +7,40 @@ Results and gradients are compared.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.ops._core.tolerances import agree, agree_gradients
+from voronerf.router.axes import multiple
 from voronerf.router.cells import clone_module
 from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
-from voronerf.router.grouped import Grouped, Loop, NoRandomness, Recorder, Step, Ungroupable, Way, steps_of
-from voronerf.router.grouping import Grouping, cell_parameters
-from voronerf.router.layout import BROADCAST, RAY, Call, Results, as_plain, map_tensors, tensors_of
+from voronerf.router.grouped import (
+    Grouped,
+    Loop,
+    NoRandomness,
+    Recorder,
+    Step,
+    Ungroupable,
+    Way,
+    steps_of,
+    text_of_line,
+)
+from voronerf.router.grouping import Grouping, cell_parameters, parts_of
+from voronerf.router.layout import BROADCAST, RAY, Call, Results, as_plain, map_tensors, map_tree, tensors_of
 from voronerf.router.trace import Unfusable
 from voronerf.router.watch import Inputs
 
 _OP = "VoronoiRouter"
 FEWEST = 8  # minimum number of samples in a probe; a smaller batch is extended by similar samples
 _SAMPLES, _CELLS = 41, 3  # numbers of samples and cells of a probe
-_OTHER = 37  # another number of samples, by which sizes that count samples differ from other sizes
+_COUNTS = (_SAMPLES, 37)  # numbers of samples by which sizes that count samples differ from other sizes
 _FEW = 8  # rows for the check whether a module needs a subclass of tensors
 _PIECE = 8 << 20  # bytes of the largest tensor in a piece of rows on a CPU; larger tensors outgrow the cache
 
@@ -44,12 +57,21 @@ class Options:
     names: tuple[str, ...]  # names of the parameters that the module was wrapped with
 
 
+class Recording(NamedTuple):
+    """Two runs of a module: their functions, the leaves of their results by name, and the double that ran."""
+
+    runs: tuple[Recorder, Recorder]
+    leaves: list[dict[str, Any]]
+    double: Double
+
+
 class Probe:
     """A copy of a module with three cells of different parameters, and a few samples of a call in these cells."""
 
     def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
         self._source = call, grouping
         self.refused = ""  # why a changed value cannot be an input
+        self.counts: dict[str, int] = {}  # for each number in the results that counts samples, its multiple of n
         device, generator = grouping.device, torch.Generator().manual_seed(0)
         call = _widened(call, generator) if call.layout.n < FEWEST else call
         picked = torch.arange(_SAMPLES, device=device) * call.layout.n // _SAMPLES
@@ -93,6 +115,11 @@ class Probe:
                 why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
         else:
             return [Loop(why)], False
+        steps: Callable[[], list[Step]] = self.steps
+        with contextlib.suppress(Exception):  # the ways name the reason
+            recording = self.recorded()
+            self._note_numbers(recording, warn_once)
+            steps = functools.partial(steps_of, recording.runs, _COUNTS)
         ways, may_group, unfused = list[Way](), False, too_many
         if unfused:
             warn_once(f"changes {call.method}", f"{call.name} is {unfused}")
@@ -109,7 +136,7 @@ class Probe:
                 warn_once(f"fuse {call.method}", message)
         if options.way in ("fastest", "grouped") or (options.way == "fused" and not ways):
             try:
-                grouped = Grouped([self.steps()], quiet=True)
+                grouped = Grouped([steps()], quiet=True)
                 if self._agrees(grouped, loop, expected):
                     piece = min(max(_PIECE * _SAMPLES // grouped.widest, 1 << 10), 1 << 16)
                     ways.append(Grouped(grouped.records, piece, why=unfused))
@@ -128,13 +155,46 @@ class Probe:
         return [*ways, loop], may_group and not ways
 
     def steps(self) -> list[Step]:
-        """Runs the first cell's module with two numbers of samples, and returns its steps."""
-        rows, runs = self._call.arranged(self._entries), (Recorder(), Recorder())
+        """Returns the steps of the module; see :class:`Recording`."""
+        return steps_of(self.recorded().runs, _COUNTS)
+
+    def recorded(self, reads: set[tuple[int, str]] | None = None) -> Recording:
+        """Runs the first cell's module with two numbers of samples, and records the runs."""
+        rows, runs, leaves = self._call.arranged(self._entries), (Recorder(), Recorder()), list[dict[str, Any]]()
         cell = {id(parameter): parameter[0] for parameter in cell_parameters(self._call.module)}
+        double = Double(self._call.module, reads)
+
+        def note(name: str, leaf: Any, nested: bool) -> Any:
+            leaves[-1][name] = leaf
+            return leaf
+
         with NoRandomness():
-            for count, recorder in zip((_SAMPLES, _OTHER), runs, strict=True):
-                Double(self._call.module).run(self._call, [tensor[:count] for tensor in rows], cell, recorder)
-        return steps_of(runs, (_SAMPLES, _OTHER))
+            for count, recorder in zip(_COUNTS, runs, strict=True):
+                leaves.append({})
+                map_tree(double.run(self._call, [tensor[:count] for tensor in rows], cell, recorder), note)
+        return Recording(runs, leaves, double)
+
+    def _note_numbers(self, recording: Recording, warn_once: Callable[[str, str], None]) -> None:
+        """Finds the results that count samples; warns of other numbers, which a call cannot follow."""
+        name, (ours, theirs), counts = self._call.name, recording.leaves, dict[str, int]()
+        for key, number in ours.items():
+            other: Any = theirs.get(key)
+            if type(number) not in (int, float) or type(other) is not type(number) or number == other:
+                continue
+            m = multiple((number, other), _COUNTS) if type(number) is int and len(self._call.layout.lead) == 1 else 0
+            if m:
+                counts[key] = m
+            else:
+                what = f"a number{f' in {key!r}' if key else ''} that depends on the samples of a cell"
+                warn_once(f"number {name}", f"{name} returns {what}; the router returns the number of one cell")
+        self.counts = counts
+        if recording.double.assigned:
+            parts = [*parts_of(self._call.module).values()]
+            for (place, key), line in self.recorded(set()).double.writes.items():
+                if (place, key) in recording.double.assigned:
+                    what = f"{type(parts[place]).__name__}.{key}{text_of_line(*line)}"
+                    rule = "set it outside of forward, since assignments in forward are lost after the call"
+                    warn_once(f"assigns {name}", f"{name} changes {what} and reads it; {rule}")
 
     def is_groupable(self) -> bool:
         """Returns whether the module runs without error for all cells at once on this batch."""

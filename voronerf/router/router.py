@@ -233,8 +233,8 @@ class VoronoiRouter(nn.Module):
             **options: The options of the constructor.
 
         Raises:
-            ValueError: If there are not exactly k modules, or if they differ in the names or shapes of parameters, or
-                in buffers.
+            ValueError: If there are not exactly k modules, or if they differ in anything but the values of parameters,
+                such as buffers, attributes or activations.
         """
         modules, rule = list(modules), "VoronoiRouter.from_modules: modules must hold a module for each"
         if not modules:
@@ -292,7 +292,8 @@ class VoronoiRouter(nn.Module):
 
         Raises:
             IndexError: If there is no cell of this index.
-            ValueError: For parameters of other names or shapes, or buffers that differ from the shared ones.
+            ValueError: For parameters of other names or shapes, or buffers, attributes or submodules that differ from
+                those of the router, which all cells share.
         """
         fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
         self._drop_frozen_checks()

@@ -1,0 +1,212 @@
+"""State of a module outside of parameters and buffers: layers in lists, kept results, counters, other attributes."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import types
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from convention_harness import uniform
+from router_fields import masked_loop
+from torch import Tensor, nn
+
+from voronerf import VoronoiRouter
+
+CENTRES = torch.rand(4, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
+WAYS: list[dict[str, Any]] = [{}, {"way": "loop"}, {"way": "grouped"}, {"fuse": True, "way": "fused"}]
+every_way = pytest.mark.parametrize("options", WAYS, ids=str)
+
+
+# Hidden layers --------------------------------------------------------------------------------------------------------
+
+
+class Blocks(nn.Module):
+    """N-BEATS of philipperemy: blocks in lists, whose parameters a ParameterList registers."""
+
+    def __init__(self, keep: Callable[[list[nn.Module]], Any]) -> None:
+        super().__init__()
+        blocks = [nn.Sequential(nn.Linear(3, 8), nn.Tanh(), nn.Linear(8, 3)) for _ in range(4)]
+        self.blocks = keep(blocks)
+        self.weights = nn.ParameterList([p for block in blocks for p in block.parameters()])
+
+    def forward(self, x: Tensor) -> Tensor:
+        held = self.blocks
+        held = list(held.values()) if isinstance(held, dict) else getattr(held, "blocks", held)
+        for block in (block for part in held for block in (part if type(part) is list else [part])):
+            x = x + block(x)
+        return x
+
+
+KEPT: dict[str, Callable[[list[nn.Module]], Any]] = {
+    "list": list,
+    "lists in a list": lambda blocks: [blocks[:2], blocks[2:]],
+    "dict": lambda blocks: dict(enumerate(blocks)),
+    "object": lambda blocks: types.SimpleNamespace(blocks=blocks),
+}
+
+
+@every_way
+@pytest.mark.parametrize("keep", KEPT)
+def test_layers_in_lists_train_for_each_cell(keep: str, options: dict[str, Any]) -> None:
+    torch.manual_seed(0)
+    router = VoronoiRouter.from_modules([Blocks(KEPT[keep]) for _ in CENTRES], CENTRES, coords="first3", **options)
+    optimizer = torch.optim.SGD(router.parameters(), 0.1)
+    for _ in range(3):
+        x = uniform((50,))
+        (expected,), modules = masked_loop(router, router.assign(x), [x])
+        actual = router(x)
+        torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+        optimizer.zero_grad()
+        actual.square().mean().backward()
+        expected.square().mean().backward()
+        for name, parameter in router.module.named_parameters():
+            assert parameter.grad is not None
+            slopes = torch.stack([m.get_parameter(name).grad for m in modules])
+            torch.testing.assert_close(parameter.grad, slopes, rtol=1e-3, atol=1e-4)
+        optimizer.step()
+    assert len(list(router.parameters())) == 16 and router.module.weights[0].shape == (4, 8, 3)
+    cell = router.cell(2)
+    torch.testing.assert_close(cell(x), copy.deepcopy(cell)(x))
+    router.load_cell(1, cell)
+    torch.testing.assert_close(router.cell(1)(x), cell(x))
+    router.subdivide(2, points=uniform((200,)))
+    torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0], rtol=1e-4, atol=1e-5)
+
+
+# Kept results ---------------------------------------------------------------------------------------------------------
+
+
+class Keeps(nn.Module):
+    """A module that keeps its results in a dict and in a list."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net, self.outputs, self.inner = nn.Linear(3, 2), dict[str, Tensor](), {"lists": list[Tensor]()}
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.outputs["y"] = y = self.net(x)
+        self.inner["lists"].append(y)
+        return y.tanh()
+
+
+@every_way
+def test_a_module_that_keeps_results_in_containers(options: dict[str, Any]) -> None:
+    field = Keeps()
+    field(uniform((5,)))  # leaves results that require gradients
+    router = VoronoiRouter(field, CENTRES, coords="first3", **options)
+    optimizer = torch.optim.SGD(router.parameters(), 0.1)
+    for _ in range(6):
+        optimizer.zero_grad()
+        router(x := uniform((40,))).square().sum().backward()
+        optimizer.step()
+    assert len(router.module.inner["lists"]) == 1, "items that forward adds are dropped"
+    for copied in (copy.deepcopy(router), router.part([0, 1, 2, 3])):
+        torch.testing.assert_close(copied(x), router(x))
+    assert router.cell(0)(x).shape == (40, 2)
+
+
+# Counters -------------------------------------------------------------------------------------------------------------
+
+
+class Counter(nn.Linear):
+    step, size = 0, 0
+
+    def __init__(self) -> None:
+        super().__init__(3, 2)
+        self.step, self.size = 0, 0
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.size = len(x)  # written before it is read
+        self.step += 1
+        return super().forward(x) * min(1.0, 0.1 * self.step) + 0 * self.size
+
+
+@every_way
+def test_a_schedule_that_forward_advances_warns_once_with_its_line(options: dict[str, Any]) -> None:
+    router = VoronoiRouter(Counter(), CENTRES, coords="first3", **options)
+    with pytest.warns(UserWarning, match=r"Counter.forward changes Counter.step \(test_router_state.py:\d+: self.step"):
+        router(uniform((40,)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        router(uniform((40,)))
+
+
+class Sized(nn.Linear):
+    def forward(self, x: Tensor) -> dict[str, Any]:
+        return {"y": super().forward(x), "sizes": [len(x), 2 * len(x), 37]}
+
+
+@every_way
+def test_a_result_that_counts_samples_counts_all_samples(options: dict[str, Any]) -> None:
+    router = VoronoiRouter(Sized(3, 2), CENTRES, coords="first3", **options)
+    for n in (50, 37, 41, 1, 0, 50):
+        assert router(uniform((n,)))["sizes"] == [n, 2 * n, 37]
+
+
+def test_another_number_among_the_results_warns() -> None:
+    class Mean(nn.Linear):
+        def forward(self, x: Tensor) -> tuple[Tensor, float]:
+            return super().forward(x), float(x.detach().mean())
+
+    router = VoronoiRouter(Mean(3, 2), CENTRES, coords="first3")
+    with pytest.warns(UserWarning, match="returns a number in '.1' that depends on the samples of a cell"):
+        router(uniform((40,)))
+
+
+# Modules that differ --------------------------------------------------------------------------------------------------
+
+
+class Sine(nn.Module):
+    def __init__(self, frequency: Any = 30.0, act: Any = None, **more: Any) -> None:
+        super().__init__()
+        self.fc, self.frequency, self.act = nn.Linear(3, 4), frequency, act
+        for name, value in more.items():
+            setattr(self, name, value)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.sin(self.fc(x) * self.frequency)
+
+
+OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], nn.Module]]] = {
+    "frequency": (Sine, lambda: Sine(10.0)),
+    "act, a Tanh instead of a ReLU,": (lambda: Sine(act=nn.ReLU()), lambda: Sine(act=nn.Tanh())),
+    "act.negative_slope": (lambda: Sine(act=nn.LeakyReLU(0.1)), lambda: Sine(act=nn.LeakyReLU(0.2))),
+    "mask": (lambda: Sine(mask=torch.ones(3)), lambda: Sine(mask=torch.zeros(3))),
+    "bands": (lambda: Sine(bands=[1, {"a": 2.0}]), lambda: Sine(bands=[1, {"a": 3.0}])),
+    "call": (lambda: Sine(call=torch.sin), lambda: Sine(call=torch.cos)),
+    "part": (lambda: Sine(part=functools.partial(torch.add, 1)), lambda: Sine(part=functools.partial(torch.add, 2))),
+    "scale": (lambda: Sine(scale=lambda x: 2 * x), lambda: Sine(scale=lambda x: 3 * x)),
+    "extra": (Sine, lambda: Sine(extra=1)),
+    "kept": (lambda: Sine(kept=types.SimpleNamespace(a=1)), lambda: Sine(kept=types.SimpleNamespace(a=2))),
+    "class, a Sigmoid instead of a Tanh,": (nn.Tanh, nn.Sigmoid),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_modules_that_differ_in_more_than_parameters_are_refused_by_name(name: str) -> None:
+    make, other = OTHERS[name]
+    with pytest.raises(ValueError, match=rf"modules\[1\]: module's {name} must equal the router's"):
+        VoronoiRouter.from_modules([make(), other()])
+    assert VoronoiRouter.from_modules([make(), make()]).num_cells == 2
+    router = VoronoiRouter(make(), 2)
+    with pytest.raises(ValueError, match=rf"load_cell: module's {name} must equal the router's"):
+        router.load_cell(0, other())
+    router.load_cell(0, make())
+
+
+def test_modules_that_keep_different_results_are_one_network_for_each_cell() -> None:
+    modules = [Keeps() for _ in CENTRES]
+    for module in modules[1:]:
+        module.last = module(uniform((7,)))
+    with pytest.raises(ValueError, match="module's inner must equal"):  # another number of kept results
+        VoronoiRouter.from_modules(modules, CENTRES, coords="first3")
+    for module in modules:
+        module.inner["lists"] = []
+        module.outputs.clear()
+    router = VoronoiRouter.from_modules(modules, CENTRES, coords="first3")
+    assert router(uniform((9,))).shape == (9, 2)
