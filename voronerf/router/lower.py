@@ -169,6 +169,12 @@ def _products(x: Tensor, y: Tensor) -> Tensor:
     return (x.unsqueeze(2) * y.transpose(1, 2).unsqueeze(1)).sum(3)
 
 
+def _sign(x: Tensor) -> Tensor:
+    positive, negative = x > 0, x < 0
+    # The last term is 0. It makes the gradient 0, as in PyTorch; with comparisons alone, the gradient would be None.
+    return positive.to(x.dtype) - negative.to(x.dtype) + torch.where(positive & negative, x, 0.0)
+
+
 _DECOMPOSED: dict[str, Callable[..., Any]] = {
     "maximum": _maximum,
     "minimum": lambda x, y: -_maximum(-x, -y),
@@ -186,7 +192,7 @@ _DECOMPOSED: dict[str, Callable[..., Any]] = {
     "mish": lambda x: x * F.softplus(x).tanh(),
     "log_sigmoid_forward": lambda x: (-F.softplus(-x), x.new_zeros(0)),
     "ceil": lambda x: -(-x).floor(),
-    "sign": lambda x: (x > 0).to(x.dtype) - (x < 0).to(x.dtype),
+    "sign": _sign,
     "addcmul": lambda x, y, z, value=1: x + value * (y * z),
     "addcdiv": lambda x, y, z, value=1: x + value * (y / z),
     "masked_fill": lambda x, mask, value: torch.where(mask, value, x),
