@@ -64,6 +64,7 @@ STEPS: dict[str, Callable[[Any, Tensor], Tensor]] = {
     "a parameter without dimensions": lambda net, h: h * net.single,
     "a product added to one row": lambda net, h: torch.addmm(net.gain[None], h, net.a.weight @ net.a.weight.t()),
     "constants beside samples": lambda net, h: torch.cat([h[:, 2:], torch.arange(2.0).repeat(len(h), 1)], 1),
+    "a transpose, flattened": lambda net, h: h.view(-1, 2, 4).tanh().transpose(1, 2).flatten(1),
     "writing into zeros": written(torch.zeros_like),
     "writing into new memory": written(lambda h: torch.empty(len(h), 8).fill_(0.5)),
     "writing into a mask": written(lambda h: torch.ones(h.shape, dtype=h.dtype)),
@@ -327,6 +328,12 @@ def by_sum(net: Any, h: Tensor) -> Tensor:
     return gradient
 
 
+def turned(net: Any, h: Tensor) -> Tensor:
+    """Returns a view that is possible only because functions of PyTorch keep the strides of a transposed tensor."""
+    y = torch.lgamma(h.view(-1, 2, 4).transpose(1, 2) + 1.5)
+    return y.transpose(1, 2).contiguous().view(-1, 8)
+
+
 class Slope(Around):
     """The gradient of the first output by ``torch.autograd.grad`` inside ``forward``, as in NeuS."""
 
@@ -351,6 +358,8 @@ BETWEEN: dict[str, tuple[Callable[[], nn.Module], str]] = {
     "a gradient": (lambda: Slope(lambda net, h: h.square()), "grad"),
     "a gradient by new positions": (lambda: Field(lambda net, h: h.square()), "grad"),
     "a gradient of a sum, by what was computed": (lambda: Around(by_sum), "sum, grad"),
+    "a view of a transposed tensor": (lambda: Around(turned), "torch.lgamma"),
+    "a view by PyTorch": (lambda: Around(lambda net, h: torch.cosh(turned(net, h))), "torch.lgamma"),
     "no gradient": (lambda: Around(lambda net, h: h * torch.no_grad()(torch.lgamma)(h + 1.5)), "torch.lgamma"),
 }
 

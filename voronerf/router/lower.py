@@ -488,7 +488,7 @@ class _EntryMode(TorchDispatchMode):
         if name == "detach" and of is None:
             places, numbers = self.lowering.order(codes(args[0]))
             return [self._placed(self.b.apply("stop", self.lowering.operand(numbers)), places, args[0].shape)]
-        args, kwargs = map_tensors((args, {k: v for k, v in kwargs.items() if k != "memory_format"}), codes)
+        args, kwargs = map_tensors((args, kwargs), codes)
         return [Entries(t, of) for t in tensors_of(func(*args, **kwargs))]
 
     def of_samples(self, tensor: Tensor, entries: Entries | None) -> Entries:
