@@ -15,6 +15,7 @@ from router_fields import masked_loop, perturb, tensors
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
+from voronerf.router.lower import Lowering, NotAStep
 
 K = 4
 
@@ -262,6 +263,39 @@ class Recurrent(nn.Module):
         return self.out(self.cell(x, self.cell(x)))
 
 
+class Cells(nn.Module):
+    """An LSTM cell after an Elman cell; the loop's second derivatives of both exist."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first, self.cell, self.out = nn.RNNCell(3, 4), nn.LSTMCell(4, 4), nn.Linear(4, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        first = self.first(x)
+        h, c = self.cell(first)
+        return self.out(self.cell(first, (c, h))[0])
+
+
+class Sequence(nn.Module):
+    """The function of ``nn.GRU`` or ``nn.LSTM`` over the columns of a sample, as a sequence of three numbers."""
+
+    def __init__(self, name: str, bidirectional: bool = False, bias: bool = True) -> None:
+        super().__init__()
+        layer = getattr(nn, name)(1, 4, 2, bidirectional=bidirectional, bias=bias)
+        self.weights, self.function = (
+            nn.ParameterList(map(nn.Parameter, layer._flat_weights)),
+            [getattr(torch, name.lower())],
+        )
+        self.out, self.options, self.states = nn.Linear(12 if not bidirectional else 24, 2), (bias, bidirectional), name
+
+    def forward(self, x: Tensor) -> Tensor:
+        bias, bidirectional = self.options
+        h = x.new_zeros(4 if bidirectional else 2, len(x), 4)
+        state = (h, h) if self.states == "LSTM" else h
+        y = self.function[0](x[:, :, None], state, list(self.weights), bias, 2, 0.0, False, bidirectional, True)[0]
+        return self.out(y.flatten(1))
+
+
 class Masked(nn.Module):
     """A network that writes numbers by a mask of entries and by a mask of samples."""
 
@@ -292,6 +326,11 @@ MODULES: dict[str, Callable[[], nn.Module]] = {
         for form in ("over samples", "behind", "covers", "lines")
     },
     "GRUCell": Recurrent,
+    "LSTMCell": Cells,
+    "GRU": lambda: Sequence("GRU"),
+    "LSTM": lambda: Sequence("LSTM"),
+    "LSTM in both directions": lambda: Sequence("LSTM", bidirectional=True),
+    "LSTM without biases": lambda: Sequence("LSTM", bias=False),
     "x[mask] = number": Masked,
 }
 
@@ -303,8 +342,23 @@ def test_a_module_that_is_one_program(name: str) -> None:
     actual, expected, router = both(MODULES[name], x)
     assert router.explain() == "forward: fused"
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
-    for a, b in zip(derivatives(actual, x, router), derivatives(expected, x, router), strict=True):
+    twice = not name.startswith("LSTM") or name == "LSTMCell"  # PyTorch has no second derivatives of its LSTM
+    ours, theirs = (derivatives(y, x, router, twice) for y in (actual, expected))
+    for a, b in zip(ours, theirs, strict=True):
         torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
+
+
+def test_a_function_that_cannot_be_a_step_says_why() -> None:
+    x = torch.rand(37, 17, 3)
+    for function, args, reason in (
+        (F.linear, (torch.rand(2, 3),), "a layer of 17 rows of each sample, more than 16"),
+        (F.batch_norm, (None, None, None, None, True), "it mixes samples"),
+        (F.batch_norm, (torch.zeros(17), torch.ones(17), None, None, True), "it mixes samples"),
+    ):
+        lowering = Lowering(37)
+        entries = lowering.input(None, x.shape, 0)
+        with pytest.raises(NotAStep, match=reason):
+            lowering.run(function, (x, *args), {}, lambda tensor, entries=entries: entries if tensor is x else None)
 
 
 class Exponential(torch.autograd.Function):

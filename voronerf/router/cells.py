@@ -147,7 +147,7 @@ def _held_by(function: types.FunctionType, objects: dict[int, str]) -> str:
 
 
 def _refusal(part: nn.Module) -> str:
-    if isinstance(part, nn.modules.batchnorm._BatchNorm):
+    if isinstance(part, nn.modules.batchnorm._BatchNorm) and (part.training or part.running_mean is None):
         return "mixes the samples of a batch (use LayerNorm)"
     if isinstance(part, nn.RNNBase):
         return "is recurrent, and its weights cannot be stacked, one set for each cell"
