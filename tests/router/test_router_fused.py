@@ -296,6 +296,17 @@ class Sequence(nn.Module):
         return self.out(y.flatten(1))
 
 
+class Alone(nn.Module):
+    """A network of a vector alone, which reads nothing of the samples but their number."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.code, self.out = nn.Parameter(torch.randn(4)), nn.Linear(4, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(torch.tanh(self.code.expand(len(x), 4)))
+
+
 class Masked(nn.Module):
     """A network that writes numbers by a mask of entries and by a mask of samples."""
 
@@ -346,6 +357,18 @@ def test_a_module_that_is_one_program(name: str) -> None:
     ours, theirs = (derivatives(y, x, router, twice) for y in (actual, expected))
     for a, b in zip(ours, theirs, strict=True):
         torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
+
+
+def test_a_vector_alone() -> None:
+    x = uniform((90,)).requires_grad_()
+    actual, expected, router = both(Alone, x)
+    assert router.explain() == "forward: fused"
+    torch.testing.assert_close(actual, expected)
+    ours, theirs = (
+        torch.autograd.grad(y.square().sum(), [*router.parameters(), x], allow_unused=True) for y in (actual, expected)
+    )
+    torch.testing.assert_close(ours[:-1], theirs[:-1])
+    assert ours[-1] is None and theirs[-1] is None
 
 
 def test_a_function_that_cannot_be_a_step_says_why() -> None:

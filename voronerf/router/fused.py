@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -298,7 +298,11 @@ class Fused:
                 if level[columns.index] == number:
                     outputs.append(node)
                     operands.append(columns)
-            runs[number] = _renumbered(chosen, operands, lowering, outputs)
+            runs[number] = run = _renumbered(chosen, operands, lowering, outputs)
+            if not run.inputs:  # constants: an argument tells the number of samples
+                run.inputs = self._inputs[:1]
+                width = self._inputs[0].meta["value"].numel() // lowering.rows
+                run.program = replace(run.program, inputs=(width,))
         return runs
 
     # Running ----------------------------------------------------------------------------------------------------------
