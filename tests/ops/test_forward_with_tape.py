@@ -11,6 +11,7 @@ from op_cases import refused
 from voronerf import MLP, HashGrid, Layer
 from voronerf.ops import forward_with_tape, routed_mlp
 from voronerf.ops._core.backends import BackendUnavailable
+from voronerf.ops._core.program import Builder
 
 pytestmark = pytest.mark.op("forward_with_tape")
 
@@ -124,6 +125,20 @@ def test_only_what_needs_gradients_gets_them(device, backend):
         if len(frozen) < 4:
             learn(arguments, backward=True, backend=backend)
         assert [p.grad is None for p in parameters] == [number in frozen or len(frozen) == 4 for number in range(4)]
+
+
+def test_a_detached_layer_gets_no_gradient(device, backend):
+    b = Builder()
+    hidden = b.apply("stop", b.linear(b.input(3), b.parameter(4, 3), 4))
+    program = b.program([b.linear(hidden, b.parameter(2, 4), 2)])
+    weights = [
+        torch.randn(1, 4, 3, device=device).requires_grad_(),
+        torch.randn(1, 2, 4, device=device).requires_grad_(),
+    ]
+    network = {"program": program, "inputs": [torch.randn(5, 3, device=device)], "parameters": weights}
+    tape = forward_with_tape(network, backend=backend)
+    tape.backward(*squares(tape.raw))
+    assert weights[0].grad is None and weights[1].grad is not None
 
 
 def test_gradients_reach_what_parameters_are_made_of(device, backend):

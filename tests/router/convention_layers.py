@@ -165,6 +165,40 @@ class Convolution(nn.Module):
         return self.fc(self.conv(x[:, None]).flatten(1))
 
 
+class Between(nn.Module):
+    """A field with one layer between two linear layers; ``shape`` is a sample's shape in that layer."""
+
+    def __init__(self, layer: nn.Module, *shape: int) -> None:
+        super().__init__()
+        self.fc, self.layer, self.out, self.shape = nn.Linear(7, 8), layer, nn.Linear(8, 3), shape or (8,)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(self.layer(self.fc(x).view(-1, *self.shape)).flatten(1))
+
+
+class Pairs(nn.Module):
+    """A field with a bilinear layer or a tensordot of features and samples."""
+
+    def __init__(self, way: str) -> None:
+        super().__init__()
+        self.way = way
+        self.fc, self.pairs = nn.Linear(7, 6), nn.Bilinear(6, 7, 3, bias=way != "bilinear without bias")
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = torch.tanh(self.fc(x))
+        if self.way == "tensordot":
+            return torch.tensordot((h[:, :, None] * x[:, None]), self.pairs.weight, ([1, 2], [1, 2])) + self.pairs.bias
+        return self.pairs(h, x)
+
+
+def batch_norm(kind: type[nn.Module], channels: int, *, affine: bool = True) -> nn.Module:
+    """Returns a batch norm in evaluation mode, which treats samples one by one."""
+    layer: Any = kind(channels, affine=affine)
+    layer.running_mean += torch.linspace(-0.5, 0.5, channels)
+    layer.running_var *= torch.linspace(0.5, 2.0, channels)
+    return layer.eval()
+
+
 def images(lead: tuple[int, ...]) -> Any:
     return (uniform(lead, 7), torch.randint(0, 6, lead)), {}
 
@@ -186,4 +220,22 @@ LAYERS = [
     Case("embedding", Lookup, images),
     Case("embedding's average", Lookup),
     Case("convolution", Convolution, way="cell by cell"),
+    Case(
+        "batch norm in evaluation, plain",
+        lambda: Between(batch_norm(nn.BatchNorm2d, 4, affine=False), 4, 2, 1),
+        fuses=True,
+    ),
+    *(
+        Case(name, make, fuses=True)
+        for name, make in {
+            "PReLU": lambda: Between(nn.PReLU()),
+            "PReLU of channels": lambda: Between(nn.PReLU(4), 4, 2),
+            "group norm": lambda: Between(nn.GroupNorm(2, 8)),
+            "group norm of channels": lambda: Between(nn.GroupNorm(2, 4), 4, 2),
+            "instance norm": lambda: Between(nn.InstanceNorm1d(2, affine=True), 2, 4),
+            "batch norm in evaluation": lambda: Between(batch_norm(nn.BatchNorm1d, 8)),
+            "batch norm in evaluation, of channels": lambda: Between(batch_norm(nn.BatchNorm1d, 4), 4, 2),
+            **{way: lambda way=way: Pairs(way) for way in ("bilinear", "bilinear without bias", "tensordot")},
+        }.items()
+    ),
 ]

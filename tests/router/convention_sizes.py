@@ -127,18 +127,6 @@ class Attention(nn.Module):
         return (x + self.project(y)).flatten(1)
 
 
-class Products(nn.Module):
-    """A bilinear layer, slopes and norms of channels."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.pair, self.one, self.each = nn.Bilinear(3, 3, 8), nn.PReLU(), nn.PReLU(8)
-        self.norm, self.out = nn.GroupNorm(2, 8), nn.Linear(8, 2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.out(self.norm(self.each(self.one(self.pair(x, x.sin())))))
-
-
 class Cells(nn.Module):
     """Single steps of recurrent cells."""
 
@@ -163,27 +151,6 @@ class Series(nn.Module):
         return self.out(self.layer(x.reshape(len(x), 4, 3))[0][:, -1])
 
 
-class Normalised(nn.Module):
-    """Batch norms in evaluation mode, of features and of channels [n, c, places]."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.inner, self.outer, self.layer, self.out = (
-            nn.BatchNorm1d(8),
-            nn.BatchNorm1d(4),
-            nn.Linear(3, 8),
-            nn.Linear(8, 2),
-        )
-        for norm in (self.inner, self.outer):
-            norm.running_mean.copy_(torch.linspace(-1, 1, len(norm.running_mean)))
-            norm.running_var.copy_(torch.linspace(0.5, 2, len(norm.running_var)))
-        self.eval()
-
-    def forward(self, x: Tensor) -> Tensor:
-        h = F.relu(self.inner(self.layer(x)))
-        return self.out(self.outer(h.view(-1, 4, 2)).flatten(1))
-
-
 SIZES = [
     Case("heads in front", HeadsInFront, one(12), fuses=True),
     Case("heads in front, cosh", lambda: HeadsInFront(True), one(12), fuses=True),
@@ -197,11 +164,9 @@ SIZES = [
         Case(f"{t} tokens", lambda t=t, h=h: Attention(t, h), one(4 * t), fuses=True)
         for t, h in ((1, 2), (3, 1), (33, 2))
     ),
-    Case("bilinear", Products, one(3), fuses=True),
     Case("recurrent cells", Cells, one(3), fuses=True),
     Case("LSTM", lambda: Series(nn.LSTM), one(12)),
     Case("LSTM of two layers in both directions", lambda: Series(nn.LSTM, num_layers=2, bidirectional=True), one(12)),
     Case("GRU", lambda: Series(nn.GRU), one(12)),
     Case("RNN without biases", lambda: Series(nn.RNN, bias=False, nonlinearity="relu"), one(12)),
-    Case("batch norms in evaluation mode", Normalised, one(3), fuses=True),
 ]

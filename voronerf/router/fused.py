@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -132,6 +132,10 @@ class Fused:
                     "write it with functions of PyTorch"
                 )
         self._writes = any(node.meta.get("inplace") for node in self._between)
+        if not self._writes:  # results of runs are contiguous, so PyTorch's view of such a result may need a copy
+            for node in self._between:
+                if node.target is Tensor.view and not isinstance(node.args[1], torch.dtype):
+                    node.target = Tensor.reshape
         self._runs = self._cut()
         if not any(run.parameters for run in self._runs.values()):
             first = next(iter(self._reasons.values()), "no result depends on a layer")
@@ -201,6 +205,7 @@ class Fused:
                 if node.meta["on"] == SAMPLES
                 else Entries(torch.arange(value.numel()).reshape(value.shape), node)
             )
+            _match_strides(self._entries[node], value)
         return self._entries[node]
 
     def _lower(self, node: fx.Node) -> None:
@@ -229,7 +234,11 @@ class Fused:
         entry_list = [entries(tensor) for tensor in ([args[0]] if written else tensors_of(result))]
         if written:  # the codes of views of the tensor change too
             self._entries[written] = old_entries
+        # The codes of a view of an argument share memory with the codes of the argument, so their strides stay.
+        memory = {source.meta["value"].untyped_storage().data_ptr() for source in values.values()}
         for value, value_entries in zip(node.meta["results"], entry_list, strict=True):
+            if value.meta["value"].untyped_storage().data_ptr() not in memory:
+                _match_strides(value_entries, value.meta["value"])
             if self._recorded and not node.meta["grad"]:
                 places, numbers = self._lowering.order(value_entries.codes)
                 b = self._lowering.builder
@@ -294,7 +303,11 @@ class Fused:
                 if level[columns.index] == number:
                     outputs.append(node)
                     operands.append(columns)
-            runs[number] = _renumbered(chosen, operands, lowering, outputs)
+            runs[number] = run = _renumbered(chosen, operands, lowering, outputs)
+            if not run.inputs:  # constants: an argument tells the number of samples
+                run.inputs = self._inputs[:1]
+                width = self._inputs[0].meta["value"].numel() // lowering.rows
+                run.program = replace(run.program, inputs=(width,))
         return runs
 
     # Running ----------------------------------------------------------------------------------------------------------
@@ -463,6 +476,13 @@ def _renumbered(steps: list[Step], results: list[Columns], lowering: Lowering, o
         values[step.out] = b.emit(step.op, step.width, operands, numbers, step.name).index
     run.program = b.program([columns(c) for c in results])
     return run
+
+
+def _match_strides(entries: Entries, tensor: Tensor) -> None:
+    """Gives codes the strides of their tensor, which decide whether a later view is possible."""
+    if entries.codes.stride() != tensor.stride() and 0 not in tensor.stride():
+        codes = torch.empty_strided(tensor.shape, tensor.stride(), dtype=entries.codes.dtype)
+        entries.codes = codes.copy_(entries.codes)
 
 
 def _meets_cells(node: fx.Node) -> bool:

@@ -142,6 +142,56 @@ def _layer_norm(x: Tensor, shape: Sequence[int], weight: Any, bias: Any, eps: fl
     return y if bias is None else y + bias, mean, scale
 
 
+def _group_norm(
+    x: Tensor, weight: Any, bias: Any, n: int, channels: int, _: int, groups: int, eps: float
+) -> tuple[Tensor, ...]:
+    y, mean, scale = _layer_norm(x.reshape(n, groups, -1), [x[0].numel() // groups], None, None, eps)
+    y = _per_channel(y.reshape(x.shape), weight, bias)
+    return y, mean.squeeze(2), scale.squeeze(2)
+
+
+def _batch_norm(
+    x: Tensor, weight: Any, bias: Any, mean: Tensor, variance: Tensor, _: float, eps: float
+) -> tuple[Tensor, ...]:
+    """Normalises by the running statistics, as in evaluation mode."""
+    y = _per_channel(_per_channel(x, None, -mean), (variance + eps).rsqrt(), None)
+    return _per_channel(y, weight, bias), x.new_zeros(0), x.new_zeros(0)
+
+
+def _per_channel(x: Tensor, scale: Any, shift: Any) -> Tensor:
+    """Returns ``x * scale + shift`` for x [n, c, ...], with one scale and one shift for each channel, or None."""
+    shape = [-1, *[1] * (x.dim() - 2)]
+    x = x if scale is None else x * scale.reshape(shape)
+    return x if shift is None else x + shift.reshape(shape)
+
+
+def _lstm_layer(
+    x: Tensor, w: Tensor, u: Tensor, b: Any, v: Any, h: Tensor, c: Tensor, back: bool, *rule: Any
+) -> tuple[Tensor, ...]:
+    """Writes a layer of an LSTM, x [t, n, i], as t cells; ``back``: from the last x to the first."""
+    if len(x) > _PRODUCTS:
+        raise NotAStep(f"an LSTM of {len(x)} steps, more than {_PRODUCTS}")
+    (h,), (c,), rows, (_, _, _, _, has_biases, *_) = h, c, list(x), rule
+    b, v = (b, v) if has_biases else (None, None)
+    for at in reversed(range(len(x))) if back else range(len(x)):
+        h, c = torch.lstm_cell(rows[at], (h, c), w, u, b, v)
+        rows[at] = h
+    return torch.stack(rows), h.unsqueeze(0), c.unsqueeze(0)
+
+
+def _bilinear(x: Tensor, weight: Tensor, y: Tensor, *_: Any) -> Tensor:
+    """Writes the sum of ``x_i W_oij y_j`` as a linear layer of the products ``x_i y_j``."""
+    return F.linear((x.unsqueeze(2) * y.unsqueeze(1)).flatten(1), weight.flatten(1))
+
+
+def _batch_norm_in_training(x: Tensor, weight: Any, bias: Any, *rule: Any) -> tuple[Tensor, ...]:
+    """Normalises by the batch's own statistics: PyTorch writes an instance norm in this way, as a batch of one."""
+    if len(rule) > 3 or len(x) > 1:  # with running statistics, or of samples
+        raise NotAStep("it mixes samples")
+    y, mean, scale = _layer_norm(x, x.shape[2:], None, None, rule[-1])
+    return _per_channel(y, weight, bias), mean.flatten(), scale.flatten()
+
+
 def _convolution(x: Tensor, weight: Tensor, bias: Any, *rule: Any) -> Tensor:
     """Writes a convolution of [n, c, ...] as a linear layer; its kernel must have size 1 or cover the whole input."""
     (stride, padding, dilation, transposed, _, groups), size, more = rule, weight.shape[2:], x.shape[2:]
@@ -170,6 +220,12 @@ def _products(x: Tensor, y: Tensor) -> Tensor:
     return (x.unsqueeze(2) * y.transpose(1, 2).unsqueeze(1)).sum(3)
 
 
+def _sign(x: Tensor) -> Tensor:
+    positive, negative = x > 0, x < 0
+    # The last term is 0. It makes the gradient 0, as in PyTorch; with comparisons alone, the gradient would be None.
+    return positive.to(x.dtype) - negative.to(x.dtype) + torch.where(positive & negative, x, 0.0)
+
+
 _DECOMPOSED: dict[str, Callable[..., Any]] = {
     "maximum": _maximum,
     "minimum": lambda x, y: -_maximum(-x, -y),
@@ -182,12 +238,18 @@ _DECOMPOSED: dict[str, Callable[..., Any]] = {
     "std": lambda *args, **kwargs: _variance(*args, **kwargs).sqrt(),
     "linalg_vector_norm": _norm,
     "native_layer_norm": _layer_norm,
+    "native_group_norm": _group_norm,
+    "_native_batch_norm_legit_no_training": _batch_norm,
+    "_native_batch_norm_legit": _batch_norm_in_training,
+    "_prelu_kernel": lambda x, slope: torch.where(x > 0, x, slope * x),
+    "mkldnn_rnn_layer": _lstm_layer,
+    "_trilinear": _bilinear,  # PyTorch uses it for F.bilinear alone
     "_softmax": _softmax,
     "_log_softmax": _log_softmax,
     "mish": lambda x: x * F.softplus(x).tanh(),
     "log_sigmoid_forward": lambda x: (-F.softplus(-x), x.new_zeros(0)),
     "ceil": lambda x: -(-x).floor(),
-    "sign": lambda x: (x > 0).to(x.dtype) - (x < 0).to(x.dtype),
+    "sign": _sign,
     "addcmul": lambda x, y, z, value=1: x + value * (y * z),
     "addcdiv": lambda x, y, z, value=1: x + value * (y / z),
     "masked_fill": lambda x, mask, value: torch.where(mask, value, x),
@@ -479,7 +541,7 @@ class _EntryMode(TorchDispatchMode):
         if name == "detach" and of is None:
             places, numbers = self.lowering.order(codes(args[0]))
             return [self._placed(self.b.apply("stop", self.lowering.operand(numbers)), places, args[0].shape)]
-        args, kwargs = map_tensors((args, {k: v for k, v in kwargs.items() if k != "memory_format"}), codes)
+        args, kwargs = map_tensors((args, kwargs), codes)
         return [Entries(t, of) for t in tensors_of(func(*args, **kwargs))]
 
     def of_samples(self, tensor: Tensor, entries: Entries | None) -> Entries:
@@ -662,7 +724,9 @@ class _EntryMode(TorchDispatchMode):
             raise NotAStep("it mixes samples")
         places, _ = self.lowering.order((rows << 32)[:, 0])
         numbers = flat[places] & _LOW  # [rows, m, i]
-        if m > _PRODUCTS or not (numbers == numbers[:1]).all():
+        if m > _PRODUCTS:
+            raise NotAStep(f"a layer of {m} rows of each sample, more than {_PRODUCTS}")
+        if not (numbers == numbers[:1]).all():
             raise NotAStep("the tensor's layout differs between samples")
         weight, (width, _) = self.lowering.parameter(matrix, matrix=True), matrix.codes.shape
         table = torch.empty(len(flat), width, dtype=torch.int64)

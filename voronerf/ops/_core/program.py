@@ -700,6 +700,39 @@ def gradient(
     return pruned(b.program(results, [at for at, i in enumerate(wanted_inputs) if i in program.rays]))
 
 
+def gradient_reaches(program: Program, outputs: Sequence[bool], sums: Sequence[bool]) -> tuple[bool, ...]:
+    """Returns for each input, then for each parameter, whether a gradient reaches it; else autograd gives it None.
+
+    Nothing passes ``stop`` or a comparison. A gradient of zeros, as ``floor`` has, counts as a gradient; so does
+    the second derivative of ReLU, whose gradient is a ``gate`` by its output.
+
+    Args:
+        program: the program.
+        outputs: for each output, whether it has a gradient.
+        sums: for each sum, whether it has a gradient.
+    """
+    values, parameters, inputs = set[int](), set[int](), set[int]()
+
+    def add(operands: Sequence[Columns]) -> None:
+        for columns in operands:
+            (values if columns.of == VALUE else parameters).add(columns.index)
+
+    add([columns for columns, exists in zip(program.outputs, outputs, strict=True) if exists])
+    for step in reversed(program.steps):
+        exists = sums[step.out] if _is_sum(step) else step.out in values
+        if not exists or step.name in ("stop", "step", "at_least"):
+            continue
+        add(step.operands)
+        if step.op == "input":
+            inputs.add(int(step.numbers[0]))
+        elif step.op == "linear":
+            parameters.add(int(step.numbers[0]))
+        elif step.op == "encode" and step.name == HASH:
+            parameters.add(int(step.numbers[1]))
+    reached = [i in inputs for i in range(len(program.inputs))]
+    return tuple(reached + [p in parameters for p in range(len(program.parameters))])
+
+
 def _differentiate_sum(b: Builder, arriving: _Arriving, step: Step, parameter: int) -> None:
     if step.op == "scatter":
         # For a gradient C of the sum, <C, T_m(x, g; h ..)> is <g, F_m(x; h ..)> with C as the table.

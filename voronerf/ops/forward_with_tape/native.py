@@ -61,19 +61,19 @@ class _NativeTape(Tape):
     def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor:
         wanted = [tensor.requires_grad for tensor in self.leaves]
         with torch.no_grad():
-            gradients = self._gradients(gradient, wanted)
-            learning = [tensor for tensor, want in zip(self.leaves, wanted) if want]
-            pairs = zip(gradients, learning, strict=True)
+            slopes = zip(self._gradients(gradient, wanted), self.leaves, strict=True)
+            pairs = [(slope, tensor) for slope, tensor in slopes if slope is not None]
+            learning = [tensor for _, tensor in pairs]
             gradients = [slope if slope.dim() == tensor.dim() else slope.view_as(tensor) for slope, tensor in pairs]
             if not defer and all(map(_takes_gradients, learning)):
                 _add_gradients(learning, gradients)
                 return loss
         return run_backward(with_gradients(loss, learning, gradients), defer)
 
-    def _gradients(self, gradient: Tensor, wanted: Sequence[bool]) -> list[Tensor]:
-        """Returns the gradients of the wanted inputs and parameters."""
+    def _gradients(self, gradient: Tensor, wanted: Sequence[bool]) -> list[Tensor | None]:
+        """Returns the gradient of each leaf; None if it is unwanted, or if the outputs do not depend on the leaf."""
         if not any(wanted):
-            return []
+            return [None] * len(wanted)
         if self.count is not None:
             (gradient,), _ = mask_rows([gradient], self.cells, self.count)
         if self.frozen is not None:  # the backward pass drops rows with a zero gradient

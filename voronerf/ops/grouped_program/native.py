@@ -19,7 +19,7 @@ from voronerf.ops._core import backends, native
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import needed_gradients
-from voronerf.ops._core.program import Program, gradient
+from voronerf.ops._core.program import Program, gradient, gradient_reaches
 from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.grouped_program.arguments import ProgramArguments, index_name
 from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
@@ -133,6 +133,22 @@ def _results(text: str) -> int:
     """Returns the number of outputs and sums; kept features follow them in the list of results."""
     program = Program.parse(text)
     return len(program.outputs) + len(program.sums)
+
+
+@functools.lru_cache(maxsize=1024)
+def _constant_results(text: str) -> tuple[int, ...]:
+    """Returns the indices of the outputs without a gradient, such as detached outputs.
+
+    Excludes gradients that are 0, which `gradient` writes as a move of no columns: PyTorch can differentiate them.
+    """
+    program = Program.parse(text)
+    zeros = {step.out for step in program.steps if step.op == "move" and not step.operands}
+    constant = list[int]()
+    for i, columns in enumerate(program.outputs):
+        alone = [j == i for j in range(len(program.outputs))]
+        if columns.index not in zeros and not any(gradient_reaches(program, alone, [False] * len(program.sums))):
+            constant.append(i)
+    return tuple(constant)
 
 
 @constant_result
@@ -373,8 +389,9 @@ def _setup(ctx: Any, inputs: tuple[Rows, RunOptions], output: Sequence[Tensor]) 
     ctx.count, ctx.parameters, ctx.results = len(rows.inputs), len(rows.parameters), _results(ctx.options.text)
     ctx.set_materialize_grads(False)
     ctx.kept, kept = len(rows.kept), output[ctx.results :]
-    if kept:
-        ctx.mark_non_differentiable(*kept)
+    constant = _constant_results(ctx.options.text)
+    if kept or constant:
+        ctx.mark_non_differentiable(*kept, *[output[i] for i in constant])
     ctx.save_for_backward(*rows.inputs, *rows.parameters, rows.offsets, rows.order, rows.ray_index, *kept)
 
 
@@ -388,20 +405,20 @@ def _saved_gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> list[Tensor
     """Returns the gradients of the inputs, then of the parameters; None for an unwanted gradient."""
     count, saved = ctx.count + ctx.parameters, ctx.saved_tensors
     wanted = needed_gradients(ctx, saved[:count])
-    gradients: list[Tensor | None] = [None] * count
     arriving = arriving[: ctx.results]
-    if any(g is not None for g in arriving) and any(wanted):
-        offsets, order, ray_index, *kept = saved[count:]
-        rows = Rows(saved[: ctx.count], saved[ctx.count : count], offsets, order, ray_index, kept)
-        results = iter(run_gradient(rows, ctx.options, arriving, wanted))
-        gradients = [next(results) if want else None for want in wanted]
-    return gradients
+    if not any(g is not None for g in arriving) or not any(wanted):
+        return [None] * count
+    offsets, order, ray_index, *kept = saved[count:]
+    rows = Rows(saved[: ctx.count], saved[ctx.count : count], offsets, order, ray_index, kept)
+    return run_gradient(rows, ctx.options, arriving, wanted)
 
 
 def run_gradient(
     rows: Rows, options: RunOptions, arriving: Sequence[Tensor | None], wanted: Sequence[bool]
-) -> list[Tensor]:
-    """Returns the gradients of the wanted inputs and parameters.
+) -> list[Tensor | None]:
+    """Returns the gradients of the inputs, then of the parameters.
+
+    A gradient is None if it is unwanted, or if no arriving gradient reaches the tensor (:func:`gradient_reaches`).
 
     Args:
         rows: the tensors of the program, with the kept features.
@@ -412,20 +429,22 @@ def run_gradient(
     program, count = Program.parse(options.text), len(rows.inputs)
     split, present = len(program.outputs), tuple([g is not None for g in arriving])
     derived = _gradient(program.text, options.caller, options.products, count, tuple(wanted), present)
+    gradients: list[Tensor | None] = [None] * len(wanted)
+    if not derived.places:
+        return gradients
     inputs = [*rows.inputs, *[g for g in arriving[:split] if g is not None]]
     parameters = [*rows.parameters, *[g for g in arriving[split:] if g is not None]]
     call = Rows(inputs, parameters, rows.offsets, rows.order, rows.ray_index, rows.kept if derived.keeps else ())
     # `run_program` keeps the looked-up features again, for a pass that is differentiated further.
     values = run_program(call, derived.options) if torch.is_grad_enabled() else run(call, derived.options)
-    results, learning = (
-        values[: derived.outputs],
-        [p for p, want in zip(rows.parameters, wanted[count:]) if want],
-    )
-    for total, p in zip(values[derived.outputs :], learning, strict=True):
-        if p.shape[0] == 1 and total.shape[0] > 1:
-            total = total.sum(0, keepdim=True)
-        results.append(total if p.dtype is total.dtype else total.to(p.dtype))
-    return results
+    for place, total in zip(derived.places, values, strict=True):
+        if place >= count:
+            p = rows.parameters[place - count]
+            if p.shape[0] == 1 and total.shape[0] > 1:
+                total = total.sum(0, keepdim=True)
+            total = total if p.dtype is total.dtype else total.to(p.dtype)
+        gradients[place] = total
+    return gradients
 
 
 class _Gradient(NamedTuple):
@@ -433,12 +452,12 @@ class _Gradient(NamedTuple):
 
     Attributes:
         options: the options of the gradient's program.
-        outputs: the number of its results that are gradients of inputs.
+        places: the index of the tensor whose gradient each result is, among the inputs, then the parameters.
         keeps: whether it can use the features that the program kept.
     """
 
     options: RunOptions
-    outputs: int
+    places: tuple[int, ...]
     keeps: bool
 
 
@@ -448,13 +467,15 @@ def _gradient(
 ) -> _Gradient:
     program = Program.parse(text)
     split = len(program.outputs)
+    reached = gradient_reaches(program, present[:split], present[split:])
+    wanted = tuple([want and reaches for want, reaches in zip(wanted, reached, strict=True)])
     derived = gradient(program, wanted[:count], wanted[count:], present[:split], present[split:])
     sifts = not derived.outputs and all(i < count for i in derived.rays) and not any(present[split:])
     keeps = bool(program.grids) and compiled_runs(derived.text) and compiled_runs(text)
     keeps = keeps and lower(derived.text).lookups == lower(text).lookups
     return _Gradient(
         RunOptions(derived.text, caller, products, False, count if sifts else -1),
-        len(derived.outputs),
+        tuple([place for place, want in enumerate(wanted) if want]),
         keeps,
     )
 
