@@ -349,34 +349,37 @@ for _function in (F.layer_norm, F.rms_norm):
     register(_function, functools.partial(_norm, EXACT.get(_function, _function)))
 
 
-@rule(F.group_norm)
-def group_norm(
-    run: GroupedRun, input: Tensor, num_groups: int, weight: Any = None, bias: Any = None, eps: float = 1e-5
-) -> Any:
-    """Normalises groups of channels [n, c, ...], then applies weight and bias."""
+def _of_channels(run: GroupedRun, input: Tensor, func: Callable[[], Tensor], weight: Any, bias: Any) -> Any:
+    """Normalises channels [n, c, ...] by a function, then applies weight and bias."""
     if not run.is_rows(input) or run.axis(input).dim:
         return NotImplemented
-    x = F.group_norm(input, num_groups, eps=eps)
-    return _scaled(run, x, run.axis(input), weight, bias, input.dim() - 2)
+    return _scaled(run, func(), run.axis(input), weight, bias, input.dim() - 2)
+
+
+@rule(F.group_norm)
+def group_norm(
+    run: GroupedRun, input: Tensor, groups: int, weight: Any = None, bias: Any = None, eps: Any = 1e-5
+) -> Any:
+    """Normalises groups of channels."""
+    return _of_channels(run, input, lambda: F.group_norm(input, groups, eps=eps), weight, bias)
 
 
 @rule(F.batch_norm)
 def batch_norm(
-    run: GroupedRun,
-    input: Tensor,
-    running_mean: Tensor | None,
-    running_var: Tensor | None,
-    weight: Any = None,
-    bias: Any = None,
-    training: bool = False,
-    momentum: float = 0.1,
-    eps: float = 1e-5,
+    run: GroupedRun, input: Tensor, mean: Any, variance: Any, weight: Any = None, bias: Any = None, **options: Any
 ) -> Any:
-    """Normalises channels [n, c, ...] by statistics that all cells share; supports only evaluation mode."""
-    if not run.is_rows(input) or run.axis(input).dim == 1 or training:
+    """Normalises channels by statistics that all cells share; not in training, which mixes samples."""
+    if options.pop("training", False):
         return NotImplemented
-    x = F.batch_norm(input, running_mean, running_var, eps=eps)
-    return _scaled(run, x, run.axis(input), weight, bias, input.dim() - 2)
+    return _of_channels(run, input, lambda: F.batch_norm(input, mean, variance, **options), weight, bias)
+
+
+@rule(F.instance_norm)
+def instance_norm(run: GroupedRun, input: Tensor, *, weight: Any = None, bias: Any = None, **options: Any) -> Any:
+    """Normalises channels by the statistics of each sample; not in training with running statistics."""
+    if options["use_input_stats"] and options["running_mean"] is not None:
+        return NotImplemented
+    return _of_channels(run, input, lambda: F.instance_norm(input, **options), weight, bias)
 
 
 @rule(F.prelu, torch.prelu, torch.Tensor.prelu)
