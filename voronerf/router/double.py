@@ -86,24 +86,35 @@ class Double:
             self._registries.append((twin, registry, set(registry)))
 
     def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any], mode: Any = None) -> Any:
-        """Runs a call with ``rows`` as its arguments, and with ``values``, by parameter id, as its parameters.
+        """Runs a call once; see :meth:`runs`."""
+        return self.runs(call, [rows], [values], mode)[0]
 
-        The PyTorch function mode ``mode``, if any, is active only while the method runs.
+    def runs(
+        self, call: Call, parts: Iterable[Iterable[Tensor]], values: Iterable[Mapping[int, Any]], mode: Any = None
+    ) -> list[Any]:
+        """Runs a call for each part of the rows, with ``values``, by parameter id, as its parameters.
+
+        The values of one parameter are parts of one tensor. The PyTorch function mode ``mode``, if any, is active only
+        while the method runs.
 
         Raises:
             Forbidden: If the method adds, removes or replaces parameters, or writes into them.
         """
-        placed = self.fill(values)
-        for attributes, name in self._containers:
-            attributes[name] = _copied(attributes[name])
-        versions = _versions(placed)
         copied = Call(self.module, call.method, call.layout, call.names, call.args, call.kwargs, call.kinds)
+        placed, versions, results = list[tuple[dict[str, Any], str, Any]](), list[int](), []
         try:
             with mode or contextlib.nullcontext():
-                return copied.run(rows)
+                for rows, parameters in zip(parts, values, strict=True):
+                    placed = self.fill(parameters)
+                    versions = versions or _versions(placed)
+                    for attributes, name in self._containers:
+                        attributes[name] = _copied(attributes[name])
+                    results.append(copied.run(rows))
+                    self._restore_attributes()
         finally:
             self._check(call.name, placed, versions)
             self._restore_attributes()
+        return results
 
     def _check(self, name: str, placed: list[tuple[dict[str, Any], str, Any]], versions: list[int]) -> None:
         """Raises Forbidden if a run has changed the parameters."""

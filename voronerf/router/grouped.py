@@ -73,9 +73,18 @@ _BY_FIRST = find("to type_as expand_as view_as reshape_as", torch.Tensor)
 
 
 class Exact(TorchFunctionMode):
-    """A mode that replaces functions whose higher derivatives are wrong in PyTorch."""
+    """A mode that replaces functions whose higher derivatives are wrong in PyTorch.
+
+    Attributes:
+        met: Whether one of these functions was called.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.met = False
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.met = self.met or func in EXACT
         return EXACT.get(func, func)(*args, **(kwargs or {}))
 
 
@@ -526,7 +535,8 @@ class Loop:
     """The loop: the module runs once for each cell that has samples. It defines the result of a routed call.
 
     ``again`` is for modules whose code runs again in the backward pass (``torch.utils.checkpoint``): every cell then
-    has its own double, which keeps the cell's parameters.
+    has its own double, which keeps the cell's parameters. Other loops replace the functions of ``EXACT`` if a call can
+    be differentiated by its arguments, and the first cell meets one; the mode that replaces them takes time.
     """
 
     why: str = ""
@@ -541,12 +551,15 @@ class Loop:
         """Runs the module once for each (cell, first row, end row) of ``bounds``."""
         module, counts = call.module, [last - first for _, first, last in bounds]
         pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
-        values, double = [], Double(module)
-        arguments = call.arranged(grouping)
-        mode = Exact() if torch.is_grad_enabled() and not self.again else None
-        for (cell, _, _), part in zip(bounds, split_rows(arguments, counts), strict=True):
-            double = Double(module) if self.again else double
-            values.append(double.run(call, part, {key: piece[cell] for key, piece in pieces.items()}, mode))
-        if not self.again:
+        rows, double = call.arranged(grouping), Double(module)
+        parts, mode = split_rows(rows, counts), None
+        values = [{key: piece[cell] for key, piece in pieces.items()} for cell, _, _ in bounds]
+        if self.again:
+            results = [Double(module).run(call, *each) for each in zip(parts, values, strict=True)]
+        else:
+            if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in rows):
+                mode = Exact()
+            results = double.runs(call, parts[:1], values[:1], mode)
+            results += double.runs(call, parts[1:], values[1:], mode if mode is not None and mode.met else None)
             double.end()
-        return Results.joined(values, counts, grouping)
+        return Results.joined(results, counts, grouping)
