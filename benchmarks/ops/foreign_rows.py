@@ -190,7 +190,7 @@ class Case:
 
     @property
     def per_ray(self) -> list[int]:
-        """The numbers of the arguments with one row for each ray, which are ambiguous for as many rays as samples a ray."""
+        """The numbers of the arguments with one row for each ray; shapes are ambiguous for as many rays as samples."""
         lead, tensors = self.row.lead, [(i, arg) for i, arg in enumerate(self.args) if isinstance(arg, Tensor)]
         return [i for i, arg in tensors if arg.shape[:1] == lead[:1] and arg.shape[: len(lead)] != lead]
 
