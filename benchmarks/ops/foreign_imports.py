@@ -10,6 +10,7 @@ import importlib
 import io
 import itertools
 import math
+import os
 import sys
 import types
 from collections.abc import Callable, Iterator
@@ -150,8 +151,17 @@ STAND_INS: dict[str, dict[str, Any]] = {
     "shencoder": {"SHEncoder": SHEncoder},
     "einops": {"repeat": repeated, "rearrange": None, "reduce": None},
 }
-ABSENT = ("raymarching", "psencoder", "torchsearchsorted", "hash_encoding", "internal.datasets")
-"""Modules that compile or use CUDA at import, or need an older numpy."""
+ABSENT = (
+    "raymarching",
+    "psencoder",
+    "torchsearchsorted",
+    "hash_encoding",
+    "internal.datasets",
+    "external.pohsun_ssim",
+    "deepctr_torch.models",
+    "deepctr_torch.utils",
+)
+"""Modules that compile, use CUDA or call servers at import, need an older numpy, or belong to other repositories."""
 
 
 @contextlib.contextmanager
@@ -166,7 +176,11 @@ def repository(folder: Path) -> Iterator[Callable[[str], Any]]:
     sys.modules["gin"] = mock.MagicMock(configurable=_unchanged)
     sys.path.insert(0, str(folder))
     try:
-        with mock.patch("torch.utils.cpp_extension.load"), contextlib.redirect_stdout(io.StringIO()):
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(mock.patch("torch.utils.cpp_extension.load"))
+            stack.enter_context(mock.patch.object(sys, "argv", sys.argv[:1]))  # scripts parse it at import
+            stack.enter_context(mock.patch.dict(os.environ, DDE_BACKEND="pytorch"))  # DeepXDE would write a file
+            stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
             yield _imported
     finally:
         sys.path[:] = path

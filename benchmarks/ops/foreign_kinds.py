@@ -6,6 +6,8 @@ import itertools
 import math
 from collections import namedtuple
 from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -14,7 +16,7 @@ from torch import Tensor, nn
 
 from ops import foreign_fields as fields
 from ops.foreign_imports import GridEncoder, SHEncoder
-from ops.foreign_rows import Row
+from ops.foreign_rows import Row, evaluated, inner, uniform
 
 W = 24  # width
 Part = int | tuple[int, int] | Callable[[], Any]
@@ -776,6 +778,186 @@ METHODS = [Row(name, Methods, (3,) * count, method=name) for name, count in ASKE
 METHODS += [Row("color", Methods, (3, 3, 7), method="color"), Row("alpha", Methods, (3, 1), method="alpha")]
 METHODS += [Row("warp", Methods, (3, 1), method="warp")]
 
+# samples on other axes, and networks of constants --------------------------------------------------------------------
+
+
+def tokens(name: str, call: Callable[..., Any], *shape: int, **parts: Part) -> Row:
+    """Returns the row of a module whose samples have axes of their own, [n, *shape]."""
+    return replace(own(name, call, lambda lead: uniform(lead, *shape), **parts), coords=inner)
+
+
+def heads_in_front(s: Any, x: Tensor) -> Tensor:
+    q, k, v = (torch.stack(torch.split(torch.tensordot(x, w, dims=([-1], [0])), 4, dim=2)) for w in (s.q, s.k, s.v))
+    result = torch.matmul(F.softmax(torch.einsum("bnik,bnjk->bnij", q, k), dim=-1), v)
+    return F.relu(torch.squeeze(torch.cat(torch.split(result, 1), dim=-1), dim=0))
+
+
+def heads_in_the_batch(s: Any, x: Tensor) -> Tensor:
+    q, k, v = (torch.cat(layer(x).split(W // 4, 2), 0) for layer in (s.a, s.k, s.v))
+    attention = torch.softmax(q.bmm(k.transpose(1, 2)) / math.sqrt(W), 2)
+    return s.o(torch.cat((q + attention.bmm(v)).split(x.size(0), 0), 2))
+
+
+def causal(s: Any, x: Tensor) -> Tensor:
+    n, t, c = x.size()
+    q, k, v = (part.view(n, t, 2, c // 2).transpose(1, 2) for part in s.qkv(x).split(c, dim=2))
+    y = F.scaled_dot_product_attention(q, k, v, is_causal=True)
+    return x + s.out(y.transpose(1, 2).contiguous().view(n, t, c))
+
+
+def widths(s: Any, x: Tensor) -> Tensor:
+    """Computes a hidden layer of one unit for each of W networks, which are the first axis."""
+    h = torch.tanh(torch.matmul(x.unsqueeze(0).repeat(W, 1, 1), s.w) + s.c)
+    return torch.matmul(h, s.u).mean(0)
+
+
+def of_the_time(s: Any, x: Tensor, t: Tensor) -> Tensor:
+    weight, bias = s.m(t.view(1, 1)).view(-1).split([3 * W, W])
+    return s.o(torch.tanh(F.linear(x, weight.view(W, 3), bias)))
+
+
+def at_noon(_: tuple[int, ...]) -> Tensor:
+    return torch.tensor(0.5)
+
+
+SQUARE: dict[str, Part] = {name: parameter(8, 8) for name in "qkv"}
+AXES = [
+    tokens("heads in front", heads_in_front, 5, 8, **SQUARE),
+    tokens("heads in the batch", heads_in_the_batch, 5, 3, k=(3, W), v=(3, W)),
+    tokens("causal attention", causal, 6, 16, qkv=(16, 48), out=(16, 16)),
+    tokens("tensordot", lambda s, x: torch.tanh(torch.tensordot(x, s.w, dims=([-1], [0]))), 5, 3, w=parameter(3, W)),
+    own("turned between", lambda s, x: s.b(torch.cosh(s.a(x).t()).t()), a=(3, 64), b=(64, 2)),
+    own("weights in front", lambda s, x: s.o(torch.relu(s.w @ x.t()).t()), w=parameter(W, 3)),
+    own("weights before columns", lambda s, x: s.o(torch.matmul(s.w, x[..., None]).squeeze(-1)), w=parameter(W, 3)),
+    own("weights of heads", lambda s, x: s.o(torch.relu(x @ s.w).mean(0)), w=parameter(6, 3, W)),
+    own("networks in front", widths, w=parameter(W, 3, 1), c=parameter(W, 1, 1), u=parameter(W, 1, 2)),
+    own(
+        "trunk of sensors",
+        lambda s, x: s.branch(x) @ s.trunk(s.sensors).t() + s.c,
+        branch=(3, W),
+        trunk=(2, W),
+        sensors=buffer(20, 2),
+        c=number(0.1),
+    ),
+    own("gate of a constant", lambda s, x: s.a(x) * torch.sigmoid(s.g(torch.ones(1, 1))), g=(1, W)),
+    own("layer of the time", of_the_time, 3, at_noon, m=mlp(1, 4 * W, nn.Tanh)),
+    own("layer of a constant", lambda s, x: s.o(torch.relu(x @ s.m(torch.eye(3)))), m=(3, W)),
+    own("masked weights", lambda s, x: s.o(F.linear(x, s.w * s.mask)), w=parameter(W, 3), mask=buffer(W, 3)),
+]
+
+# layers ---------------------------------------------------------------------------------------------------------------
+
+
+def evaluating(row: Row) -> Row:
+    return replace(row, make=lambda: evaluated(row.make()))
+
+
+def stepped(s: Any, x: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    h, c = s.cell(x, (h, c))
+    return s.o(h), c
+
+
+def with_states(s: Any, x: Tensor) -> Tensor:
+    zeros = torch.zeros(2, x.size(0), W)
+    return s.o(s.r(x, (zeros, zeros))[0][:, -1, :])
+
+
+def attended(s: Any, x: Tensor) -> Tensor:
+    h = s.a(x)
+    return s.o(h + s.m(h, h, h)[0])
+
+
+LAYERS = [
+    evaluating(between("BatchNorm in eval", lambda s, h: s.n(h), n=lambda: nn.BatchNorm1d(W))),
+    evaluating(
+        tokens(
+            "BatchNorm2d in eval",
+            lambda s, x: s.n(s.c(x)),
+            3,
+            5,
+            5,
+            c=conv(3, 4, nn.Conv2d),
+            n=lambda: nn.BatchNorm2d(4),
+        )
+    ),
+    evaluating(between("Dropout in eval", lambda s, h: s.n(h), n=lambda: nn.Dropout(0.5))),
+    between("PReLU", lambda s, h: s.n(h), n=nn.PReLU),
+    between("PReLU of channels", lambda s, h: s.n(h), n=lambda: nn.PReLU(W)),
+    between("GroupNorm", lambda s, h: s.n(h), n=lambda: nn.GroupNorm(4, W)),
+    own("Bilinear", lambda s, x, z: s.o(F.relu(s.n(x, z))), 3, 4, n=lambda: nn.Bilinear(3, 4, W)),
+    own("bilinear", lambda s, x, z: s.o(F.bilinear(x, z, s.w)), 3, 4, w=parameter(W, 3, 4)),
+    tokens("GRU", lambda s, x: s.o(s.r(x)[0][:, -1]), 5, 3, r=lambda: nn.GRU(3, W, batch_first=True)),
+    tokens("LSTM", lambda s, x: s.o(s.r(x)[0]), 5, 3, r=lambda: nn.LSTM(3, W, batch_first=True)),
+    tokens("LSTM with states", with_states, 5, 3, r=lambda: nn.LSTM(3, W, 2, batch_first=True)),
+    own("GRUCell", lambda s, x, h: s.o(s.cell(x, h)), 3, W, cell=lambda: nn.GRUCell(3, W)),
+    own("LSTMCell", stepped, 3, W, W, cell=lambda: nn.LSTMCell(3, W)),
+    tokens("MultiheadAttention", attended, 5, 3, m=lambda: nn.MultiheadAttention(W, 4, batch_first=True)),
+]
+
+# state ----------------------------------------------------------------------------------------------------------------
+
+
+class Hidden(nn.Module):
+    """A module whose layers are in a list, a dict or an object; their parameters are in a ParameterList."""
+
+    def __init__(self, keep: Callable[[nn.Module, nn.Module], Any], call: Callable[..., Tensor]) -> None:
+        super().__init__()
+        layers = nn.Linear(3, W), nn.Linear(W, 4)
+        self.kept, self.call = keep(*layers), call
+        self.weights = nn.ParameterList(parameter for layer in layers for parameter in layer.parameters())
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.call(self.kept, x)
+
+
+def hidden(name: str, keep: Callable[[nn.Module, nn.Module], Any], call: Callable[..., Tensor]) -> Row:
+    return Row(name, lambda: Hidden(keep, call), (3,))
+
+
+def keeps(s: Any, x: Tensor) -> Tensor:
+    s.outputs["h"] = F.relu(s.a(x))
+    s.outputs["q"] = s.o(s.outputs["h"])
+    return s.outputs["q"]
+
+
+def kept(s: Any, x: Tensor) -> Tensor:
+    s.h, s.parts = F.relu(s.a(x)), [x]
+    s.parts.append(s.o(s.h))
+    return s.parts[-1]
+
+
+def annealed(s: Any, x: Tensor) -> Tensor:
+    s.step += 1  # the schedule is over
+    return s.o(F.relu(s.a(x))) * min(s.step / 50, 1.0)
+
+
+def numbered(s: Any, x: Tensor) -> Tensor:
+    if s.rows is None or len(s.rows) != len(x):
+        s.rows = torch.arange(len(x))
+    return s.o(F.relu(s.a(x[s.rows])))
+
+
+def frozen(s: Any, x: Tensor) -> Tensor:
+    with torch.no_grad():
+        h = F.relu(s.a(x))
+    return s.o(F.relu(s.b(h)))
+
+
+STATE = [
+    hidden("layers in a list", lambda a, b: [a, b], lambda kept, x: kept[1](F.relu(kept[0](x)))),
+    hidden("layers in a dict", lambda a, b: {"a": a, "b": b}, lambda kept, x: kept["b"](F.relu(kept["a"](x)))),
+    hidden("layers in an object", lambda a, b: SimpleNamespace(a=a, b=b), lambda kept, x: kept.b(F.relu(kept.a(x)))),
+    own("results in a dict", keeps, outputs=dict),
+    own("results as attributes", kept),
+    own("counted steps", annealed, step=lambda: 100),
+    own("counted steps, buffer", annealed, step=lambda: torch.tensor(100.0)),
+    own("cache by the number of samples", numbered, rows=lambda: None),
+    own("frozen encoder", frozen),
+    own("detached encoder", lambda s, x: s.o(F.relu(s.b(F.relu(s.a(x)).detach())))),
+    own("unused head", lambda s, x: (s.o(F.relu(s.a(x))), s.c(x).detach()), c=(3, 2)),
+    own("tensor in a list", lambda s, x: s.net(x * s.scale[0]), scale=lambda: [torch.tensor([1.0, 2.0, 3.0])]),
+]
+
 KINDS = {
     "plain": PLAIN,
     "encodings": ENCODINGS,
@@ -793,7 +975,11 @@ KINDS = {
     "gradients": GRADIENTS,
     "tables": TABLES,
     "between": BETWEEN,
+    "axes": AXES,
+    "layers": LAYERS,
+    "state": STATE,
 }
 IN_RUNS = ("gradients", "tables", "between")
-"""The kinds whose modules are only partly fused: PyTorch computes functions between the fused parts. All other kinds
-are fused completely."""
+"""The kinds whose modules are only partly fused: PyTorch computes functions between the fused parts."""
+IN_ANY_WAY = ("axes", "layers", "state")
+"""The kinds whose modules run in any way. The modules of the kinds in neither list are fused completely."""

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ops.foreign_rows import Row, uniform
+from ops.foreign_rows import Row, evaluated, inner, uniform
 
 Lead = tuple[int, ...]
-RAYS = (60, 5)
+RAYS = (70, 5)
 BOX = [-1.0, -1.0, -1.0, 1.0, 1.0, 1.0]
 SDF = {"skip_in": (2,), "multires": 6}
 WIDE = [64] * 4
@@ -54,6 +54,79 @@ class Unbatched(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return self.net(x[None])[0]
+
+
+def of(*shape: int) -> Any:
+    """Returns a function that makes a tensor of a shape for each sample."""
+    return lambda lead: uniform(lead, *shape)
+
+
+def pair(*sizes: int) -> Any:
+    """Returns a function that makes a tuple of tensors."""
+    return lambda lead: tuple(uniform(lead, size) for size in sizes)
+
+
+def numbers(bound: int, *shape: int) -> Any:
+    """Returns a function that makes whole numbers below a bound for each sample."""
+    return lambda lead: torch.randint(0, bound, (*lead, *shape))
+
+
+class OfSensors(nn.Module):
+    """A DeepONet whose trunk reads constant sensors."""
+
+    def __init__(self, net: nn.Module, sensors: Tensor) -> None:
+        super().__init__()
+        self.net = net
+        self.register_buffer("sensors", sensors)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.net((x, self.sensors))
+
+
+def deeponet(m: Any) -> nn.Module:
+    return OfSensors(m.DeepONetCartesianProd([6, 32, 16], [2, 32, 16], "tanh", "Glorot normal"), torch.rand(20, 2))
+
+
+def gpt(m: Any) -> nn.Module:
+    dropouts = {"dropout": 0.0, "attn_pdrop": 0.0, "resid_pdrop": 0.0}
+    return m.Block(ns(n_embd=24, n_head=4, bias=True, block_size=8, **dropouts))
+
+
+def series(m: Any, **more: Any) -> nn.Module:
+    """Makes a forecaster of series [n, 12, 3]."""
+    sizes = {"seq_len": 12, "pred_len": 6, "enc_in": 3, "d_model": 16, "moving_avg": 5, "seg_len": 3, "e_layers": 2}
+    return m.Model(ns(task_name="long_term_forecast", dropout=0.0, individual=False, **sizes), **more)
+
+
+def nbeats(m: Any) -> nn.Module:
+    sizes = {"backcast_size": 10, "forecast_size": 5}
+    blocks = [m.NBeatsBlock(10, 15, m.GenericBasis(**sizes), 3, 32) for _ in range(3)]
+    return m.NBeats(nn.ModuleList(blocks))
+
+
+def tabular(m: Any) -> nn.Module:
+    sizes = {"d_in": 6, "n_blocks": 2, "d_main": 16, "d_hidden": 24, "d_out": 2}
+    return evaluated(m.ResNet.make_baseline(**sizes, dropout_first=0.0, dropout_second=0.0))
+
+
+def drawn(module: nn.Module) -> nn.Module:
+    """Draws the weights of a module that starts with zeros or with undefined numbers."""
+    for parameter in module.parameters():
+        nn.init.normal_(parameter, std=0.3)
+    return module
+
+
+SERIES, INNER = (of(12, 3), None, None, None), {"coords": inner}
+
+
+def moment(_: Lead) -> Tensor:
+    """Returns a time, which all samples have in common."""
+    return torch.tensor(0.3)
+
+
+def after_the_time(_: Tensor, x: Any) -> Tensor:
+    """Returns the positions of a call whose first argument is the time."""
+    return x[0] if isinstance(x, tuple) else x
 
 
 def dreamfusion(m: Any) -> nn.Module:
@@ -329,7 +402,7 @@ PUBLIC: dict[str, list[Row]] = {
         Row("RenderingNetwork", rendering, (3, 3, 3, 64, None)),
     ],
     "ActiveVisionLab/nerfmm:models.nerf_models": [
-        Row("OfficialNerf", lambda m: m.OfficialNerf(63, 27, 64), (63, 27), lead=(6, 10, 5))
+        Row("OfficialNerf", lambda m: m.OfficialNerf(63, 27, 64), (63, 27), lead=(70, 2, 3))
     ],
     "chenhsuanlin/bundle-adjusting-NeRF:model.barf": [
         Row("NeRF (BARF)", lambda m: progressed(m.NeRF(BARF)), (BARF, 3, 3))
@@ -530,5 +603,204 @@ PUBLIC: dict[str, list[Row]] = {
             coords=lambda features, *_, **__: features[..., 0, :3],
             lead=RAYS,
         )
+    ],
+    "shenweichen/DeepCTR-Torch:deepctr_torch.layers.interaction": [
+        Row("InteractingLayer", lambda m: m.InteractingLayer(8), (of(5, 8),), **INNER),
+        Row("InteractingLayer, 4 heads", lambda m: m.InteractingLayer(8, 4, scaling=True), (of(3, 8),), **INNER),
+        Row("CrossNet", lambda m: m.CrossNet(9), (9,)),
+        Row("CrossNet, matrix", lambda m: m.CrossNet(9, parameterization="matrix"), (9,)),
+        Row("BilinearInteraction", lambda m: m.BilinearInteraction(4, 6), (of(4, 6),), **INNER),
+        Row("SENETLayer", lambda m: m.SENETLayer(6), (of(6, 5),), **INNER),
+        Row("CIN", lambda m: m.CIN(4, (8, 8)), (of(4, 6),), **INNER),
+        Row(
+            "AFMLayer",
+            lambda m: m.AFMLayer(6),
+            (lambda lead: list(uniform(lead, 4, 6).split(1, 1)),),
+            coords=lambda x: x[0][:, 0, :3],
+        ),
+    ],
+    "shenweichen/DeepCTR-Torch:deepctr_torch.layers.core": [
+        Row("DNN, BatchNorm in eval", lambda m: evaluated(m.DNN(9, [32, 16], use_bn=True, init_std=0.3)), (9,)),
+    ],
+    "shenweichen/DeepCTR-Torch:deepctr_torch.layers.activation": [
+        Row("Dice in eval", lambda m: evaluated(m.Dice(9)), (9,))
+    ],
+    "shenweichen/DeepCTR-Torch:deepctr_torch.layers.sequence": [
+        Row("AUGRUCell", lambda m: drawn(m.AUGRUCell(6, 8)), (6, 8, 1)),
+    ],
+    "rtqichen/ffjord/lib/layers:diffeq_layers.basic": [
+        Row("ConcatSquashLinear", lambda m: m.ConcatSquashLinear(3, 16), (moment, 3), coords=after_the_time),
+        Row("HyperLinear", lambda m: drawn(m.HyperLinear(3, 16)), (moment, 3), coords=after_the_time),
+    ],
+    "rtqichen/ffjord/lib:layers.odefunc": [
+        Row(
+            "ODEnet, concatsquash",
+            lambda m: m.ODEnet((32, 32), (3,), None, False, "concatsquash"),
+            (moment, 3),
+            coords=after_the_time,
+        ),
+    ],
+    "rtqichen/ffjord/lib/layers:coupling": [Row("CouplingLayer", lambda m: m.CouplingLayer(4), (4,))],
+    "rtqichen/torchdiffeq/examples:cnf": [
+        Row("CNF", lambda m: m.CNF(2, 16, 8), (moment, pair(2, 1)), coords=after_the_time)
+    ],
+    "bayesiains/nflows:nflows.transforms.made": [
+        Row("MADE", lambda m: m.MADE(4, 16), (4,)),
+        Row("MADE with context", lambda m: m.MADE(4, 16, 3), (4, 3)),
+        Row("MADE, BatchNorm in eval", lambda m: evaluated(m.MADE(4, 16, use_batch_norm=True)), (4,)),
+        Row("MaskedLinear", lambda m: m.MaskedLinear(torch.arange(1, 5), 8, 4, False, False), (4,)),
+    ],
+    "bayesiains/nflows:nflows.nn.nets.resnet": [
+        Row("ResidualNet with context", lambda m: m.ResidualNet(4, 6, 24, 3), (4, 3)),
+        Row(
+            "ResidualNet, BatchNorm in eval",
+            lambda m: evaluated(m.ResidualNet(4, 6, 24, use_batch_norm=True)),
+            (4,),
+        ),
+    ],
+    "ikostrikov/pytorch-flows:flows": [
+        Row("MADE", lambda m: m.MADE(4, 16), (4,)),
+        Row("FlowSequential in eval", lambda m: m.FlowSequential(m.MADE(4, 16), m.BatchNormFlow(4)).eval(), (4,)),
+        Row("LUInvertibleMM", lambda m: m.LUInvertibleMM(4), (4,)),
+        Row("InvertibleMM", lambda m: m.InvertibleMM(4), (4,)),
+        Row(
+            "FlowSequential",
+            lambda m: m.FlowSequential(m.MADE(4, 16), m.Reverse(4), m.CouplingLayer(4, 16, torch.arange(4.0) % 2)),
+            (4,),
+        ),
+    ],
+    "karpathy/pytorch-normalizing-flows:nflib.flows": [
+        Row("SlowMAF", lambda m: m.SlowMAF(4, True), (4,)),
+        Row("MAF", lambda m: m.MAF(4, True), (4,)),
+        Row("AffineHalfFlow", lambda m: m.AffineHalfFlow(4, False), (4,)),
+    ],
+    "philipperemy/n-beats:nbeats_pytorch.model": [
+        Row("NBeatsNet", lambda m: m.NBeatsNet(hidden_layer_units=32), (10,)),
+        Row("NBeatsNet, generic", lambda m: m.NBeatsNet(stack_types=("generic",) * 2, hidden_layer_units=32), (10,)),
+        Row("GenericBlock", lambda m: m.GenericBlock(32, 4, "cpu"), (10,)),
+    ],
+    "ServiceNow/N-BEATS:models.nbeats": [Row("NBeats", nbeats, (10, lambda lead: torch.ones(*lead, 10)))],
+    "karpathy/nanoGPT:model": [
+        Row("Block", gpt, (of(6, 24),), **INNER),
+        Row("MLP", lambda m: gpt(m).mlp, (24,)),
+    ],
+    "karpathy/minGPT:mingpt.model": [
+        Row("Block", gpt, (of(6, 24),), **INNER),
+        Row("CausalSelfAttention", lambda m: gpt(m).attn, (of(6, 24),), **INNER),
+    ],
+    "jadore801120/attention-is-all-you-need-pytorch:transformer.SubLayers": [
+        Row(
+            "MultiHeadAttention",
+            lambda m: m.MultiHeadAttention(2, 16, 8, 8, 0.0).eval(),
+            (of(5, 16), of(7, 16), of(7, 16)),
+            **INNER,
+        )
+    ],
+    "juho-lee/set_transformer:modules": [
+        Row("SAB", lambda m: m.SAB(3, 16, 4, ln=True), (of(5, 3),), **INNER),
+        Row("ISAB", lambda m: m.ISAB(3, 16, 2, 6), (of(5, 3),), **INNER),
+        Row("PMA", lambda m: m.PMA(16, 4, 2), (of(5, 16),), **INNER),
+    ],
+    "manzilzaheer/DeepSets/PointClouds:classifier": [
+        Row("PermEqui2_max", lambda m: m.PermEqui2_max(3, 16), (of(6, 3),), **INNER)
+    ],
+    "thuml/Time-Series-Library:models.SegRNN": [Row("SegRNN", series, SERIES, **INNER)],
+    "thuml/Time-Series-Library:models.DLinear": [
+        Row("DLinear", series, SERIES, **INNER),
+        Row("DLinear, individual", lambda m: series(m, individual=True), SERIES, **INNER),
+    ],
+    "thuml/Time-Series-Library:models.TSMixer": [Row("TSMixer", series, SERIES, **INNER)],
+    "thuml/Time-Series-Library:models.TiDE": [Row("ResBlock", lambda m: m.ResBlock(9, 16, 8, 0.0), (9,))],
+    "cure-lab/LTSF-Linear:models.NLinear": [Row("NLinear", series, (of(12, 3),), **INNER)],
+    "sktime/pytorch-forecasting/pytorch_forecasting/models/temporal_fusion_transformer:sub_modules": [
+        Row(
+            "GatedResidualNetwork",
+            lambda m: m.GatedResidualNetwork(6, 16, 8, 0.0, context_size=5),
+            (6, 5),
+        )
+    ],
+    "locuslab/TCN:TCN.tcn": [
+        Row("TemporalConvNet", lambda m: m.TemporalConvNet(3, [8, 8]).eval(), (of(3, 12),), **INNER)
+    ],
+    "ndrplz/ConvLSTM_pytorch:convlstm": [
+        Row("ConvLSTM", lambda m: m.ConvLSTM(2, 4, (3, 3), 1, batch_first=True), (of(3, 2, 5, 5),), **INNER)
+    ],
+    "raminmh/CfC:torch_cfc": [
+        Row(
+            "CfcCell",
+            lambda m: m.CfcCell(4, 8, {"backbone_activation": "lecun", "backbone_units": 16, "backbone_layers": 2}),
+            (4, 8, 1),
+        ),
+        Row("LSTMCell", lambda m: m.LSTMCell(4, 8), (4, pair(8, 8))),
+    ],
+    "mlech26l/ncps:ncps.torch.cfc": [
+        Row("CfC", lambda m: m.CfC(4, 8, proj_size=2, backbone_units=16), (of(5, 4),), **INNER)
+    ],
+    "ctallec/world-models:models.mdrnn": [Row("MDRNNCell", lambda m: m.MDRNNCell(8, 3, 16, 2), (3, 8, pair(16, 16)))],
+    "ikostrikov/pytorch-a2c-ppo-acktr-gail:a2c_ppo_acktr.model": [
+        Row("MLPBase", lambda m: m.MLPBase(6, hidden_size=32), (6, 1, 1)),
+        Row("MLPBase, recurrent", lambda m: m.MLPBase(6, True, 32), (6, 32, 1)),
+    ],
+    "sfujim/TD3:TD3": [
+        Row("Critic", lambda m: m.Critic(8, 3), (8, 3)),
+        Row("Critic.Q1", lambda m: m.Critic(8, 3), (8, 3), method="Q1"),
+    ],
+    "pranz24/pytorch-soft-actor-critic:model": [
+        Row("GaussianPolicy", lambda m: m.GaussianPolicy(8, 3, 32), (8,)),
+    ],
+    "openai/spinningup/spinup/algos/pytorch/td3:core": [
+        Row("MLPQFunction", lambda m: m.MLPQFunction(8, 3, (32, 32), nn.ReLU), (8, 3))
+    ],
+    "Kaixhin/Rainbow:model": [Row("NoisyLinear", lambda m: m.NoisyLinear(8, 4), (8,))],
+    "rixwew/pytorch-fm:torchfm.layer": [
+        Row("MultiLayerPerceptron in eval", lambda m: evaluated(m.MultiLayerPerceptron(9, [32, 16], 0.2)), (9,)),
+        Row("OuterProductNetwork", lambda m: m.OuterProductNetwork(4, 5), (of(4, 5),), **INNER),
+        Row("CrossNetwork", lambda m: m.CrossNetwork(9, 3), (9,)),
+        Row(
+            "AttentionalFactorizationMachine",
+            lambda m: m.AttentionalFactorizationMachine(5, 8, (0.0, 0.0)),
+            (of(4, 5),),
+            **INNER,
+        ),
+        Row("CompressedInteractionNetwork", lambda m: m.CompressedInteractionNetwork(4, (8, 8)), (of(4, 6),), **INNER),
+    ],
+    "yandex-research/rtdl:rtdl.modules": [
+        Row("NumericalFeatureTokenizer", lambda m: m.NumericalFeatureTokenizer(6, 8, True, "uniform"), (6,)),
+        Row("ResNet, BatchNorm in eval", tabular, (6,)),
+    ],
+    "dreamquark-ai/tabnet:pytorch_tabnet.tab_network": [
+        Row("FeatTransformer in eval", lambda m: evaluated(m.FeatTransformer(9, 8, None, 2)), (9,))
+    ],
+    "greydanus/hamiltonian-nn:hnn": [
+        Row("HNN.time_derivative", lambda m: m.HNN(4, m.MLP(4, 32, 2)), (4,), method="time_derivative"),
+    ],
+    "tanelp/tiny-diffusion:ddpm": [Row("MLP", lambda m: m.MLP(32, 2, 16), (2, numbers(50)))],
+    "tkipf/c-swm:modules": [
+        Row("TransitionGNN", lambda m: m.TransitionGNN(4, 16, 2, 3), (of(3, 4), numbers(6)), **INNER),
+        Row("EncoderMLP", lambda m: m.EncoderMLP(6, 4, 16, 3), (of(3, 6),), **INNER),
+    ],
+    "fxia22/pointnet.pytorch:pointnet.model": [
+        Row("STN3d in eval", lambda m: evaluated(m.STN3d()), (of(3, 10),), **INNER)
+    ],
+    "kuangliu/pytorch-cifar:models.senet": [
+        Row("BasicBlock in eval", lambda m: evaluated(m.BasicBlock(3, 16)), (of(3, 6, 6),), **INNER)
+    ],
+    "KindXiaoming/pykan:kan.KANLayer": [Row("KANLayer", lambda m: m.KANLayer(3, 4), (3,))],
+    "neuraloperator/neuraloperator/neuralop/layers:channel_mlp": [
+        Row("ChannelMLP", lambda m: m.ChannelMLP(3, 4, 16), (of(3, 5),), **INNER)
+    ],
+    "AdityaLab/pinnsformer:model.qres": [Row("QRes", lambda m: m.QRes(2, 32, 1, 3), (1, 1), second=True)],
+    "AdityaLab/pinnsformer:model.fls": [Row("FLS", lambda m: m.FLS(2, 32, 1, 3), (1, 1), second=True)],
+    "AdityaLab/pinnsformer:model.pinnsformer": [
+        Row("PINNsformer", lambda m: m.PINNsformer(1, 16, 32, 1, 2), (of(5, 1), of(5, 1)), coords=lambda x, t: x[:, 0])
+    ],
+    "lululxvi/deepxde:deepxde.nn.pytorch.deeponet": [
+        Row("DeepONetCartesianProd", deeponet, (6,)),
+        Row(
+            "DeepONet",
+            lambda m: m.DeepONet([6, 32, 16], [2, 32, 16], "tanh", "Glorot normal"),
+            (pair(6, 2),),
+            coords=lambda x: x[1],
+        ),
     ],
 }

@@ -1,25 +1,47 @@
 """Compares a module of other code in VoronoiRouter with a loop over masks of distinct modules.
 
-A new module needs only a :class:`Row`; :func:`compare` does the rest. n samples, k cells.
+A new module needs only a :class:`Row`; :func:`compare` and :func:`speed` do the rest. n samples, k cells.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
+import functools
+import itertools
+import math
 import re
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
+from harness import Run, Stopwatch, measure
 from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 from voronerf import VoronoiRouter
 
 N, K, SEED = 300, 4, 1
+SIZES = range(1, 70)
+"""The batch sizes at which values are compared: the number of samples, or of rays."""
+WAYS: dict[str, dict[str, Any]] = {
+    "fused": {"fuse": True, "way": "fused"},
+    "grouped": {"way": "grouped"},
+    "as it comes": {},
+}
+"""The options of the routers that are compared at all of :data:`SIZES`."""
+TIMED: dict[str, dict[str, Any]] = {
+    "fuse=True": {"fuse": True},
+    "grouped": {"way": "grouped"},
+    "cell by cell": {"way": "loop"},
+    "as it comes": {},
+}
+"""The options of the routers that are timed."""
+TIMED_SIZES, TIME_LIMIT = (1024, 8192), 0.05
+"""The numbers of samples of timed steps, and the seconds for each way at each number."""
 ROUNDED = 1e-4
 """If the float32 error of a module exceeds this value, the module is compared in float64, too."""
 NO_PART = 1e-6
@@ -30,6 +52,20 @@ size, whichever is larger: a smaller tensor is zero except for rounding."""
 def uniform(lead: tuple[int, ...], *shape: int) -> Tensor:
     """Returns numbers between -1 and 1, [*lead, *shape]."""
     return torch.rand(*lead, *shape) * 2 - 1
+
+
+def inner(x: Tensor, *_: Any, **__: Any) -> Tensor:
+    """Returns the first three features of each sample, for samples with axes of their own."""
+    return x.flatten(1)[:, :3]
+
+
+def evaluated(module: nn.Module) -> nn.Module:
+    """Sets a module to evaluation mode, and the running statistics of its BatchNorms to random numbers."""
+    for layer in module.modules():
+        if isinstance(layer, nn.modules.batchnorm._BatchNorm):
+            layer.running_mean.normal_()
+            layer.running_var.uniform_(0.5, 2)
+    return module.eval()
 
 
 @dataclass(frozen=True)
@@ -104,47 +140,184 @@ class Row:
         return value[rows // self.lead[1]] if d > 1 and value.shape[:1] == self.lead[:1] else value
 
 
+class Case:
+    """The modules, arguments and cells of a row.
+
+    The first samples are the centres of the cells, so that small batches have samples of several cells, too.
+
+    Attributes:
+        modules: The module of each cell.
+        args, kwargs: The arguments of the samples.
+        tensors: The tensors of the arguments.
+        centres: The centres of the cells, [k, d].
+    """
+
+    def __init__(self, row: Row, imported: tuple[Any, ...], dtype: torch.dtype = torch.float32) -> None:
+        self.row, self.modules = row, row.modules(dtype, imported)
+        self.args, self.kwargs = row.arguments(dtype)
+        self.tensors = [value for value in tree_leaves((self.args, self.kwargs)) if isinstance(value, Tensor)]
+        self.coords: Any = row.coords or f"first{min(3, self.tensors[0].shape[-1])}"
+        positions = row.coords(*self.args, **self.kwargs) if row.coords else self.tensors[0][..., :3]
+        self.positions = positions.detach().flatten(0, len(row.lead) - 1)
+        self.centres = self.positions[:: math.prod(row.lead[1:])][:K].clone()
+
+    def cells(self) -> Tensor:
+        """Returns the cell of each sample, [n]."""
+        return (self.positions[:, None] - self.centres).square().sum(-1).argmin(1)
+
+    def router(self, **options: Any) -> VoronoiRouter:
+        """Returns a router of the modules."""
+        methods = [self.row.method] * (self.row.method != "forward")
+        options = {"coords": self.coords, "methods": methods, **options, **self.row.options}
+        return VoronoiRouter.from_modules(self.modules, self.centres, **options)
+
+    def routed(self, router: VoronoiRouter, first: int | None = None) -> list[Tensor]:
+        """Returns a router's results for the first samples or rays; None for all."""
+        method = getattr(router, self.row.method)
+        if first is None:
+            return _tensors(method(*self.args, **self.kwargs))
+
+        def short(value: Tensor) -> Tensor:
+            part = value.detach()[:first] if value.shape[:1] == self.row.lead[:1] else value.detach()
+            return part.requires_grad_(value.requires_grad and torch.is_grad_enabled())
+
+        args, kwargs = tree_map_only(Tensor, short, (self.args, self.kwargs))
+        return _tensors(method(*args, **kwargs))
+
+    def loop(self) -> list[Tensor]:
+        """Returns the results of the loop over masks."""
+        return _loop(self.row, self.modules, self.cells(), self.args, self.kwargs)
+
+    @property
+    def per_ray(self) -> list[int]:
+        """The numbers of the arguments with one row for each ray; shapes are ambiguous for as many rays as samples."""
+        lead, tensors = self.row.lead, [(i, arg) for i, arg in enumerate(self.args) if isinstance(arg, Tensor)]
+        return [i for i, arg in tensors if arg.shape[:1] == lead[:1] and arg.shape[: len(lead)] != lead]
+
+    @functools.cached_property
+    def looped(self) -> list[Tensor]:
+        """The results of the loop over masks, with gradients."""
+        return self.loop()
+
+    @functools.cached_property
+    def differentiates(self) -> bool:
+        """True if the module differentiates a result in its forward, and therefore needs gradients to be on."""
+        with torch.no_grad():
+            try:
+                self.loop()
+            except RuntimeError:
+                return True
+        return False
+
+
 def compare(row: Row, *imported: Any) -> dict[str, Any]:
-    """Returns how a module runs in the router and its largest errors, or why the router refuses it."""
+    """Returns how a module runs in the router and its largest errors, or why the router refuses it.
+
+    The result also has the batch sizes at which values are wrong or which raise an error, by way, with the first
+    message. For a module that is not fused, ``otherwise`` says how it runs without ``fuse``.
+    """
     kind = type(row.make(*imported))
     found: dict[str, Any] = {"module": row.module, "class": f"{kind.__module__}.{kind.__qualname__}"}
-    try:
-        way, errors = _compared(row, torch.float32, imported)
-    except Exception as error:
-        return {**found, "how": f"refused: {_short(str(error) or type(error).__name__)}"}
-    if max(errors.values()) > ROUNDED:
-        torch.set_default_dtype(torch.float64)
-        try:
-            exact = _compared(row, torch.float64, imported)[1]
-        finally:
-            torch.set_default_dtype(torch.float32)
-        errors |= {f"{name}_float64": error for name, error in exact.items()}
-    return {**found, **way, **errors}
-
-
-def _compared(row: Row, dtype: torch.dtype, imported: tuple[Any, ...]) -> tuple[dict[str, Any], dict[str, float]]:
-    modules, (args, kwargs) = row.modules(dtype, imported), row.arguments(dtype)
-    tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
-    d = min(3, tensors[0].shape[-1])
-    positions = row.coords(*args, **kwargs) if row.coords else tensors[0][..., :d]
-    positions = positions.detach().flatten(0, len(row.lead) - 1)
-    centres = uniform((K,), positions.shape[-1]).to(dtype)
-    cells = (positions[:, None] - centres).square().sum(-1).argmin(1)
-    methods = [row.method] * (row.method != "forward")
-    options = {"coords": row.coords or f"first{d}", "methods": methods, **row.options}
-    router = VoronoiRouter.from_modules(modules, centres, fuse=True, way="fused", **options)
+    case = Case(row, imported)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row already reports an unfused module
-        for _ in range(2):  # the first call selects the evaluation path of the next call
-            routed = _tensors(getattr(router, row.method)(*args, **kwargs))
-    looped = _loop(row, modules, cells, args, kwargs)
+        try:
+            way, errors = _compared(case)
+        except Exception as error:
+            found["how"] = f"refused: {_reason(error)}"
+        else:
+            if not max(errors.values()) <= ROUNDED and (exact := _in_double(_compared, case, imported)):
+                errors |= {f"{name}_float64": error for name, error in exact[1].items()}
+            found |= {**way, **errors}
+        try:
+            _ = case.looped
+        except Exception:  # the module mixes samples, and masks fail, too
+            return found
+        for name, options in WAYS.items():
+            if name != "fused" or "value_error" in found:
+                how = _add_sizes(found, name, options, case, imported)
+                if name == "grouped" and not found["how"].startswith("fused"):
+                    found["otherwise"] = how
+    return found
+
+
+def _add_sizes(found: dict[str, Any], name: str, options: Any, case: Case, imported: tuple[Any, ...]) -> str:
+    """Adds the sizes with wrong values and with errors of a way to a result; returns how the router runs.
+
+    A value is wrong only if it is wrong in float64, too.
+    """
+    how, wrong, raised = _sizes(case, options)
+    if wrong and (exact := _in_double(_sizes, case, imported, options)):
+        wrong = [size for size in wrong if size in exact[1] or size in exact[2]]
+    if wrong:
+        found.setdefault("wrong_sizes", {})[name] = _ranges(wrong)
+    if raised:
+        first = next(iter(raised.values()))
+        found.setdefault("error_sizes", {})[name] = {"sizes": _ranges(list(raised)), "first": first}
+    return how
+
+
+def _ranges(sizes: list[int]) -> str:
+    """Returns ascending numbers in short, such as "1-3, 7"."""
+    runs = itertools.groupby(enumerate(sizes), key=lambda pair: pair[1] - pair[0])
+    ends = [(run[0][1], run[-1][1]) for run in (list(group) for _, group in runs)]
+    return ", ".join(str(low) if low == high else f"{low}-{high}" for low, high in ends)
+
+
+def _in_double(function: Callable[..., Any], case: Case, imported: tuple[Any, ...], *rest: Any) -> Any:
+    """Returns what a function returns in float64, or None for modules that compute in float32 only."""
+    torch.set_default_dtype(torch.float64)
+    try:
+        return function(Case(case.row, imported, torch.float64), *rest)
+    except Exception:
+        return None
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def _sizes(case: Case, options: Mapping[str, Any]) -> tuple[str, list[int], dict[int, str]]:
+    """Calls one router at all sizes, and new routers for which a size of a tensor of the module is the first size.
+
+    Returns:
+        How the router runs, the sizes with wrong values, and the messages of the sizes that raise an error.
+    """
+    wrong: set[int] = set()
+    raised: dict[int, str] = {}
+    options = {"per_ray": case.per_ray or None, **options}
+    looped = [(value.detach(), float(value.abs().max()) or 1.0) for value in case.looped]
+    tensors = [*case.modules[0].parameters(), *case.modules[0].buffers()]
+    first = {size for tensor in tensors for size in tensor.shape if size in SIZES}
+    with torch.set_grad_enabled(case.differentiates):
+        try:
+            router = case.router(**options)
+        except Exception as error:
+            return f"refused: {_reason(error)}", [], {}
+        for size, called in [*((size, router) for size in SIZES), *((size, None) for size in sorted(first))]:
+            try:
+                routed = case.routed(called or case.router(**options), size)
+            except Exception as error:
+                raised.setdefault(size, _reason(error))
+                continue
+            pairs = [(a.detach(), b[:size], largest) for a, (b, largest) in zip(routed, looped, strict=True)]
+            if not all(a.shape == b.shape and float((a - b).abs().max()) <= ROUNDED * s for a, b, s in pairs):
+                wrong.add(size)
+        how = _way(router, case.row.method)["how"] if len(raised) < len(SIZES) else "refused"
+    return how, sorted(wrong), dict(sorted(raised.items()))
+
+
+def _compared(case: Case) -> tuple[dict[str, Any], dict[str, float]]:
+    row, modules, router = case.row, case.modules, case.router(**WAYS["fused"])
+    for _ in range(2):  # the first call selects the evaluation path of the next call
+        routed = case.routed(router)
+    looped = case.looped
     if [value.shape for value in routed] != [value.shape for value in looped]:
         raise ValueError(f"shapes {[list(v.shape) for v in routed]} instead of {[list(v.shape) for v in looped]}")
 
-    inputs = [value for value in tensors if value.requires_grad]
+    inputs = [value for value in case.tensors if value.requires_grad]
     names, shared = [n for n, p in modules[0].named_parameters() if p.requires_grad], row.shared(modules[0])
-    stacked = [router.module.get_parameter(name) for name in names]
-    single = [[m.get_parameter(name) for m in modules[: 1 if name in shared else K]] for name in names]
+    stacked = [dict(router.module.named_parameters())[name] for name in names]
+    tables = [dict(module.named_parameters()) for module in modules]
+    single = [[table[name] for table in tables[: 1 if name in shared else K]] for name in names]
     losses = {"gradient_error": _weighted, **({"second_derivative_error": _eikonal} if row.second else {})}
     errors = {"value_error": _error(routed, looped, lambda x: x.abs().max())}
     for name, loss in losses.items():
@@ -154,6 +327,44 @@ def _compared(row: Row, dtype: torch.dtype, imported: tuple[Any, ...]) -> tuple[
         expected = [torch.stack(part) if len(part) > 1 else part[0] for part in parts]
         errors[name] = _error(got, [*expected, *right], torch.linalg.vector_norm)
     return _way(router, row.method), errors
+
+
+def speed(row: Row, *imported: Any) -> dict[str, dict[str, float]]:
+    """Returns the milliseconds of a step by masks and the speeds of the ways relative to it, by the number of samples.
+
+    A step is a forward and a backward pass to the parameters. A loop over masks finds the cells, too. The ways that
+    the router refuses are left out.
+    """
+    rest = math.prod(row.lead[1:])
+    return {str(n): _speed(Case(replace(row, lead=(n // rest, *row.lead[1:])), imported)) for n in TIMED_SIZES}
+
+
+def _speed(case: Case) -> dict[str, float]:
+    case.args, case.kwargs = tree_map_only(Tensor, Tensor.detach, (case.args, case.kwargs))
+
+    def step(forward: Callable[[], list[Tensor]], *modules: nn.Module) -> Run:
+        parameters = [parameter for module in modules for parameter in module.parameters()]
+
+        def run(_: int) -> None:
+            for parameter in parameters:
+                parameter.grad = None
+            losses = [value.square().mean() for value in forward() if value.requires_grad]
+            torch.stack(losses).sum().backward()
+
+        for _ in range(3):  # the router selects the way
+            run(0)
+        return run
+
+    contenders = {"masks": step(case.loop, *case.modules)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, options in TIMED.items():
+            with contextlib.suppress(Exception):
+                router = case.router(**options)
+                contenders[name] = step(functools.partial(case.routed, router), router)
+        timings = measure(contenders, dict.fromkeys(contenders, TIME_LIMIT), Stopwatch(torch.device("cpu")))
+    masks = timings.pop("masks").median_ms
+    return {"masks_ms": round(masks, 3), **{name: round(masks / t.median_ms, 2) for name, t in timings.items()}}
 
 
 def _loop(row: Row, modules: list[nn.Module], cells: Tensor, args: Any, kwargs: Any) -> list[Tensor]:
@@ -197,6 +408,10 @@ def _error(got: list[Tensor], right: list[Tensor], size: Callable[[Tensor], Tens
     least = max(NO_PART * max(sizes), 1e-30)
     errors = [float(size((a - b).detach())) / max(s, least) for a, b, s in zip(got, right, sizes, strict=True)]
     return float(f"{max(errors):.1g}")
+
+
+def _reason(error: Exception) -> str:
+    return _short(str(error) or type(error).__name__)
 
 
 def _short(reason: str) -> str:
