@@ -228,6 +228,33 @@ def test_layers_that_are_made_inside_of_forward(kept: bool, fuse: bool, generato
         router(torch.rand(100, 3, generator=generator))
 
 
+class RunningMean(nn.Linear):
+    """A layer that subtracts a running mean, which it writes into a buffer in place."""
+
+    def __init__(self) -> None:
+        super().__init__(3, 4)
+        self.register_buffer("mean", torch.zeros(4))
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = super().forward(x)
+        self.mean.mul_(0.9).add_(0.1 * h.detach().mean(0))
+        return h - self.mean
+
+
+class Gaussian(nn.Linear):
+    """A layer whose result is the log-likelihood of a distribution, which checks its arguments."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.distributions.Normal(super().forward(x), 1.0).log_prob(x[:, :2])
+
+
+def test_refusals_name_a_written_buffer_and_a_distribution_that_checks(generator: torch.Generator) -> None:
+    with pytest.raises(TypeError, match="RunningMean writes into its buffer 'mean'; write it outside of forward"):
+        router_of(RunningMean(), generator, way="fastest")(torch.rand(100, 3, generator=generator))
+    with pytest.raises(ValueError, match="mixes or selects them; pass validate_args=False to the distribution"):
+        router_of(Gaussian(3, 2), generator, fuse=True, way="fused")(torch.rand(100, 3, generator=generator))
+
+
 # Parameters under other names -----------------------------------------------------------------------------------------
 
 

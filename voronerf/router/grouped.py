@@ -182,10 +182,10 @@ class PerCell(torch.Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
-        """Raises TypeError, because a function ran outside of a routed call."""
+        """Raises TypeError, because no rule could run instead of the function."""
         raise TypeError(
-            f"VoronoiRouter: {func} met the parameters of all cells outside of a routed call; call the router, or take "
-            "one cell's module with cell(i)"
+            f"VoronoiRouter: {func} got the parameters of all cells where PyTorch's function modes do not see it, as "
+            "in TorchScript or outside of a routed call; call the router, or take one cell's module with cell(i)"
         )
 
 

@@ -270,13 +270,18 @@ class Probe:
         halves = [half for cell, a, b, c in bounds for half in ((cell, a, b), (cell, b, c))]
         with NoRandomness():
             apart = loop.on(self._call, self._entries, halves)
-        results, again = self._run(loop).tensors, self._run(loop).tensors
-        name = type(self._call.module).__name__
+        results, buffers = self._run(loop).tensors, dict(self._call.module.named_buffers())
+        versions = [buffer._version for buffer in buffers.values()]
+        again, name = self._run(loop).tensors, type(self._call.module).__name__
         if not all(map(agree, results, again)):
-            raise TypeError(
-                f"{_OP}: module must give the same results for the same samples, but {name} makes layers or draws "
-                "numbers inside of its forward; make layers in __init__, and pass numbers as an argument"
+            written = [key for key, old in zip(buffers, versions, strict=True) if buffers[key]._version != old]
+            what = (
+                "makes layers or draws numbers inside of its forward; make layers in __init__, and pass numbers as an"
             )
+            what = (
+                f"writes into its buffer {written[0]!r}; write it outside of forward" if written else f"{what} argument"
+            )
+            raise TypeError(f"{_OP}: module must give the same results for the same samples, but {name} {what}")
         if not all(map(agree, apart.tensors, results)):
             raise TypeError(
                 f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when other "

@@ -8,6 +8,7 @@ from sizes of the module.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import operator
 import sys
 from collections.abc import Iterator
@@ -108,6 +109,14 @@ def _sizes(node: fx.Node) -> tuple[list[str], list[list[int]]]:
     return names, shapes
 
 
+def _remedy(usual: str) -> str:
+    """Returns how to avoid a refusal: the usual way, or another one while a distribution checks its arguments."""
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__") != "torch.distributions.distribution":
+        frame = frame.f_back
+    return usual if frame is None else "pass validate_args=False to the distribution"
+
+
 class Trace(TorchFunctionMode):
     """Records the functions that the routed module calls with its first cell's parameters.
 
@@ -164,10 +173,10 @@ class Trace(TorchFunctionMode):
         if isinstance(value, Tensor):
             self._nodes[id(value)] = node
             if on == SAMPLES and not node.meta.get("counts") and not self._has_rows(value):
+                remedy = _remedy("keep a row for each, as torch.where does")
                 node.meta["mixes"] = (
                     f"{name_of(node.target)}{node.meta.get('line', '')} gives a tensor of shape {list(value.shape)}, "
-                    f"which has no row for each of {self.rows} samples: it mixes or selects them; keep a row for each, "
-                    "as torch.where does"
+                    f"which has no row for each of {self.rows} samples: it mixes or selects them; {remedy}"
                 )
                 if value.dim() or node.target not in _TOTALS:
                     raise Unfusable(node.meta["mixes"])
@@ -274,9 +283,8 @@ class Trace(TorchFunctionMode):
         from_n = counts and type(result) is int and result and result % self.rows == 0  # becomes a node at its use
         if used and not outputs and result is not None and not from_n:
             name = "the truth value of a tensor" if isinstance(result, bool) else name_of(node.target)
-            raise Unfusable(
-                f"{name} is read{line}, so the module's control flow depends on values; write it with torch.where"
-            )
+            remedy = _remedy("write it with torch.where")
+            raise Unfusable(f"{name} is read{line}, so the module's control flow depends on values; {remedy}")
         for source in used:
             if "mixes" in source.meta and func is not torch.autograd.grad:
                 raise Unfusable(source.meta["mixes"])
