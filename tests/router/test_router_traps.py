@@ -245,7 +245,7 @@ class Gaussian(nn.Linear):
     """A layer whose result is the log-likelihood of a distribution, which checks its arguments."""
 
     def forward(self, x: Tensor) -> Tensor:
-        return torch.distributions.Normal(super().forward(x), 1.0).log_prob(x[:, :2])
+        return torch.distributions.Normal(super().forward(x), 1.0, validate_args=True).log_prob(x[:, :2])
 
 
 def test_refusals_name_a_written_buffer_and_a_distribution_that_checks(generator: torch.Generator) -> None:

@@ -85,16 +85,16 @@ def check_module(module: nn.Module) -> None:
 
 
 def hide_parts(module: nn.Module) -> None:
-    """Notes the submodules that only lists, dicts or objects hold, if their parameters are registered elsewhere."""
+    """Notes which submodules hold parameters or submodules in other attributes, and submodules that only these hold."""
     registered = set(map(id, module.parameters()))
     for part in list(parts_of(module).values()):
-        known = parts_of(module)
-        items = {id(item): item for item in _held(part) if isinstance(item, nn.Module) and id(item) not in known}
-        hidden = [item for item in items.values() if any(id(p) in registered for p in item.parameters())]
-        if hidden:
+        known, items = parts_of(module), [*_held(part)]
+        modules = {id(item): item for item in items if isinstance(item, nn.Module) and id(item) not in known}
+        hidden = [item for item in modules.values() if any(id(p) in registered for p in item.parameters())]
+        if hidden or any(id(item) in registered or id(item) in known for item in items):
             vars(part)[HIDDEN] = hidden
-            for item in hidden:
-                hide_parts(item)
+        for item in hidden:
+            hide_parts(item)
 
 
 def _held(part: nn.Module) -> Iterator[Any]:

@@ -31,10 +31,11 @@ from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
-from voronerf.router.layout import Call, Results, map_tensors, map_tree, tensors_of
+from voronerf.router.layout import SHARED, Call, Results, map_tensors, map_tree, tensors_of
 from voronerf.router.plan import SLICE, CallPlan, measured_samples
 from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import CellProgram
+from voronerf.router.trace import Unfusable
 from voronerf.router.transforms import aside, is_watched, outside, recorded
 from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup
 
@@ -308,8 +309,11 @@ class Dispatch:
         if losses and size not in plan.choices and (recorded() or time.monotonic() < retry_time):
             return ways[0], why
         if size not in plan.choices:
-            with self._lock, aside(call) as copied:
-                times = measure(ways, copied, grouping)
+            try:
+                with self._lock, aside(call) as copied:
+                    times = measure(ways, copied, grouping)
+            except (Ungroupable, Unfusable):  # `_run` finds another way for this batch
+                return ways[0], ways[0].why
             fused = isinstance(ways[0], Fused)  # the fused way is kept unless it is clearly slower each time
             is_slower = fused and times[0] > _CLEAR * min(times)
             losses += is_slower
@@ -330,18 +334,20 @@ class Dispatch:
         """Runs a call as planned, or cell by cell if its batch cannot be grouped."""
         way, why = self._choose(plan, call, grouping)
         latest, warns = self._latest_ways.setdefault(call.method, {}), len(plan.ways) == 1
-        if isinstance(way, Grouped):
+        if isinstance(way, (Fused, Grouped)):
             try:
-                results, plan.wait = self._run_grouped(way, call, grouping), 0
+                results, plan.wait = self._run_once(way, call, grouping), 0
                 latest[way.name] = why
                 return results
             except Exception as error:
                 fatal = (BackendUnavailable, MemoryError, torch.OutOfMemoryError)
                 if isinstance(error, fatal) or "can't allocate memory" in str(error):
                     raise
+                if isinstance(way, Fused) and not isinstance(error, Unfusable):
+                    raise
                 if not recorded():
                     plan.postpone()
-                reason = error if isinstance(error, Ungroupable) else f"its forward fails ({error})"
+                reason = error if isinstance(error, (Ungroupable, Unfusable)) else f"its forward fails ({error})"
                 way, why, warns = plan.ways[-1], f"for some batches, since {reason}", True
         layout = call.layout
         try:
@@ -362,12 +368,12 @@ class Dispatch:
             self.warn_once(f"cells {call.method}", f"{call.name} runs cell by cell: {why}")
         return results
 
-    def _run_grouped(self, way: Grouped, call: Call, grouping: Grouping) -> Results:
-        """Runs a call for all cells at once; if the module does something new, its steps are recorded again."""
+    def _run_once(self, way: Fused | Grouped, call: Call, grouping: Grouping) -> Results:
+        """Runs a call for all cells at once; if a grouped module does something new, its steps are recorded again."""
         try:
             return way.run(call, grouping)
         except Ungroupable as error:
-            if not error.is_new or recorded():
+            if isinstance(way, Fused) or not error.is_new or recorded():
                 raise
         with self._lock, _own_randomness(grouping), aside(call) as copied:
             way.records[:] = [*way.records[1 - _TRACES :], Probe(copied, grouping).steps()]
@@ -444,6 +450,8 @@ def _plan_key(call: Call, device: torch.device) -> Any:
     autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
     lead, d = call.layout.lead, len(call.layout.lead)
     call.changed(lambda tensor, kind: tensor)
+    if not set(call.kinds.values()) - {SHARED}:
+        raise ValueError(f"{_OP}: arguments of {call.name} must include a tensor with a row for each sample, got none")
     has_rays = d > 1 and lead[-1] > 1  # rays of one sample cannot show that a module mixes the samples of a ray
     modes = call.method, call.module.training, torch.is_grad_enabled(), autocast
     kind: list[Any] = [*modes, tuple(call.kwargs), d, has_rays, *call.kinds.items()]

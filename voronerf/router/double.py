@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
+import math
 import operator
 import sys
 import types
@@ -18,13 +19,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf.router.grouping import parts_of
+from voronerf.router.grouping import HIDDEN, parts_of
 from voronerf.router.layout import Call, map_tree, reachable
 
 _OP = "VoronoiRouter"
 _PLAIN = {type(None), bool, int, float, str, type, torch.dtype, torch.device, torch.Size, types.FunctionType, Tensor}
 _LAYERS = "torch.nn.modules."  # modules from this package assign no attributes in ``forward``
 _REGISTRIES, _OF_HOOKS = ("_parameters", "_buffers", "_modules"), (OrderedDict, dict, set)
+_SEARCHED = 1000  # maximum number of searched objects in an attribute, unless wrapping found parameters or submodules
 _OWN = frozenset(vars(nn.Module()))  # attributes that every module has
 
 
@@ -69,8 +71,9 @@ class Double:
             members["_buffers"] = dict(part._buffers)
             members["_modules"] = {name: twins.get(id(child), child) for name, child in part._modules.items()}
             rest = [item for item in members.items() if type(item[1]) not in _PLAIN and item[0] not in _REGISTRIES]
+            most = math.inf if HIDDEN in members else _SEARCHED
             for name, value in rest:  # nearly all are empty dicts of hooks
-                held = () if type(value) in _OF_HOOKS and not value else [*map(id, reachable(value))]
+                held = () if type(value) in _OF_HOOKS and not value else [*map(id, reachable(value, most))]
                 if any(key in parts for key in held):
                     members[name] = moved(value, twins)
                 if any(key in parameters for key in held):

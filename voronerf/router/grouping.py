@@ -21,7 +21,9 @@ SHARED = "_voronerf_shared"
 
 
 HIDDEN = "_voronerf_hidden"
-"""The attribute of a submodule that holds the submodules in its other attributes, such as lists."""
+"""The attribute that lists the unregistered submodules in other attributes of a submodule, such as lists.
+
+It exists if such an attribute holds a parameter or a submodule."""
 
 
 class Grouping:

@@ -22,7 +22,6 @@ from voronerf.router.grouping import Grouping
 
 _OP = "VoronoiRouter"
 DEEPEST = 6  # maximum depth to which nested objects are searched for tensors
-_SEARCHED = 1000  # maximum number of objects in an attribute that are searched for modules, tensors and functions
 _LEAVES = {type(None), type(...), bool, int, float, str, torch.Size, torch.dtype, torch.device}
 AS_TENSOR = "pass torch.as_tensor(points, dtype=torch.float32)"
 SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
@@ -59,10 +58,13 @@ def contents(value: Any) -> dict[Any, Any] | None:
     return dict(vars(value)) if hasattr(value, "__dict__") else None
 
 
-def reachable(value: Any) -> Iterator[Any]:
-    """Yields the modules, tensors and functions that a value holds, through containers and objects but not modules."""
+def reachable(value: Any, most: float = math.inf) -> Iterator[Any]:
+    """Yields the modules, tensors and functions that a value holds, through containers and objects but not modules.
+
+    Stops after ``most`` objects.
+    """
     pending, seen = [value], dict[int, Any]()
-    while pending and len(seen) < _SEARCHED:
+    while pending and len(seen) < most:
         item = pending.pop()
         if type(item) in _LEAVES or id(item) in seen:
             continue

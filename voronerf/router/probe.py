@@ -271,10 +271,10 @@ class Probe:
         with NoRandomness():
             apart = loop.on(self._call, self._entries, halves)
         results, buffers = self._run(loop).tensors, dict(self._call.module.named_buffers())
-        versions = [buffer._version for buffer in buffers.values()]
+        old = {key: buffer.clone() for key, buffer in buffers.items()}
         again, name = self._run(loop).tensors, type(self._call.module).__name__
         if not all(map(agree, results, again)):
-            written = [key for key, old in zip(buffers, versions, strict=True) if buffers[key]._version != old]
+            written = [key for key, buffer in buffers.items() if not torch.equal(buffer, old[key])]
             what = (
                 "makes layers or draws numbers inside of its forward; make layers in __init__, and pass numbers as an"
             )
