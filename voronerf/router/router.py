@@ -86,12 +86,12 @@ class VoronoiRouter(nn.Module):
     - fused: one operation for the whole network. This needs a field with a method ``program``
       (:func:`voronerf.router.layered_program`), or ``fuse=True``.
     - grouped: the module's own ``forward`` runs once, on the samples of all cells sorted by cell. Functions that take
-      parameters have a rule for all cells at once: linear layers (also ``F.linear``, ``@``, ``einsum``), embeddings,
-      normalisation layers, scales. :func:`voronerf.router.register` adds a rule.
+      parameters have a rule for all cells at once: linear layers (also ``F.linear``, ``@``, ``einsum``), recurrent
+      layers, embeddings, normalisation layers, scales. :func:`voronerf.router.register` adds a rule.
     - cell by cell: the module runs once for each cell that has samples. A warning names the step that prevents a faster
       way.
 
-    A module that mixes samples (BatchNorm, attention across samples) is refused.
+    A module that mixes samples (BatchNorm in training mode, attention across samples) is refused.
 
     If ``diagram`` is the number of networks, cells have no centres. Every call then passes the cell of each sample,
     ``router(x, cells=labels)``, such as its speaker, station, object or image. A router with a diagram accepts
