@@ -65,6 +65,13 @@ STEPS: list[Callable[[Any, Tensor], Tensor]] = [
     lambda net, h: F.conv2d(h.t()[None, :, None], net.square[..., None, None])[0, :, 0].t(),
     lambda net, h: F.conv1d(h.t(), net.square[..., None], net.vector, stride=1, padding=0).t(),
     lambda net, h: F.conv1d(h[:, None], net.vector.view(1, 1, 4), padding="same")[:, 0],
+    lambda net, h: h.to(net.vector) * net.vector.type_as(h) + net.one.new_ones(len(h), 4),
+    lambda net, h: net.one.new_zeros(2, 4).sum(0) + torch.ones(1, 4).to(h).expand_as(h) * net.vector,
+    lambda net, h: torch.baddbmm(
+        net.one, h.view(-1, 2, 2).movedim(1, 0), net.cube.view(2, 2, 2)[..., [0, 1, 0, 1]]
+    ).sum(0),
+    lambda net, h: torch.bmm(net.square.view(2, 2, 4), h.t().expand(2, 4, len(h))).flatten(0, 1).t(),
+    lambda net, h: torch.addmm(net.vector, h, net.square) + torch.mv(h, net.vector)[:, None],
 ]
 
 

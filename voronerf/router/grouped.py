@@ -68,8 +68,16 @@ RANDOM = find(
     torch.nn.functional,
 )
 """The functions that draw random numbers."""
-_BY_TYPE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
-_BY_FIRST = find("to type_as expand_as view_as reshape_as", torch.Tensor)
+LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
+"""The functions that make tensors of another tensor's dtype, and read none of its values."""
+_TO = find("to type_as", torch.Tensor)
+
+
+def converted(func: Any, args: Any) -> tuple[Any, Any]:
+    """Returns a conversion to another tensor's dtype and device as a conversion that does not take that tensor."""
+    if func in _TO and len(args) > 1 and isinstance(args[1], Tensor):
+        return torch.Tensor.to, (args[0], args[1].device, args[1].dtype, *args[2:])
+    return func, args
 
 
 class Exact(TorchFunctionMode):
@@ -418,13 +426,17 @@ class GroupedRun(TorchFunctionMode):
         kwargs = kwargs or {}
         if func in METADATA:
             return func(*args, **kwargs)
-        step, operands = self._step(func), tensors_of((args, kwargs))
+        step = self._step(func)
+        func, args = converted(func, args)
+        if func in LIKE and type(args[0]) is PerCell:
+            args = (args[0].stacked, *args[1:])
+        operands = tensors_of((args, kwargs))
         if any(type(tensor) is PerCell for tensor in operands):
             return self._with_parameters(func, args, kwargs, operands, step)
         exact = EXACT.get(func, func)
         result = without_randomness(exact, args, kwargs) if self.quiet else exact(*args, **kwargs)
-        read = [] if func in _BY_TYPE else operands[:1] if func in _BY_FIRST else operands
-        marked, outputs = [tensor for tensor in read if self.is_rows(tensor)], tensors_of(result)
+        marked = [] if func in LIKE else [tensor for tensor in operands if self.is_rows(tensor)]
+        outputs = tensors_of(result)
         if marked:
             if writes_in_place(func):
                 self.mark(operands[0])

@@ -23,14 +23,23 @@ from torch.overrides import TorchFunctionMode
 
 from voronerf.router.axes import axis_of, multiple
 from voronerf.router.double import Double
-from voronerf.router.grouped import METADATA, RANDOM, find, line_of, name_of, user_frame, writes_in_place
+from voronerf.router.grouped import (
+    LIKE,
+    METADATA,
+    RANDOM,
+    converted,
+    find,
+    line_of,
+    name_of,
+    user_frame,
+    writes_in_place,
+)
 from voronerf.router.grouping import cell_parameters, owned_parameters, parts_of
 from voronerf.router.layout import Call, rebuild, tensors_of
 from voronerf.router.watch import Inputs, lookup
 
 CONSTANTS, CELLS, SAMPLES = range(3)  # dependence of a value: the maximum over its operands
 _PAIRS = ((37, 31), (29, 23), (19, 17))  # numbers of samples of two traces, tried in turn
-_LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
 _TOTALS = find("any all sum", torch, torch.Tensor)  # their scalar results may be used for a gradient only
 
 
@@ -261,8 +270,7 @@ class Trace(TorchFunctionMode):
         self._line = line = line_of(frame)
         self._code = (frame.f_code.co_names, frame.f_globals) if frame else ((), {})
         operands = tensors_of((args, kwargs))
-        if func in (torch.Tensor.type_as, torch.Tensor.to) and isinstance(args[-1], Tensor):
-            func, args = torch.Tensor.to, (args[0], args[1].device, args[1].dtype)
+        func, args = converted(func, args)
         if func is torch.autograd.grad:  # all cells have one graph; in a loop, each has its own
             kwargs = {**kwargs, "retain_graph": True}
         node = self.graph.call_function(func, *map_aggregate((args, kwargs), self._argument))
@@ -288,7 +296,7 @@ class Trace(TorchFunctionMode):
         for source in used:
             if "mixes" in source.meta and func is not torch.autograd.grad:
                 raise Unfusable(source.meta["mixes"])
-        is_constant = func in _LIKE and not self._has_rows(outputs[0])
+        is_constant = func in LIKE and not self._has_rows(outputs[0])
         if not used or is_constant or not outputs or (not inplace and any(result is tensor for tensor in operands)):
             self.graph.erase_node(node)
             return
