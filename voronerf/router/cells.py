@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from voronerf.router.double import moved
 from voronerf.router.grouping import HIDDEN, SHARED, cell_parameters, owned_parameters, parts_of
-from voronerf.router.layout import DEEPEST, reachable
+from voronerf.router.layout import reachable
 
 _OP = "VoronoiRouter"
 _REGISTRIES = ("_parameters", "_buffers", "_modules")
@@ -231,16 +231,19 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
             tensor[index] = theirs[name].to(tensor)
 
 
-def _difference(ours: nn.Module, theirs: nn.Module) -> str:
+def _difference(ours: nn.Module, theirs: nn.Module, seen: set[int] | None = None) -> str:
     """Returns the name of a submodule of another class, or of an attribute of another value; "" if there is none."""
-    others = dict(theirs.named_modules())
+    others, seen = dict(theirs.named_modules()), set() if seen is None else seen
     for name, part in ours.named_modules():
         other, prefix = cast(nn.Module, others.get(name)), f"{name}." if name else ""
         if _class_of(other) != _class_of(part):
             return f"{name or 'class'}, a {type(other).__name__} instead of a {type(part).__name__},"
+        if id(part) in seen:
+            continue
+        seen.add(id(part))
         ours_by_name, theirs_by_name = _attributes(part), _attributes(other)
         for key in sorted(ours_by_name.keys() | theirs_by_name.keys()):
-            if not _same(ours_by_name.get(key), theirs_by_name.get(key)):
+            if not _same(ours_by_name.get(key), theirs_by_name.get(key), seen):
                 return f"{prefix}{key}"
     return ""
 
@@ -251,40 +254,54 @@ def _class_of(value: Any) -> tuple[str, str]:
 
 
 def _attributes(part: nn.Module) -> dict[str, Any]:
-    """Returns the attributes of a submodule by which its results may differ, without parameters, buffers and parts."""
-    members = {name: value for name, value in vars(part).items() if name not in _PRIVATE}
+    """Returns the attributes of a submodule by which its results may differ, without parameters, buffers and parts.
+
+    Weight norm and pruning compute an attribute such as ``weight`` from parameters such as ``weight_v``.
+    """
+    computed = {name.rpartition("_")[0] for name in part._parameters}
+    members = {name: value for name, value in vars(part).items() if name not in _PRIVATE and name not in computed}
     return members | {name: [*vars(part)[name].values()] for name in ("_forward_hooks", "_forward_pre_hooks")}
 
 
-def _same(a: Any, b: Any, depth: int = 0) -> bool:
+def _same(a: Any, b: Any, seen: set[int]) -> bool:
     """Returns whether two attributes are equal; parameters, and tensors that a call has left there, equal any value."""
-    if a is b or depth > DEEPEST or any(isinstance(x, Tensor) and (x.requires_grad or not x.is_leaf) for x in (a, b)):
+    if a is b or any(isinstance(x, Tensor) and (x.requires_grad or not x.is_leaf) for x in (a, b)):
         return True
     if isinstance(a, Number) and isinstance(b, Number):
         return bool(a == b or (a != a and b != b))  # NaN
     if _class_of(a) != _class_of(b):
         return False
+    if isinstance(a, nn.Module):
+        return not _difference(a, b, seen)
     if isinstance(a, Tensor):
         return torch.equal(a, b.to(a.device))
-    if isinstance(a, types.FunctionType):
-        cells = [[cell.cell_contents for cell in f.__closure__ or ()] for f in (a, b)]
-        return a.__code__ == b.__code__ and _same([a.__defaults__, *cells[0]], [b.__defaults__, *cells[1]], depth + 1)
+    if hasattr(a, "__array__"):
+        return a.shape == b.shape and bool((a == b).all())
     if isinstance(a, types.MethodType):
         return a.__func__ is b.__func__
-    if isinstance(a, (list, tuple)):
-        return len(a) == len(b) and all(_same(x, y, depth + 1) for x, y in zip(a, b, strict=True))
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(_same(a[key], b[key], depth + 1) for key in a)
-    if isinstance(a, nn.Module):
-        return not _difference(a, b)
-    if hasattr(a, "__array__"):
-        return bool((a == b).all()) if a.shape == b.shape else False
-    if isinstance(a, functools.partial):
-        return _same([a.func, a.args, a.keywords], [b.func, b.args, b.keywords], depth + 1)
-    if hasattr(a, "__dict__") and not isinstance(a, type):
-        return _same(vars(a), vars(b), depth + 1)
-    is_comparable = callable(a) or isinstance(a, (str, bytes, set, frozenset, torch.dtype, torch.device))
-    return bool(a == b) if is_comparable else True
+    ours, theirs = _parts(a), _parts(b)
+    if ours is None or theirs is None:
+        return bool(a == b)
+    if id(a) in seen:
+        return True
+    seen.add(id(a))
+    return len(ours) == len(theirs) and all(_same(x, y, seen) for x, y in zip(ours, theirs, strict=True))
+
+
+def _parts(value: Any) -> list[Any] | None:
+    """Returns the objects that define a function, a container or an object; None for a value that compares itself."""
+    if isinstance(value, types.FunctionType):
+        return [value.__code__, value.__defaults__, *(cell.cell_contents for cell in value.__closure__ or ())]
+    if isinstance(value, functools.partial):
+        return [value.func, value.args, value.keywords]
+    if isinstance(value, dict):
+        return [*value, *value.values()]
+    if isinstance(value, (list, tuple)):
+        return list(value)
+    if hasattr(value, "__dict__") and not isinstance(value, type):
+        return _parts(vars(value))
+    compares = callable(value) or vars(type(value)).get("__eq__", object.__eq__) is not object.__eq__
+    return None if compares else []  # an object without attributes, such as a lock, tells nothing
 
 
 def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:

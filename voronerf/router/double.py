@@ -152,6 +152,13 @@ class Double:
             attributes[name] = members[name] = moved(value, values)
         return placed
 
+    def replace(self, place: int, name: str, value: Any) -> None:
+        """Replaces an attribute or a buffer of a submodule in all later runs."""
+        part = self.parts[place]
+        registries = [vars(part), *(members for at, _, members in self._assignable if at == place)]
+        for registry in registries if name in vars(part) else [part._buffers]:
+            registry[name] = value
+
     def own_buffers(self) -> None:
         """Copies the buffers, so that the double no longer shares them."""
         for part in self.module.modules():

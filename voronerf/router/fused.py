@@ -27,7 +27,7 @@ from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable, name_of
 from voronerf.router.grouping import Grouping, owned_parameters, parts_of
 from voronerf.router.layout import Call, Results, map_tensors, recordable, tensors_of
 from voronerf.router.lower import Entries, Lowering, NotAStep
-from voronerf.router.trace import CELLS, SAMPLES, Unfusable, differentiable, trace
+from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable, is_custom
 from voronerf.router.watch import Inputs, lookup
 from voronerf.router.waves import with_encodings
 
@@ -90,7 +90,7 @@ class WholeProgram(NamedTuple):
 class Fused:
     """A call of the routed module as runs of programs with PyTorch functions between them.
 
-    The call is traced on rows of its arguments (:func:`voronerf.router.trace.trace`). Raises :class:`Unfusable` if
+    The call is traced on rows of its arguments (:class:`voronerf.router.trace.Trace`). Raises :class:`Unfusable` if
     nothing can be fused, or if a step cannot be repeated for other samples.
 
     Attributes:
@@ -100,7 +100,7 @@ class Fused:
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
         self.module, self.inputs = call.module, inputs
-        traced = trace(self._with_inputs(call, tensors[0].device), tensors, inputs)
+        traced = Trace(self._with_inputs(call, tensors[0].device), tensors, inputs)
         parts, self.reads = list(parts_of(call.module).values()), traced.reads
         self._places = [(parts[i], i, name) for i, name in traced.places]
         self._n, self._inputs, self._shared, self._parameters = (
@@ -126,7 +126,7 @@ class Fused:
         self._weights = [node for node in nodes if node.meta["on"] != SAMPLES]
         self._between = [node for node in nodes if node.meta["on"] == SAMPLES]
         for node in self._between:
-            if _is_custom(node) and any(source.meta["on"] == CELLS for source in node.all_input_nodes):
+            if is_custom(node) and any(source.meta["on"] == CELLS for source in node.all_input_nodes):
                 raise Unfusable(
                     f"{name_of(node.target)}{node.meta['line']} is a custom function that takes parameters of cells; "
                     "write it with functions of PyTorch"
@@ -217,7 +217,7 @@ class Fused:
                 values[id(value)] = source
             return value
 
-        if _is_custom(node):
+        if is_custom(node):
             raise NotAStep("a custom function with its own backward; write it with functions of PyTorch")
         if node.target in (torch.autograd.grad, differentiable):
             raise NotAStep("a gradient")
@@ -520,8 +520,3 @@ def _flat(value: Tensor, n: int, source: Any) -> Tensor:
     dim = source.meta["axis"].dim if isinstance(source, fx.Node) else 0
     value = value.movedim(dim, 0) if dim else value
     return value.reshape(n, -1) if n else value.reshape(0, max(value.shape[1:].numel(), 1))
-
-
-def _is_custom(node: fx.Node) -> bool:
-    """Returns whether a node is a ``torch.autograd.Function`` of the module."""
-    return getattr(node.target, "__name__", "") == "apply"

@@ -12,6 +12,7 @@ Letters: n samples, k cells; a tensor of rows has n * m entries in one dimension
 from __future__ import annotations
 
 import inspect
+import itertools
 import linecache
 import os
 from collections.abc import Callable, Sequence
@@ -262,14 +263,17 @@ def text_of_line(file: str, number: int) -> str:
 
 
 class Step(NamedTuple):
-    """One function that a module calls: the axis of each tensor among its arguments, and its integers' multiples of n.
+    """One function that a module calls: the axes of the tensors among its arguments and among its results.
 
-    ``counts`` is empty if no integer counts samples.
+    ``counts`` has the multiple of n of each integer among its arguments; it is empty if no integer counts samples.
+    ``varies`` tells whether another size of its arguments depends on n without being a multiple of it.
     """
 
     function: Any
     axes: tuple[Axis | None, ...]
     counts: tuple[int, ...]
+    results: tuple[Axis | None, ...]
+    varies: bool
 
 
 def integers_of(value: Any) -> list[int]:
@@ -303,18 +307,20 @@ def with_counts(value: Any, counts: Sequence[int]) -> Any:
 
 
 class Recorder(TorchFunctionMode):
-    """A mode that notes each PyTorch function, the shapes of its tensor arguments, and its integers."""
+    """A mode that notes each PyTorch function, the shapes of its tensors, and its integers."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.calls: list[tuple[Any, list[torch.Size], list[int]]] = []
+        self.calls: list[tuple[Any, list[torch.Size], list[int], list[torch.Size]]] = []
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if func not in METADATA:
-            shapes = [tensor.shape for tensor in tensors_of((args, kwargs))]
-            self.calls.append((func, shapes, integers_of((args, kwargs))))
-        return func(*args, **kwargs)
+        if func in METADATA:
+            return func(*args, **kwargs)
+        shapes, integers = [tensor.shape for tensor in tensors_of((args, kwargs))], integers_of((args, kwargs))
+        result = func(*args, **kwargs)
+        self.calls.append((func, shapes, integers, [tensor.shape for tensor in tensors_of(result)]))
+        return result
 
 
 def steps_of(runs: Sequence[Recorder], n: Sequence[int]) -> list[Step]:
@@ -322,15 +328,18 @@ def steps_of(runs: Sequence[Recorder], n: Sequence[int]) -> list[Step]:
 
     Raises :class:`Ungroupable` if the runs call different functions.
     """
-    steps = []
-    for (function, shapes, integers), (other, *others) in zip(*(run.calls for run in runs), strict=False):
-        if other != function or [len(shapes), len(integers)] != [*map(len, others)]:
-            break
-        axes = tuple(axis_of(*pair, n) for pair in zip(shapes, others[0], strict=True))
-        counts = tuple(multiple(pair, n) for pair in zip(integers, others[1], strict=True))
-        steps.append(Step(function, axes, counts if any(counts) else ()))
-    if len(steps) != len(runs[0].calls) or len(steps) != len(runs[1].calls):
-        raise Ungroupable("its forward calls other functions for another number of samples", of_batch=True)
+    steps = list[Step]()
+    for one, other in itertools.zip_longest(*(run.calls for run in runs)):
+        if one is None or other is None or one[0] != other[0] or [*map(len, one[1:])] != [*map(len, other[1:])]:
+            raise Ungroupable("its forward calls other functions for another number of samples", of_batch=True)
+        shapes, integers = list(zip(one[1], other[1])), list(zip(one[2], other[2]))
+        axes, counts = [axis_of(*pair, n) for pair in shapes], [multiple(pair, n) for pair in integers]
+        fits = [
+            *(axis or a == b for axis, (a, b) in zip(axes, shapes)),
+            *(m or a == b for m, (a, b) in zip(counts, integers)),
+        ]
+        results = tuple(axis_of(*pair, n) for pair in zip(one[3], other[3]))
+        steps.append(Step(one[0], tuple(axes), tuple(counts) if any(counts) else (), results, not all(fits)))
     return steps
 
 

@@ -1,8 +1,7 @@
 """Traces one call of a module as a graph of functions.
 
 A function mode records every PyTorch function with the line that called it. A profile function of the thread records
-custom autograd functions. Two traces with different numbers of samples (:func:`trace`) tell sizes that count samples
-from sizes of the module.
+custom autograd functions.
 """
 
 from __future__ import annotations
@@ -17,21 +16,25 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, fx
+from torch import Tensor, fx, nn
 from torch.fx.node import map_aggregate, map_arg
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.axes import axis_of, multiple
+from voronerf.router.axes import Axis, Count, axis_of
 from voronerf.router.double import Double
 from voronerf.router.grouped import (
     LIKE,
     METADATA,
     RANDOM,
+    Recorder,
+    Step,
     converted,
     find,
     line_of,
     name_of,
+    steps_of,
     user_frame,
+    with_counts,
     writes_in_place,
 )
 from voronerf.router.grouping import cell_parameters, owned_parameters, parts_of
@@ -39,7 +42,7 @@ from voronerf.router.layout import Call, rebuild, tensors_of
 from voronerf.router.watch import Inputs, lookup
 
 CONSTANTS, CELLS, SAMPLES = range(3)  # dependence of a value: the maximum over its operands
-_PAIRS = ((37, 31), (29, 23), (19, 17))  # numbers of samples of two traces, tried in turn
+_ROWS = (37, 41, 31, 29)  # numbers of samples of a trace, see `rows_for`
 _TOTALS = find("any all sum", torch, torch.Tensor)  # their scalar results may be used for a gradient only
 
 
@@ -65,57 +68,11 @@ class _Begun(NamedTuple):
     operands: list[Tensor]
 
 
-def trace(call: Call, tensors: list[Tensor], inputs: Inputs) -> Trace:
-    """Traces a call on rows of its arguments, at least 37 of each.
-
-    The ``meta`` of each node with a tensor gets ``axis``, the :class:`Axis` of its samples or None. Raises
-    :class:`Unfusable`.
-    """
-    error: Unfusable | None = None
-    for pair in _PAIRS:
-        try:
-            first, second = (Trace(call, [tensor[:rows] for tensor in tensors], inputs) for rows in pair)
-            _compare(first, second)
-            return first
-        except Unfusable as caught:
-            error = error or caught
-    assert error is not None
-    raise error
-
-
-def _compare(first: Trace, second: Trace) -> None:
-    """Stores the axis of each value; raises Unfusable if the traces differ, or if another size is a multiple of n."""
-    counts, nodes = (first.rows, second.rows), (list(first.graph.nodes), list(second.graph.nodes))
-    if len(nodes[0]) != len(nodes[1]):
-        raise Unfusable("its forward calls other functions for another number of samples")
-    for node, other in zip(*nodes, strict=True):
-        (arguments, shapes), (other_arguments, other_shapes) = _sizes(node), _sizes(other)
-        pairs = [pair for a, b in zip(shapes, other_shapes) for pair in zip(a, b)]
-        same = node.target == other.target and arguments == other_arguments
-        same = same and list(map(len, shapes)) == list(map(len, other_shapes))
-        if not same or any(a != b and not multiple((a, b), counts) for a, b in pairs):
-            line = node.meta.get("line", "")
-            raise Unfusable(f"{name_of(node.target)}{line} gets or gives other sizes for another number of samples")
-        if any(a == b and a and not (a % counts[0] and a % counts[1]) for a, b in pairs):
-            raise Unfusable(f"a size of the module is a multiple of {counts[0]} or {counts[1]}")
-        if isinstance(node.meta.get("value"), Tensor):
-            node.meta["axis"] = axis_of(shapes[0], other_shapes[0], counts)
-
-
-def _sizes(node: fx.Node) -> tuple[list[str], list[list[int]]]:
-    """Returns the names of the nodes in a node's arguments, and the sizes of its value and of other arguments."""
-    names: list[str] = []
-    shapes = [list(value.shape)] if isinstance(value := node.meta.get("value"), Tensor) else []
-
-    def note(leaf: Any) -> Any:
-        if isinstance(leaf, fx.Node):
-            names.append(leaf.name)
-        elif isinstance(leaf, Tensor) or type(leaf) is int:
-            shapes.append(list(leaf.shape) if isinstance(leaf, Tensor) else [leaf])
-        return leaf
-
-    map_aggregate((node.args, node.kwargs), note)
-    return names, shapes
+def rows_for(module: nn.Module, tensors: list[Tensor]) -> int:
+    """Returns a number of samples that divides no size of the module or its arguments, if there is one."""
+    sizes = {size for tensor in (*module.parameters(), *module.buffers()) for size in tensor.shape}
+    sizes.update(size for tensor in tensors for size in tensor.shape[1:])
+    return next((rows for rows in _ROWS if all(size % rows or not size for size in sizes)), _ROWS[0])
 
 
 def _remedy(usual: str) -> str:
@@ -132,6 +89,7 @@ class Trace(TorchFunctionMode):
     The ``meta`` of a node has:
 
     - ``value``: the value of the node;
+    - ``axis``: the :class:`Axis` of the samples of a tensor; None for a tensor without rows;
     - ``on``: the kind of data on which the value depends: CONSTANTS, CELLS or SAMPLES;
     - ``line``: the line of the module that called the function;
     - ``grad``: whether gradients were on;
@@ -139,8 +97,9 @@ class Trace(TorchFunctionMode):
     - ``counts``: whether the value holds numbers derived from the number of samples, and no rows, such as
       ``torch.tensor(x.shape)``.
 
-    ``tensors`` are rows of the arguments, ``inputs`` are the values that each call looks up, and ``reads`` are the
-    attributes that were read. Raises :class:`Unfusable` for a step that cannot be repeated for other samples.
+    ``tensors`` are rows of the arguments, at least 41; ``inputs`` are the values that each call looks up, and ``reads``
+    are the attributes that were read. Two runs with different numbers of samples precede the trace (:class:`Recorder`).
+    Raises :class:`Unfusable` for a step that cannot be repeated for other samples.
     """
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
@@ -154,34 +113,43 @@ class Trace(TorchFunctionMode):
         self._running, self._line = False, ""
         self._code: tuple[tuple[str, ...], dict[str, Any]] = (), {}  # the line's code: its names and its globals
         self._nodes: dict[int, fx.Node] = {}  # by the id of the node's tensor, which ``meta`` keeps alive
-        self.rows = len(tensors[0])
+        self.rows = rows_for(module, tensors)
+        tensors = [tensor[: self.rows] for tensor in tensors]
         self.n = self._new(self.rows)
-        self.inputs = [self._new(tensor) for tensor in tensors]
+        self.inputs = [self._new(tensor, axis=Axis(0)) for tensor in tensors]
         self.shared = [self._new(tensor, on=CONSTANTS) for tensor in call.shared()]
         self.reads = set[tuple[int, str]]()
         double, parts = Double(module, self.reads), list(parts_of(module).values())
         self.places = [source for source in inputs.sources if not isinstance(source, str)]
         for place, name in self.places:
-            value, part = inputs.tensor(lookup(parts[place], name), tensors[0].device), double.parts[place]
-            (vars(part) if name in vars(part) else part._buffers)[name] = value
+            value = inputs.tensor(lookup(parts[place], name), tensors[0].device)
+            double.replace(place, name, value)
             self.shared.append(self._new(value, on=CONSTANTS))
+        counts, runs = (self.rows, self.rows // 2 + 1), (Recorder(), Recorder())
+        results = [
+            tensors_of(double.run(call, [tensor[:count] for tensor in tensors], single, recorder))
+            for count, recorder in zip(counts, runs, strict=True)
+        ]
+        self._steps = iter(steps_of(runs, counts))
         self.reads.clear()
         with self._custom_functions(), self:
             result = double.run(call, tensors, single)
         self._separate_gradients()
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
         self.outputs = [self._argument(tensor) for tensor in tensors_of(result)]
-        for node in self.outputs:
-            if isinstance(node, fx.Node) and "mixes" in node.meta:
-                raise Unfusable(node.meta["mixes"])
+        for node, *pair in zip(self.outputs, *results, strict=True):
+            if isinstance(node, fx.Node):
+                node.meta["axis"] = axis_of(pair[0].shape, pair[1].shape, counts)
+                if "mixes" in node.meta:
+                    raise Unfusable(node.meta["mixes"])
 
-    def _new(self, value: Any, node: fx.Node | None = None, on: int = SAMPLES) -> fx.Node:
+    def _new(self, value: Any, node: fx.Node | None = None, on: int = SAMPLES, axis: Axis | None = None) -> fx.Node:
         """Assigns a node to a value; without ``node``, adds a new input of the graph."""
         node = self.graph.placeholder("given") if node is None else node
-        node.meta.update(value=value, on=on)
+        node.meta.update(value=value, on=on, axis=axis)
         if isinstance(value, Tensor):
             self._nodes[id(value)] = node
-            if on == SAMPLES and not node.meta.get("counts") and not self._has_rows(value):
+            if on == SAMPLES and not node.meta.get("counts") and axis is None and not is_custom(node):
                 remedy = _remedy("keep a row for each, as torch.where does")
                 node.meta["mixes"] = (
                     f"{name_of(node.target)}{node.meta.get('line', '')} gives a tensor of shape {list(value.shape)}, "
@@ -191,28 +159,29 @@ class Trace(TorchFunctionMode):
                     raise Unfusable(node.meta["mixes"])
         return node
 
-    def _has_rows(self, value: Tensor) -> bool:
-        return any(size and size % self.rows == 0 for size in value.shape)
-
     def _argument(self, value: Any) -> Any:
         """Returns the node of an argument, or the argument itself if it is a constant."""
-        if type(value) is int and value and value % self.rows == 0:
-            return self._new(value, self.graph.call_function(operator.mul, (self.n, value // self.rows)))
+        if isinstance(value, Count):
+            return self._new(int(value), self.graph.call_function(operator.mul, (self.n, value // self.rows)))
         if not isinstance(value, Tensor) or id(value) in self._nodes:
             return self._nodes.get(id(value), value)
         if id(value) in self._places:
             node = self._new(value, on=CELLS if id(value) in self._cell_ids else CONSTANTS)
             self.parameters[node] = self._places[id(value)]
             return node
-        if value.requires_grad or value.shape[:1] == (self.rows,):
-            names = self._compiled()
-            remedy = (
-                f"perhaps {names}, which torch.jit has compiled; use what it was compiled from"
-                if names
-                else "write it with functions of PyTorch, or call it in a torch.autograd.Function"
-            )
-            raise Unfusable(f"a tensor was not computed by a PyTorch function{self._line}, {remedy}")
+        if value.requires_grad:
+            raise self._unrecorded()
         return value
+
+    def _unrecorded(self) -> Unfusable:
+        """Returns the error for a tensor that no recorded function has computed."""
+        names = self._compiled()
+        remedy = (
+            f"perhaps {names}, which torch.jit has compiled; use what it was compiled from"
+            if names
+            else "write it with functions of PyTorch, or call it in a torch.autograd.Function"
+        )
+        return Unfusable(f"a tensor was not computed by a PyTorch function{self._line}, {remedy}")
 
     def _compiled(self) -> str:
         """Returns the names of submodules and called functions that ``torch.jit`` has compiled."""
@@ -223,15 +192,20 @@ class Trace(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Calls a function and records it."""
-        if self._running or func in METADATA:
+        if func in METADATA:
             return func(*args, **(kwargs or {}))
-        begun = self._begin(func, args, kwargs or {})
+        step = next(self._steps, None)
+        if step is None or step.function != func:
+            raise Unfusable(f"{name_of(func)}{line_of(user_frame())} is not called in every call of the forward")
+        if self._running:  # in a custom function of autograd
+            return func(*args, **(kwargs or {}))
+        begun = self._begin(func, args, kwargs or {}, step)
         self._running = True  # inner functions are not recorded
         try:
             result = begun.function(*begun.args, **begun.kwargs)
         finally:
             self._running = False
-        self._end(begun, result)
+        self._end(begun, result, step)
         return result
 
     @contextlib.contextmanager
@@ -264,12 +238,23 @@ class Trace(TorchFunctionMode):
             if in_c:
                 old_profile.enable()
 
-    def _begin(self, func: Any, args: Any, kwargs: Any) -> _Begun:
-        """Records a function before its call; returns the node with the function and arguments to call."""
+    def _begin(self, func: Any, args: Any, kwargs: Any, step: Step | None = None) -> _Begun:
+        """Records a function before its call; returns the node with the function and arguments to call.
+
+        A custom function of autograd has no step.
+        """
         frame = user_frame()
         self._line = line = line_of(frame)
         self._code = (frame.f_code.co_names, frame.f_globals) if frame else ((), {})
         operands = tensors_of((args, kwargs))
+        if step and step.varies:
+            raise Unfusable(f"{name_of(func)}{line} gets a size that depends on, but is no multiple of, the samples")
+        for tensor, axis in zip(operands, step.axes if step else ()):
+            if id(tensor) in self._nodes:
+                self._nodes[id(tensor)].meta["axis"] = axis
+            elif axis is not None and id(tensor) not in self._places:
+                raise self._unrecorded()
+        args, kwargs = with_counts((args, kwargs), step.counts) if step and step.counts else (args, kwargs)
         func, args = converted(func, args)
         if func is torch.autograd.grad:  # all cells have one graph; in a loop, each has its own
             kwargs = {**kwargs, "retain_graph": True}
@@ -278,7 +263,7 @@ class Trace(TorchFunctionMode):
         node.meta["line"], node.meta["grad"] = line, torch.is_grad_enabled()
         return _Begun(node, func, args, kwargs, operands)
 
-    def _end(self, begun: _Begun, result: Any) -> None:
+    def _end(self, begun: _Begun, result: Any, step: Step | None = None) -> None:
         """Records the results of a function."""
         node, func, _, kwargs, operands = begun
         inplace, line = node.meta["inplace"], node.meta["line"]
@@ -296,7 +281,8 @@ class Trace(TorchFunctionMode):
         for source in used:
             if "mixes" in source.meta and func is not torch.autograd.grad:
                 raise Unfusable(source.meta["mixes"])
-        is_constant = func in LIKE and not self._has_rows(outputs[0])
+        axes = (None,) * len(outputs) if step is None else step.axes[:1] if inplace else step.results
+        is_constant = func in LIKE and axes == (None,)
         if not used or is_constant or not outputs or (not inplace and any(result is tensor for tensor in operands)):
             self.graph.erase_node(node)
             return
@@ -304,9 +290,9 @@ class Trace(TorchFunctionMode):
         if not inplace and not isinstance(result, Tensor):
             nodes = [self.graph.call_function(operator.getitem, (node, i)) for i in range(len(outputs))]
         node.meta["results"] = nodes
-        for value, tensor in zip(nodes, outputs, strict=True):
-            value.meta["counts"] = counts and not self._has_rows(tensor)
-            self._new(tensor, value, on)
+        for value, tensor, axis in zip(nodes, outputs, axes, strict=True):
+            value.meta["counts"] = counts and axis is None
+            self._new(tensor, value, on, axis)
         node.meta["on"] = on
 
     def _separate_gradients(self) -> None:
@@ -326,3 +312,11 @@ class Trace(TorchFunctionMode):
                     for user in [user for user in source.users if user is not new]:
                         user.replace_input_with(source, new)
                     new.meta.update(source.meta, results=[new], inplace=False, grad=True, line=node.meta["line"])
+
+
+def is_custom(node: fx.Node) -> bool:
+    """Returns whether a node is a ``torch.autograd.Function`` of the module, or one of its results."""
+    target = (
+        node.args[0].target if node.target is operator.getitem and isinstance(node.args[0], fx.Node) else node.target
+    )
+    return getattr(target, "__name__", "") == "apply"
