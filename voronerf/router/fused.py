@@ -100,29 +100,24 @@ class Fused:
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
         self.module, self.inputs = call.module, inputs
-        traced = Trace(self._with_inputs(call, tensors[0].device), tensors, inputs)
-        parts, self.reads = list(parts_of(call.module).values()), traced.reads
-        self._places = [(parts[i], i, name) for i, name in traced.places]
-        self._n, self._inputs, self._shared, self._parameters = (
-            traced.n,
-            traced.inputs,
-            traced.shared,
-            traced.parameters,
-        )
-        self.result, self._outputs = traced.result, traced.outputs
+        trace = Trace(self._with_inputs(call, tensors[0].device), tensors, inputs)
+        parts, self.reads = list(parts_of(call.module).values()), trace.reads
+        self._places = [(parts[i], i, name) for i, name in trace.places]
+        self._n, self._inputs, self._shared, self._parameters = trace.n, trace.inputs, trace.shared, trace.parameters
+        self.result, self._outputs = trace.result, trace.outputs
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         if not all(isinstance(value, fx.Node) and value.meta["on"] == SAMPLES for value in self._outputs):
             raise Unfusable("a result depends on no sample")
-        self._recorded = torch.is_grad_enabled() or any(node.meta.get("grad") for node in traced.graph.nodes)
-        self._differentiates = any(node.target is torch.autograd.grad for node in traced.graph.nodes)
-        self._lowering = Lowering(traced.rows)
+        self._recorded = torch.is_grad_enabled() or any(node.meta.get("grad") for node in trace.graph.nodes)
+        self._differentiates = any(node.target is torch.autograd.grad for node in trace.graph.nodes)
+        self._lowering = Lowering(trace.rows)
         self._entries: dict[fx.Node, Entries] = {}  # entries of each value that steps compute or move
         self._ready: dict[fx.Node, int] = {}  # the first run that can read each value from PyTorch
         self._reasons: dict[fx.Node, str] = {}
-        for node in traced.graph.nodes:
+        for node in trace.graph.nodes:
             self._add(node)
         needed = self._needed()
-        nodes = [node for node in traced.graph.nodes if node in needed and node.op == "call_function"]
+        nodes = [node for node in trace.graph.nodes if node in needed and node.op == "call_function"]
         self._weights = [node for node in nodes if node.meta["on"] != SAMPLES]
         self._between = [node for node in nodes if node.meta["on"] == SAMPLES]
         for node in self._between:
@@ -150,7 +145,7 @@ class Fused:
         self.why = (
             f"{len(self._runs)} run{'s' * (len(self._runs) > 1)}, between them {'; '.join(texts)}" if texts else ""
         )
-        for node in traced.graph.nodes:
+        for node in trace.graph.nodes:
             if isinstance(node.meta.get("value"), Tensor):
                 node.meta["dtype"] = node.meta.pop("value").dtype
         del self._lowering, self._entries

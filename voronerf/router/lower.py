@@ -547,9 +547,10 @@ class _EntryMode(TorchDispatchMode):
     def of_samples(self, tensor: Tensor, entries: Entries | None) -> Entries:
         """Expands a parameter or constant, equal for all samples, to a tensor of samples; returns its entries."""
         shape, rows = tensor.shape, self.lowering.rows
-        at = next((d for d, size in enumerate(shape) if size and size % rows == 0), None)
-        if at is None or not tensor.numel() or not (tensor.is_floating_point() or tensor.dtype == torch.bool):
+        dims = [d for d, size in enumerate(shape) if size and size % rows == 0]
+        if len(dims) != 1 or not tensor.numel() or not (tensor.is_floating_point() or tensor.dtype == torch.bool):
             raise NotAStep("a constant without samples")
+        (at,) = dims
         by_sample = (tensor if entries is None else entries.codes).movedim(at, 0).reshape(rows, -1)
         if not (by_sample == by_sample[:1]).all():
             raise NotAStep("a constant that differs between samples")
