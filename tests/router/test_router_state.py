@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import collections
 import copy
 import functools
+import math
 import types
 import warnings
 from collections.abc import Callable
@@ -95,6 +97,7 @@ class Keeps(nn.Module):
 
 
 @every_way
+@pytest.mark.filterwarnings("ignore:VoronoiRouter.*restored after the call")
 def test_a_module_that_keeps_results_in_containers(options: dict[str, Any]) -> None:
     field = Keeps()
     field(uniform((5,)))  # leaves results that require gradients
@@ -104,7 +107,7 @@ def test_a_module_that_keeps_results_in_containers(options: dict[str, Any]) -> N
         optimizer.zero_grad()
         router(x := uniform((40,))).square().sum().backward()
         optimizer.step()
-    assert len(router.module.inner["lists"]) == 1, "items that forward adds are dropped"
+    assert len(router.module.inner["lists"]) == 1 and len(router.module.outputs) == 1, "no call leaves items"
     for copied in (copy.deepcopy(router), router.part([0, 1, 2, 3])):
         torch.testing.assert_close(copied(x), router(x))
     assert router.cell(0)(x).shape == (40, 2)
@@ -172,6 +175,28 @@ class Sine(nn.Module):
         return torch.sin(self.fc(x) * self.frequency)
 
 
+class Scale:
+    __slots__ = ("factor",)
+
+    def __init__(self, factor: float) -> None:
+        self.factor = factor
+
+    def apply(self, x: Tensor) -> Tensor:
+        return x * self.factor
+
+
+def with_buffer(value: float) -> nn.Module:
+    module = Sine()
+    module.register_buffer("buffer", torch.tensor([value, math.nan]), persistent=False)
+    return module
+
+
+def nested(value: Any) -> Any:
+    for _ in range(9):
+        value = [value]
+    return value
+
+
 OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], nn.Module]]] = {
     "frequency": (Sine, lambda: Sine(10.0)),
     "act, a Tanh instead of a ReLU,": (lambda: Sine(act=nn.ReLU()), lambda: Sine(act=nn.Tanh())),
@@ -182,6 +207,10 @@ OTHERS: dict[str, tuple[Callable[[], nn.Module], Callable[[], nn.Module]]] = {
     "part": (lambda: Sine(part=functools.partial(torch.add, 1)), lambda: Sine(part=functools.partial(torch.add, 2))),
     "scale": (lambda: Sine(scale=lambda x: 2 * x), lambda: Sine(scale=lambda x: 3 * x)),
     "extra": (Sine, lambda: Sine(extra=1)),
+    "buffer": (lambda: with_buffer(1.0), lambda: with_buffer(2.0)),
+    "method": (lambda: Sine(method=Scale(1.0).apply), lambda: Sine(method=Scale(2.0).apply)),
+    "queue": (lambda: Sine(queue=collections.deque([1])), lambda: Sine(queue=collections.deque([2]))),
+    "nested": (lambda: Sine(nested=nested(1)), lambda: Sine(nested=nested(2))),
     "kept": (lambda: Sine(kept=types.SimpleNamespace(a=1)), lambda: Sine(kept=types.SimpleNamespace(a=2))),
     "class, a Sigmoid instead of a Tanh,": (nn.Tanh, nn.Sigmoid),
 }
@@ -203,10 +232,130 @@ def test_modules_that_keep_different_results_are_one_network_for_each_cell() -> 
     modules = [Keeps() for _ in CENTRES]
     for module in modules[1:]:
         module.last = module(uniform((7,)))
-    with pytest.raises(ValueError, match="module's inner must equal"):  # another number of kept results
-        VoronoiRouter.from_modules(modules, CENTRES, coords="first3")
-    for module in modules:
-        module.inner["lists"] = []
-        module.outputs.clear()
     router = VoronoiRouter.from_modules(modules, CENTRES, coords="first3")
-    assert router(uniform((9,))).shape == (9, 2)
+    x = uniform((9,))
+    torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0])
+    cell = router.cell(1)
+    with torch.no_grad():
+        cell(x)  # leaves results without gradients
+    router.load_cell(2, cell)
+
+
+# Containers that several submodules share -----------------------------------------------------------------------------
+
+
+class Block(nn.Module):
+    def __init__(self, store: Any) -> None:
+        super().__init__()
+        self.layer, self.store = nn.Linear(3, 3), store
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.layer(x)
+        self.store["losses"].append(y.square().sum(1))
+        return y * self.store["scale"]
+
+
+class Sharing(nn.Module):
+    """Blocks that exchange values through one dict, which also contains itself, and a schedule in a dict."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.store: dict[str, Any] = {"losses": [], "steps": 0}
+        self.store["self"] = self.store
+        self.blocks = nn.ModuleList([Block(self.store) for _ in range(2)])
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        self.store["scale"], self.store["losses"][:] = x[:, :1].exp(), []
+        self.store["steps"] += 1
+        y = self.blocks[1](self.blocks[0](x))
+        return y, torch.stack(self.store["losses"], 1).sum(1)
+
+
+@every_way
+def test_submodules_that_share_a_container(options: dict[str, Any]) -> None:
+    router = VoronoiRouter.from_modules([Sharing() for _ in CENTRES], CENTRES, coords="first3", **options)
+    with pytest.warns(
+        UserWarning, match="forward changes the items of Sharing.store, which are restored after the call"
+    ):
+        router(uniform((40,)))
+    for n in (40, 3):
+        x = uniform((n,))
+        expected, _ = masked_loop(router, router.assign(x), [x])
+        for actual, right in zip(router(x), expected, strict=True):
+            torch.testing.assert_close(actual, right, rtol=1e-4, atol=1e-5)
+    assert router.module.store.keys() == {"losses", "steps", "self"} and router.module.store["steps"] == 0
+    assert router.module.store["self"] is router.module.blocks[1].store is router.module.store
+
+
+# A forward that changes between calls ---------------------------------------------------------------------------------
+
+
+class Turning(nn.Module):
+    """A module that sets of attributes lead along other paths, which no function names or sizes show."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer, self.scale, self.other = nn.Linear(3, 12), nn.Parameter(torch.rand(4)), nn.Parameter(torch.rand(4))
+        self.dim, self.joined = 0, False
+
+    def forward(self, x: Tensor) -> Tensor:
+        n = len(x)
+        if self.joined:  # entries of a sample that are not adjacent
+            a, b = self.layer(torch.cat([x, -x])).chunk(2)
+            return a + b
+        h = self.layer(x).view(n, 3, 4).transpose(0, self.dim) * self.scale
+        shift = self.other.expand(n, 4) if self.dim else self.other.expand(4, 4)[0]
+        return h.transpose(0, self.dim).sum(1) + shift
+
+
+def test_steps_of_other_paths_are_recorded_and_compared_with_the_loop() -> None:
+    modules = [Turning() for _ in CENTRES]
+    router = VoronoiRouter.from_modules(modules, CENTRES, coords="first3", way="grouped")
+    for _ in range(2):
+        for dim, joined, n in (
+            (0, False, 50),
+            (1, False, 3),
+            (0, False, 4),
+            (1, False, 4),
+            (0, True, 50),
+            (1, False, 50),
+        ):
+            router.module.dim, router.module.joined, x = dim, joined, uniform((n,))
+            expected, _ = masked_loop(router, router.assign(x), [x])
+            torch.testing.assert_close(router(x), expected[0], rtol=1e-4, atol=1e-5)
+
+
+class Masked(nn.Module):
+    """BARF's schedule by a whole number: encoded features from ``bands`` on are 0."""
+
+    def __init__(self, use: Callable[[Any, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.layer, self.out, self.bands, self.use = nn.Linear(12, 6), nn.Linear(6, 2), 2, [use]
+
+    def forward(self, x: Tensor) -> Tensor:
+        e = torch.cat([x, x.sin(), x.cos(), x.square()], 1)
+        return self.out(torch.tanh(self.layer(self.use[0](self, e))))
+
+
+def masked(net: Any, e: Tensor) -> Tensor:
+    mask = torch.ones_like(e)
+    mask[:, net.bands :] = 0
+    return e * mask
+
+
+INDICES: dict[str, Callable[[Any, Tensor], Tensor]] = {
+    "a mask": masked,
+    "a slice": lambda net, e: torch.cat([e[:, : net.bands], 0 * e[:, net.bands :]], 1),
+    "a dimension": lambda net, e: e.view(-1, 12, 1, 1).transpose(1, net.bands % 3 + 1).flatten(1),
+    "a column": lambda net, e: e + e[:, net.bands : net.bands + 1],
+}
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter.*no longer fused")
+@pytest.mark.parametrize("name", INDICES)
+def test_a_number_that_is_an_index_is_followed(name: str) -> None:
+    router = VoronoiRouter.from_modules([Masked(INDICES[name]) for _ in CENTRES], CENTRES, coords="first3", fuse=True)
+    for bands in (2, 3, 5, 8, 4, 6, 7):
+        router.module.bands, x = bands, uniform((30,))
+        expected, _ = masked_loop(router, router.assign(x), [x])
+        torch.testing.assert_close(router(x), expected[0], rtol=1e-4, atol=1e-5)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from router_fields import masked_loop
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiDiagram
@@ -253,6 +254,35 @@ def test_refusals_name_a_written_buffer_and_a_distribution_that_checks(generator
         router_of(RunningMean(), generator, way="fastest")(torch.rand(100, 3, generator=generator))
     with pytest.raises(ValueError, match="mixes or selects them; pass validate_args=False to the distribution"):
         router_of(Gaussian(3, 2), generator, fuse=True, way="fused")(torch.rand(100, 3, generator=generator))
+
+
+class Forecast(nn.Module):
+    """Two recurrent layers with dropout between them, or a packed sequence."""
+
+    def __init__(self, packed: bool) -> None:
+        super().__init__()
+        self.layers, self.packed = nn.LSTM(3, 5, num_layers=2, dropout=0.5, batch_first=True), packed
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x.view(len(x), 2, 3)
+        if self.packed:
+            lengths = torch.full((len(x),), 2)
+            x = nn.utils.rnn.pack_padded_sequence(x, lengths, batch_first=True)
+        return self.layers(x)[1][0][-1]
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter")
+@pytest.mark.parametrize("packed", [False, True])
+def test_recurrent_layers_with_dropout_and_packed_sequences(packed: bool, generator: torch.Generator) -> None:
+    router, x = router_of(Forecast(packed), generator, way="fastest"), torch.rand(50, 6, generator=generator)
+    assert not torch.equal(router(x), router(x)), "dropout"
+    router.eval()
+    expected = masked_loop(router, router.assign(x[:, :3].contiguous()), [x])[0][0]
+    torch.testing.assert_close(router(x), expected, rtol=1e-4, atol=1e-5)
+    assert router.explain().split("\n")[-1].startswith("forward: cell by cell" if packed else "forward: grouped")
+    if not packed:
+        with pytest.raises(ValueError, match=r"torch\.lstm .*draws random numbers"):
+            router_of(Forecast(False), generator, fuse=True, way="fused")(x)
 
 
 # Parameters under other names -----------------------------------------------------------------------------------------

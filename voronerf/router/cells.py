@@ -11,7 +11,7 @@ import copy
 import fnmatch
 import functools
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from numbers import Number
 from typing import Any, cast
 
@@ -19,12 +19,12 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.router.double import moved
-from voronerf.router.grouping import HIDDEN, SHARED, cell_parameters, owned_parameters, parts_of
+from voronerf.router.grouping import CHANGES, HIDDEN, HOLDERS, SHARED, cell_parameters, owned_parameters, parts_of
 from voronerf.router.layout import reachable
 
 _OP = "VoronoiRouter"
 _REGISTRIES = ("_parameters", "_buffers", "_modules")
-_PRIVATE = {*vars(nn.Module()), SHARED, HIDDEN, "_flat_weight_refs"}
+_PRIVATE = {*vars(nn.Module()), SHARED, HIDDEN, HOLDERS, CHANGES, "_flat_weight_refs"}
 
 
 def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
@@ -85,21 +85,21 @@ def check_module(module: nn.Module) -> None:
 
 
 def hide_parts(module: nn.Module) -> None:
-    """Notes which submodules hold parameters or submodules in other attributes, and submodules that only these hold."""
-    registered = set(map(id, module.parameters()))
-    for part in list(parts_of(module).values()):
-        known, items = parts_of(module), [*_held(part)]
-        modules = {id(item): item for item in items if isinstance(item, nn.Module) and id(item) not in known}
-        hidden = [item for item in modules.values() if any(id(p) in registered for p in item.parameters())]
-        if hidden or any(id(item) in registered or id(item) in known for item in items):
-            vars(part)[HIDDEN] = hidden
-        for item in hidden:
-            hide_parts(item)
-
-
-def _held(part: nn.Module) -> Iterator[Any]:
-    """Yields the modules, tensors and functions in the attributes of a submodule, without registered ones."""
-    return reachable({name: value for name, value in vars(part).items() if name not in _REGISTRIES})
+    """Notes which attributes hold parameters or submodules (HOLDERS), and submodules that only these hold (HIDDEN)."""
+    registered, waiting = set(map(id, module.parameters())), list(parts_of(module).values())
+    while waiting:
+        part, known = waiting.pop(), parts_of(module)
+        holders, hidden = list[str](), dict[int, nn.Module]()
+        for name, value in vars(part).items():
+            for item in () if name in _REGISTRIES else reachable(value):
+                is_module = isinstance(item, nn.Module)
+                if is_module and id(item) not in known and any(id(p) in registered for p in item.parameters()):
+                    hidden[id(item)] = item
+                if id(item) in registered or id(item) in known or id(item) in hidden:
+                    holders.append(name)
+        if holders:
+            vars(part).update({HOLDERS: (*dict.fromkeys(holders),), HIDDEN: [*hidden.values()]})
+            waiting += hidden.values()
 
 
 def _check_reach(module: nn.Module, registered: set[int]) -> None:
@@ -213,6 +213,7 @@ def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
 @torch.no_grad()
 def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None:
     """Copies a plain module's parameters into one cell; raises ValueError if the modules differ in anything else."""
+    module = getattr(module, "_orig_mod", module)
     stacked = {id(parameter) for parameter in cell_parameters(routed)}
     ours, theirs = routed.state_dict(keep_vars=True), module.state_dict()
     odd = sorted(ours.keys() ^ theirs.keys())
@@ -222,7 +223,7 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
         shape, value = tensor.shape[id(tensor) in stacked :], theirs[name]
         if value.shape != shape:
             raise ValueError(f"{op}: module's {name} must have shape {list(shape)}, got {list(value.shape)}")
-        if id(tensor) not in stacked and not torch.equal(value.to(tensor), tensor):
+        if id(tensor) not in stacked and not _equal(value.to(tensor), tensor):
             raise ValueError(f"{op}: module's {name} must equal the router's, since all cells share it")
     if other := _difference(routed, module):
         raise ValueError(f"{op}: module's {other} must equal the router's, since all cells share it")
@@ -231,16 +232,16 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
             tensor[index] = theirs[name].to(tensor)
 
 
-def _difference(ours: nn.Module, theirs: nn.Module, seen: set[int] | None = None) -> str:
+def _difference(ours: nn.Module, theirs: nn.Module, seen: dict[int, Any] | None = None) -> str:
     """Returns the name of a submodule of another class, or of an attribute of another value; "" if there is none."""
-    others, seen = dict(theirs.named_modules()), set() if seen is None else seen
+    others, seen = dict(theirs.named_modules()), {} if seen is None else seen
     for name, part in ours.named_modules():
         other, prefix = cast(nn.Module, others.get(name)), f"{name}." if name else ""
         if _class_of(other) != _class_of(part):
             return f"{name or 'class'}, a {type(other).__name__} instead of a {type(part).__name__},"
         if id(part) in seen:
             continue
-        seen.add(id(part))
+        seen[id(part)] = part
         ours_by_name, theirs_by_name = _attributes(part), _attributes(other)
         for key in sorted(ours_by_name.keys() | theirs_by_name.keys()):
             if not _same(ours_by_name.get(key), theirs_by_name.get(key), seen):
@@ -254,16 +255,17 @@ def _class_of(value: Any) -> tuple[str, str]:
 
 
 def _attributes(part: nn.Module) -> dict[str, Any]:
-    """Returns the attributes of a submodule by which its results may differ, without parameters, buffers and parts.
+    """Returns the attributes of a submodule by which its results may differ, without its state and its parts.
 
     Weight norm and pruning compute an attribute such as ``weight`` from parameters such as ``weight_v``.
     """
     computed = {name.rpartition("_")[0] for name in part._parameters}
     members = {name: value for name, value in vars(part).items() if name not in _PRIVATE and name not in computed}
+    members |= {name: part._buffers[name] for name in part._non_persistent_buffers_set}
     return members | {name: [*vars(part)[name].values()] for name in ("_forward_hooks", "_forward_pre_hooks")}
 
 
-def _same(a: Any, b: Any, seen: set[int]) -> bool:
+def _same(a: Any, b: Any, seen: dict[int, Any]) -> bool:
     """Returns whether two attributes are equal; parameters, and tensors that a call has left there, equal any value."""
     if a is b or any(isinstance(x, Tensor) and (x.requires_grad or not x.is_leaf) for x in (a, b)):
         return True
@@ -273,34 +275,47 @@ def _same(a: Any, b: Any, seen: set[int]) -> bool:
         return False
     if isinstance(a, nn.Module):
         return not _difference(a, b, seen)
-    if isinstance(a, Tensor):
-        return torch.equal(a, b.to(a.device))
-    if hasattr(a, "__array__"):
-        return a.shape == b.shape and bool((a == b).all())
-    if isinstance(a, types.MethodType):
-        return a.__func__ is b.__func__
-    ours, theirs = _parts(a), _parts(b)
+    if isinstance(a, Tensor) or hasattr(a, "__array__"):
+        return _equal(a, b)
+    ours, theirs = _parts(a, b), _parts(b, a)
     if ours is None or theirs is None:
         return bool(a == b)
     if id(a) in seen:
         return True
-    seen.add(id(a))
+    seen[id(a)] = a  # keeps the object alive, and so its id
     return len(ours) == len(theirs) and all(_same(x, y, seen) for x, y in zip(ours, theirs, strict=True))
 
 
-def _parts(value: Any) -> list[Any] | None:
-    """Returns the objects that define a function, a container or an object; None for a value that compares itself."""
+def _equal(a: Any, b: Any) -> bool:
+    """Returns whether two tensors or arrays have the same shape and numbers; NaN equals NaN."""
+    if a.shape != b.shape:
+        return False
+    a, b = (x.detach().to_dense().cpu() if isinstance(x, Tensor) and x.layout != torch.strided else x for x in (a, b))
+    b = b.to(a.device) if isinstance(a, Tensor) else b
+    return bool(((a == b) | ((a != a) & (b != b))).all())
+
+
+def _parts(value: Any, other: Any) -> list[Any] | None:
+    """Returns the objects that define a function, a container or an object; None for a value that compares itself.
+
+    A call may have left tensors in one of two containers, under further keys or at the end; these do not count.
+    """
     if isinstance(value, types.FunctionType):
-        return [value.__code__, value.__defaults__, *(cell.cell_contents for cell in value.__closure__ or ())]
+        options, cells = value.__kwdefaults__ or {}, value.__closure__ or ()
+        return [value.__code__, value.__defaults__, *options.values(), *(cell.cell_contents for cell in cells)]
+    if isinstance(value, types.MethodType):
+        return [value.__func__, *([] if isinstance(value.__self__, nn.Module) else [value.__self__])]
     if isinstance(value, functools.partial):
         return [value.func, value.args, value.keywords]
     if isinstance(value, dict):
-        return [*value, *value.values()]
+        kept = {key: item for key, item in value.items() if key in other or not isinstance(item, Tensor)}
+        return [part for key in sorted(kept, key=repr) for part in (key, kept[key])]
     if isinstance(value, (list, tuple)):
-        return list(value)
-    if hasattr(value, "__dict__") and not isinstance(value, type):
-        return _parts(vars(value))
-    compares = callable(value) or vars(type(value)).get("__eq__", object.__eq__) is not object.__eq__
+        return [item for at, item in enumerate(value) if at < len(other) or not isinstance(item, Tensor)]
+    slots = [name for kind in type(value).__mro__ for name in getattr(kind, "__slots__", ())]
+    if (slots or hasattr(value, "__dict__")) and not isinstance(value, type):
+        return [getattr(value, "__dict__", None), *(getattr(value, name, None) for name in slots)]
+    compares = callable(value) or type(value).__dict__.get("__eq__", object.__eq__) is not object.__eq__
     return None if compares else []  # an object without attributes, such as a lock, tells nothing
 
 

@@ -292,7 +292,9 @@ class Dispatch:
         new = {source for source in changed if source not in refused and is_number(value(source))}
         sources = frozenset(new | fused.inputs.sources)
         present = [fused.inputs] if fused.inputs.sources else []
-        tried = [Inputs(sources, dtype) for dtype in NUMBERS] if new else []
+        earlier = [(s, plans[0].constants.get(s) if isinstance(s, str) else plans[0].watch.value(s)) for s in new]
+        others = tuple((source, old) for source, old in earlier if is_number(old) and old is not value(source))
+        tried = [Inputs(sources, dtype, others) for dtype in NUMBERS] if new else []
         return [*tried, *present, Inputs()], ""
 
     def _choose(self, plan: CallPlan, call: Call, grouping: Grouping) -> tuple[Way, str]:
@@ -376,7 +378,7 @@ class Dispatch:
             if isinstance(way, Fused) or not error.is_new or recorded():
                 raise
         with self._lock, _own_randomness(grouping), aside(call) as copied:
-            way.records[:] = [*way.records[1 - _TRACES :], Probe(copied, grouping).steps()]
+            way.records = [*way.records[1 - _TRACES :], Probe(copied, grouping).confirmed_steps()]
         return way.run(call, grouping)
 
     def _run_apart(self, plan: CallPlan, call: Call, grouping: Grouping, frozen: Tensor) -> Results:

@@ -6,7 +6,6 @@ The module itself never changes, so other threads may save, copy or call it at a
 from __future__ import annotations
 
 import contextlib
-import copy
 import functools
 import math
 import operator
@@ -19,15 +18,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf.router.grouping import HIDDEN, parts_of
+from voronerf.router.grouping import CHANGES, HOLDERS, parts_of
 from voronerf.router.layout import Call, map_tree, reachable
 
 _OP = "VoronoiRouter"
 _PLAIN = {type(None), bool, int, float, str, type, torch.dtype, torch.device, torch.Size, types.FunctionType, Tensor}
 _LAYERS = "torch.nn.modules."  # modules from this package assign no attributes in ``forward``
 _REGISTRIES, _OF_HOOKS = ("_parameters", "_buffers", "_modules"), (OrderedDict, dict, set)
-_SEARCHED = 1000  # maximum number of searched objects in an attribute, unless wrapping found parameters or submodules
-_OWN = frozenset(vars(nn.Module()))  # attributes that every module has
+_SEARCHED = 1000  # maximum number of searched objects in an attribute that is not one of HOLDERS
 
 
 class Forbidden(TypeError):
@@ -37,8 +35,8 @@ class Forbidden(TypeError):
 class Double:
     """A copy of a module tree that shares its buffers and has its own registries of parameters.
 
-    Each run starts with the module's attributes; attributes that ``forward`` assigns, and items that it puts into
-    lists, dicts and sets, are dropped after the run. Parameters and submodules in other attributes are replaced, too.
+    Each run starts with the module's attributes; attributes that ``forward`` assigns are dropped after the run, and the
+    items of :data:`CHANGES` are restored. Parameters and submodules in other attributes are replaced, too.
 
     Args:
         module: The routed module, or a field.
@@ -59,7 +57,7 @@ class Double:
         self._places: list[tuple[dict[str, Any], str, int]] = []
         self._assignable: list[tuple[int, nn.Module, dict[str, Any]]] = []  # submodules that may assign attributes
         self._registries: list[tuple[nn.Module, dict[str, Any], set[str]]] = []
-        self._containers: list[tuple[dict[str, Any], str]] = []  # attributes of which each run gets a copy
+        self._containers: list[Any] = []  # lists, dicts and sets whose items are restored after each run
         self._held: list[tuple[dict[str, Any], dict[str, Any], str, Any]] = []  # attributes that hold parameters
         self.assigned: dict[tuple[int, str], Any] = {}
         parameters = {id(p) for part in parts.values() for p in part._parameters.values()}
@@ -71,15 +69,15 @@ class Double:
             members["_buffers"] = dict(part._buffers)
             members["_modules"] = {name: twins.get(id(child), child) for name, child in part._modules.items()}
             rest = [item for item in members.items() if type(item[1]) not in _PLAIN and item[0] not in _REGISTRIES]
-            most = math.inf if HIDDEN in members else _SEARCHED
+            holders = members.get(HOLDERS, ())
             for name, value in rest:  # nearly all are empty dicts of hooks
+                most = math.inf if name in holders else _SEARCHED
                 held = () if type(value) in _OF_HOOKS and not value else [*map(id, reachable(value, most))]
                 if any(key in parts for key in held):
                     members[name] = moved(value, twins)
                 if any(key in parameters for key in held):
                     self._held.append((vars(twin), members, name, members[name]))
-                if name not in _OWN and isinstance(value, (dict, list, set)):
-                    self._containers.append((vars(twin), name))
+            self._containers += [members[name] for name in members.get(CHANGES, ()) if name in members]
             if isinstance(part, nn.RNNBase):  # it would move the weights of cells to other memory
                 members["flatten_parameters"] = _nothing
             vars(twin).update(members)
@@ -105,18 +103,19 @@ class Double:
         """
         copied = Call(self.module, call.method, call.layout, call.names, call.args, call.kwargs, call.kinds)
         placed, versions, results = list[tuple[dict[str, Any], str, Any]](), list[int](), []
+        items = items_of(self._containers)
         try:
             with mode or contextlib.nullcontext():
                 for rows, parameters in zip(parts, values, strict=True):
                     placed = self.fill(parameters)
                     versions = versions or _versions(placed)
-                    for attributes, name in self._containers:
-                        attributes[name] = _copied(attributes[name])
                     results.append(copied.run(rows))
                     self._restore_attributes()
+                    _restore_items(items)
         finally:
             self._check(call.name, placed, versions)
             self._restore_attributes()
+            _restore_items(items)
         return results
 
     def _check(self, name: str, placed: list[tuple[dict[str, Any], str, Any]], versions: list[int]) -> None:
@@ -228,13 +227,22 @@ def _nothing() -> None:
     """Does nothing."""
 
 
-def _copied(value: Any) -> Any:
-    """Copies a container and the containers in it, but no other items."""
-    if type(value) is dict:
-        return {key: _copied(item) for key, item in value.items()}
-    if type(value) is list:
-        return [_copied(item) for item in value]
-    return copy.copy(value) if isinstance(value, (dict, list, set)) else value
+def items_of(containers: Iterable[Any]) -> list[tuple[Any, Any]]:
+    """Lists (container, copy) of lists, dicts and sets, and of those in them."""
+    pending, items = list(containers), dict[int, tuple[Any, Any]]()
+    while pending:
+        container = pending.pop()
+        if isinstance(container, (list, dict, set)) and id(container) not in items:
+            items[id(container)] = container, container.copy()
+            pending += container.values() if isinstance(container, dict) else container
+    return list(items.values())
+
+
+def _restore_items(items: list[tuple[Any, Any]]) -> None:
+    """Gives containers the items that they had in :func:`items_of`."""
+    for container, copied in items:
+        container.clear()
+        container.extend(copied) if isinstance(container, list) else container.update(copied)
 
 
 def moved(value: Any, twins: Mapping[int, Any]) -> Any:

@@ -398,7 +398,9 @@ class Fused:
     def _with_inputs(self, call: Call, device: torch.device) -> Call:
         """Returns the call with tensors instead of the numbers that are inputs of the trace."""
         names = {source for source in self.inputs.sources if isinstance(source, str)}
-        return call.with_tensors(names, lambda value: self.inputs.tensor(value, device)) if names else call
+        if not names:
+            return call
+        return call.with_leaves(lambda name, leaf: self.inputs.tensor(leaf, device) if name in names else leaf)
 
     def _compute(self, values: dict[Any, Any], grouping: Grouping, sort: bool) -> None:
         order = None if sort else grouping.source
@@ -487,6 +489,7 @@ def _meets_cells(node: fx.Node) -> bool:
 def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None:
     """Calls a node's function; a function of the cells' parameters is called for all cells at once."""
     meets_cells = _meets_cells(node)
+    grouped.counted = any(type(values[source]) is int for source in node.all_input_nodes)
 
     def argument(source: fx.Node) -> Any:
         value = values[source]

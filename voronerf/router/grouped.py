@@ -15,19 +15,20 @@ import inspect
 import itertools
 import linecache
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any, NamedTuple, Protocol
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.axes import Axis, Count, axis_of, multiple
 from voronerf.router.double import Double
 from voronerf.router.grouping import Grouping, cell_parameters, cells_of
-from voronerf.router.layout import Call, Results, map_tensors, map_tree, split_rows, tensors_of
+from voronerf.router.layout import Call, Results, map_tensors, split_rows, tensors_of
 from voronerf.router.norms import EXACT
 
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
@@ -69,6 +70,8 @@ RANDOM = find(
     torch.nn.functional,
 )
 """The functions that draw random numbers."""
+RECURRENT = find("lstm gru rnn_tanh rnn_relu", torch)
+"""The functions of recurrent layers; their only argument of type float is the dropout between layers."""
 LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
 """The functions that make tensors of another tensor's dtype, and read none of its values."""
 _TO = find("to type_as", torch.Tensor)
@@ -104,8 +107,19 @@ class NoRandomness(TorchFunctionMode):
         return without_randomness(func, args, kwargs or {})
 
 
+def is_random(func: Any, args: Any, kwargs: Any) -> bool:
+    """Returns whether a function draws random numbers."""
+    if func in RECURRENT:
+        _, dropout, training, *_ = [value for value in args if isinstance(value, (bool, int, float))][1:]
+        return bool(dropout and training)
+    is_identity = func is F.dropout and not (kwargs["training"] and kwargs["p"])
+    return func in RANDOM and not is_identity
+
+
 def without_randomness(func: Any, args: Any, kwargs: Any) -> Any:
     """Calls a function with random numbers of 0 and without dropout."""
+    if func in RECURRENT:
+        return func(*(0.0 if type(value) is float else value for value in args), **kwargs)
     if func not in RANDOM:
         return func(*args, **kwargs)
     if "dropout" in getattr(func, "__name__", ""):
@@ -265,45 +279,40 @@ def text_of_line(file: str, number: int) -> str:
 class Step(NamedTuple):
     """One function that a module calls: the axes of the tensors among its arguments and among its results.
 
-    ``counts`` has the multiple of n of each integer among its arguments; it is empty if no integer counts samples.
+    ``integers`` are the integers among its arguments, and ``counts`` has the multiple of n of each that counts samples.
     ``varies`` tells whether another size of its arguments depends on n without being a multiple of it.
     """
 
     function: Any
     axes: tuple[Axis | None, ...]
+    integers: tuple[int, ...]
     counts: tuple[int, ...]
     results: tuple[Axis | None, ...]
     varies: bool
 
 
-def integers_of(value: Any) -> list[int]:
-    """Lists the integers of a structure."""
+def integers_of(items: Iterable[Any]) -> list[int]:
+    """Lists the integers among arguments, also in lists, tuples and dicts."""
     integers: list[int] = []
-
-    def note(name: str, leaf: Any, nested: bool) -> Any:
-        integers.extend([leaf] * (type(leaf) is int))
-        return leaf
-
-    map_tree(value, note)
+    for item in items:
+        if isinstance(item, int):
+            integers.append(item)
+        elif isinstance(item, (list, tuple)):
+            integers += integers_of(item)
+        elif isinstance(item, dict):
+            integers += integers_of(item.values())
     return integers
 
 
-def has_counts(value: Any) -> bool:
-    """Returns whether a structure has a :class:`Count`."""
-    counts: list[Any] = []
-
-    def note(name: str, leaf: Any, nested: bool) -> Any:
-        counts.extend([leaf] * isinstance(leaf, Count))
-        return leaf
-
-    map_tree(value, note)
-    return bool(counts)
-
-
-def with_counts(value: Any, counts: Sequence[int]) -> Any:
-    """Returns a structure in which the integers with a multiple in ``counts`` are a :class:`Count`."""
-    following = iter(counts)
-    return map_tree(value, lambda _, leaf, nested: Count(leaf) if type(leaf) is int and next(following, 0) else leaf)
+def with_counts(value: Any, counts: Iterator[int]) -> Any:
+    """Returns arguments in which the integers with a multiple in ``counts`` are a :class:`Count`."""
+    if isinstance(value, int):
+        return Count(value) if next(counts) else value
+    if type(value) in (list, tuple, torch.Size):
+        return tuple(with_counts(item, counts) for item in value)
+    if isinstance(value, dict):
+        return {key: with_counts(item, counts) for key, item in value.items()}
+    return value
 
 
 class Recorder(TorchFunctionMode):
@@ -317,7 +326,10 @@ class Recorder(TorchFunctionMode):
         kwargs = kwargs or {}
         if func in METADATA:
             return func(*args, **kwargs)
-        shapes, integers = [tensor.shape for tensor in tensors_of((args, kwargs))], integers_of((args, kwargs))
+        shapes, integers = (
+            [tensor.shape for tensor in tensors_of((args, kwargs))],
+            integers_of((*args, *kwargs.values())),
+        )
         result = func(*args, **kwargs)
         self.calls.append((func, shapes, integers, [tensor.shape for tensor in tensors_of(result)]))
         return result
@@ -339,7 +351,8 @@ def steps_of(runs: Sequence[Recorder], n: Sequence[int]) -> list[Step]:
             *(m or a == b for m, (a, b) in zip(counts, integers)),
         ]
         results = tuple(axis_of(*pair, n) for pair in zip(one[3], other[3]))
-        steps.append(Step(one[0], tuple(axes), tuple(counts) if any(counts) else (), results, not all(fits)))
+        constants = tuple(0 if m else value for m, value in zip(counts, one[2]))
+        steps.append(Step(one[0], tuple(axes), constants, tuple(counts) if any(counts) else (), results, not all(fits)))
     return steps
 
 
@@ -350,8 +363,7 @@ class GroupedRun(TorchFunctionMode):
         grouping: The samples by cell.
         tables: The look-up tables that the call has read, with buffers for their gradients. If the rows of the call are
             run in parts, all parts share this dict.
-        records: The known sequences of the module's functions; the latest is tried first. None if the caller itself
-            marks all rows with their axis.
+        steps: The module's functions; None if the caller itself marks all rows with their axis.
         quiet: Whether random numbers are 0.
 
     Attributes:
@@ -363,7 +375,7 @@ class GroupedRun(TorchFunctionMode):
         self,
         grouping: Grouping,
         tables: dict[Any, Any],
-        records: Sequence[list[Step]] | None = None,
+        steps: list[Step] | None = None,
         quiet: bool = False,
     ) -> None:
         super().__init__()
@@ -371,7 +383,8 @@ class GroupedRun(TorchFunctionMode):
         self.failed: Ungroupable | None = None
         self.widest = 1
         self._token = object()
-        self._records, self._steps, self._at = records, records[-1] if records else [], 0
+        self.counted = False  # whether an argument of the function is a Count
+        self._steps = None if steps is None else iter(steps)
 
     # For rules --------------------------------------------------------------------------------------------------------
 
@@ -415,27 +428,27 @@ class GroupedRun(TorchFunctionMode):
 
     # Functions --------------------------------------------------------------------------------------------------------
 
-    def _step(self, func: Any) -> Step | None:
-        """Returns the step of the next function, in a known sequence that begins like this run."""
-        if self._records is None:
+    def _step(self, func: Any, args: Any, kwargs: Any) -> Step | None:
+        """Returns the step of the next function, after a comparison with its name and its integers."""
+        if self._steps is None:
             return None
-        at, self._at = self._at, self._at + 1
-        if at >= len(self._steps) or self._steps[at].function != func:
-            begun = [step.function for step in self._steps[:at]]
-            for steps in self._records:
-                if [step.function for step in steps[: at + 1]] == [*begun, func]:
-                    self._steps = steps
-                    break
-            else:
-                raise self.fail("its forward calls other functions than before", of_batch=True, is_new=True)
-        return self._steps[at]
+        step = next(self._steps, None)
+        if step is not None and step.function == func:
+            integers, counts = integers_of((*args, *kwargs.values())), step.counts or (0,) * len(step.integers)
+            if len(integers) == len(counts) and all(
+                value == m * self.n if m else value == constant
+                for value, m, constant in zip(integers, counts, step.integers)
+            ):
+                self.counted = bool(step.counts)
+                return step
+        raise self.fail("its forward calls other functions than before", of_batch=True, is_new=True)
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Runs one PyTorch function of the module."""
         kwargs = kwargs or {}
         if func in METADATA:
             return func(*args, **kwargs)
-        step = self._step(func)
+        step = self._step(func, args, kwargs)
         func, args = converted(func, args)
         if func in LIKE and type(args[0]) is PerCell:
             args = (args[0].stacked, *args[1:])
@@ -477,11 +490,12 @@ class GroupedRun(TorchFunctionMode):
                     self.mark(tensor, axis)
                 elif axis is not None and type(tensor) is not PerCell:
                     raise self.fail(f"{name_of(func)} takes rows that were not computed by a recorded PyTorch function")
-            args, kwargs = with_counts((args, kwargs), step.counts) if step.counts else (args, kwargs)
+            if step.counts:
+                args, kwargs = with_counts((args, kwargs), iter(step.counts))
         rule = _RULES.get(func)
         result = NotImplemented if rule is None else rule(self, *args, **kwargs)
         if result is NotImplemented:
-            if any(self.is_rows(tensor) for tensor in operands) or has_counts((args, kwargs)):
+            if any(self.is_rows(tensor) for tensor in operands) or self.counted:
                 raise self.fail(
                     f"{name_of(func)} takes parameters, and has no rule for all cells at once; "
                     "voronerf.router.register adds a rule"
@@ -535,16 +549,24 @@ class Grouped:
             pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
         values, widest, tables, double = [], 1, dict[Any, Any](), Double(call.module)
         for part, rows in zip(parts, split_rows(arguments, [part.n for part in parts]), strict=True):
-            run = GroupedRun(part, tables, self.records, self.quiet)
-            for tensor in rows:
-                run.mark(tensor, Axis(0))
             origin = part.start
             stand_ins = {id(p): PerCell(piece[origin], (p, origin)) for p, piece in pieces}
-            with run:
-                values.append(double.run(call, rows, stand_ins))
+            for steps in reversed(self.records):
+                run = GroupedRun(part, tables, steps, self.quiet)
+                for tensor in rows:
+                    run.mark(tensor, Axis(0))
+                try:
+                    value = double.run(call, rows, stand_ins, run)
+                except Exception:
+                    if run.failed is None:
+                        raise
+                if run.failed is None or not run.failed.is_new:
+                    break
             if run.failed is not None:
                 raise run.failed
-            if any(isinstance(tensor, PerCell) for tensor in tensors_of(values[-1])):
+            self.records = [*(other for other in self.records if other is not steps), steps]
+            values.append(value)
+            if any(isinstance(tensor, PerCell) for tensor in tensors_of(value)):
                 raise Ungroupable("a result is made of parameters alone")
             widest = max(widest, run.widest)
         self.widest = widest

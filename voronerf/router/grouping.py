@@ -21,9 +21,11 @@ SHARED = "_voronerf_shared"
 
 
 HIDDEN = "_voronerf_hidden"
-"""The attribute that lists the unregistered submodules in other attributes of a submodule, such as lists.
-
-It exists if such an attribute holds a parameter or a submodule."""
+"""The attribute of a submodule that lists the unregistered submodules in its other attributes, such as lists."""
+HOLDERS = "_voronerf_holders"
+"""The attribute that names the attributes of a submodule in which wrapping found parameters or submodules."""
+CHANGES = "_voronerf_changes"
+"""The attribute that names the lists, dicts and sets of a submodule whose items ``forward`` changes."""
 
 
 class Grouping:

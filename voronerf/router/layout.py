@@ -12,7 +12,7 @@ import functools
 import inspect
 import math
 import types
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -64,8 +64,8 @@ def reachable(value: Any, most: float = math.inf) -> Iterator[Any]:
     Stops after ``most`` objects.
     """
     pending, seen = [value], dict[int, Any]()
-    while pending and len(seen) < most:
-        item = pending.pop()
+    while pending and most > 0:
+        item, most = pending.pop(), most - 1
         if type(item) in _LEAVES or id(item) in seen:
             continue
         seen[id(item)] = item  # keeps the item alive, and so its id
@@ -289,10 +289,10 @@ class Call:
             map_tree(value, note, name)
         return constants
 
-    def with_tensors(self, names: Container[str], make: Callable[[Any], Tensor]) -> Call:
-        """Returns the call with the named numbers replaced by shared tensors."""
+    def with_leaves(self, change: Callable[[str, Any], Any]) -> Call:
+        """Returns the call with ``change(name, leaf)`` instead of each leaf of the arguments."""
         arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
-        values = [map_tree(v, lambda name, leaf, _: make(leaf) if name in names else leaf, n) for n, v in arguments]
+        values = [map_tree(value, lambda name, leaf, _: change(name, leaf), name) for name, value in arguments]
         args, kwargs = tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
         call = dataclasses.replace(self, args=args, kwargs=kwargs, kinds=dict(self.kinds))
         call.changed(lambda tensor, kind: tensor)

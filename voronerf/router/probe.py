@@ -19,7 +19,7 @@ from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.ops._core.tolerances import agree, agree_gradients
 from voronerf.router.axes import multiple
 from voronerf.router.cells import clone_module
-from voronerf.router.double import Double, Forbidden
+from voronerf.router.double import Double, Forbidden, items_of
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import (
     Grouped,
@@ -32,10 +32,10 @@ from voronerf.router.grouped import (
     steps_of,
     text_of_line,
 )
-from voronerf.router.grouping import Grouping, cell_parameters, parts_of
+from voronerf.router.grouping import CHANGES, Grouping, cell_parameters, parts_of
 from voronerf.router.layout import BROADCAST, RAY, Call, Results, as_plain, map_tensors, map_tree, tensors_of
 from voronerf.router.trace import Unfusable
-from voronerf.router.watch import Inputs
+from voronerf.router.watch import Inputs, Source
 
 _OP = "VoronoiRouter"
 FEWEST = 8  # minimum number of samples in a probe; a smaller batch is extended by similar samples
@@ -43,6 +43,8 @@ _SAMPLES, _CELLS = 41, 3  # numbers of samples and cells of a probe
 _COUNTS = (_SAMPLES, 37)  # numbers of samples by which sizes that count samples differ from other sizes
 _FEW = 8  # rows for the check whether a module needs a subclass of tensors
 _PIECE = 8 << 20  # bytes of the largest tensor in a piece of rows on a CPU; larger tensors outgrow the cache
+
+_OWN = frozenset(vars(nn.Module()))  # attributes that every module has
 
 Outcome = tuple[Results, list[Tensor]]  # results and gradients
 
@@ -66,10 +68,19 @@ class Recording(NamedTuple):
 
 
 class Probe:
-    """A copy of a module with three cells of different parameters, and a few samples of a call in these cells."""
+    """A copy of a module with three cells of different parameters, and a few samples of a call in these cells.
 
-    def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
-        self._source = call, grouping
+    ``others`` are values of arguments, attributes and buffers that replace the current ones.
+    """
+
+    def __init__(
+        self,
+        call: Call,
+        grouping: Grouping,
+        dtype: torch.dtype | None = None,
+        others: Sequence[tuple[Source, Any]] = (),
+    ) -> None:
+        self._source, self._others = (call, grouping), others
         self.refused = ""  # why a changed value cannot be an input
         self.counts: dict[str, int] = {}  # for each number in the results that counts samples, its multiple of n
         device, generator = grouping.device, torch.Generator().manual_seed(0)
@@ -90,7 +101,14 @@ class Probe:
             return copied
 
         args, kwargs = map_tensors((call.args, call.kwargs), leaf)
+        parts, arguments = [*parts_of(module).values()], {s: value for s, value in others if isinstance(s, str)}
         self._call = replace(call, module=module, args=args, kwargs=kwargs)
+        if arguments:
+            self._call = self._call.with_leaves(arguments.get)
+        for source, value in others:
+            if not isinstance(source, str):
+                part = parts[source[0]]
+                (part._buffers if source[1] in part._buffers else vars(part))[source[1]] = value
 
     def find_ways(
         self, options: Options, warn_once: Callable[[str, str], None], inputs: Sequence[Inputs], too_many: str = ""
@@ -117,9 +135,7 @@ class Probe:
             return [Loop(why)], False
         steps: Callable[[], list[Step]] = self.steps
         with contextlib.suppress(Exception):  # the ways name the reason
-            recording = self.recorded()
-            self._note_numbers(recording, warn_once)
-            steps = functools.partial(steps_of, recording.runs, _COUNTS)
+            steps = functools.partial(steps_of, self.note_changes(warn_once).runs, _COUNTS)
         ways, may_group, unfused = list[Way](), False, too_many
         if unfused:
             warn_once(f"changes {call.method}", f"{call.name} is {unfused}")
@@ -158,6 +174,13 @@ class Probe:
         """Returns the steps of the module; see :class:`Recording`."""
         return steps_of(self.recorded().runs, _COUNTS)
 
+    def confirmed_steps(self) -> list[Step]:
+        """Returns the steps of the module, with which it runs grouped like the loop; raises :class:`Ungroupable`."""
+        steps, loop = self.steps(), Loop()
+        if not self._agrees(Grouped([steps], quiet=True), loop, self._outcome(loop)):
+            raise Ungroupable("its forward gives other results than the loop over cells", of_batch=True)
+        return steps
+
     def recorded(self, reads: set[tuple[int, str]] | None = None) -> Recording:
         """Runs the first cell's module with two numbers of samples, and records the runs."""
         rows, runs, leaves = self._call.arranged(self._entries), (Recorder(), Recorder()), list[dict[str, Any]]()
@@ -173,6 +196,24 @@ class Probe:
                 leaves.append({})
                 map_tree(double.run(self._call, [tensor[:count] for tensor in rows], cell, recorder), note)
         return Recording(runs, leaves, double)
+
+    def note_changes(self, warn_once: Callable[[str, str], None]) -> Recording:
+        """Records the module, and notes what calls cannot keep: items of containers (CHANGES), numbers, and counts."""
+        places = [
+            (place, name, items_of([value]))
+            for place, part in enumerate(parts_of(self._call.module).values())
+            for name, value in vars(part).items()
+            if isinstance(value, (list, dict, set)) and name not in _OWN
+        ]
+        recording, parts = self.recorded(), [*parts_of(self._source[0].module).values()]
+        for place, name, items in places:
+            if any(not _same_items(*pair) for pair in items):
+                changes = vars(parts[place]).get(CHANGES, ())
+                vars(parts[place])[CHANGES] = (*dict.fromkeys((*changes, name)),)
+                what = f"changes the items of {type(parts[place]).__name__}.{name}"
+                warn_once(f"items {self._call.name}", f"{self._call.name} {what}, which are restored after the call")
+        self._note_numbers(recording, warn_once)
+        return recording
 
     def _note_numbers(self, recording: Recording, warn_once: Callable[[str, str], None]) -> None:
         """Finds the results that count samples; warns of other numbers, which a call cannot follow."""
@@ -243,7 +284,7 @@ class Probe:
         with torch.autocast(device, enabled=False):
             for dtype in dtypes:
                 with contextlib.suppress(Exception):
-                    exact = Probe(*self._source, dtype=dtype)
+                    exact = Probe(*self._source, dtype, self._others)
                     if _same(exact._outcome(way), exact._outcome(loop)):
                         return True
         return False
@@ -257,6 +298,10 @@ class Probe:
                     way = Fused(call, self._call.arranged(self._entries), candidate)
                 if not self._agrees(way, loop, expected):
                     raise Unfusable("the traced network gives other results than its forward")
+                if candidate.others:
+                    probe = Probe(*self._source, others=candidate.others)
+                    if not probe._agrees(way, loop, probe._outcome(loop)):
+                        raise Unfusable("the traced network gives other results for an earlier value")
                 return way
             except Exception as error:
                 if candidate is inputs[-1]:
@@ -287,6 +332,18 @@ class Probe:
                 f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when other "
                 "samples are left out: it mixes samples (attention or statistics over a batch)"
             )
+
+
+def _same_items(container: Any, items: Any) -> bool:
+    """Returns whether a list, dict or set still has the same items."""
+    if len(container) != len(items) or isinstance(container, set):
+        return bool(container == items)
+    pairs = (
+        zip((*container, *container.values()), (*items, *items.values()))
+        if isinstance(items, dict)
+        else zip(container, items)
+    )
+    return all(x is y for x, y in pairs)
 
 
 def _same(outcome: Outcome, expected: Outcome) -> bool:

@@ -427,22 +427,16 @@ def _recurrent_cell(
     return y if len(y) > 1 else y[0]
 
 
-def _recurrent(
-    cell: Any,
-    run: GroupedRun,
-    x: Tensor,
-    hx: Any,
-    parameters: Any,
-    has_biases: bool,
-    num_layers: int,
-    dropout: float,
-    training: bool,
-    bidirectional: bool,
-    batch_first: bool,
-) -> Any:
-    """Runs layers of a cell along sequences [n, t, i], or [t, n, i]; supports neither packing nor projections."""
-    is_packed, directions = isinstance(hx, Tensor) and isinstance(parameters, Tensor), 1 + bidirectional
-    if is_packed or not run.is_rows(x) or x.dim() != 3 or (dropout and training and num_layers > 1):
+def _recurrent(cell: Any, run: GroupedRun, x: Tensor, hx: Any, parameters: Any, *options: Any) -> Any:
+    """Runs layers of a cell along sequences [n, t, i], or [t, n, i]; supports neither packing nor projections.
+
+    ``options`` are has_biases, num_layers, dropout, training, bidirectional and batch_first.
+    """
+    if len(options) != 6 or isinstance(parameters, Tensor) or not run.is_rows(x) or x.dim() != 3:
+        return NotImplemented  # packed sequences have (data, batch_sizes, hx, ...)
+    has_biases, num_layers, dropout, training, bidirectional, batch_first = options
+    directions = 1 + bidirectional
+    if dropout and training and num_layers > 1:
         return NotImplemented
     states, count = (hx,) if isinstance(hx, Tensor) else tuple(hx), 4 if has_biases else 2
     if run.axis(x) != (0 if batch_first else 1, 1) or len(parameters) != count * directions * num_layers:

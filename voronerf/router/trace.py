@@ -15,7 +15,6 @@ from types import FrameType
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, fx, nn
 from torch.fx.node import map_aggregate, map_arg
 from torch.overrides import TorchFunctionMode
@@ -25,11 +24,11 @@ from voronerf.router.double import Double
 from voronerf.router.grouped import (
     LIKE,
     METADATA,
-    RANDOM,
     Recorder,
     Step,
     converted,
     find,
+    is_random,
     line_of,
     name_of,
     steps_of,
@@ -254,7 +253,8 @@ class Trace(TorchFunctionMode):
                 self._nodes[id(tensor)].meta["axis"] = axis
             elif axis is not None and id(tensor) not in self._places:
                 raise self._unrecorded()
-        args, kwargs = with_counts((args, kwargs), step.counts) if step and step.counts else (args, kwargs)
+        if step and step.counts:
+            args, kwargs = with_counts((args, kwargs), iter(step.counts))
         func, args = converted(func, args)
         if func is torch.autograd.grad:  # all cells have one graph; in a loop, each has its own
             kwargs = {**kwargs, "retain_graph": True}
@@ -269,8 +269,7 @@ class Trace(TorchFunctionMode):
         inplace, line = node.meta["inplace"], node.meta["line"]
         outputs = operands[:1] if inplace else tensors_of(result)
         used = node.all_input_nodes
-        is_identity = func is F.dropout and not (kwargs["training"] and kwargs["p"])
-        if used and func in RANDOM and not is_identity:
+        if used and is_random(func, begun.args, kwargs):
             raise Unfusable(f"{name_of(func)} draws random numbers{line}; pass them as an argument")
         counts = all(s.meta.get("counts") or type(s.meta["value"]) is int for s in used)
         from_n = counts and type(result) is int and result and result % self.rows == 0  # becomes a node at its use

@@ -37,6 +37,7 @@ class Inputs:
 
     sources: frozenset[Source] = frozenset()
     dtype: torch.dtype = torch.float64  # dtype of numbers as tensors, one of NUMBERS
+    others: tuple[tuple[Source, Any], ...] = ()  # earlier values of sources, for which the trace must hold, too
 
     def tensor(self, value: Any, device: torch.device) -> Tensor:
         """Returns a number as a tensor, and a tensor unchanged."""
@@ -103,6 +104,10 @@ class Watch:
                 self._tensor_sources.append(source)
         elif value is not _MISSING and (items := _items(value)) is not None:
             self._holders.append((source, value, items))
+
+    def value(self, source: Source) -> Any:
+        """Returns the value that a trace took as a constant; None if there is none."""
+        return dict(zip(self.sources, self._values, strict=True)).get(source)
 
     def note(self, guard: Any) -> None:
         """Adds the watched values to a guard, which detects their changes (`voronerf.ops._core.unchanged`)."""
