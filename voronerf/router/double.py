@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf.router.grouping import CHANGES, HOLDERS, parts_of
+from voronerf.router.grouping import CHANGES, HOLDERS, SHARED, parts_of
 from voronerf.router.layout import Call, map_tree, reachable
 
 _OP = "VoronoiRouter"
@@ -44,6 +44,7 @@ class Double:
             reads; None to record nothing.
 
     Attributes:
+        stacked: The stacked parameters of the module, without those that cells share, by id.
         assigned: The numbers among the attributes that runs have assigned, with the values that were dropped.
         writes: With ``reads``, the file and line of the first assignment to each attribute that was read before.
     """
@@ -60,6 +61,7 @@ class Double:
         self._containers: list[Any] = []  # lists, dicts and sets whose items are restored after each run
         self._held: list[tuple[dict[str, Any], dict[str, Any], str, Any]] = []  # attributes that hold parameters
         self.assigned: dict[tuple[int, str], Any] = {}
+        self.stacked: dict[int, nn.Parameter] = {}
         parameters = {id(p) for part in parts.values() for p in part._parameters.values()}
         for place, (key, part) in enumerate(parts.items()):
             twin, members = twins[key], dict(vars(part))
@@ -68,14 +70,15 @@ class Double:
             registry = members["_parameters"] = dict(part._parameters)
             members["_buffers"] = dict(part._buffers)
             members["_modules"] = {name: twins.get(id(child), child) for name, child in part._modules.items()}
-            rest = [item for item in members.items() if type(item[1]) not in _PLAIN and item[0] not in _REGISTRIES]
             holders = members.get(HOLDERS, ())
-            for name, value in rest:  # nearly all are empty dicts of hooks
-                most = math.inf if name in holders else _SEARCHED
-                held = () if type(value) in _OF_HOOKS and not value else [*map(id, reachable(value, most))]
-                if any(key in parts for key in held):
+            for name, value in list(members.items()):
+                kind = type(value)
+                if kind in _PLAIN or (kind in _OF_HOOKS and not value) or name in _REGISTRIES:
+                    continue  # nearly all are empty dicts of hooks
+                held = {*map(id, reachable(value, math.inf if name in holders else _SEARCHED))}
+                if not held.isdisjoint(parts):
                     members[name] = moved(value, twins)
-                if any(key in parameters for key in held):
+                if not held.isdisjoint(parameters):
                     self._held.append((vars(twin), members, name, members[name]))
             self._containers += [members[name] for name in members.get(CHANGES, ()) if name in members]
             if isinstance(part, nn.RNNBase):  # it would move the weights of cells to other memory
@@ -83,7 +86,12 @@ class Double:
             vars(twin).update(members)
             if not type(part).__module__.startswith(_LAYERS) or part._forward_pre_hooks or isinstance(part, nn.RNNBase):
                 self._assignable.append((place, twin, members))
-            self._places += [(registry, name, id(p)) for name, p in registry.items() if p is not None]
+            shared = members.get(SHARED, ())
+            for name, parameter in registry.items():
+                if parameter is not None:
+                    self._places.append((registry, name, id(parameter)))
+                    if name not in shared:
+                        self.stacked[id(parameter)] = parameter
             self._registries.append((twin, registry, set(registry)))
 
     def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any], mode: Any = None) -> Any:

@@ -593,8 +593,8 @@ class Loop:
     def on(self, call: Call, grouping: Grouping, bounds: list[tuple[int, int, int]]) -> Results:
         """Runs the module once for each (cell, first row, end row) of ``bounds``."""
         module, counts = call.module, [last - first for _, first, last in bounds]
-        pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
         rows, double = call.arranged(grouping), Double(module)
+        pieces = {key: cells_of(parameter) for key, parameter in double.stacked.items()}
         parts, mode = split_rows(rows, counts), None
         values = [{key: piece[cell] for key, piece in pieces.items()} for cell, _, _ in bounds]
         if self.again:

@@ -124,7 +124,7 @@ class Grouping:
     def _permute(self, x: Tensor, back: bool = False) -> Tensor:
         order = self._order
         if x.requires_grad and torch.is_grad_enabled():
-            permuted: Tensor = _Permute.apply(x, *((self._inverse, order) if back else (order, self._inverse)))
+            permuted: Tensor = _applied(_Permute, x, *((self._inverse, order) if back else (order, self._inverse)))
             return permuted
         assert order is not None
         return x.index_select(0, self._inverse if back else order)
@@ -143,6 +143,13 @@ class Grouping:
         return rows.reshape(self.n * m, *stacked.shape[1:])
 
 
+def _applied(function: type[torch.autograd.Function], *args: Any) -> Any:
+    """Applies a function of autograd without PyTorch's check of its signature, which takes 50 us."""
+    if torch._C._are_functorch_transforms_active():
+        return function.apply(*args)
+    return super(torch.autograd.Function, function).apply(*args)  # type: ignore[misc]
+
+
 class _Permute(torch.autograd.Function):
     """A permutation of rows whose backward is also a gather; the backward of indexing would be a scatter-add."""
 
@@ -159,7 +166,9 @@ class _Permute(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         index, inverse = ctx.saved_tensors
-        return _Permute.apply(gradient, inverse, index), None, None
+        if torch.is_grad_enabled():
+            return _applied(_Permute, gradient, inverse, index), None, None
+        return gradient.index_select(0, inverse), None, None
 
 
 class Assigned(NamedTuple):
@@ -220,7 +229,7 @@ def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
 def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
     """Splits a stacked tensor [k, ...] into the tensor of each cell."""
     large = stacked.nbytes >= LARGE and stacked.requires_grad and torch.is_grad_enabled()
-    cells: tuple[Tensor, ...] = _Cells.apply(stacked) if large else stacked.unbind(0)
+    cells: tuple[Tensor, ...] = _applied(_Cells, stacked) if large else stacked.unbind(0)
     return cells
 
 

@@ -293,7 +293,7 @@ class VoronoiRouter(nn.Module):
         Raises:
             IndexError: If there is no cell of this index.
             ValueError: For parameters of other names or shapes, or buffers, attributes or submodules that differ from
-                those of the router, which all cells share.
+                the router, since all cells share them.
         """
         fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
         self._drop_frozen_checks()
