@@ -165,7 +165,7 @@ def test_an_argument_per_ray_may_come_first(way: str, generator: torch.Generator
     torch.testing.assert_close(router(shift, x, cells=cells).flatten(0, 1), expected[0])
 
 
-@pytest.mark.parametrize("way", ["grouped", "loop"])
+@pytest.mark.parametrize("way", WAYS)
 def test_a_vector_for_each_label(way: str, generator: torch.Generator) -> None:
     class Vector(nn.Module):
         def __init__(self) -> None:

@@ -291,11 +291,11 @@ def test_submodules_that_share_a_container(options: dict[str, Any]) -> None:
 
 
 class Turning(nn.Module):
-    """A module that sets of attributes lead along other paths, which no function names or sizes show."""
+    """A module whose attributes choose paths that differ in neither the functions nor, for 3 samples, the sizes."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.layer, self.scale, self.other = nn.Linear(3, 12), nn.Parameter(torch.rand(4)), nn.Parameter(torch.rand(4))
+        self.layer, self.scale = nn.Linear(3, 12), nn.Parameter(torch.rand(4))
         self.dim, self.joined = 0, False
 
     def forward(self, x: Tensor) -> Tensor:
@@ -304,8 +304,7 @@ class Turning(nn.Module):
             a, b = self.layer(torch.cat([x, -x])).chunk(2)
             return a + b
         h = self.layer(x).view(n, 3, 4).transpose(0, self.dim) * self.scale
-        shift = self.other.expand(n, 4) if self.dim else self.other.expand(4, 4)[0]
-        return h.transpose(0, self.dim).sum(1) + shift
+        return h.transpose(0, self.dim).sum(1)
 
 
 def test_steps_of_other_paths_are_recorded_and_compared_with_the_loop() -> None:
