@@ -445,7 +445,7 @@ FAULTS = (
     _router(
         "Items that forward changes stay changed for the next cell",
         "double.py",
-        "                    _restore_items(items)",
+        "                    restore_items(items)",
         "                    pass",
         "test_router_state.py",
     ),

@@ -113,6 +113,28 @@ def test_a_module_that_keeps_results_in_containers(options: dict[str, Any]) -> N
     assert router.cell(0)(x).shape == (40, 2)
 
 
+class Caches(nn.Linear):
+    """A layer with a table that its first call makes."""
+
+    def __init__(self) -> None:
+        super().__init__(3, 2)
+        self.cache = dict[str, Tensor]()
+
+    def forward(self, x: Tensor) -> Tensor:
+        if "table" not in self.cache:
+            self.cache["table"] = torch.linspace(0, 1, 2)
+        return super().forward(x) * self.cache["table"].to(x)
+
+
+@every_way
+def test_a_cache_that_the_first_call_fills_needs_no_warning(options: dict[str, Any]) -> None:
+    router, x = VoronoiRouter(Caches(), CENTRES, coords="first3", **options), uniform((40,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(2):
+            torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0])
+
+
 # Counters -------------------------------------------------------------------------------------------------------------
 
 

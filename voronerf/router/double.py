@@ -119,11 +119,11 @@ class Double:
                     versions = versions or _versions(placed)
                     results.append(copied.run(rows))
                     self._restore_attributes()
-                    _restore_items(items)
+                    restore_items(items)
         finally:
             self._check(call.name, placed, versions)
             self._restore_attributes()
-            _restore_items(items)
+            restore_items(items)
         return results
 
     def _check(self, name: str, placed: list[tuple[dict[str, Any], str, Any]], versions: list[int]) -> None:
@@ -246,7 +246,7 @@ def items_of(containers: Iterable[Any]) -> list[tuple[Any, Any]]:
     return list(items.values())
 
 
-def _restore_items(items: list[tuple[Any, Any]]) -> None:
+def restore_items(items: list[tuple[Any, Any]]) -> None:
     """Gives containers the items that they had in :func:`items_of`."""
     for container, copied in items:
         container.clear()

@@ -19,7 +19,7 @@ from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.ops._core.tolerances import agree, agree_gradients
 from voronerf.router.axes import multiple
 from voronerf.router.cells import clone_module
-from voronerf.router.double import Double, Forbidden, items_of
+from voronerf.router.double import Double, Forbidden, items_of, restore_items
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import (
     Grouped,
@@ -123,6 +123,9 @@ class Probe:
             ValueError: If fusion is required, but fails, and only one method of the module is routed.
         """
         call = self._call
+        steps: Callable[[], list[Step]] = self.steps
+        with contextlib.suppress(Exception):  # the ways name the reason
+            steps = functools.partial(steps_of, self.note_changes(warn_once).runs, _COUNTS)
         for loop in (Loop(), Loop(again=True)):
             try:
                 expected = self._outcome(loop)
@@ -133,9 +136,6 @@ class Probe:
                 why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
         else:
             return [Loop(why)], False
-        steps: Callable[[], list[Step]] = self.steps
-        with contextlib.suppress(Exception):  # the ways name the reason
-            steps = functools.partial(steps_of, self.note_changes(warn_once).runs, _COUNTS)
         ways, may_group, unfused = list[Way](), False, too_many
         if unfused:
             warn_once(f"changes {call.method}", f"{call.name} is {unfused}")
@@ -186,6 +186,8 @@ class Probe:
         rows, runs, leaves = self._call.arranged(self._entries), (Recorder(), Recorder()), list[dict[str, Any]]()
         cell = {id(parameter): parameter[0] for parameter in cell_parameters(self._call.module)}
         double = Double(self._call.module, reads)
+        if self._containers():
+            self.run_once(self._call.module)
 
         def note(name: str, leaf: Any, nested: bool) -> Any:
             leaves[-1][name] = leaf
@@ -197,21 +199,39 @@ class Probe:
                 map_tree(double.run(self._call, [tensor[:count] for tensor in rows], cell, recorder), note)
         return Recording(runs, leaves, double)
 
-    def note_changes(self, warn_once: Callable[[str, str], None]) -> Recording:
-        """Records the module, and notes what calls cannot keep: items of containers (CHANGES), numbers, and counts."""
-        places = [
-            (place, name, items_of([value]))
+    def run_once(self, module: nn.Module) -> None:
+        """Runs the first cell of a module for both numbers of samples, which fills caches in dicts and lists."""
+        rows, cell = self._call.arranged(self._entries), {id(p): p.detach()[0] for p in cell_parameters(module)}
+        for count in _COUNTS:
+            Double(module).run(self._call, [tensor[:count] for tensor in rows], cell)
+
+    def _containers(self) -> dict[tuple[int, str], Any]:
+        """Returns the items of the lists, dicts and sets of the module, by submodule and attribute."""
+        return {
+            (place, name): items_of([value])
             for place, part in enumerate(parts_of(self._call.module).values())
             for name, value in vars(part).items()
             if isinstance(value, (list, dict, set)) and name not in _OWN
-        ]
-        recording, parts = self.recorded(), [*parts_of(self._source[0].module).values()]
-        for place, name, items in places:
-            if any(not _same_items(*pair) for pair in items):
-                changes = vars(parts[place]).get(CHANGES, ())
-                vars(parts[place])[CHANGES] = (*dict.fromkeys((*changes, name)),)
+        }
+
+    def note_changes(self, warn_once: Callable[[str, str], None]) -> Recording:
+        """Records the module, and notes what calls cannot keep: items of containers (CHANGES), numbers, and counts."""
+
+        initial, call = self._containers(), self._source[0]
+        if initial:
+            self.run_once(self._call.module)
+        filled, recording = self._containers(), self.recorded()
+        trees = [[*parts_of(module).values()] for module in (self._call.module, call.module)]
+        for (place, name), items in filled.items():
+            if not all(_same_items(*pair) for pair in items):
+                restore_items(initial[place, name])
+                for parts in trees:
+                    changes = vars(parts[place]).get(CHANGES, ())
+                    vars(parts[place])[CHANGES] = (*dict.fromkeys((*changes, name)),)
                 what = f"changes the items of {type(parts[place]).__name__}.{name}"
-                warn_once(f"items {self._call.name}", f"{self._call.name} {what}, which are restored after the call")
+                warn_once(f"items {call.name}", f"{call.name} {what}, which are restored after the call")
+        if initial:
+            self.run_once(call.module)
         self._note_numbers(recording, warn_once)
         return recording
 
