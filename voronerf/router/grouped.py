@@ -2,7 +2,7 @@
 
 The rows are sorted by cell, and :class:`PerCell` tensors replace the module's parameters. :class:`GroupedRun`
 intercepts every PyTorch function. A function of rows and parameters runs by a rule (:func:`register`), a function of
-parameters alone is mapped over cells, and any other function runs unchanged. a :class:`Step` tells which axis of each
+parameters alone is mapped over cells, and any other function runs unchanged. A :class:`Step` tells which axis of each
 argument has the samples. Tensors that depend on the samples are marked; the marks reveal host reads of samples' values.
 If a step has no rule, :class:`Ungroupable` names the step, and the call becomes a loop over cells.
 
@@ -297,7 +297,7 @@ def integers_of(items: Iterable[Any]) -> list[int]:
     for item in items:
         if isinstance(item, int):
             integers.append(item)
-        elif isinstance(item, (list, tuple)):
+        elif type(item) in (list, tuple, torch.Size):
             integers += integers_of(item)
         elif isinstance(item, dict):
             integers += integers_of(item.values())
@@ -309,7 +309,8 @@ def with_counts(value: Any, counts: Iterator[int]) -> Any:
     if isinstance(value, int):
         return Count(value) if next(counts) else value
     if type(value) in (list, tuple, torch.Size):
-        return tuple(with_counts(item, counts) for item in value)
+        items = [with_counts(item, counts) for item in value]
+        return items if type(value) is list else tuple(items)
     if isinstance(value, dict):
         return {key: with_counts(item, counts) for key, item in value.items()}
     return value
@@ -326,11 +327,8 @@ class Recorder(TorchFunctionMode):
         kwargs = kwargs or {}
         if func in METADATA:
             return func(*args, **kwargs)
-        shapes, integers = (
-            [tensor.shape for tensor in tensors_of((args, kwargs))],
-            integers_of((*args, *kwargs.values())),
-        )
-        result = func(*args, **kwargs)
+        shapes = [tensor.shape for tensor in tensors_of((args, kwargs))]  # before a write in place
+        result, integers = func(*args, **kwargs), integers_of((*args, *kwargs.values()))
         self.calls.append((func, shapes, integers, [tensor.shape for tensor in tensors_of(result)]))
         return result
 
@@ -346,13 +344,10 @@ def steps_of(runs: Sequence[Recorder], n: Sequence[int]) -> list[Step]:
             raise Ungroupable("its forward calls other functions for another number of samples", of_batch=True)
         shapes, integers = list(zip(one[1], other[1])), list(zip(one[2], other[2]))
         axes, counts = [axis_of(*pair, n) for pair in shapes], [multiple(pair, n) for pair in integers]
-        fits = [
-            *(axis or a == b for axis, (a, b) in zip(axes, shapes)),
-            *(m or a == b for m, (a, b) in zip(counts, integers)),
-        ]
+        fits = all(told or a == b for told, (a, b) in zip((*axes, *counts), (*shapes, *integers)))
         results = tuple(axis_of(*pair, n) for pair in zip(one[3], other[3]))
         constants = tuple(0 if m else value for m, value in zip(counts, one[2]))
-        steps.append(Step(one[0], tuple(axes), constants, tuple(counts) if any(counts) else (), results, not all(fits)))
+        steps.append(Step(one[0], tuple(axes), constants, tuple(counts) if any(counts) else (), results, not fits))
     return steps
 
 
