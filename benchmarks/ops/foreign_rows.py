@@ -11,6 +11,7 @@ import functools
 import itertools
 import math
 import re
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -362,7 +363,8 @@ def _speed(case: Case) -> dict[str, float]:
             with contextlib.suppress(Exception):
                 router = case.router(**options)
                 contenders[name] = step(functools.partial(case.routed, router), router)
-        timings = measure(contenders, dict.fromkeys(contenders, TIME_LIMIT), Stopwatch(torch.device("cpu")))
+        stopwatch = Stopwatch(torch.device("cpu"), time.process_time)
+        timings = measure(contenders, dict.fromkeys(contenders, TIME_LIMIT), stopwatch)
     masks = timings.pop("masks").median_ms
     return {"masks_ms": round(masks, 3), **{name: round(masks / t.median_ms, 2) for name, t in timings.items()}}
 

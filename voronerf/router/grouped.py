@@ -590,14 +590,16 @@ class Loop:
         module, counts = call.module, [last - first for _, first, last in bounds]
         rows, double = call.arranged(grouping), Double(module)
         pieces = {key: cells_of(parameter) for key, parameter in double.stacked.items()}
-        parts, mode = split_rows(rows, counts), None
+        parts, first = split_rows(rows, counts), 0
         values = [{key: piece[cell] for key, piece in pieces.items()} for cell, _, _ in bounds]
         if self.again:
             results = [Double(module).run(call, *each) for each in zip(parts, values, strict=True)]
         else:
+            mode, results = None, []
             if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in rows):
-                mode = Exact()
-            results = double.runs(call, parts[:1], values[:1], mode)
-            results += double.runs(call, parts[1:], values[1:], mode if mode is not None and mode.met else None)
+                mode, first = Exact(), 1
+                results = double.runs(call, parts[:1], values[:1], mode)
+                mode = mode if mode.met else None
+            results += double.runs(call, parts[first:], values[first:], mode)
             double.end()
         return Results.joined(results, counts, grouping)

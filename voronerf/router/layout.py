@@ -273,7 +273,10 @@ class Call:
             return value if self.kinds[name] == SHARED else change(value, self.kinds[name])
 
         arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
-        values = [map_tree(value, changed, name) for name, value in arguments]
+        values = [
+            changed(name, value, False) if isinstance(value, Tensor) else map_tree(value, changed, name)
+            for name, value in arguments
+        ]
         return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
 
     def constants(self) -> dict[str, Any]:
@@ -300,6 +303,8 @@ class Call:
 
     def plain(self) -> Call:
         """Returns the call with plain tensors instead of subclasses, or itself if it has none."""
+        if all(type(value) is Tensor for value in (*self.args, *self.kwargs.values())):
+            return self
         args, kwargs = map_tensors((self.args, self.kwargs), as_plain)
         same = args is self.args and kwargs is self.kwargs
         return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)

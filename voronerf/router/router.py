@@ -809,7 +809,8 @@ class VoronoiRouter(nn.Module):
         self._run_training_checks()
         if isinstance(coords, Labels):
             coords.ensure(self.num_cells)
-        function, key = getattr(self.module, method), call_key(method, self.module.training, args, kwargs, coords)
+        function = getattr(self.module, method)
+        key = call_key(method, self.module.training, args, kwargs, coords) if self.fuse else None
         has_program = method == "forward" and self._field_program is not None
         if has_program and (expanded := each_direction(args, kwargs)) is not None:
             (args, kwargs), key = expanded, None
