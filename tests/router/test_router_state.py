@@ -135,6 +135,26 @@ def test_a_cache_that_the_first_call_fills_needs_no_warning(options: dict[str, A
             torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0])
 
 
+class Carries(nn.Linear):
+    """A layer that assigns a buffer, from which it reads in the next call."""
+
+    def __init__(self) -> None:
+        super().__init__(3, 2)
+        self.register_buffer("calls", torch.zeros(()))
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.calls = self.calls + 1
+        return super().forward(x) * self.calls
+
+
+@every_way
+def test_an_assigned_buffer_does_not_reach_the_next_cell(options: dict[str, Any]) -> None:
+    router, x = VoronoiRouter(Carries(), CENTRES, coords="first3", **options), uniform((40,))
+    for _ in range(3):
+        torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0])
+    assert router.module.calls == 0
+
+
 # Counters -------------------------------------------------------------------------------------------------------------
 
 

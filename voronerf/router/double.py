@@ -81,6 +81,8 @@ class Double:
                 if not held.isdisjoint(parameters):
                     self._held.append((vars(twin), members, name, members[name]))
             self._containers += [members[name] for name in members.get(CHANGES, ()) if name in members]
+            if part._buffers:  # a buffer that ``forward`` assigns must not reach the next cell
+                self._containers.append(members["_buffers"])
             if isinstance(part, nn.RNNBase):  # it would move the weights of cells to other memory
                 members["flatten_parameters"] = _nothing
             vars(twin).update(members)
