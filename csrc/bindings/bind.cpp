@@ -75,9 +75,17 @@ void call(const Loaded& loaded, Result& result) {
 // Row counts are read again from memory at each replay, so tensors must be large enough for the largest row counts.
 class Recording {
  public:
-  // Calls of this thread between `begin` and `end` are added to the recording.
-  void begin() { recorded() = this; }
-  void end() { recorded() = nullptr; }
+  // Calls of this thread between `begin` and `end` are added to the recording, which owns itself in between.
+  static void begin(const py::object& self) {
+    if (recorded() != nullptr) throw std::logic_error("another recording is active");
+    recorded() = py::cast<Recording*>(self);
+    self.inc_ref();
+  }
+  static void end(const py::object& self) {
+    if (recorded() != py::cast<Recording*>(self)) return;
+    recorded() = nullptr;
+    self.dec_ref();
+  }
 
   // Adds a tensor argument of a call, or the base of a view. Replays check that the tensor is unchanged, unless a
   // recording allocated its memory. Returns whether its number of rows may vary between replays (RowCount).
@@ -260,7 +268,7 @@ constexpr const char* kStub =
     "most_held: int\n"
     "\n"
     "class Unchanged:\n"
-    "    def contents(self, container: Any, free: Sequence[str] = ...) -> None: ...\n"
+    "    def contents(self, container: Any, free: Sequence[str] = ..., read: set[str] | None = ...) -> None: ...\n"
     "    def entries(self, dictionary: dict[str, Any], names: Sequence[str]) -> None: ...\n"
     "    def attributes(self, object: Any, names: Sequence[str]) -> None: ...\n"
     "    def answer(self, function: Any) -> None: ...\n"

@@ -103,8 +103,8 @@ bool Unchanged::Seen::holds(PyObject* tensor) const {
   return !place || std::equal(strides.begin(), strides.end(), now.strides);
 }
 
-void Unchanged::contents(const py::object& container, const std::vector<std::string>& free) {
-  Container noted{container, {}};
+void Unchanged::contents(const py::object& container, const std::vector<std::string>& free, const py::object& read) {
+  Container noted{container, {}, read};
   each(container.ptr(), [&](PyObject* key, PyObject* value) {
     bool any = false;
     if (key != nullptr) {
@@ -154,10 +154,11 @@ bool Unchanged::holds() const {
     }
     size_t i = 0;
     const bool all = each(noted.container.ptr(), [&](PyObject* key, PyObject* value) {
-      if (key != nullptr && (i == noted.values.size() || !is_same(noted.values[i++].ptr(), key))) return false;
-      if (i == noted.values.size()) return false;
+      const auto matters = [&] { return noted.read.is_none() || PySet_Contains(noted.read.ptr(), key) != 0; };
+      if (i == noted.values.size()) return !matters();  // a new element
+      if (key != nullptr && !is_same(noted.values[i++].ptr(), key)) return false;
       PyObject* const was = noted.values[i++].ptr();
-      return was == nullptr || is_same(was, value);
+      return was == nullptr || is_same(was, value) || !matters();
     });
     if (!all || i != noted.values.size()) return false;
   }
@@ -181,7 +182,7 @@ bool Unchanged::holds() const {
 int Unchanged::each_held(const Visit& visit) const {
   std::vector<PyObject*> held;
   for (const Container& noted : containers_) {
-    held.push_back(noted.container.ptr());
+    held.insert(held.end(), {noted.container.ptr(), noted.read.ptr()});
     for (const py::object& value : noted.values) held.push_back(value.ptr());
   }
   for (const std::vector<Named>* named : {&entries_, &attributes_}) {
@@ -198,7 +199,8 @@ int Unchanged::each_held(const Visit& visit) const {
 void bind_unchanged(py::module_& module) {
   py::class_<Unchanged>(module, "Unchanged", py::module_local(), in_cycles<Unchanged>())
       .def(py::init())
-      .def("contents", &Unchanged::contents, py::arg("container"), py::arg("free") = py::tuple())
+      .def("contents", &Unchanged::contents, py::arg("container"), py::arg("free") = py::tuple(),
+           py::arg("read") = py::none())
       .def("entries", &Unchanged::entries)
       .def("attributes", &Unchanged::attributes)
       .def("answer", &Unchanged::answer)

@@ -19,8 +19,9 @@ namespace py = pybind11;
 // of tensors are held, so the memory of a tensor is not freed after `x.data = y`.
 class Unchanged {
  public:
-  // Notes the elements of a list, tuple, set or dictionary in order. The values of the keys `free` may change.
-  void contents(const py::object& container, const std::vector<std::string>& free);
+  // Notes the elements of a list, tuple, set or dictionary in order. The values of the keys `free` may change and, if
+  // `read` is a set instead of None, the values of keys that are not in this set at the time of `holds`.
+  void contents(const py::object& container, const std::vector<std::string>& free, const py::object& read);
   // Notes the values of some keys of a dictionary, or that the keys are missing.
   void entries(const py::dict& dictionary, const std::vector<std::string>& names);
   void attributes(const py::object& object, const std::vector<std::string>& names);
@@ -54,6 +55,7 @@ class Unchanged {
   struct Container {
     py::object container;
     std::vector<py::object> values;  // for a dictionary, keys and values alternate; null: any value
+    py::object read;                 // the keys whose values matter; None: all
   };
   struct Named {
     py::object owner, name, value;  // null value: none

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import input_files
+import interrupts
 import mutate
 import op_attacks
 import rank_attacks
@@ -33,6 +34,7 @@ PARTS = {
         (Part("valid-calls", op_attacks.valid_call, 60, 200, peak=3 * MEMORY), 140_000, 150),
         (Part("invalid-calls", op_attacks.invalid_call, 20, 200, MEMORY // 2), 60_000, 150),
         (Part("steps", step_sequences.changed_steps, 120, 20, peak=2 * MEMORY), 500, 5),
+        (Part("interrupts", interrupts.interrupted_step, 60, 20, peak=2 * MEMORY), 1000, 12),
         (Part("routers", router_sequences.random_sequence, 60, 10), 500, 6),
         (Part("kills", training_attacks.killed_training, 300, 1, prepare=input_files.prepare_scenes), 20, 1),
         (Part("ranks", rank_attacks.harmed_ranks, 600), 16, 0),

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import sys
+import threading
 import warnings
 from unittest import mock
 
 import pytest
 import torch
+from helpers import Interrupt
 from torch import Tensor
+from torch.utils import _python_dispatch
 from torch.utils._python_dispatch import _disable_current_modes
 from torch.utils._pytree import tree_leaves
 
 from voronerf import ops
 from voronerf.ops import Rule, adam, cell_sort, composite, grouped_program, nearest_centre
 from voronerf.ops._core import backends
+from voronerf.ops._core.active import active
 from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops._core.custom_op import Op
 from voronerf.ops._core.program import Builder
@@ -168,6 +173,47 @@ def test_a_recording_has_calls_of_which_modes_hear_nothing():
             cells = nearest_centre(taken, centres)
     assert recording.replay(threads=1, inputs=[others])
     assert torch.equal(recording.now(cells), nearest_centre(others, centres))
+
+
+def test_an_interrupted_recording_ends():
+    """Ctrl-C at any place of a recording leaves no mode of torch and no recording on, and stays KeyboardInterrupt."""
+    points, centres, flags = torch.rand(5, 3), torch.rand(4, 3), dict(vars(_python_dispatch))
+
+    def record():
+        recording = Recording()
+        recording.record(lambda: nearest_centre(recording.take(points), centres).add(1))
+        return recording
+
+    assert record().obstacle is None
+    with Interrupt() as counting:
+        record()
+    for place in range(1, counting.places):
+        with pytest.raises(KeyboardInterrupt), Interrupt(place):
+            record()
+        assert torch._C._len_torch_dispatch_stack() == 0 and active.recording is None and active.vary is None, place
+        assert vars(_python_dispatch) == flags, place
+        before = sys.getrefcount(points)
+        nearest_centre(points, centres)
+        assert sys.getrefcount(points) == before, place
+    assert counting.places > 100 and record().replay(1, inputs=[points]) == 1
+
+
+def test_an_active_recording_owns_itself():
+    """Calls of a thread whose recording has no reference in Python neither crash nor are recorded twice."""
+
+    def calls():
+        native.compiled.Recording().begin()
+        gc.collect()
+        results.append(nearest_centre(points, centres))
+        with pytest.raises(RuntimeError, match="another recording is active"):
+            native.compiled.Recording().begin()
+        results.append(nearest_centre(points, centres))
+
+    points, centres, results = torch.rand(5, 3), torch.rand(4, 3), []
+    thread = threading.Thread(target=calls)
+    thread.start()
+    thread.join()
+    assert len(results) == 2 and all(torch.equal(cells, nearest_centre(points, centres)) for cells in results)
 
 
 def test_what_autograd_cannot_keep_is_refused_by_both():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
 
 import pytest
@@ -354,3 +356,183 @@ def test_attributes_of_ones_own_record_nothing_anew():
     training.sampler.grid = OccupancyGrid.for_training(training.sampler.grid.box, 32, resolution=8)
     training.train(4)
     assert training.recorded > recorded
+
+
+@replayed
+class Optional(SparseDepth):
+    """A `replayed` term whose attributes have names from outside."""
+
+    def __init__(self, **options):
+        super().__init__(0.0)
+        self.nested = dict(options)
+        for name, value in options.items():
+            setattr(self, name, value)
+
+    def add(self, along, batch):
+        along.gradient.mul_(getattr(self, next(iter(self.nested))) * self.nested["gain"])
+
+
+@pytest.mark.parametrize("change", [lambda term: setattr(term, "gain", 2.0), lambda term: term.nested.update(gain=3.0)])
+def test_each_attribute_of_a_replayed_class_is_followed(change):
+    results = []
+    for as_it_is in (False, True):
+        training = Training(cells=2)
+        training.loss.terms = (Optional(gain=0.5),)
+        training.train(4, as_it_is=as_it_is)
+        change(training.loss.terms[0])
+        results.append([*training.train(4, as_it_is=as_it_is), *training.everything()])
+        assert as_it_is or "recorded and replayed" in training.step.explain()
+    assert same(*results)
+
+
+def test_reads_of_an_unmarked_subclass_are_followed():
+    """An attribute that recorded code reads by a computed name is followed; counters record nothing anew."""
+
+    @replayed
+    class Wider(Occupancy):
+        def sample(self, rays, near, far, **options):
+            return super().sample(rays, near, far * getattr(self, "wi" + "de"), **options)
+
+    class Seen(Wider):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            self.wide, self.counts = 1.0, {}
+
+        def step_post_backward(self, output):
+            self.steps = getattr(self, "steps", 0) + 1
+            self.counts = {**self.counts, self.steps: True}
+            super().step_post_backward(output)
+
+    results = []
+    for as_it_is in (False, True):
+        training = Training(cells=2, sampler=Seen)
+        training.train(6, as_it_is=as_it_is)
+        recorded = training.recorded
+        assert as_it_is or (0 < recorded < 3 and type(training.sampler) is Seen)
+        training.sampler.wide = 1.3
+        results.append([*training.train(6, as_it_is=as_it_is), *training.everything()])
+        assert as_it_is or recorded < training.recorded < recorded + 3
+    assert same(*results)
+
+
+def counted(owner, name):
+    """Replaces a method on an object itself by one that counts its calls in the object; returns the count."""
+    method, calls = getattr(owner, name), []
+
+    def replaced(*arguments, **options):
+        calls.append(1)
+        return method(*arguments, **options)
+
+    setattr(owner, name, replaced)
+    return calls
+
+
+@pytest.mark.parametrize(
+    "name, of, said",
+    [
+        ("march", lambda t: t.sampler, "in Python: Occupancy.sample"),
+        ("sample", lambda t: t.sampler, "in Python: Occupancy.sample"),
+        ("add", lambda t: t.loss.terms[0], "in Python: SparseDepth.add"),
+        ("draw", lambda t: t.batches, "in Python: RayBatches.draw"),
+        ("step_post_backward", lambda t: t.step.strategy, "in Python: SplitStrategy.step_post_backward"),
+        ("zero_grad", lambda t: t.optimizer, "Adam may run Python code"),
+        ("_learn", lambda t: t.loss, "RayLoss may run Python code"),
+        ("observe", lambda t: t.sampler.grid, "OccupancyGrid may run Python code"),
+        ("add", lambda t: t.step.strategy.reservoir, "SampleReservoir may run Python code"),
+    ],
+)
+def test_a_replaced_method_runs_in_each_step(name, of, said):
+    training = Training(photograph=True)
+    with_strategy(training, SplitStrategy)
+    training.train(3)
+    calls = counted(of(training), name)
+    training.train(4)
+    assert len(calls) == 4 and said in training.step.explain(), training.step.explain()
+
+
+def test_the_step_that_a_scheduler_of_torch_replaces_is_no_obstacle():
+    training = Training()
+    torch.optim.lr_scheduler.StepLR(training.optimizer, 5)
+    assert "step" in vars(training.optimizer)
+    training.train(3)
+    assert "recorded and replayed" in training.step.explain()
+
+
+def replace_parameter(training):
+    layer = training.router.module.colour
+    old, layer.weight = layer.weight, torch.nn.Parameter(2 * layer.weight.detach())
+    for group in training.optimizer.param_groups:
+        group["params"] = [layer.weight if parameter is old else parameter for parameter in group["params"]]
+
+
+CHANGES = {
+    "a parameter": replace_parameter,
+    "the optimiser": lambda t: t.optimizer.load_state_dict(t.optimizer.state_dict()),
+    "a group": lambda t: t.optimizer.param_groups[0].update(eps=1e-3),
+    "the loss": lambda t: setattr(t.loss, "robust", 0.1),
+    "the sampler": lambda t: setattr(t.sampler, "samples", 16),
+    "forget": lambda t: t.step.forget(),
+}
+
+
+@pytest.mark.parametrize("place", ["rays", "term", "strategy"])
+@pytest.mark.parametrize("name", CHANGES)
+def test_changes_within_a_step_take_effect_at_once(name, place):
+    """A hook before, between or after the recorded segments changes something, in the first or in a later step."""
+    for at in (1, 4):
+        results = []
+        for as_it_is in (False, True):
+            training = Training(cells=2)
+            changing(training, place, at, CHANGES[name])
+            steps = training.train(7, as_it_is=as_it_is)
+            results.append([*steps, *(tensor for tensor in training.everything() if tensor is not None)])
+            assert training.done == 7 and (as_it_is or "recorded and replayed" in training.step.explain())
+        assert same(*results), at
+
+
+def changing(training, place, at, change):
+    """Lets a hook at a place in the step call ``change(training)`` in its call number ``at``."""
+
+    def call():
+        training.done += 1
+        if training.done == at:
+            change(training)
+
+    if place == "rays":
+        draw = training.batches.draw
+        training.batches.draw = lambda *arguments: (call(), draw(*arguments))[1]
+    elif place == "term":
+        training.loss.terms = (*training.loss.terms, lambda rays, batch: (call(), clear(rays, batch))[1])
+    else:
+        with_strategy(training, type("Changing", (SplitStrategy,), {"step_post_backward": lambda _, output: call()}))
+
+
+def test_a_step_within_its_own_hook_is_refused():
+    training = Training()
+    training.loss.terms = (lambda rays, batch: training.step(8).loss,)
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="a step must not be called while it runs, by one of its hooks"):
+            training.step(64)
+    training.loss.terms = ()
+    training.train(3)
+    assert "recorded and replayed" in training.step.explain()
+
+
+@pytest.mark.parametrize("hooks", [False, True])
+@pytest.mark.parametrize("of", [copy.copy, copy.deepcopy, lambda step: pickle.loads(pickle.dumps(step))])
+def test_a_copy_of_a_step_has_recordings_of_its_own(of, hooks):
+    """A deep copy trains a copy of the networks, exactly like the original; a shallow copy trains the same networks."""
+    training = Training(cells=2)
+    del training.step._run_stages  # a closure of the test, which the copy would share
+    if hooks:
+        with_strategy(training)
+    training.train(3)
+    copied, before = of(training.step), [tensor.clone() for tensor in training.router.parameters()]
+    assert copied.explain() == "step: will be recorded"
+    outcomes = [float(copied(64).loss) for _ in range(4)]
+    assert "recorded and replayed" in copied.explain()
+    shares = copied.optimizer is training.optimizer
+    assert shares == (of is copy.copy) and shares != same([*training.router.parameters()], before)
+    if not shares:
+        assert outcomes == [float(training.step(64).loss) for _ in range(4)]
+        assert same([*copied.loss.renderer.field.parameters()], [*training.router.parameters()])

@@ -85,6 +85,11 @@ class Adam(torch.optim.Adam):
         super().__init__(params, lr=lr, betas=betas, eps=eps, fused=True)
         self.average, self.backend, self.steps_done = average, backend, 0
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the state of torch's optimiser for a copy, and the attributes of this class."""
+        own = {"average": self.average, "backend": self.backend, "steps_done": self.steps_done}
+        return {**super().__getstate__(), **own}
+
     @classmethod
     def of(
         cls,
@@ -247,9 +252,9 @@ class Adam(torch.optim.Adam):
     def _state(self, parameter: Tensor) -> dict[str, Tensor]:
         """Returns the state of a parameter on its device; a checkpoint holds the step count on the CPU."""
         state = self.state[parameter]
-        if not state:
-            state["step"] = torch.zeros((), device=parameter.device)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        if not state:  # the entries are added at once, so an interrupt leaves none of them
+            moments = {"exp_avg": torch.zeros_like(parameter), "exp_avg_sq": torch.zeros_like(parameter)}
+            state.update(step=torch.zeros((), device=parameter.device), **moments)
         if state["step"].get_device() != parameter.get_device():
             state["step"] = state["step"].to(parameter.device)
         return state

@@ -22,6 +22,7 @@ from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
 from voronerf.nerf.radiance import radiance_of
 from voronerf.nerf.sampling import random_uniforms
+from voronerf.nerf.segment import replayed
 from voronerf.ops._core.checks import check_range
 from voronerf.ops.draw_points import draw_points
 from voronerf.ops.formulas import voxels_of
@@ -51,6 +52,7 @@ HIDDEN = 1e-3  # a sample is hidden if at most this fraction of the light reache
 HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 9, 2, 2.0
 
 
+@replayed
 class OccupancyGrid:
     """A grid that stores the largest recent densities in a box; its dense voxels are occupied.
 

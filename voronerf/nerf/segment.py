@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import dis
 import functools
-import inspect
 import itertools
-import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,6 +11,7 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.recording import Recording, entries_of, mapped
+from voronerf.router.double import Unregistered
 
 T = TypeVar("T", bound=type)
 
@@ -24,6 +22,7 @@ _REPLAYED = set[type]()
 _HARMLESS = {
     *("__dict__", "__weakref__", "__init__", "__init_subclass__", "__class_getitem__"),
     *("__repr__", "__str__", "__eq__", "__hash__", "__reduce__", "__getstate__", "__setstate__"),
+    "step",  # of an optimiser, which torch's schedulers replace; a TrainingStep calls ``update`` instead
 }
 
 
@@ -32,9 +31,10 @@ def replayed(kind: T) -> T:
 
     Its methods must compute only with ops and elementwise functions of torch, and data that changes from step to step
     must lie in tensors. Other Python code runs only once, while the step is recorded. All classes of this package are
-    marked. If an unmarked subclass overrides a hook, this hook runs in Python in each step. If it overrides another
-    member that hooks may use, all its hooks run in Python in each step. A step detects changes of instance
-    attributes, but not of class attributes.
+    marked. If an unmarked subclass, or an object itself, overrides a hook, this hook runs in Python in each step. If it
+    overrides another member that hooks may use, or if a subclass adds a property, all its hooks run in Python in each
+    step. A step detects changes of instance attributes, also within lists, tuples, dictionaries and dataclasses, but
+    not of class attributes.
 
     Examples:
         >>> from voronerf.nerf import SplitStrategy, replayed
@@ -46,7 +46,6 @@ def replayed(kind: T) -> T:
     """
     _REPLAYED.add(kind)
     _overrides.cache_clear()
-    _names_read.cache_clear()
     return kind
 
 
@@ -58,48 +57,75 @@ def in_python(part: Any, hook: str = "") -> bool:
         hook: The name of the hook; "" asks whether this is true of any hook of the object.
     """
     kind: Any = type(part)
-    return hook in getattr(part, "__dict__", ()) or _overrides(kind, hook)
+    replaced = frozenset(name for name in getattr(part, "__dict__", ()) if callable(getattr(kind, name, None)))
+    return _overrides(kind, replaced, hook)
 
 
 @functools.lru_cache(maxsize=256)
-def _overrides(kind: Any, hook: str) -> bool:
-    """Returns whether a class overrides a hook of a `replayed` class, or another member that this hook may use."""
+def _overrides(kind: Any, replaced: frozenset[str], hook: str) -> bool:
+    """Returns whether a class, or the methods that an object itself replaces, change what a hook does."""
     replayed_base = next((base for base in kind.__mro__ if base in _REPLAYED), None)
     if replayed_base is None:
         return True
-    protocol, names = [base for base in kind.__mro__ if base in _REPLAYED][-1], _names_read(kind)
-    subclasses = kind.__mro__[: kind.__mro__.index(protocol)]
-    members = [each for base in subclasses if base not in _REPLAYED for each in vars(base).items()]
-    behaviour = {name for name, value in members if callable(value) or hasattr(value, "__get__")}
-    overridden = {
-        name for name in behaviour - _HARMLESS if hasattr(replayed_base, name) or name in names or name == "__getattr__"
-    }
+    protocol, overridden = [base for base in kind.__mro__ if base in _REPLAYED][-1], set(replaced)
+    for base in kind.__mro__[: kind.__mro__.index(protocol)]:
+        for name, value in vars(base).items() if base not in _REPLAYED else ():
+            is_method = callable(value) or isinstance(value, classmethod)
+            changes = hasattr(replayed_base, name) if is_method else hasattr(value, "__get__")
+            overridden |= {name} if changes or name == "__getattr__" else set()
+    overridden -= _HARMLESS
     return hook in overridden or any(not hook or not callable(getattr(protocol, name, None)) for name in overridden)
 
 
-def free_names(part: Any) -> list[str]:
-    """Returns the attributes of an object that no `replayed` class reads, so they may change from step to step."""
-    kind: Any = type(part)
-    names_read = _names_read(kind)
-    return [name for name in vars(part) if name not in names_read]
+def note_attributes(guard: Any, part: Any) -> set[str] | None:
+    """Adds the attributes of an object to a guard (`voronerf.ops._core.unchanged`).
+
+    Returns:
+        A set to which :func:`noting_reads` adds the names of the attributes that matter; None if all attributes matter,
+        since the object's class is `replayed` itself.
+    """
+    if type(part) not in _REPLAYED:
+        guard.contents(vars(part), read=(names := set[str]()))
+        return names
+    seen, waiting = set[int](), [part]
+    while waiting:
+        held = waiting.pop()
+        held = vars(held) if type(held) in _REPLAYED else held
+        if (entries := entries_of(held)) is not None and id(held) not in seen:
+            seen.add(id(held))
+            waiting += entries
+            if isinstance(held, (list, tuple, dict)):
+                guard.contents(held)
+            else:
+                guard.attributes(held, [*held.__dataclass_fields__])
+    return None
 
 
-@functools.lru_cache(maxsize=256)
-def _names_read(kind: Any) -> frozenset[str]:
-    """Returns the attributes of `self` that the `replayed` classes among a class and its bases use."""
-    names, codes = set[str](), list[types.CodeType]()
-    for base in filter(_REPLAYED.__contains__, kind.__mro__):
-        for value in vars(base).values():
-            functions = (value.fget, value.fset) if isinstance(value, property) else (inspect.unwrap(value),)
-            codes += [each.__code__ for each in functions if inspect.isfunction(each)]
-    while codes:
-        code = codes.pop()
-        for previous, instruction in itertools.pairwise(dis.get_instructions(code)):
-            of_self = previous.argrepr.rpartition(", ")[2] == "self"  # newer Pythons load two names in one instruction
-            if of_self and instruction.opname in ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR"):
-                names.add(instruction.argval)
-        codes += [each for each in code.co_consts if inspect.iscode(each)]
-    return frozenset(names)
+def noting_reads(reads: Iterable[tuple[Any, set[str]]], function: Callable[..., Any], *arguments: Any) -> Any:
+    """Calls a function; for each (object, names) it adds to ``names`` the attributes that are read from the object."""
+    kinds = [(part, type(part)) for part, _ in reads]
+    try:
+        for part, names in reads:
+            object.__setattr__(part, "__class__", _noting_class(type(part), names))
+        return function(*arguments)
+    finally:
+        for part, kind in kinds:
+            object.__setattr__(part, "__class__", kind)
+
+
+def _noting_class(kind: Any, names: set[str]) -> type:
+    """Makes a subclass of the same memory layout that notes the attributes which are read."""
+
+    class Unlisted(type(kind)):  # type: ignore[misc]
+        def mro(cls) -> list[type]:  # before ``kind``, whose ``__init_subclass__`` may register the subclass
+            return [cls, Unregistered, *kind.__mro__]
+
+    def getattribute(self: Any, name: str) -> Any:
+        names.update((name, *(object.__getattribute__(self, name) if name == "__dict__" else ())))
+        return kind.__getattribute__(self, name)
+
+    members = {"__module__": kind.__module__, "__qualname__": kind.__qualname__, "__getattribute__": getattribute}
+    return Unlisted(kind.__name__, (kind,), members)
 
 
 class Stage(NamedTuple):
@@ -151,11 +177,19 @@ class SegmentResult(NamedTuple):
         return value if self.recording is None else self.recording.now(value)
 
 
+class _Recorded(NamedTuple):
+    """A recording with the function's result, and with the results of other segments and the key of its arguments."""
+
+    recording: Recording
+    value: Any
+    results: list[Any]
+    key: list[Any]
+
+
 class Segment:
     """A function that is recorded in its first call; later calls replay its compiled calls.
 
     Attributes:
-        recording: The recorded calls; None if there is no recording.
         replayed: Whether the last call was replayed.
         obstacle: The reason why the last recording cannot be replayed; "" if it can.
         eager_calls: The number of upcoming calls that run eagerly, as a back-off after recordings that could not be
@@ -178,11 +212,14 @@ class Segment:
         self._numbers = list[int]()  # the row counts of this call
         self.forget()
 
+    @property
+    def recording(self) -> Recording | None:
+        """The recorded calls; None if there is no recording."""
+        return None if self._recorded is None else self._recorded.recording
+
     def forget(self) -> None:
         """Drops the recording, so the next call is recorded again."""
-        self.recording: Recording | None = None
-        self._value: Any = None
-        self._results, self._key = list[Any](), list[Any]()
+        self._recorded: _Recorded | None = None
 
     def __call__(self, function: Callable[..., Any], *arguments: Any, times: int = 1) -> SegmentResult:
         """Returns the result of a function; replays the recorded calls of the function if possible.
@@ -197,12 +234,12 @@ class Segment:
         tensors, key = _flatten(arguments)
         self._numbers = [each for each in arguments if type(each) is int]
         results = [each for each in arguments if isinstance(each, SegmentResult)]
-        recorded = self.recording
-        if recorded is not None and len(results) == len(self._results) and key == self._key:
-            same_results = all(each.value is value for each, value in zip(results, self._results))
-            if same_results and (times_made := recorded.replay(backends.threads(), times, tensors)):
+        recorded = self._recorded
+        if recorded is not None and len(results) == len(recorded.results) and key == recorded.key:
+            same_results = all(each.value is value for each, value in zip(results, recorded.results))
+            if same_results and (times_made := recorded.recording.replay(backends.threads(), times, tensors)):
                 self.replayed, self._backoff, self.eager_calls = True, 0, 0
-                return SegmentResult(self._value, recorded, times_made)
+                return SegmentResult(recorded.value, recorded.recording, times_made)
         self.replayed = False
         if self.eager_calls or any(each.recording is None for each in results):
             self.eager_calls = max(0, self.eager_calls - 1)
@@ -210,14 +247,12 @@ class Segment:
                 function(*(each.now(each.value) if isinstance(each, SegmentResult) else each for each in arguments))
             )
         self.eager_calls, self._backoff = self._backoff, min(2 * self._backoff or 1, MAX_BACKOFF)
-        with Recording(*(each.recording for each in results if each.recording is not None)) as recording:
-            value = function(*self._in_recorded_memory(recording, arguments))
-        self.forget()
-        self.obstacle = recording.obstacle or ""
+        recording = Recording(*(each.recording for each in results if each.recording is not None))
+        value = recording.record(lambda: function(*self._in_recorded_memory(recording, arguments)))
+        self.obstacle, self._recorded = recording.obstacle or "", None
         if self.obstacle:
             return SegmentResult(value)
-        self.recording, self._value = recording, value
-        self._results, self._key = [each.value for each in results], key
+        self._recorded = _Recorded(recording, value, [each.value for each in results], key)
         return SegmentResult(value, recording)
 
     def _in_recorded_memory(self, recording: Recording, arguments: Iterable[Any]) -> Iterator[Any]:

@@ -108,6 +108,9 @@ class SplitDone(NamedTuple):
     importance: Tensor
 
 
+replayed(SampleReservoir)
+
+
 @replayed
 class Strategy:
     """The base class of rules for splitting cells in a training; this class itself never splits a cell.

@@ -21,11 +21,21 @@ from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RaySource
 from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.radiance import Radiance
-from voronerf.nerf.segment import MAX_BACKOFF, Segment, SegmentResult, Stage, free_names, in_python, run_stages
+from voronerf.nerf.segment import (
+    MAX_BACKOFF,
+    Segment,
+    SegmentResult,
+    Stage,
+    in_python,
+    note_attributes,
+    noting_reads,
+    run_stages,
+)
 from voronerf.nerf.split import Strategy
 from voronerf.nerf.volume import Batch, RenderOutput
 from voronerf.ops import Guard
 from voronerf.ops._core import backends
+from voronerf.ops._core.active import active
 from voronerf.ops._core.capture import Capture
 from voronerf.ops._core.custom_op import is_watched
 from voronerf.ops._core.recording import Recording
@@ -140,9 +150,22 @@ class TrainingStep:
         self.batches, self.loss, self.optimizer, self.strategy, self.guard = batches, loss, optimizer, strategy, guard
         self.generator, self.autocast, self.scaler = generator, autocast, scaler
         self.run_within(nullcontext)
-        self._segments, self._unchanged = dict[str, Segment](), False
+        self._start_anew()
+
+    def _start_anew(self) -> None:
+        self._segments, self._unchanged, self._is_running = dict[str, Segment](), False, False
         self._rays = self._backoff = self._eager_steps = 0  # for captures, as in `Segment`
-        self.forget()
+        self._forget()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the attributes without recordings, which a copy makes for itself."""
+        blank = object.__new__(type(self))
+        blank._start_anew()
+        return {name: value for name, value in vars(self).items() if name not in vars(blank)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._start_anew()
 
     def run_within(self, context: Callable[[], AbstractContextManager[None]]) -> None:
         """Sets the context manager in which steps and stages run if they are not replayed.
@@ -153,16 +176,23 @@ class TrainingStep:
         self._context = context
 
     def forget(self) -> None:
-        """Drops all recordings, so the next step is recorded again."""
+        """Drops all recordings, so the next step is recorded again; the rest of a running step runs eagerly."""
+        self._dependencies: Any = Never()
+        if not self._is_running:
+            self._forget()
+
+    def _forget(self) -> None:
         for segment in self._segments.values():
             segment.forget()
         self._capture: Capture | None = None
         self._captured: Any = None  # batch and output of the captured step
         self._groups = list[tuple[bool, str, list[Stage]]]()  # (whether in Python, name, stages)
+        self._draws = True  # whether the stages draw the batch
         self._last = SegmentResult({})
         self._spent = dict[str, tuple[float, int]]()  # seconds and calls of each Python hook
-        self._gradients = list[tuple[nn.Parameter, Tensor | None]]()  # replays write to this memory
-        self._dependencies: Any = Never()
+        self._gradients = list[tuple[nn.Parameter, Tensor | None]]()  # a captured step writes to this memory
+        self._dependencies = Never()
+        self._reads = list[tuple[Any, set[str]]]()  # objects, and the names of the attributes that segments read
         self._radiance: Radiance | None = None
         self._obstacle = ""
 
@@ -179,8 +209,8 @@ class TrainingStep:
         if not obstacle and (eager := max((self._eager_steps, *(each.eager_calls for each in segments)))):
             steps = f"{eager} more step{'s' * (eager > 1)}"
             return f"step: runs eagerly for {steps}, since the last recordings could not be replayed"
-        if not recorded:
-            return "step: will be recorded"
+        if not recorded or not self._dependencies.holds():
+            return f"step: will be recorded{' again, since something that it reads has changed' * bool(recorded)}"
         calls, several = sum(map(len, recorded)), f" in {len(recorded)} segments" if len(recorded) > 1 else ""
         lines = [f"step: recorded and replayed, {calls} calls{several}"]
         others = [each.obstacle for each in self._segments.values() if each.obstacle]
@@ -243,7 +273,7 @@ class TrainingStep:
             pre_backward()  # may change the sampler
         self._unchanged = self._is_unchanged()
         if not self._unchanged:
-            self.forget()
+            self._forget()
             self._obstacle = self._standing_obstacle() or ("it runs on a GPU" if self._on_gpu() else "")
             if not self._obstacle:
                 self._note_dependencies()
@@ -269,7 +299,8 @@ class TrainingStep:
             return SegmentResult(
                 function(*(each.now(each.value) if isinstance(each, SegmentResult) else each for each in arguments))
             )
-        return self._segments.setdefault(name, Segment())(function, *arguments)
+        run = functools.partial(noting_reads, self._reads, function)
+        return self._segments.setdefault(name, Segment())(run, *arguments)
 
     def end(self, at: int, output: RenderOutput, *gradients: SegmentResult) -> None:
         """Ends a step of segments: updates optimiser, sampler and split strategy.
@@ -291,11 +322,10 @@ class TrainingStep:
 
     def _stages(self, field: Radiance) -> list[Stage]:
         """Returns the stages of a step whose networks, loss and gradients are fused."""
-        draw = Stage(f"{type(self.batches).__name__}.draw", self._draw, ("rays",), self._draws_in_python())
         clear = Stage("clear", functools.partial(self.optimizer.zero_grad, set_to_none=True))
-        update = Stage("update", lambda output: self._update(output.loss), ("output",))
+        update = Stage("update", self._update_and_hold, ("output",))
         *evaluate, learn = self.loss.stages(field, self.generator, True, lambda value: self._last.now(value))
-        return [draw, *evaluate, clear, learn, update, *self._post_backward_stages()]
+        return [self._draw_stage(), *evaluate, clear, learn, update, *self._post_backward_stages()]
 
     def _post_backward_stages(self) -> Iterator[Stage]:
         """Yields the stages that update sampler and split strategy."""
@@ -303,6 +333,9 @@ class TrainingStep:
             if part is not None:
                 python, name = in_python(part, "step_post_backward"), f"{type(part).__name__}.step_post_backward"
                 yield Stage(name, part.step_post_backward, ("output",), python)
+
+    def _draw_stage(self) -> Stage:
+        return Stage(f"{type(self.batches).__name__}.draw", self._draw, ("rays",))
 
     def _draw(self, rays: int) -> dict[str, Any]:
         return {"batch": self.batches.draw(rays, self.generator)}
@@ -312,6 +345,16 @@ class TrainingStep:
 
     def _update(self, loss: Tensor, *gradients: Any) -> None:
         self.optimizer.update(self.guard, None if self.guard is None else loss)
+
+    def _update_and_hold(self, output: RenderOutput) -> dict[str, Any]:
+        """Updates the parameters, and returns them with the gradients, which replays write."""
+        self._update(output.loss)
+        gradients = self._with_gradients()
+        if active.recording is not None:
+            for _, gradient in gradients:
+                if gradient is not None:
+                    active.recording.hold(gradient)
+        return {"gradients": gradients}
 
     def _pre_backward(self, step: int) -> Callable[[], None]:
         renderer = self.loss.renderer
@@ -337,33 +380,55 @@ class TrainingStep:
 
     def _run_or_replay(self, rays: int, steps: int) -> tuple[int, StepOutput]:
         """Runs one step or replays several; returns their number, and the result of the last one."""
-        is_unchanged = self._is_unchanged()
+        if self._is_running:
+            raise RuntimeError(
+                "TrainingStep: a step must not be called while it runs, by one of its hooks or in another thread"
+            )
+        try:
+            self._is_running = True
+            return self._run_once(rays, steps)
+        finally:
+            self._is_running = False
+
+    def _run_once(self, rays: int, steps: int) -> tuple[int, StepOutput]:
+        batch = None
+        if self._draws_in_python():  # before all checks, since this hook may change what they look at
+            batch = self._call_stage(self._draw_stage(), {"rays": rays})["batch"]
+        is_unchanged = self._is_unchanged() and (batch is None) == self._draws
         if not is_unchanged and (obstacle := self._standing_obstacle()):
-            self.forget()
+            self._forget()
             self._obstacle = obstacle
-            return 1, StepOutput(*self._run_eagerly(rays))
+            return 1, StepOutput(*self._run_eagerly(rays, batch))
         if self._on_gpu():
-            return self._run_or_replay_on_gpu(rays, steps, is_unchanged)
+            return self._run_or_replay_on_gpu(rays, steps, is_unchanged, batch)
         if not is_unchanged:
-            self.forget()
-            stages = self._stages(cast(Radiance, self.loss.radiance()))
+            self._forget()
+            self._draws, stages = batch is None, self._stages(cast(Radiance, self.loss.radiance()))
+            stages = stages if self._draws else stages[1:]
             groups = itertools.groupby(stages, operator.attrgetter("python"))
             self._groups = [(python, f"step {place}", [*group]) for place, (python, group) in enumerate(groups)]
             for name in self._segments.keys() - {"before", "after", *(name for _, name, _ in self._groups)}:
                 del self._segments[name]  # these segments lie between other hooks
             self._note_dependencies()  # before the hooks, whose changes the next step uses
-        self._last, hook_results = SegmentResult({}), dict[str, Any]()
+        self._last, hook_results = SegmentResult({}), dict[str, Any]() if batch is None else {"batch": batch}
         for python, name, stages in self._groups:
             if python:
                 for stage in stages:
                     hook_results |= self._call_stage(stage, {"rays": rays, **hook_results})
                 continue
             segment, earlier = self._segments.setdefault(name, Segment()), self._last if self._last.value else {}
-            run, times = functools.partial(self._run_stages, stages), steps if len(self._groups) == 1 else 1
-            self._last = segment(run, rays, earlier, hook_results, times=times)
+            run, times = (
+                functools.partial(self._run_stages, stages),
+                steps if self._draws and len(self._groups) == 1 else 1,
+            )
+            if len(self._groups) > 1 and not self._dependencies.holds():  # a hook of this step has changed them
+                earlier = self._last.now(self._last.value)
+                self._last = SegmentResult(run(rays, earlier, hook_results))
+            else:
+                self._last = segment(run, rays, earlier, hook_results, times=times)
+                if any(each.name == "update" for each in stages):
+                    self._settle_gradients(segment)
             hook_results = {}
-            if any(each.name == "update" for each in stages):
-                self._settle_gradients(segment)
         value = self._last.value
         return self._last.times, StepOutput(value["batch"], value["output"], self._last.recording)
 
@@ -382,7 +447,7 @@ class TrainingStep:
 
     def _run_stages(self, stages: list[Stage], rays: int, earlier: Any, hook_results: Any) -> dict[str, Any]:
         with self._context():
-            return run_stages(stages, {**earlier, **hook_results, "rays": rays})
+            return noting_reads(self._reads, run_stages, stages, {**earlier, **hook_results, "rays": rays})
 
     def _settle_gradients(self, segment: Segment) -> None:
         """Points ``grad`` of all parameters to the memory that replays write.
@@ -390,19 +455,14 @@ class TrainingStep:
         Eager steps or the loop may have set ``grad`` to other tensors.
         """
         if segment.replayed:
-            for parameter, gradient in self._gradients:
+            for parameter, gradient in self._last.value["gradients"]:
                 if parameter.grad is not gradient:
                     parameter.grad = gradient
-        elif (recording := self._last.recording) is not None:  # a new recording
-            self._gradients = self._with_gradients()
-            for _, gradient in self._gradients:
-                if gradient is not None:
-                    recording.hold(gradient)
 
     def _run_or_replay_hook(self, name: str, function: Callable[[], None]) -> None:
         """Calls a hook before or after a step, or replays the compiled calls that were recorded in the hook."""
         if self._last.recording is not None and self._is_unchanged():
-            self._segments.setdefault(name, Segment())(function)
+            self.run_segment(name, function)
         else:
             function()
 
@@ -413,12 +473,14 @@ class TrainingStep:
     def _on_gpu(self) -> bool:
         return self.batches.device.type == "cuda"
 
-    def _run_or_replay_on_gpu(self, rays: int, steps: int, is_unchanged: bool) -> tuple[int, StepOutput]:
+    def _run_or_replay_on_gpu(
+        self, rays: int, steps: int, is_unchanged: bool, batch: Batch | None
+    ) -> tuple[int, StepOutput]:
         """Does the same as `_run_or_replay` by a CUDA graph, which is captured after a warm-up step."""
         if self._calls_hooks():
-            self.forget()
+            self._forget()
             self._obstacle = "it calls a Python hook, which a CUDA graph cannot replay"
-            return 1, StepOutput(*self._run_eagerly(rays))
+            return 1, StepOutput(*self._run_eagerly(rays, batch))
         self._rays, capture = rays, self._capture
         if capture is not None and is_unchanged and (times := capture.replay(backends.threads(), steps)):
             self._backoff = self._eager_steps = 0
@@ -428,7 +490,7 @@ class TrainingStep:
         if self._eager_steps:
             self._eager_steps -= 1
             return 1, StepOutput(*self._run_eagerly(rays))
-        self.forget()
+        self._forget()
         if not is_unchanged:
             result, self._obstacle = self._run_eagerly(rays), "it needs a warm-up step before the capture"
         else:
@@ -453,10 +515,10 @@ class TrainingStep:
     def _with_gradients(self) -> list[tuple[nn.Parameter, Tensor | None]]:
         return [(p, p.grad) for group in self.optimizer.param_groups for p in group["params"]]
 
-    def _run_eagerly(self, rays: int) -> tuple[Batch, RenderOutput]:
-        """Runs one step eagerly."""
+    def _run_eagerly(self, rays: int, batch: Batch | None = None) -> tuple[Batch, RenderOutput]:
+        """Runs one step eagerly, with ``batch`` if it has been drawn already."""
         with self._context():
-            batch = self.batches.draw(rays, self.generator)
+            batch = self.batches.draw(rays, self.generator) if batch is None else batch
             self.optimizer.zero_grad(set_to_none=True)
             if self.autocast is None:
                 output = self.loss(batch, self.generator, backward=True)
@@ -514,8 +576,11 @@ class TrainingStep:
             return "it runs under autocast"
         if self._scales():
             return "a GradScaler scales its loss"
-        for part in (self.loss, renderer, self.optimizer):
-            if in_python(part):
+        parts = [self.loss, renderer, self.optimizer, renderer.sampler.grid]
+        if self.strategy is not None and not in_python(self.strategy, "step_post_backward"):
+            parts.append(getattr(self.strategy, "reservoir", None))
+        for part in parts:
+            if part is not None and in_python(part):
                 return f"{type(part).__name__} may run Python code that a recording does not see"
         with self._in_precision():  # under autocast a traced field has no program
             reason = self.loss.why_not_fused()
@@ -537,18 +602,13 @@ class TrainingStep:
         compiled = backends.compiled()
         if not isinstance(radiance, Radiance) or compiled is None:
             return
-        self._radiance, guard = radiance, unchanged()
+        self._radiance, self._reads, guard = radiance, [], unchanged()
         field, grid = cast(nn.Module, renderer.field), getattr(renderer.sampler, "grid", None)
         guard.entries(vars(self), _ATTRIBUTES)
         guard.entries(vars(radiance.router), ["assignment", "temperature", "backend", "coords"])
-        parts = [self.loss, renderer, renderer.sampler]  # the objects that segments read
-        parts += [each for each in self.loss.terms if hasattr(each, "add") and not in_python(each, "add")]
-        if not self._draws_in_python():
-            parts.append(self.batches)
-        if self.strategy is not None and not in_python(self.strategy, "step_post_backward"):
-            parts.append(self.strategy)
-        for part in parts:
-            guard.contents(vars(part), free_names(part))
+        for part in self._parts():
+            if (names := note_attributes(guard, part)) is not None:
+                self._reads.append((part, names))
         dictionaries: list[dict[Any, Any]] = [renderer.fields, *([] if grid is None else [vars(grid)])]
         for module in field.modules():  # the field is the router or a module around it
             for name, members in vars(module).items():
@@ -587,6 +647,15 @@ class TrainingStep:
         ):
             guard.answer(query)
         self._dependencies = guard
+
+    def _parts(self) -> list[Any]:
+        """Returns the objects with hooks that may be replayed."""
+        parts = [self.loss, self.loss.renderer, self.loss.renderer.sampler]
+        parts += [term for term in self.loss.terms if hasattr(term, "add") and not in_python(term, "add")]
+        parts += [] if self._draws_in_python() else [self.batches]
+        if self.strategy is not None and not in_python(self.strategy, "step_post_backward"):
+            parts.append(self.strategy)
+        return parts
 
     def _precision(self) -> str:
         return torch.backends.cuda.matmul.fp32_precision if self._on_gpu() else backends.cpu_precision()

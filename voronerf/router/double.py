@@ -190,10 +190,10 @@ def _twin(part: nn.Module, place: int, reads: set[tuple[int, str]] | None, write
     return twin
 
 
-class _Unregistered:
+class Unregistered:
     """A base class whose ``__init_subclass__`` does nothing.
 
-    Many classes register their subclasses in ``__init_subclass__``. The subclasses that `_recording_class` makes must
+    Many classes register their subclasses in ``__init_subclass__``. Subclasses that record accesses to attributes must
     not appear in such a registry.
     """
 
@@ -221,7 +221,7 @@ def _recording_class(
     names: dict[str, Any] = {"__module__": kind.__module__, "__qualname__": kind.__qualname__}
     names |= {"__getattribute__": getattribute, "__setattr__": set_attribute}
     metaclass: Any = type(kind)
-    recording: type[nn.Module] = metaclass(kind.__name__, (_Unregistered, kind), names)
+    recording: type[nn.Module] = metaclass(kind.__name__, (Unregistered, kind), names)
     return recording
 
 

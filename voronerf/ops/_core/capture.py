@@ -52,11 +52,11 @@ class Capture:
         """Runs the function eagerly, and sets ``obstacle`` if the function synchronises host and device."""
         current, mode = torch.cuda.current_stream(self._device), torch.cuda.get_sync_debug_mode()
         self._stream.wait_stream(current)
-        active.vary = self._make_number
         with warnings.catch_warnings(record=True) as caught, torch.cuda.stream(self._stream):
             warnings.simplefilter("always")
-            torch.cuda.set_sync_debug_mode("warn")
             try:
+                torch.cuda.set_sync_debug_mode("warn")
+                active.vary = self._make_number
                 result = function()
             finally:
                 torch.cuda.set_sync_debug_mode(mode)
@@ -72,8 +72,8 @@ class Capture:
 
     def capture(self, function: Callable[[], T]) -> T:
         """Captures the function without running its kernels. Each replay fills the tensors of the returned result."""
-        active.vary = self._take_number
         try:
+            active.vary = self._take_number
             # Other threads, such as a viewer's, may allocate device memory during the capture.
             with torch.cuda.graph(self._graph, self._pool, self._stream, capture_error_mode="thread_local"):
                 return function()

@@ -17,16 +17,18 @@ memory has room for a quarter more rows than the recorded run; :meth:`Recording.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+from torch.utils import _python_dispatch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from voronerf.ops._core.active import active
 from voronerf.ops._core.rows import Count, RowCount
@@ -36,6 +38,7 @@ SPARE, SOME = 4, 64
 _NEW = ("aten::new_empty", "aten::empty")
 _HARMLESS = ("aten::promote_types", "aten::result_type")
 _KINDS = {torch.Tag.pointwise, torch.Tag.nondeterministic_seeded}
+_set_flag = getattr(_python_dispatch, "set_is_in_mode_without_ignore_compile_internals", None)  # newer torch
 _PASSED_OVER = (str(Path(torch.__file__).absolute().parent), str(Path(__file__).absolute()))
 
 
@@ -66,7 +69,7 @@ class _Computed(NamedTuple):
 
 
 class Recording(TorchDispatchMode):
-    """The recorded calls of a function. The function runs within this context, which is entered once.
+    """The recorded calls of a function, which runs in :meth:`record`, or within this context; either once.
 
     Attributes:
         obstacle: The reason why the calls cannot be replayed; None if they can.
@@ -106,6 +109,10 @@ class Recording(TorchDispatchMode):
         self._places: dict[Tensor, RowCount | None] = {}
         self._views: dict[Tensor, Tensor] = {}
         self._held: dict[int, _Held] = {}  # by the id of the object
+        self._is_paused = False  # whether torch operations run without an inspection
+        # Torch's record of its active modes, before this mode: their number, and flags for its compiler.
+        self._modes = torch._C._len_torch_dispatch_stack()
+        self._flags = {name: value for name, value in vars(_python_dispatch).items() if name.startswith("_is_in_")}
         self.obstacle: str | None = None
 
     @classmethod
@@ -121,10 +128,32 @@ class Recording(TorchDispatchMode):
         return self
 
     def __exit__(self, *error: Any) -> None:
-        super().__exit__(*error)
+        """Ends the recording. Unlike torch's method, it can be called again after an interrupt."""
         active.recording = active.vary = None
         self._calls.end()
+        while torch._C._len_torch_dispatch_stack() > self._modes:
+            torch._C._pop_torch_dispatch_stack(None)
+        vars(_python_dispatch).update(self._flags)
+        if _set_flag is not None:
+            _set_flag(self._flags["_is_in_any_mode_without_ignore_compile_internals"])
         self._refuse(self._calls.obstacle)
+
+    def record(self, function: Callable[[], Any]) -> Any:
+        """Runs a function and records its calls. The recording also ends if Ctrl-C interrupts :meth:`__exit__`."""
+        try:
+            with self:
+                return function()
+        finally:
+            self.__exit__()
+
+    @contextlib.contextmanager
+    def _paused(self) -> Iterator[None]:
+        """Returns a context in which torch operations run without an inspection."""
+        before, self._is_paused = self._is_paused, True
+        try:
+            yield
+        finally:
+            self._is_paused = before
 
     def __len__(self) -> int:
         """Returns the number of recorded calls."""
@@ -136,14 +165,14 @@ class Recording(TorchDispatchMode):
 
     def count(self, source: Callable[[], int]) -> int:
         """Returns the number of rows of this run; replays call ``source`` for the number before each run."""
-        with _disable_current_modes():
+        with self._paused():
             count = self._new_count(torch.tensor([source()]), source)
         self._counts.append(count)
         return RowCount.of(count)
 
     def computed(self, memory: Tensor) -> int:
         """Returns the number of rows that a call has written into ``memory``, int64 [1]."""
-        with _disable_current_modes():
+        with self._paused():
             if memory.dtype is not torch.int64:  # a number on a GPU: calls on a GPU are not recorded
                 self._refuse("a number of rows is not int64")
                 return int(memory)
@@ -158,7 +187,7 @@ class Recording(TorchDispatchMode):
 
     def vary(self, value: Callable[[], float]) -> Tensor:
         """Returns a number that varies from run to run, float32 []."""
-        with _disable_current_modes():
+        with self._paused():
             number = torch.tensor(value(), dtype=torch.float32)
         self._numbers.append((ctypes.c_float.from_address(number.data_ptr()), number, value))
         return number
@@ -172,7 +201,7 @@ class Recording(TorchDispatchMode):
             memory = self.new_rows(tensor, (self.count(lambda: len(self._taken[place])), *shape[1:]), None)
         else:
             memory = tensor.new_empty(())
-        with _disable_current_modes():
+        with self._paused():
             memory.copy_(tensor.detach())
         self._inputs.append(memory)
         return memory
@@ -181,7 +210,7 @@ class Recording(TorchDispatchMode):
         """Allocates memory for a `RowCount` of rows, large enough for the largest number of rows."""
         rows, *columns = shape
         assert isinstance(rows, RowCount)
-        with _disable_current_modes():
+        with self._paused():
             whole = like.new_empty([rows.capacity + max(rows.offset, 0), *columns], dtype=dtype)
             self._compiled.advise_huge_pages(whole, whole.nbytes)
         self._register(whole, rows.count)
@@ -320,6 +349,8 @@ class Recording(TorchDispatchMode):
         """Inspects each torch operation of the recorded function."""
         name, kwargs = func._schema.name, kwargs or {}
         result = func(*args, **kwargs)
+        if self._is_paused:
+            return result
         if name in _NEW:
             if name == "aten::new_empty" and self._place(args[0]) is not None and [*args[1][:1]] == [len(args[0])]:
                 self._refuse(f"memory of {len(args[0])} rows was allocated without a RowCount{_line()}")
@@ -357,7 +388,7 @@ class Recording(TorchDispatchMode):
         if not func._schema.is_mutable:
             memory = self._register(result) if rows is None else self.new_rows(result, (rows, *result.shape[1:]), None)
             if memory is not result:
-                with _disable_current_modes():
+                with self._paused():
                     memory.copy_(result)
         self._computed.append(_Computed(len(self._calls), func, args, kwargs, memory))
         return result if memory is None else memory
@@ -370,8 +401,8 @@ def mapped(function: Callable[[Any], Any], tree: Any) -> Any:
         return type(tree)(*entries) if hasattr(tree, "_fields") else type(tree)(entries)
     if isinstance(tree, dict):
         return {name: function(value) for name, value in tree.items()}
-    if hasattr(tree, "__dataclass_fields__"):
-        return type(tree)(**{name: function(value) for name, value in vars(tree).items()})
+    if names := _field_names(tree):
+        return type(tree)(**{name: function(getattr(tree, name)) for name in names})
     return tree
 
 
@@ -379,8 +410,13 @@ def entries_of(tree: Any) -> list[Any] | None:
     """Returns the entries to which `mapped` applies its function, or None for an object without entries."""
     if isinstance(tree, (list, tuple)):
         return [*tree]
-    by_name = tree if isinstance(tree, dict) else vars(tree) if hasattr(tree, "__dataclass_fields__") else None
-    return None if by_name is None else [*by_name.values()]
+    if isinstance(tree, dict):
+        return [*tree.values()]
+    return [getattr(tree, name) for name in names] if (names := _field_names(tree)) else None
+
+
+def _field_names(tree: Any) -> list[str]:
+    return [] if isinstance(tree, type) else [*getattr(tree, "__dataclass_fields__", ())]
 
 
 def _line() -> str:
