@@ -448,6 +448,9 @@ def test_a_replaced_method_runs_in_each_step(name, of, said):
     calls = counted(of(training), name)
     training.train(4)
     assert len(calls) == 4 and said in training.step.explain(), training.step.explain()
+    delattr(of(training), name)
+    training.train(3)
+    assert len(calls) == 4 and re.fullmatch(r"step: recorded and replayed, \d+ calls", training.step.explain())
 
 
 def test_the_step_that_a_scheduler_of_torch_replaces_is_no_obstacle():

@@ -57,8 +57,13 @@ def in_python(part: Any, hook: str = "") -> bool:
         hook: The name of the hook; "" asks whether this is true of any hook of the object.
     """
     kind: Any = type(part)
-    replaced = frozenset(name for name in getattr(part, "__dict__", ()) if callable(getattr(kind, name, None)))
+    replaced = _methods(kind).intersection(getattr(part, "__dict__", ()))
     return _overrides(kind, replaced, hook)
+
+
+@functools.lru_cache(maxsize=256)
+def _methods(kind: Any) -> frozenset[str]:
+    return frozenset(name for name in dir(kind) if callable(getattr(kind, name, None)))
 
 
 @functools.lru_cache(maxsize=256)
@@ -77,17 +82,18 @@ def _overrides(kind: Any, replaced: frozenset[str], hook: str) -> bool:
     return hook in overridden or any(not hook or not callable(getattr(protocol, name, None)) for name in overridden)
 
 
-def note_attributes(guard: Any, part: Any) -> set[str] | None:
-    """Adds the attributes of an object to a guard (`voronerf.ops._core.unchanged`).
+def note_attributes(guard: Any, parts: Iterable[Any]) -> list[tuple[Any, set[str]]]:
+    """Adds the attributes of objects to a guard (`voronerf.ops._core.unchanged`).
 
     Returns:
-        A set to which :func:`noting_reads` adds the names of the attributes that matter; None if all attributes matter,
-        since the object's class is `replayed` itself.
+        The objects whose class is not `replayed` itself, each with a set to which :func:`noting_reads` adds the names
+        of the attributes that matter. All attributes of the other objects matter.
     """
-    if type(part) not in _REPLAYED:
-        guard.contents(vars(part), read=(names := set[str]()))
-        return names
-    seen, waiting = set[int](), [part]
+    waiting, seen, reads = [*parts], set[int](), list[tuple[Any, set[str]]]()
+    for part in waiting[:]:
+        if type(part) not in _REPLAYED:
+            reads.append((part, set()))
+            guard.contents(vars(part), read=reads[-1][1])
     while waiting:
         held = waiting.pop()
         held = vars(held) if type(held) in _REPLAYED else held
@@ -96,9 +102,11 @@ def note_attributes(guard: Any, part: Any) -> set[str] | None:
             waiting += entries
             if isinstance(held, (list, tuple, dict)):
                 guard.contents(held)
+            elif hasattr(held, "__dict__"):  # a dataclass
+                guard.contents(vars(held))
             else:
                 guard.attributes(held, [*held.__dataclass_fields__])
-    return None
+    return reads
 
 
 def noting_reads(reads: Iterable[tuple[Any, set[str]]], function: Callable[..., Any], *arguments: Any) -> Any:

@@ -394,7 +394,7 @@ class TrainingStep:
         batch = None
         if self._draws_in_python():  # before all checks, since this hook may change what they look at
             batch = self._call_stage(self._draw_stage(), {"rays": rays})["batch"]
-        is_unchanged = self._is_unchanged() and (batch is None) == self._draws
+        is_unchanged = self._is_unchanged()
         if not is_unchanged and (obstacle := self._standing_obstacle()):
             self._forget()
             self._obstacle = obstacle
@@ -602,14 +602,16 @@ class TrainingStep:
         compiled = backends.compiled()
         if not isinstance(radiance, Radiance) or compiled is None:
             return
-        self._radiance, self._reads, guard = radiance, [], unchanged()
-        field, grid = cast(nn.Module, renderer.field), getattr(renderer.sampler, "grid", None)
+        self._radiance, guard = radiance, unchanged()
+        field = cast(nn.Module, renderer.field)
         guard.entries(vars(self), _ATTRIBUTES)
         guard.entries(vars(radiance.router), ["assignment", "temperature", "backend", "coords"])
-        for part in self._parts():
-            if (names := note_attributes(guard, part)) is not None:
-                self._reads.append((part, names))
-        dictionaries: list[dict[Any, Any]] = [renderer.fields, *([] if grid is None else [vars(grid)])]
+        self._reads = note_attributes(guard, self._parts())
+        hooks = [(self.batches, ["draw", "fetch"]), (self.strategy, ["step_post_backward"])]
+        for part, names in (*hooks, *((term, ["add"]) for term in self.loss.terms)):
+            if hasattr(part, "__dict__"):  # replaced hooks run in Python
+                guard.entries(vars(part), names)
+        dictionaries = list[dict[Any, Any]]()
         for module in field.modules():  # the field is the router or a module around it
             for name, members in vars(module).items():
                 if name in ("_parameters", "_buffers", "_modules") or name.endswith("_hooks"):
@@ -650,7 +652,8 @@ class TrainingStep:
 
     def _parts(self) -> list[Any]:
         """Returns the objects with hooks that may be replayed."""
-        parts = [self.loss, self.loss.renderer, self.loss.renderer.sampler]
+        sampler = self.loss.renderer.sampler
+        parts = [self.loss, self.loss.renderer, sampler, *([] if sampler.grid is None else [sampler.grid])]
         parts += [term for term in self.loss.terms if hasattr(term, "add") and not in_python(term, "add")]
         parts += [] if self._draws_in_python() else [self.batches]
         if self.strategy is not None and not in_python(self.strategy, "step_post_backward"):
