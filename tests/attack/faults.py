@@ -352,7 +352,7 @@ FAULTS = (
     _step(
         "nothing that it depends on is noted",
         "nerf/step.py",
-        "            self._note_dependencies()  # before the hooks, whose changes the next step uses\n",
+        "            self._note_dependencies()  # before the hooks, which may change them\n",
         "",
     ),
     _step(

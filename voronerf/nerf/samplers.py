@@ -80,9 +80,9 @@ class Sampler:
     subclass that skips empty space defines ``grid``. The library uses only these members, never the class of a sampler.
 
     Each training step calls :meth:`step_pre_backward`, then :meth:`sample` after drawing its rays, then
-    :meth:`step_post_backward` after the optimiser. These hooks may change the sampler and its grid; changes to other
-    objects take effect in the next step. The tensors that a hook receives belong to the step, and must be read before
-    the hook returns. A replayed step calls the hooks that a subclass overrides, and replays the other hooks.
+    :meth:`step_post_backward` after the optimiser. These hooks may change the sampler and its grid; after changes to
+    other objects, the rest of the step runs eagerly. The tensors that a hook receives belong to the step, and must be
+    read before the hook returns. A replayed step calls the hooks that a subclass overrides, and replays the others.
 
     Attributes:
         passes: The number of passes over a ray, each with its own number of samples.

@@ -99,12 +99,14 @@ class TrainingStep:
     Python runs in between, and threads are woken once per call. The results are bit-identical to eager steps.
 
     A user's hook of a `Sampler`, a `Strategy`, a source of rays or a term of the loss is called in each step, between
-    two replayed segments; see `replayed`. If the hook changes other objects, the next step uses the changes. On CUDA, a
-    step without such hooks is captured in a CUDA graph after a warm-up step; a new number of rays needs a new capture.
+    two replayed segments; see `replayed`. If the hook changes other objects, the rest of the step runs eagerly with the
+    changes, and the next step is recorded again. A step must not be called within its own hooks. On CUDA, a step
+    without such hooks is captured in a CUDA graph after a warm-up step; a new number of rays needs a new capture.
 
     A step that cannot be replayed runs eagerly; :meth:`explain` tells why. One reason is a parameter that needs a
     gradient but belongs to another optimiser. Changed attributes of the objects are detected, and so is a tensor that
-    moves to other memory (``x.data = y``). After other changes inside an object, call :meth:`forget`.
+    moves to other memory (``x.data = y``). After other changes inside an object, call :meth:`forget`. A copy of a step
+    has recordings of its own; a shallow copy trains the same networks.
 
     Args:
         batches: The source of rays: `RayBatches`, or another :class:`RaySource`.
@@ -409,7 +411,7 @@ class TrainingStep:
             self._groups = [(python, f"step {place}", [*group]) for place, (python, group) in enumerate(groups)]
             for name in self._segments.keys() - {"before", "after", *(name for _, name, _ in self._groups)}:
                 del self._segments[name]  # these segments lie between other hooks
-            self._note_dependencies()  # before the hooks, whose changes the next step uses
+            self._note_dependencies()  # before the hooks, which may change them
         self._last, hook_results = SegmentResult({}), dict[str, Any]() if batch is None else {"batch": batch}
         for python, name, stages in self._groups:
             if python:
