@@ -70,7 +70,7 @@ __global__ void __launch_bounds__(kThreads)
 __global__ void __launch_bounds__(kScanThreads) march_scan_kernel(int32_t* offsets, int64_t r, int64_t capacity) {
   VN_SHARED(sums, int32_t[32]);
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-  int64_t before = 0;  // the counts of all rays can exceed int32
+  int32_t before = 0;  // r * s < 2^31
   if (threadIdx.x == 0) offsets[0] = 0;
   for (int64_t first = 1; first <= r; first += kScanThreads) {
     const int64_t i = first + threadIdx.x;
@@ -79,7 +79,7 @@ __global__ void __launch_bounds__(kScanThreads) march_scan_kernel(int32_t* offse
     __syncthreads();
     const int32_t of_warps = running_sum(sums[lane], lane);
     const int32_t lower = __shfl_sync(kAllLanes, of_warps, warp == 0 ? 0 : warp - 1);
-    const int64_t total = before + (warp == 0 ? 0 : lower) + sum;
+    const int32_t total = before + (warp == 0 ? 0 : lower) + sum;
     if (i <= r) offsets[i] = static_cast<int32_t>(total < capacity ? total : capacity);
     before += __shfl_sync(kAllLanes, of_warps, 31);
     __syncthreads();  // sums are free for the next round

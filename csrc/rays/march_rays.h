@@ -43,7 +43,8 @@ constexpr int64_t kMarchWord = 32;
 
 VN_HD int64_t march_words(int64_t s) { return (s + kMarchWord - 1) / kMarchWord; }
 
-// mask: [r, march_words(s)], bit i of word w for stratum 32 w + i. offsets: [r+1], at most capacity.
+// Requires r * s < 2^31. mask: [r, march_words(s)], bit i of word w for stratum 32 w + i. offsets: [r+1], at most
+// capacity.
 void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t* total, int64_t capacity,
                           Isa isa, int threads);
 void march_rays_count_cuda(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, void* stream);

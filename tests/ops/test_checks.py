@@ -4,7 +4,11 @@ import pytest
 import torch
 from op_cases import refused
 
+from voronerf import ops
 from voronerf.ops._core import checks
+from voronerf.ops._core.cases import Draw, cases
+
+CASES = cases()
 
 
 def test_shape_binds_letters():
@@ -68,6 +72,20 @@ def test_a_batch_too_large_for_its_index_is_refused_before_it_is_touched():
         cell_sort(many, 2)
     with refused(ValueError, "nearest_centre: points must have fewer than 2**31 rows, got 2147483648: split the batch"):
         nearest_centre(torch.zeros(1, 3).expand(2**31, 3), torch.zeros(1, 3))
+
+
+@pytest.mark.parametrize("op", ["march_rays", "render_opaque", "resample"])
+def test_more_results_than_an_index_can_number_are_refused(op):
+    """Kernels add up the samples of all rays in int32."""
+    arguments = CASES[op].make(Draw(), 11)
+    arguments.pop("uniforms", None)
+    count, name = ("count", "count times the rays") if op == "resample" else ("samples", "samples of all rays")
+    for key, value in arguments.items():
+        if isinstance(value, torch.Tensor):
+            rows = value[:1].expand(2**16 + 1, *value.shape[1:]) if len(value) == 11 else value
+            arguments[key] = rows.to("meta")  # nothing is computed
+    with refused(ValueError, f"{op}: {name} must have fewer than 2**31 rows, got 2147516416: split the batch"):
+        getattr(ops, op)(**{**arguments, count: 2**15})
 
 
 def test_more_cells_than_any_input_fills_are_refused_before_memory_is_taken():
