@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from attempts import REFUSED, RIGHT, Failed
 from hostile import NUMBERS, TEXTS
+from pages import at_page_end
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -94,9 +95,13 @@ def negated(value: Any) -> Any:
 
 
 def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tuple[list[Tensor], list[Tensor]]:
-    """Returns an op's output tensors (in-place outputs too), and the gradients of their sum if `gradients` is set."""
+    """Returns an op's output tensors (in-place outputs too), and the gradients of their sum if `gradients` is set.
+
+    Contiguous arguments and incoming gradients are copied to the ends of memory pages.
+    """
     case = CASES[op]
     own = tree_map(lambda value: value.detach().clone() if isinstance(value, Tensor) and case.in_place else value, call)
+    own = tree_map(at_page_end, own)
     leaves = []
     if gradients:
 
@@ -112,8 +117,8 @@ def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tup
     smooth = [part for part in found if part.requires_grad and part.numel()]
     if not smooth:
         return found, []
-    total = sum(part.double().sum() for part in smooth)
-    return found, list(torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True))
+    ones = [at_page_end(torch.ones_like(part)) for part in smooth]
+    return found, list(torch.autograd.grad(smooth, leaves, ones, allow_unused=True, materialize_grads=True))
 
 
 def invalid_call(rng: random.Random, folder: Path, inputs: Path) -> str:

@@ -4,6 +4,7 @@ import blocks
 import op_attacks
 import pytest
 import torch
+from pages import at_page_end
 
 from voronerf.ops._core.cases import Draw
 
@@ -13,6 +14,57 @@ COMPARED = [op for op, case in op_attacks.CASES.items() if case.comparable]
 def test_constants_of_kernels_are_found():
     assert {16, 32, 64, 128, 256, 1024, 2048, 4096, 16384, 32768} <= set(blocks.blocks())
     assert {127, 128, 129, 385, 4097, 16383} <= set(blocks.sizes(20_000)) and max(blocks.sizes(20_000)) <= 20_000
+
+
+@pytest.fixture
+def at_page_ends(monkeypatch):
+    """Places results at the ends of pages, as `op_attacks.results` places arguments and incoming gradients.
+
+    Runs with three threads.
+    """
+    for place, name in ((torch.Tensor, "new_empty"), (torch, "empty")):
+        make = getattr(place, name)
+        monkeypatch.setattr(place, name, lambda *args, make=make, **options: at_page_end(make(*args, **options)))
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("op", op_attacks.CASES)
+def test_touches_nothing_behind_a_tensor(at_page_ends, op):
+    """An access behind a tensor ends the process."""
+    case = op_attacks.CASES[op]
+    for n in (1, 7, 16, 17, 32, 33, 48, 128):
+        for draw in (Draw(n, **[*case.kinds.values()][n % len(case.kinds)]), Draw(n, free=True)):
+            op_attacks.results(op, case.make(draw, n), "auto", case.differentiable)
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("k", [17, 33, 300])
+def test_nearest_centre_stays_in_its_index_with_an_infinite_bound(at_page_ends, k):
+    """The distance of 3e38 to the last point's centre overflows; the boxes of missing children are infinitely far."""
+    call = op_attacks.CASES["nearest_centre"].make(Draw(k=k, indexed=True), 16)
+    call["points"][1::2] = 3e38
+    op_attacks.results("nearest_centre", call, "native", gradients=False)
+
+
+@pytest.mark.native
+def test_keep_heaviest_has_memory_for_ascending_samples(at_page_ends):
+    """Every sample is heavier than all samples before it, so that it is collected."""
+    call = op_attacks.CASES["keep_heaviest"].make(Draw(rays=False), 128)
+    op_attacks.results("keep_heaviest", {**call, "weights": torch.arange(128.0)}, "native", gradients=False)
+
+
+@pytest.mark.slow
+@pytest.mark.native
+@pytest.mark.parametrize("op", op_attacks.CASES)
+def test_touches_nothing_behind_a_tensor_with_any_instruction_set(at_page_ends, isa, op):
+    case = op_attacks.CASES[op]
+    for n in blocks.sizes(260):
+        for draw in (*(Draw(n, **kind) for kind in case.kinds.values()), Draw(n, free=True)):
+            op_attacks.results(op, case.make(draw, n), "auto", case.differentiable)
 
 
 @pytest.mark.slow
