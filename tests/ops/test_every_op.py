@@ -16,7 +16,7 @@ from unittest import mock
 import pytest
 import torch
 from helpers import on_any_number_of_threads
-from op_cases import need, refused, strided
+from op_cases import FLOATS, need, refused, strided
 from tolerances import assert_as_exact
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
@@ -382,6 +382,33 @@ def test_the_compiled_module_checks_what_python_checks(op):
     for kind in case.kinds.values():
         with mock.patch.object(declared(name), "_call", side_effect=AssertionError):
             call(**case.make(Draw(**kind), 6))
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("op", [op for op in CASES if op not in NETWORKS])
+def test_the_compiled_module_refuses_the_dtypes_that_python_refuses(op):
+    """Each argument in turn has another floating-point dtype than the others."""
+    case, name = CASES[op], CASES[op].call or op
+    call = getattr(ops, name)
+
+    def error(arguments):
+        try:
+            call(**arguments)
+        except (TypeError, ValueError) as refusal:
+            return str(refusal)
+        return None
+
+    for kind in case.kinds.values():
+        for dtype in FLOATS:
+            arguments = case.make(Draw(**{**kind, "dtype": dtype}), 6)
+            for key, tensor in arguments.items():
+                if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+                    continue
+                for other in FLOATS:
+                    changed = {**arguments, key: tensor.to(other)}
+                    with in_python(name):
+                        expected = error(changed)
+                    assert error(changed) == expected, (key, dtype, other)
 
 
 @pytest.mark.parametrize("op", CASES)
