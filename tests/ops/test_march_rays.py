@@ -136,6 +136,16 @@ def test_many_rays_of_a_picture_equal_the_reference(device, backend, rest, spaci
             same(march(arguments, 64, device, backend, **rest, **more), expected)
 
 
+def test_leaps_far_from_the_origin_allow_for_the_rounding_of_positions(device, backend):
+    """At 10,000 units float32 rounds positions to 1e-3 units, a hundredth of a cell and most of a stratum."""
+    need("march_rays", backend, device, torch.float32)
+    arguments = case(60, (24, 20, 28), 0.05)
+    for name in ("origins", "box"):
+        arguments[name] += 10_000
+    expected = march(arguments, 2000, torch.device("cpu"), "reference")
+    same(march(arguments, 2000, device, backend), expected)
+
+
 def test_a_seed_stands_for_uniforms_of_its_own(device, backend):
     r, samples = 200, 40
     box = torch.tensor([[-99.0] * 3, [99.0] * 3])
