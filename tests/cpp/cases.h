@@ -99,8 +99,8 @@ inline void within(const Array<int32_t>& cells, int64_t k, const char* what) {
 }
 
 inline int64_t some_rows() {
-  const int64_t sizes[] = {0, 1, below(20), 15 + below(4), 2047 + below(4), below(9000)};
-  return sizes[below(6)];
+  const int64_t sizes[] = {0, 1, below(20), 15 + below(4), 32 * below(9) + below(3), 2047 + below(4), below(9000)};
+  return sizes[below(7)];
 }
 
 template <typename T>

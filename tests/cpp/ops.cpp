@@ -154,7 +154,7 @@ void encode(Isa isa) {
   using voronerf::ProgramEncoding;
   const int kind = below(4);
   const bool integrated = kind == 0, harmonics = kind == 1, include = kind == 2;
-  const int64_t n = below(3) == 0 ? below(3) : below(harmonics ? 3000 : 200);
+  const int64_t counts[] = {below(3), 32 * below(9) + below(3), below(harmonics ? 3000 : 200)}, n = counts[below(3)];
   const int d = integrated || harmonics ? 3 : below(9), size = harmonics ? 1 + below(4) : below(12);
   const int width = harmonics ? size * size : d * (2 * size + (include ? 1 : 0));
   const Array<float> x = uniform<float>(n * d);

@@ -165,16 +165,17 @@ struct Case {
     for (int64_t i = 0; i < n; ++i) dark[i] = sifts && below(2) < without;
     for (size_t i = 0; i < table.inputs.size(); ++i) {
       const auto [width, ray] = table.inputs[i];
-      Array<float> values = uniform<float>((ray ? r : n) * width);
-      for (const int32_t gaussian : d.gaussians) {
-        for (size_t at = 0; gaussian == static_cast<int32_t>(i) && at < values.size(); ++at) {
-          if (static_cast<int64_t>(at) % width >= width / 2) values[at] = std::fabs(values[at]);
-        }
+      const int64_t rows = ray ? r : n;
+      Array<float> values = uniform<float>(rows * width);
+      const bool turned = !ray && !half && width != 3 && below(4) == 0;
+      const bool gaussian = std::find(d.gaussians.begin(), d.gaussians.end(), i) != d.gaussians.end();
+      const bool gradient = d.gradients >= 0 && static_cast<int64_t>(i) >= d.gradients;
+      for (int64_t at = 0; at < rows * width; ++at) {
+        const int64_t row = turned ? at % rows : at / width, column = turned ? at / rows : at % width;
+        if (gaussian && column >= width / 2) values[at] = std::fabs(values[at]);
+        if (gradient && dark[row]) values[at] = 0.0f;
       }
-      transposed.push_back(!ray && !half && width != 3 && below(4) == 0);
-      for (int64_t at = 0; d.gradients >= 0 && static_cast<int64_t>(i) >= d.gradients && at < n * width; ++at) {
-        if (dark[transposed.back() ? at % n : at / width]) values[at] = 0.0f;
-      }
+      transposed.push_back(turned);
       input_types.push_back(half ? TableType::bfloat16 : TableType::float32);
       inputs.push_back(stored(values, input_types.back()));
     }
@@ -294,10 +295,10 @@ void run_case(const Description& description, int number) {
 }  // namespace
 
 int main(int count, char** arguments) {
-  if (count < 3) fail("programs CASES FILE, with what programs.py wrote");
-  const int programs = 4 * std::atoi(arguments[1]);
+  if (count < 3) fail("programs CASES FILE [FIRST], with what programs.py wrote");
+  const int programs = 4 * std::atoi(arguments[1]), first = count > 3 ? 4 * std::atoi(arguments[3]) : 0;
   file.open(arguments[2]);
-  for (int i = 0; i < programs; ++i) run_case(next(), i);
+  for (int i = 0; i < programs; ++i) run_case(next(), first + i);
   std::printf("%d programs\n", programs);
   return 0;
 }

@@ -1,4 +1,4 @@
-"""Writes random programs as numbers for programs.cpp: ``programs.py CASES FILE``.
+"""Writes random programs as numbers for programs.cpp: ``programs.py CASES FILE [FIRST]``, FIRST for other cases.
 
 The cases are, in turn: a layer table, the gradient of a layer table, a program with all kinds of steps, and the first
 or second gradient of such a program. The requested gradients are random too. Each program is lowered for every operand
@@ -201,9 +201,10 @@ def numbers(record: Any) -> Iterator[str]:
 
 def main() -> None:
     """Writes the programs to a file."""
+    first = int(sys.argv[3]) if len(sys.argv) > 3 else 0
     with Path(sys.argv[2]).open("w") as out:
-        for number in range(4 * int(sys.argv[1])):
-            program, first = random_program(random.Random(number), number)
+        for number in range(4 * first, 4 * (first + int(sys.argv[1]))):
+            program, first_gradient = random_program(random.Random(number), number)
             of_inputs = {step.out: int(step.numbers[0]) for step in program.steps if step.op == "input"}
             encoded = {step.operands[0].index for step in program.steps if step.name == "integrated"}
             gaussians = [of_inputs[value] for value in sorted(encoded & set(of_inputs))]
@@ -212,7 +213,7 @@ def main() -> None:
                 depth = max(shape) if len(shape) > 1 and i not in program.tables else 1
                 parameters.append([math.prod(shape), depth, i in program.tables])
             tables = [table_of(program, layout) for layout in compiled.ProgramLayout]
-            for part in (*tables, parameters, gaussians, first):
+            for part in (*tables, parameters, gaussians, first_gradient):
                 out.write(" ".join(numbers(part)) + "\n")
 
 
