@@ -35,6 +35,12 @@ def _kernel(op: str, what: str, file: str, line: str, wrong: str) -> Fault:
     return Fault(f"{op}: {what}", f"csrc/{file}", line, wrong, tests)
 
 
+def _on_cuda(op: str, what: str, file: str, line: str, wrong: str) -> Fault:
+    """Returns a fault in an op's CUDA kernel, which the op's tests should detect on the emulated device."""
+    tests = (f"tests/ops/test_{op}.py", "-k", "native-cpu and not compile and not opcheck", "--emulate-cuda", "1")
+    return Fault(f"{op} on CUDA: {what}", f"csrc/{file}", line, wrong, tests)
+
+
 def _python(what: str, file: str, line: str, wrong: str, *tests: str) -> Fault:
     return Fault(what, f"voronerf/{file}", line, wrong, tests)
 
@@ -93,6 +99,111 @@ FAULTS = (
         "geometry/centre_index_isa.cpp",
         "if (!(remaining[nearest] <= best)) continue;",
         "if (!(remaining[nearest] < best)) continue;",
+    ),
+    _kernel(
+        "nearest_centre",
+        "an index of too few words is searched",
+        "geometry/nearest_centre.cpp",
+        "words != shape.words || ",
+        "",
+    ),
+    _kernel(
+        "nearest_centre",
+        "an index leaves out boxes within the rounding of the best",
+        "geometry/centre_index_isa.cpp",
+        "reach = best + (kMargin * best + kFloor);",
+        "reach = best;",
+    ),
+    _kernel(
+        "nearest_centre",
+        "the bound from the last point's centre has no margin",
+        "geometry/centre_index_isa.cpp",
+        "bound = v + 2.0f * (kMargin * v + kFloor);",
+        "bound = v;",
+    ),
+    _on_cuda(
+        "nearest_centre",
+        "the bound from the last point's centre has no margin",
+        "geometry/nearest_centre.cu",
+        "bound = fminf(v + 2.0f * (kMargin * v + kFloor), bound);",
+        "bound = fminf(v, bound);",
+    ),
+    _on_cuda(
+        "nearest_centre",
+        "an index leaves out boxes within the rounding of the best",
+        "geometry/nearest_centre.cu",
+        "reach = exact ? best : best + (kMargin * best + kFloor);",
+        "reach = best;",
+    ),
+    _kernel(
+        "nearest_centre",
+        "float32 decides between distances closer than its rounding",
+        "geometry/nearest_centre_math.h",
+        "kMargin = 2e-6f;",
+        "kMargin = 2e-7f;",
+    ),
+    _kernel(
+        "nearest_centre",
+        "an infinite bound leads to children that do not exist",
+        "geometry/centre_index_isa.cpp",
+        "bound = bound < kHuge ? bound : kHuge;",
+        "",
+    ),
+    _kernel(
+        "march_rays",
+        "uniforms behind the last stratum are read",
+        "rays/march_rays_isa.cpp",
+        "size = left < kMarchWord ? left : kMarchWord;",
+        "size = kMarchWord;",
+    ),
+    _kernel(
+        "march_rays",
+        "leaps do not allow for the rounding of positions",
+        "rays/march_rays_isa.cpp",
+        "walk.slack[j] = 1e-3f + 1e-6f *",
+        "walk.slack[j] = 0.0f *",
+    ),
+    _kernel(
+        "hash_encode",
+        "a block at the end reads points behind the last",
+        "encoding/hash_encode_tile.h",
+        "if (rows == kHashBlock) return from;",
+        "if (rows >= kLanes) return from;",
+    ),
+    _kernel(
+        "keep_heaviest",
+        "a part collects one sample more than it has memory for",
+        "rays/keep_heaviest.cpp",
+        "if (count < 2 * q) continue;",
+        "if (count <= 2 * q) continue;",
+    ),
+    _kernel(
+        "adam",
+        "the last line of a dense parameter is updated past its end",
+        "encoding/adam_isa.cpp",
+        "rule.dense && line + kLine <= end;",
+        "rule.dense && line < end;",
+    ),
+    _kernel(
+        "spherical_harmonics",
+        "a tile at the end reads rows behind the last",
+        "encoding/encode_isa.cpp",
+        "in.n - first >= kEncodeRows + kEncodeLanes;",
+        "in.n - first >= kEncodeRows;",
+    ),
+    _kernel(
+        "render_loss",
+        "float32 is taken beside float64",
+        "bindings/tensor_rules.h",
+        "(wide && first != kFloat64 ? kFloat32 : first)",
+        "(wide ? kFloat32 : first)",
+    ),
+    _python(
+        "march_rays: more strata than int32 can count are not refused",
+        "ops/march_rays/__init__.py",
+        'check_count("march_rays", "samples of all rays", arguments.origins.shape[0] * arguments.samples)',
+        "pass",
+        "tests/ops/test_checks.py",
     ),
     _kernel(
         "locate_cell",
