@@ -274,6 +274,7 @@ constexpr const char* kStub =
     "    def answer(self, function: Any) -> None: ...\n"
     "    def place(self, tensor: Tensor) -> None: ...\n"
     "    def layout(self, tensor: Tensor) -> None: ...\n"
+    "    def values(self, tensor: Tensor, copy: Tensor) -> None: ...\n"
     "    def kind(self, dictionary: dict[str, Any], name: str) -> None: ...\n"
     "    def holds(self) -> bool: ...\n"
     "\n"

@@ -48,6 +48,36 @@ bool each(PyObject* container, Look&& look) {
   return true;
 }
 
+// Returns whether the entries at `at`, from dimension `d` of the view on, have the bytes of a contiguous copy, and
+// moves `copy` behind these bytes.
+bool has_bytes(const TensorView& view, int d, const char* at, const char*& copy, int64_t size) {
+  if (d == view.dimensions) {
+    copy += size;
+    return std::memcmp(at, copy - size, static_cast<size_t>(size)) == 0;
+  }
+  for (int64_t i = 0; i < view.shape[d]; ++i) {
+    if (!has_bytes(view, d + 1, at + i * view.strides[d] * size, copy, size)) return false;
+  }
+  return true;
+}
+
+bool has_values(PyObject* tensor, PyObject* copied) {
+  TensorView view, copy;
+  if (!view.look(tensor) || !copy.look(copied)) {
+    static PyObject* const word = PyUnicode_InternFromString("equal");
+    const auto answer = py::reinterpret_steal<py::object>(PyObject_CallMethodOneArg(tensor, word, copied));
+    PyErr_Clear();
+    return answer.ptr() == Py_True;
+  }
+  if (!view.on_cpu()) return false;
+  if (view.code != copy.code || view.bits != copy.bits || view.dimensions != copy.dimensions) return false;
+  if (!std::equal(view.shape, view.shape + view.dimensions, copy.shape)) return false;
+  const int64_t size = view.bits * view.lanes / 8;
+  const char* bytes = static_cast<const char*>(copy.address());
+  if (!view.is_contiguous()) return has_bytes(view, 0, static_cast<const char*>(view.address()), bytes, size);
+  return std::memcmp(view.address(), bytes, static_cast<size_t>(view.entries() * size)) == 0;
+}
+
 py::object attribute_of(PyObject* owner, PyObject* name) {
   auto value = py::reinterpret_steal<py::object>(PyObject_GetAttr(owner, name));
   PyErr_Clear();
@@ -171,6 +201,9 @@ bool Unchanged::holds() const {
   for (const auto& [function, was] : answers_) {
     if (!is_same(was.ptr(), function().ptr())) return false;
   }
+  for (const auto& [tensor, copy] : values_) {
+    if (!has_values(tensor.ptr(), copy.ptr())) return false;
+  }
   for (const Kind& noted : kinds_) {
     PyObject* const tensor = PyDict_GetItemWithError(noted.dictionary.ptr(), noted.name.ptr());
     if (tensor == nullptr || tensor == Py_None || !noted.seen.holds(tensor)) return false;
@@ -188,7 +221,9 @@ int Unchanged::each_held(const Visit& visit) const {
   for (const std::vector<Named>* named : {&entries_, &attributes_}) {
     for (const Named& noted : *named) held.insert(held.end(), {noted.owner.ptr(), noted.value.ptr()});
   }
-  for (const auto& [function, answer] : answers_) held.insert(held.end(), {function.ptr(), answer.ptr()});
+  for (const auto* pairs : {&answers_, &values_}) {
+    for (const auto& [one, other] : *pairs) held.insert(held.end(), {one.ptr(), other.ptr()});
+  }
   for (const Tensor& noted : tensors_) held.insert(held.end(), {noted.tensor.ptr(), noted.storage.ptr()});
   for (const Kind& noted : kinds_) held.push_back(noted.dictionary.ptr());
   int status = 0;
@@ -206,6 +241,7 @@ void bind_unchanged(py::module_& module) {
       .def("answer", &Unchanged::answer)
       .def("place", &Unchanged::place)
       .def("layout", &Unchanged::layout)
+      .def("values", &Unchanged::values)
       .def("kind", &Unchanged::kind)
       .def("holds", &Unchanged::holds);
 }

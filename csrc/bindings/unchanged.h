@@ -30,6 +30,9 @@ class Unchanged {
   // Notes the address of a tensor's memory (place), or also its sizes and strides (layout).
   void place(const py::object& tensor) { add(tensor, false); }
   void layout(const py::object& tensor) { add(tensor, true); }
+  // Notes the values of a tensor on the CPU, of which `copy` is a contiguous copy. Unlike the version counter, the
+  // values also show writes through `tensor.data` and into inference tensors.
+  void values(const py::object& tensor, const py::object& copy) { values_.emplace_back(tensor, copy); }
   // Notes the sizes, dtype and device of the tensor under a key of a dictionary. The tensor itself may change.
   void kind(const py::dict& dictionary, const std::string& name);
 
@@ -72,6 +75,7 @@ class Unchanged {
   void add(const py::object& tensor, bool layout);
 
   std::vector<std::pair<py::object, py::object>> answers_;  // functions and their results
+  std::vector<std::pair<py::object, py::object>> values_;   // tensors and copies of their values
   std::vector<Container> containers_;
   std::vector<Named> entries_, attributes_;
   std::vector<Tensor> tensors_;

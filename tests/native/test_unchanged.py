@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import native
-from voronerf.ops._core.unchanged import Never, unchanged
+from voronerf.ops._core import backends, native
+from voronerf.ops._core.unchanged import Never, Values, unchanged
 
 pytestmark = pytest.mark.native
 
@@ -118,3 +118,70 @@ def test_who_asks_is_freed_with_what_is_noted():
     del thing
     gc.collect()
     assert gone() is None
+
+
+@pytest.mark.parametrize("note", ["place", "layout", "values"])
+def test_who_asks_is_freed_with_the_tensors_that_are_noted(note):
+    """Python frees the reference cycle of a guard and a tensor with an attribute that holds the guard."""
+    tensor = torch.zeros(3)
+    tensor.guard = unchanged()
+    getattr(tensor.guard, note)(tensor, *[tensor.clone()] * (note == "values"))
+    gone = weakref.ref(tensor)
+    del tensor
+    gc.collect()
+    assert gone() is None
+
+
+def of_inference(tensor):
+    with torch.inference_mode():
+        return tensor.clone()
+
+
+#: Tensors whose values a guard notes.
+NOTED = {
+    "a vector": lambda: torch.arange(8.0),
+    "a number": lambda: torch.tensor(2.0),
+    "no entries": lambda: torch.zeros(0, 3),
+    "a transposed matrix": lambda: torch.arange(6.0).reshape(2, 3).T,
+    "one number many times": lambda: torch.tensor(2.0).expand(4, 3),
+    "every second entry": lambda: torch.arange(8)[::2],
+    "flags": lambda: torch.tensor([True, False]),
+    "complex numbers": lambda: torch.tensor([1j, 2.0]),
+    "NaN": lambda: torch.tensor([torch.nan, 0.0, -0.0]),
+    "bfloat16": lambda: torch.ones(3, dtype=torch.bfloat16),
+    "inference mode": lambda: of_inference(torch.ones(3)),
+    "a parameter": lambda: torch.nn.Parameter(torch.ones(3)),
+}
+
+
+@pytest.mark.parametrize("way", ["exchange", "methods", "no module"])
+@pytest.mark.parametrize("name", NOTED)
+def test_values_are_compared(name, way, monkeypatch):
+    """Writes that no version counter counts are found; values that come back are the same."""
+    tensor = NOTED[name]()
+    if way == "no module":
+        monkeypatch.setattr(backends, "compiled", lambda: None)
+    with exchange(way != "methods"):
+        values, guard = Values(tensor), unchanged()
+        values.note(guard)
+        exact = way == "exchange" or (way == "methods" and name != "NaN")  # a guard may ask more often than needed
+        assert not values.changed() and guard.holds() == exact
+        last = (-1,) * tensor.dim()
+        was = tensor.data[last].clone() if tensor.numel() else None
+        for value in () if was is None else (was == 0, was):
+            with torch.inference_mode(tensor.is_inference()):
+                tensor.data[last].copy_(value)
+            is_changed = value is not was
+            assert values.changed() == is_changed and guard.holds() == (exact and not is_changed)
+        tensor.data = torch.ones(9, 9, dtype=tensor.dtype)
+        assert values.changed() and not guard.holds()
+
+
+def test_values_of_large_tensors_are_told_by_their_version_and_place():
+    tensor = torch.zeros((1 << 18) + 1)
+    for write in (lambda: tensor.zero_(), lambda: setattr(tensor, "data", tensor.clone())):
+        values, guard = Values(tensor), unchanged()
+        values.note(guard)
+        assert values.copy is None and not values.changed() and guard.holds()
+        write()
+        assert values.changed() and not guard.holds()

@@ -37,7 +37,7 @@ class Scheduled(nn.Module):
         self.options = types.SimpleNamespace(gain=1.0)
         self.register_buffer("scalar", torch.tensor(1.0))
         self.register_buffer("scale", torch.ones(8))
-        self.plain = torch.ones(8)
+        self.plain, self.listed = torch.ones(8), [torch.tensor(1.0)]
 
     def forward(self, x: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         return self.b(self.use[0](self, torch.tanh(self.a(x)), *args, **kwargs))
@@ -131,9 +131,11 @@ SCHEDULES: dict[str, tuple[Callable[..., Tensor], Callable[[Any, float], None]]]
         lambda net, h: h * net.scalar,
         lambda net, v: setattr(net, "scalar", torch.tensor(v)),
     ),
+    "a scalar buffer, written by .data": (lambda net, h: h * net.scalar, lambda net, v: net.scalar.data.fill_(v)),
     "a buffer, written": (lambda net, h: h * net.scale, lambda net, v: written(net, "scale", v)),
     "a function of a buffer": (lambda net, h: h * (net.scale * 2).sin(), lambda net, v: written(net, "scale", v)),
     "a tensor, replaced": (lambda net, h: h * net.plain, lambda net, v: setattr(net, "plain", torch.full((8,), v))),
+    "an item of a list, written": (lambda net, h: h * net.listed[0], lambda net, v: net.listed[0].data.fill_(v)),
     "a list": (lambda net, h: h * net.bands[1], lambda net, v: net.bands.__setitem__(1, v)),
     "an object": (lambda net, h: h * net.options.gain, lambda net, v: setattr(net.options, "gain", v)),
     "a part": (lambda net, h: net.act(h), lambda net, v: setattr(net, "act", nn.LeakyReLU(v))),

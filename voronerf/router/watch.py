@@ -1,7 +1,8 @@
 """The constants of a traced ``forward``: attributes and buffers of its module, and arguments that are not tensors.
 
 A trace stores their values. Each call compares the stored values with the current ones, so that a schedule that sets
-``module.progress`` takes effect.
+``module.progress`` takes effect. Writes through ``tensor.data`` into a buffer on a GPU, or of more than 1 MiB, are not
+noticed; write such a buffer itself, for example by ``buffer.copy_(...)``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from voronerf.ops._core.unchanged import Values
 from voronerf.router.grouping import parts_of
 
 Source = str | tuple[int, str]
@@ -62,9 +64,7 @@ class Watch:
     sources: list[Source] = field(default_factory=list)
     _values: list[Any] = field(default_factory=list)
     _dicts: list[tuple[dict[str, Any], str]] = field(default_factory=list)
-    _tensors: list[Tensor] = field(default_factory=list)
-    _versions: list[int] = field(default_factory=list)
-    _tensor_sources: list[Source] = field(default_factory=list)
+    _tensors: list[tuple[Source, Values]] = field(default_factory=list)
     _holders: list[tuple[Source, Any, tuple[Any, ...]]] = field(default_factory=list)
     _hooks: list[dict[int, Any]] = field(default_factory=list)
     _counts: list[int] = field(default_factory=list)
@@ -97,13 +97,12 @@ class Watch:
         self.sources.append(source)
         self._values.append(value)
         self._dicts.append((registry, name))
-        if isinstance(value, Tensor):
-            if not value.is_inference():  # inference tensors have no version counter
-                self._tensors.append(value)
-                self._versions.append(value._version)
-                self._tensor_sources.append(source)
-        elif value is not _MISSING and (items := _items(value)) is not None:
+        items = None if value is _MISSING or isinstance(value, Tensor) else _items(value)
+        if items is not None:
             self._holders.append((source, value, items))
+        for item in (value,) if items is None else items:
+            if isinstance(item, Tensor):
+                self._tensors.append((source, Values(item)))
 
     def value(self, source: Source) -> Any:
         """Returns the value that a trace took as a constant; None if there is none."""
@@ -113,8 +112,8 @@ class Watch:
         """Adds the watched values to a guard, which detects their changes (`voronerf.ops._core.unchanged`)."""
         for registry, name in self._dicts:
             guard.entries(registry, [name])
-        for tensor in self._tensors:
-            guard.attributes(tensor, ["_version"])
+        for _, tensor in self._tensors:
+            tensor.note(guard)
         for _, value, _ in self._holders:
             guard.contents(value if isinstance(value, (dict, list, tuple, set, frozenset)) else vars(value))
         for hooks in self._hooks:
@@ -126,9 +125,7 @@ class Watch:
         values = [registry.get(name, _MISSING) for registry, name in self._dicts]
         if not all(map(operator.is_, values, self._values)):
             changed += [s for s, a, b in zip(self.sources, values, self._values, strict=True) if not same(a, b)]
-        if self._tensors and [tensor._version for tensor in self._tensors] != self._versions:
-            pairs = zip(self._tensor_sources, self._tensors, self._versions, strict=True)
-            changed += [source for source, tensor, version in pairs if tensor._version != version]
+        changed += [source for source, tensor in self._tensors if tensor.changed()]
         for source, value, old_items in self._holders:
             items = _items(value) or ()
             if len(items) == len(old_items) and all(map(operator.is_, items, old_items)):

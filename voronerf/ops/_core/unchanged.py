@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from voronerf.ops._core import backends
+
+_COPIED = 1 << 20  # maximum number of bytes of a tensor whose values are copied and compared
 
 
 class Never:
@@ -17,10 +22,61 @@ class Never:
     def _note(self, *noted: Any) -> None:
         """Ignores the objects."""
 
-    contents = entries = attributes = answer = place = layout = kind = _note
+    contents = entries = attributes = answer = place = layout = values = kind = _note
 
 
 def unchanged() -> Any:
     """Creates an empty guard; csrc/bindings/unchanged.h lists the properties that it can note."""
     module = backends.compiled()
     return Never() if module is None else module.compiled.Unchanged()
+
+
+class Values:
+    """The values of a tensor at one time.
+
+    Small tensors on the CPU are copied and compared, since no version counter counts writes through ``tensor.data`` or
+    into inference tensors. For other tensors, the address and the version counter are compared.
+
+    Args:
+        tensor: The tensor.
+        most: The maximum number of bytes that are copied.
+
+    Attributes:
+        tensor: The tensor, whose values may change later.
+        copy: The copied values, or None.
+    """
+
+    def __init__(self, tensor: Tensor, most: float = _COPIED) -> None:
+        self._is_plain = type(tensor) in (Tensor, torch.nn.Parameter) and tensor.layout is torch.strided
+        is_copied = self._is_plain and tensor.is_cpu and tensor.nbytes <= most
+        self.tensor = tensor
+        self.copy = tensor.detach().clone(memory_format=torch.contiguous_format) if is_copied else None
+        self._mark = self._marked()
+
+    def _marked(self) -> tuple[int, int]:
+        version = 0 if self.tensor.is_inference() else self.tensor._version  # inference tensors have no version
+        return self.tensor.data_ptr() if self._is_plain else 0, version
+
+    def note(self, guard: Any) -> None:
+        """Adds the tensor to a guard, which then detects other values than when this object was made."""
+        if self.copy is not None:
+            guard.values(self.tensor, self.copy)
+            return
+        if self._is_plain:
+            guard.place(self.tensor)
+        if not self.tensor.is_inference():
+            guard.attributes(self.tensor, ["_version"])
+
+    def changed(self) -> bool:
+        """Returns whether the tensor has other values than when this object was made."""
+        if self.copy is None:
+            return self._marked() != self._mark
+        guard = unchanged()
+        guard.values(self.tensor, self.copy)
+        return not (guard.holds() or _same_bytes(self.copy, self.tensor))
+
+
+def _same_bytes(one: Tensor, other: Tensor) -> bool:
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    return torch.equal(*(x.detach().contiguous().reshape(-1).view(torch.uint8) for x in (one, other)))
