@@ -278,6 +278,32 @@ def test_methods_share_the_cells_that_were_drawn(calls: list[str]) -> None:
         assert not torch.equal(router.density(x), router.density(x)), "drawn anew for the same method"
 
 
+@pytest.mark.parametrize(
+    "change", [lambda c: c.mul_(0.5), lambda c: c.data.mul_(0.5), lambda c: setattr(c, "data", c * 0.5)]
+)
+@pytest.mark.parametrize("inside", [False, True])
+def test_methods_find_new_cells_after_a_write_to_the_centres(change: Callable[[Tensor], Any], inside: bool) -> None:
+    """Also a write that no version counter counts, and a write to centres of inference mode."""
+    router, x = routed(Named(), methods=["density"]), rows(64)
+    with torch.no_grad():
+        router.module.layer.bias.add_(torch.arange(router.num_cells)[:, None])
+    with torch.inference_mode(inside):
+        router.diagram.centres = router.diagram.centres.clone()
+        router(x, rows(64, seed=1))
+        change(router.diagram.centres)
+        (expected,), _ = masked_loop(router, router.diagram.locate(x), [x], "density")
+        torch.testing.assert_close(router.density(x), expected)
+
+
+def test_positions_of_another_dtype_than_the_indexed_centres() -> None:
+    """The search index is of float32 centres, so float64 positions are compared without it."""
+    router, x, d = routed(Named(), fuse=True), rows(64), rows(64, seed=1)
+    router.subdivide(VoronoiDiagram(rows(2048, seed=2)))
+    for _ in range(2):
+        found = router(x, d, coords=x.double())["colour"]
+    assert torch.equal(found, router(x, d)["colour"])
+
+
 def doubled(module: nn.Module) -> nn.Module:
     """Returns a copy of the module with doubled parameters."""
     copied = copy.deepcopy(module)

@@ -180,9 +180,8 @@ def test_state_that_is_loaded_in_inference_mode() -> None:
         router.load_state_dict(other.state_dict())
         for _ in range(3):
             close(router(x), expected)
-    with torch.no_grad():  # torch lets no gradient pass through inference tensors
-        for _ in range(3):
-            close(router(x), expected)
+    for _ in range(3):
+        close(router(x), expected)
     with torch.inference_mode():
         close(VoronoiRouter(other.cell(0), centres(), coords="first3")(x), other.cell(0)(x))
 

@@ -42,6 +42,7 @@ class SampleReservoir:
         2
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self, capacity: int = 10_000, batches: int = 100, *, d: int = 3, device: torch.device | str = "cpu"
     ) -> None:

@@ -12,6 +12,7 @@ Coordinates are in scene units, in the world frame of the query points.
 """
 
 import itertools
+import math
 import operator
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -25,6 +26,7 @@ from voronerf.diagram.balance import balance, in_space, in_torch
 from voronerf.diagram.drawing import draw_cell
 from voronerf.ops._core import backends
 from voronerf.ops._core.checks import check_integer
+from voronerf.ops._core.unchanged import Values
 
 MANY_CELLS = 2048
 """The minimum number of cells for which a flat diagram keeps a search index of its centres."""
@@ -68,7 +70,8 @@ class VoronoiDiagram(nn.Module):
     child: Tensor
     depth: int
     num_cells: int
-    _indexed: tuple[Tensor, int, Tensor | None] | None = None
+    _seen: Values | None = None  # the centres at the last call of `snapshot`
+    _indexed: tuple[Values, Tensor | None] | None = None  # the centres of the index, and the index
 
     def __init__(self, centres: Tensor) -> None:
         """Makes a flat diagram. A single centre is allowed; its cell is all of space.
@@ -94,9 +97,9 @@ class VoronoiDiagram(nn.Module):
 
     def _set_tables(self, centres: Tensor, child_offsets: Tensor, child: Tensor) -> None:
         self.depth, self.num_cells = _check_tree(centres, child_offsets, child)
-        self.register_buffer("centres", centres)
-        self.register_buffer("child_offsets", child_offsets)
-        self.register_buffer("child", child)
+        with torch.inference_mode(False):  # no training could use tables of inference mode
+            for name, table in zip(("centres", "child_offsets", "child"), (centres, child_offsets, child)):
+                self.register_buffer(name, table.clone() if table.is_inference() else table)
 
     @classmethod
     def _from_tables(cls, centres: Tensor, child_offsets: Tensor, child: Tensor) -> "VoronoiDiagram":
@@ -247,8 +250,7 @@ class VoronoiDiagram(nn.Module):
     def index(self) -> Tensor | None:
         """Returns an index of the centres (`voronerf.ops.index_centres`), which is cached for later calls.
 
-        The index is rebuilt if centres have changed. On the CPU, all values are compared (12 bytes per centre). On a
-        GPU, only the version counter and the address are compared, to avoid a wait for the device.
+        The index is rebuilt if centres have changed (:meth:`snapshot`).
 
         Returns:
             int32 [w]; None without the compiled module, for a nested diagram, fewer than `MANY_CELLS` cells, or centres
@@ -261,16 +263,24 @@ class VoronoiDiagram(nn.Module):
             return None
         if type(centres) is not Tensor or centres.is_meta or torch._C._are_functorch_transforms_active():
             return None
-        with _disable_current_modes():  # keeps the index out of a recorded step
-            current, kept = centres.detach().float().contiguous(), self._indexed
-            version = centres._version if centres.is_cuda and not centres.is_inference() else 0
-            if kept is None or kept[1] != version or not _is_unchanged(kept[0], current):
-                kept = self._indexed = (
-                    current if current.is_cuda else current.clone(),
-                    version,
-                    ops.index_centres(current),
-                )
-        return kept[2]
+        seen, kept = self.snapshot(), self._indexed
+        if kept is None or kept[0] is not seen:
+            with _disable_current_modes(), torch.inference_mode(False):  # keeps the index out of a recorded step
+                values = seen.tensor if seen.copy is None else seen.copy
+                kept = self._indexed = seen, ops.index_centres(values.detach().float().contiguous())
+        return kept[1]
+
+    def snapshot(self) -> Values:
+        """Returns an object that is replaced by another one when centres have changed, for caches.
+
+        On the CPU, all values are compared (12 bytes per centre). On a GPU, only the version counter and the address
+        are compared, to avoid a wait for the device.
+        """
+        seen = self._seen
+        if seen is None or seen.tensor is not self.centres or seen.changed():
+            with _disable_current_modes():
+                seen = self._seen = Values(self.centres, math.inf)
+        return seen
 
     def sample_cell(
         self, points: Tensor, *, temperature: float, generator: torch.Generator | None = None, backend: str = "auto"
@@ -417,7 +427,7 @@ class VoronoiDiagram(nn.Module):
         return points.detach().reshape(-1, d)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_indexed": None}
+        return {**self.__dict__, "_seen": None, "_indexed": None}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "VoronoiDiagram":
         kept = self.centres
@@ -426,6 +436,7 @@ class VoronoiDiagram(nn.Module):
             self.centres = kept.to(self.centres.device)
         return self
 
+    @torch.inference_mode(False)
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Loads a diagram of any size and depth; torch would refuse another size."""
         if prefix + "centres" in state_dict:
@@ -433,19 +444,6 @@ class VoronoiDiagram(nn.Module):
             loaded = VoronoiDiagram.from_state(state_dict, prefix)
             self._set_tables(loaded.centres.to(device), loaded.child_offsets.to(device), loaded.child.to(device))
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-def _is_unchanged(seen: Tensor, centres: Tensor) -> bool:
-    """Returns whether ``centres`` are the same as ``seen``, the centres from which an index was built.
-
-    On the CPU, the values are compared; on a GPU, only the addresses.
-    """
-    if seen.device != centres.device or seen.shape != centres.shape:
-        return False
-    if seen.is_cuda:
-        return seen.data_ptr() == centres.data_ptr()
-    same: bool = backends.compiled().compiled.same_bits(seen, centres, seen.numel())
-    return same
 
 
 def _check_centres(centres: Tensor, least: int = 1) -> None:

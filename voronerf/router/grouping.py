@@ -31,6 +31,8 @@ CHANGES = "_voronerf_changes"
 class Grouping:
     """n entries, each a sample in one of k cells, sorted by cell.
 
+    Tensors that are computed at their first use are never of inference mode, since later calls may use them.
+
     Args:
         cells: The cell of each entry, int32 [n]; None for a single cell.
         n: The number of entries.
@@ -59,12 +61,14 @@ class Grouping:
         return Grouping(self.cells, self.n, self.k, self.device, self.backend, self.rows)
 
     @functools.cached_property
+    @torch.inference_mode(False)
     def source(self) -> Tensor | None:
         """The sample of each sorted row, int32 [n]; None if the rows are not reordered."""
         order = self._order
         return order if self.rows is None or order is None else self.rows.int().index_select(0, order)
 
     @functools.cached_property
+    @torch.inference_mode(False)
     def _inverse(self) -> Tensor:
         """The sorted row of each entry, int32 [n]."""
         assert self._order is not None
@@ -72,6 +76,7 @@ class Grouping:
         return torch.empty_like(self._order).scatter_(0, self._order.long(), rows)
 
     @functools.cached_property
+    @torch.inference_mode(False)
     def sorted_cells(self) -> Tensor:
         """The cell of each sorted row, int64 [n]."""
         cells = torch.arange(self.k, device=self.device)

@@ -246,6 +246,7 @@ class VoronoiRouter(nn.Module):
             fill_cell(router.module, index, module, f"VoronoiRouter.from_modules: modules[{index}]")
         return router
 
+    @torch.inference_mode(False)
     @torch.no_grad()
     def part(self, cells: Sequence[int] | Tensor) -> VoronoiRouter:
         """Returns a router with only the chosen cells. Their results stay the same; shared parameters are copied.
@@ -279,6 +280,7 @@ class VoronoiRouter(nn.Module):
         count: int = diagram.num_cells
         return count
 
+    @torch.inference_mode(False)
     def cell(self, index: int) -> nn.Module:
         """Returns a plain copy of one cell's module, with parameters of its own.
 
@@ -333,6 +335,7 @@ class VoronoiRouter(nn.Module):
         none = torch.zeros(self.num_cells, dtype=torch.bool, device=device)
         return none if self.frozen_cells is None else self.frozen_cells.clone()
 
+    @torch.inference_mode(False)
     def freeze(
         self, cells: Sequence[int] | Tensor | None = None, *, optimizer: torch.optim.Optimizer | None = None
     ) -> None:
@@ -374,6 +377,7 @@ class VoronoiRouter(nn.Module):
         elif self.frozen_cells is not None:
             self._training_checks.append(FrozenRows(self.module, self.frozen_cells))
 
+    @torch.inference_mode(False)
     def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
         """Unfreezes cells, given as in `freeze`; they keep the optimiser's moments from before."""
         self._set_frozen(self.frozen & ~self._mask("unfreeze", cells))
@@ -401,6 +405,7 @@ class VoronoiRouter(nn.Module):
         self.frozen_cells = frozen if frozen is not None and bool(frozen.any()) else None
         freeze_cells(self.module, self.frozen_cells)
 
+    @torch.inference_mode(False)
     @torch.no_grad()
     def subdivide(
         self,
@@ -482,6 +487,8 @@ class VoronoiRouter(nn.Module):
             watch.remove()
         self._watches = watch_optimizers(self.module, line)
 
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def load_state_dict(
         self,
         state_dict: Mapping[str, Any],
@@ -517,6 +524,7 @@ class VoronoiRouter(nn.Module):
             drop_state(optimizer)
         return result
 
+    @torch.inference_mode(False)
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Loads the stored diagram first, so that parameters of any number of cells fit."""
         if f"{prefix}diagram.centres" not in state_dict:
@@ -858,23 +866,24 @@ class VoronoiRouter(nn.Module):
 
     def _group(self, method: str, positions: Tensor) -> Grouping:
         """Groups the samples by cell; methods that are called with the same positions share the grouping."""
-        labelled, centres = not positions.is_floating_point(), self.diagram.centres
+        labelled, keeps = not positions.is_floating_point(), bool(self.methods) and not transformed()
         drawn = self.assignment == "stochastic" and self.training and not labelled
-        version = object() if centres.is_inference() else centres._version  # inference tensors have no version
-        key = self.diagram, version, drawn, labelled, self.temperature, self.backend
-        keeps = bool(self.methods) and not transformed()
+        centres = self.diagram.snapshot() if keeps and not labelled else None
+        key = self.diagram, centres, drawn, labelled, self.temperature, self.backend
         assigned = self._assigned if keeps else None
         if assigned is not None and assigned.serves(method, positions, key, drawn):
             return assigned.grouping
-        with outside():
-            flat, k = unwrapped(positions).detach().flatten(0, -2), self.num_cells
+        with outside(), torch.inference_mode(False):  # a later call with gradients may use the grouping
+            positions = unwrapped(positions).detach()
+            positions = positions.clone() if keeps else positions  # the caller may write into its labels
+            flat, k = positions.flatten(0, -2), self.num_cells
             if flat.shape[0]:
                 cells = None if k == 1 else flat[:, 0] if labelled else self.assign(flat)
             else:  # placeholders, since the module may not take an empty batch
                 cells = torch.zeros(2, dtype=torch.int32, device=flat.device)
             grouping = Grouping(cells, flat.shape[0] or 2, k, flat.device, self.backend)
         if keeps:
-            self._assigned = Assigned(grouping, positions.detach().clone(), key, {method})
+            self._assigned = Assigned(grouping, positions, key, {method})
         return grouping
 
     def __getstate__(self) -> dict[str, Any]:
@@ -884,6 +893,7 @@ class VoronoiRouter(nn.Module):
         super().__setstate__(state)
         freeze_cells(self.module, self.frozen_cells)
 
+    @torch.inference_mode(False)
     def __deepcopy__(self, memo: dict[int, Any]) -> VoronoiRouter:
         detach_results(self, memo)
         copied = memo[id(self)] = type(self).__new__(type(self))

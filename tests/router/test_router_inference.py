@@ -1,0 +1,175 @@
+"""What a router keeps of a call or a change under inference mode, later calls with gradients can use."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from router_fields import Heads, masked_loop, tensors
+from torch import Tensor
+
+from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
+from voronerf.diagram import SampleReservoir
+
+pytestmark = pytest.mark.filterwarnings("ignore:VoronoiRouter")
+
+
+def points(n: int, seed: int = 0) -> Tensor:
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def nested() -> VoronoiDiagram:
+    return VoronoiDiagram(points(3, 1)).refine({1: points(4, 2)})[0]
+
+
+#: Routers by name: with a search index of the centres, with a tree of centres, and with methods in each way.
+ROUTERS: dict[str, Callable[[], VoronoiRouter]] = {
+    "index": lambda: VoronoiRouter(NeRF(width=8, depth=2, view_directions=False), points(2048, 1)),
+    "tree": lambda: VoronoiRouter(NeRF(width=8, depth=2, view_directions=False), nested()),
+    "fused": lambda: VoronoiRouter(Heads(), points(5, 1), coords="first3", methods=["density"], fuse=True, way="fused"),
+    "grouped": lambda: VoronoiRouter(Heads(), points(5, 1), coords="first3", methods=["density"], way="grouped"),
+}
+
+
+def called(router: VoronoiRouter) -> VoronoiRouter:
+    router(points(60))
+    return router
+
+
+def loaded(router: VoronoiRouter, cells: int | None = None) -> VoronoiRouter:
+    other = copy.deepcopy(router)
+    if cells is not None:
+        other.subdivide(VoronoiDiagram(points(cells, 3)))
+    router.load_state_dict(other.state_dict())
+    return router
+
+
+def subdivided(router: VoronoiRouter) -> VoronoiRouter:
+    router.subdivide(router.diagram.refine({0: points(2, 4)})[0])
+    return router
+
+
+def split(router: VoronoiRouter) -> VoronoiRouter:
+    few = router.num_cells < 50  # each cell is drawn
+    router.subdivide(2, points=points(400, 5), cells="worst", inherit=not few)
+    return router
+
+
+def frozen(router: VoronoiRouter) -> VoronoiRouter:
+    router.freeze([0, 1])
+    router.unfreeze([1])
+    return router
+
+
+def cell_loaded(router: VoronoiRouter) -> VoronoiRouter:
+    router.load_cell(1, router.cell(0))
+    if router.num_cells < 50:
+        router.apply(lambda module: [p.mul_(0.9) for p in module.parameters(recurse=False)])
+    return router
+
+
+def wrapped(router: VoronoiRouter) -> VoronoiRouter:
+    return VoronoiRouter(router.cell(0), VoronoiDiagram.from_state(router.diagram.state_dict()), coords="first3")
+
+
+#: Calls and changes under inference mode.
+CHANGES: dict[str, Callable[[VoronoiRouter], VoronoiRouter]] = {
+    "call": called,
+    "load": loaded,
+    "load of other cells": lambda router: loaded(router, 7),
+    "subdivide": subdivided,
+    "split": split,
+    "freeze": frozen,
+    "load_cell": cell_loaded,
+    "part": lambda router: router.part([0, 2, 3]),
+    "deepcopy": lambda router: copy.deepcopy(router),
+    "wrap": wrapped,
+}
+
+
+def train(router: VoronoiRouter) -> None:
+    """Makes a step of an optimiser for each method; compares the results with the loop over masks, if it is short."""
+    optimizer, x = torch.optim.Adam(router.parameters()), points(60)
+    router.unfreeze()
+    for method in (*router.methods, "forward", *router.methods):
+        results = tensors(getattr(router, method)(x))
+        if router.num_cells < 50:
+            torch.testing.assert_close(results, masked_loop(router, router.assign(x), [x], method)[0])
+        optimizer.zero_grad()
+        torch.stack([result.square().sum() for result in results]).sum().backward()
+        before = [parameter.detach().clone() for parameter in router.parameters()]
+        optimizer.step()
+        assert not all(map(torch.equal, before, router.parameters()))
+
+
+def freeze(router: VoronoiRouter) -> None:
+    router.freeze([0, 2], optimizer=(optimizer := torch.optim.Adam(router.parameters())))
+    before = router.cell(2).state_dict()
+    torch.stack([result.sum() for result in tensors(router(points(60)))]).sum().backward()
+    optimizer.step()
+    torch.testing.assert_close(router.cell(2).state_dict(), before, rtol=0, atol=0)
+
+
+def run_cell(router: VoronoiRouter) -> None:
+    tensors(router.cell(1)(points(4)))[0].sum().backward()
+
+
+def write(router: VoronoiRouter) -> None:
+    for buffer in router.buffers():
+        buffer.copy_(buffer.clone())
+
+
+#: Uses outside of inference mode.
+USES: dict[str, Callable[[VoronoiRouter], None]] = {
+    "train": train,
+    "freeze": freeze,
+    "subdivide": lambda router: train(subdivided(router)),
+    "split": lambda router: train(split(router)),
+    "load": lambda router: train(loaded(router)),
+    "deepcopy": lambda router: train(copy.deepcopy(router)),
+    "cell": run_cell,
+    "buffers": write,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("name", ROUTERS)
+def test_uses_after_inference_mode(name: str, change: str) -> None:
+    faults = []
+    for use, function in USES.items():
+        torch.manual_seed(0)
+        router = ROUTERS[name]()
+        with torch.inference_mode():
+            router = CHANGES[change](router)
+        try:
+            function(router)
+        except Exception as error:
+            faults.append(f"{use}: {error}")
+    assert not faults, f"{len(faults)} of {len(USES)}: {faults[0]}"
+
+
+@pytest.mark.parametrize("name", ["fused", "grouped"])
+def test_labels_of_methods_are_not_the_callers(name: str) -> None:
+    """Labels that the caller overwrites after a call do not change the cells of the next method."""
+    options: Any = {"fuse": True, "way": "fused"} if name == "fused" else {"way": "grouped"}
+    router, x = VoronoiRouter(Heads(), 3, methods=["density"], **options), points(60)
+    with torch.no_grad():
+        router.module.net[0].bias.add_(torch.arange(3.0)[:, None])
+    labels = torch.arange(60, dtype=torch.int32) % 3
+    expected = router.density(x, cells=labels)["sigma"]
+    for _ in range(2):
+        passed = labels.clone()
+        router(x, cells=passed)
+        passed.zero_()
+        torch.testing.assert_close(router.density(x, cells=labels)["sigma"], expected)
+
+
+def test_a_reservoir_of_inference_mode_takes_samples() -> None:
+    with torch.inference_mode():
+        reservoir = SampleReservoir(4, 2)
+    for backend in ("auto", "reference"):
+        reservoir.add(points(6), torch.ones(6), backend=backend)
+    assert len(reservoir) == 4
