@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import types
 from typing import Any
 
 import pytest
@@ -32,6 +33,22 @@ class Said(nn.Module):
         return self.act(self.second(self.first(positions).relu()))
 
 
+class Viewed(nn.Module):
+    """A layer whose weight is a view of the parameter."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.flat, self.bias = nn.Parameter(torch.rand(12)), nn.Parameter(torch.rand(4))
+
+    def program(self) -> CellProgram:
+        weight = self.flat.unflatten(-1, (4, 3))
+        layer: Any = types.SimpleNamespace(weight=weight, bias=self.bias)
+        return layered_program(MLP((Layer(("positions",), 4),), outputs=(0,)), [layer], torch.sigmoid)
+
+    def forward(self, positions: Tensor) -> Tensor:
+        return (positions @ self.flat.unflatten(-1, (4, 3)).T + self.bias).sigmoid()
+
+
 def make(field: nn.Module | None = None, **options: Any) -> VoronoiRouter:
     router = VoronoiRouter(Said() if field is None else field, torch.rand(K, 3), **options)
     with torch.no_grad():
@@ -43,7 +60,7 @@ def make(field: nn.Module | None = None, **options: Any) -> VoronoiRouter:
 def loop(router: VoronoiRouter, *args: Tensor) -> tuple[Tensor, ...]:
     """Returns the results of the cells' modules; each evaluates the samples of its cell."""
     cells = router.assign(args[0])
-    parts = [router.cell(cell)(*(x[cells == cell] for x in args)) for cell in range(K)]
+    parts = [router.cell(cell)(*(x[cells == cell] for x in args)) for cell in range(router.num_cells)]
     parts = [part if isinstance(part, tuple) else (part,) for part in parts]
     outputs = [torch.zeros(N, *result.shape[1:], dtype=result.dtype) for result in parts[0]]
     for cell, part in enumerate(parts):
@@ -59,6 +76,20 @@ def agree(router: VoronoiRouter, *args: Tensor, **allowed: float) -> None:
     for a, b in zip(result, loop(router, *args), strict=True):
         assert a.dtype == b.dtype
         torch.testing.assert_close(a, b, **{"rtol": 1e-4, "atol": 1e-5, **allowed})
+
+
+@pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode, torch.enable_grad])
+def test_views_of_parameters_follow_their_parameters(context: Any) -> None:
+    """A program may read views of parameters; the views are made again where the parameters get other memory."""
+    router, x = make(Viewed()), torch.rand(N, 3)
+    agree(router, x)
+    router.module.flat.data = router.module.flat.data * 2
+    with context():
+        agree(router, x)
+        router.subdivide(router.diagram.refine({1: torch.rand(2, 3)})[0])
+        agree(router, x)
+    router(x).sum().backward()
+    assert router.module.flat.grad is not None
 
 
 def other_weight(router: VoronoiRouter) -> None:

@@ -1,14 +1,20 @@
-"""A router's module never changes during a call, so other threads can save, copy and call it meanwhile."""
+"""A router's module never changes during a call, so other threads can save, copy and call it meanwhile.
+
+What a call caches is complete as soon as other calls can see it, also after an interrupt in this call.
+"""
 
 from __future__ import annotations
 
 import copy
 import functools
 import io
+import itertools
 import pickle
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -17,7 +23,9 @@ from convention_harness import uniform
 from router_fields import masked_loop
 from torch import Tensor, nn
 
-from voronerf import VoronoiRouter
+from voronerf import NeRF, VoronoiRouter
+from voronerf.router import optimizers
+from voronerf.router.program import CellProgram
 
 CENTRES = torch.rand(5, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
 
@@ -225,3 +233,161 @@ def test_parts_are_found_by_all_ways(fuse: bool) -> None:
             parameter += torch.rand(parameter.shape) - 0.5
     torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
     assert router.explain().startswith("forward: fused" if fuse else "forward: grouped")
+
+
+# Caches ---------------------------------------------------------------------------------------------------------------
+
+
+class Scaled(nn.Module):
+    """A field with a method, whose forward reads a buffer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b = nn.Linear(3, 4), nn.Linear(4, 2)
+        self.register_buffer("scale", torch.tensor(2.0))
+
+    def density(self, x: Tensor) -> Tensor:
+        return self.b(torch.tanh(self.a(x)) * self.scale)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.density(x) * 2
+
+
+def scaled(**options: Any) -> VoronoiRouter:
+    torch.manual_seed(0)
+    return VoronoiRouter(Scaled(), CENTRES[:3], coords="first3", methods=["density"], **options)
+
+
+def radiance_field() -> VoronoiRouter:
+    torch.manual_seed(0)
+    return VoronoiRouter(NeRF(width=8, depth=2, view_directions=False), CENTRES[:3])
+
+
+def call_again(router: VoronoiRouter) -> None:
+    """Compares calls with the loop over masks, before and after changes of a buffer and of the centres."""
+    x = uniform((60,))
+    for _ in range(2):
+        for method in ("forward", *router.methods):
+            expected = masked_loop(router, router.diagram.locate(x), [x], method)[0]
+            torch.testing.assert_close(list(getattr(router, method)(x).unsqueeze(0)), expected)
+        router.module.scale.mul_(3)
+        router.diagram.centres.mul_(0.5)
+    bias = router.module.b.bias
+    router.module.b.bias = nn.Parameter(torch.zeros(2, 2))
+    with pytest.raises(ValueError, match=r"parameters of module must be \[3, ...\]"):
+        router(x)
+    router.module.b.bias = bias
+    router(x)
+
+
+def ask_again(router: VoronoiRouter) -> None:
+    x = uniform((60,))
+    assert isinstance(router.program(x), CellProgram)
+    expected = masked_loop(router, router.diagram.locate(x), [x])[0]
+    torch.testing.assert_close(list(router(x)), expected)
+
+
+#: Functions that make what is cached.
+CACHING = {
+    *("_look", "with_activation", "_check_parameters", "_guard", "_guard_of", "find", "evaluate", "_plan", "_group"),
+    *("snapshot", "index"),
+}
+
+
+def interrupted(function: Callable[[], Any], at: int) -> bool:
+    """Calls a function; raises KeyboardInterrupt in it at one line of CACHING. Returns whether the line was reached."""
+    lines = itertools.count()
+
+    def trace(frame: FrameType, event: str, value: Any) -> Any:
+        if frame.f_code.co_name not in CACHING:
+            return None
+        if event == "line" and next(lines) == at:
+            raise KeyboardInterrupt
+        return trace
+
+    old = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        function()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(old)
+    return False
+
+
+FIRST: dict[
+    str, tuple[Callable[[], VoronoiRouter], Callable[[VoronoiRouter], Any], Callable[[VoronoiRouter], None]]
+] = {
+    "fused": (lambda: scaled(fuse=True, way="fused"), lambda router: router(uniform((60,))), call_again),
+    "grouped": (lambda: scaled(way="grouped"), lambda router: router(uniform((60,))), call_again),
+    "program": (radiance_field, lambda router: router.program(uniform((60,))), ask_again),
+}
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter")
+@pytest.mark.parametrize("name", FIRST)
+def test_an_interrupted_first_call_caches_nothing_by_halves(name: str) -> None:
+    make, first, again = FIRST[name]
+    faults = list[str]()
+    for at in itertools.count(0, 2):  # every second line, to save time
+        router = make()
+        if not interrupted(lambda: first(router), at):  # noqa: B023
+            break
+        try:
+            again(router)
+        except BaseException as error:
+            faults.append(f"line {at}: {type(error).__name__}: {error}")
+    assert at > 20 and not faults, f"{len(faults)} of {at}: {faults[0]}"
+
+
+@pytest.fixture
+def hasty() -> Iterator[None]:
+    """Makes Python change threads as often as it can."""
+    old = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(old)
+
+
+def together(functions: list[Callable[[], Any]]) -> list[str]:
+    """Calls functions in a thread each, at the same time; returns their errors."""
+    start, faults = threading.Barrier(len(functions)), list[str]()
+
+    def run(function: Callable[[], Any]) -> None:
+        start.wait(60)
+        try:
+            function()
+        except Exception as error:
+            faults.append(f"{type(error).__name__}: {error}")
+
+    threads = [threading.Thread(target=run, args=(function,)) for function in functions]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    return faults
+
+
+def test_programs_that_threads_ask_for_together(hasty: None) -> None:
+    faults, x = list[str](), uniform((8,))
+    for _ in range(40):
+        router = radiance_field()
+        faults += together([lambda: router.program(x)] * 3)  # noqa: B023
+    assert not faults
+
+
+def test_cells_may_be_frozen_while_an_optimizer_lists_frozen_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    routers, list_parameters = [scaled(), scaled()], optimizers.cell_parameters
+    others = [router.module for router in routers]
+    frozen = scaled()
+    frozen.freeze([1], optimizer=(optimizer := torch.optim.SGD(frozen.parameters(), 1e-3)))
+
+    def meanwhile(module: nn.Module) -> list[nn.Parameter]:
+        if others:  # as another thread may do
+            optimizers.freeze_cells(others.pop(), torch.tensor([True, False, False]))
+        return list_parameters(module)
+
+    monkeypatch.setattr(optimizers, "cell_parameters", meanwhile)
+    optimizer.step()
+    assert not others and len(optimizers.trained_parts([*frozen.parameters()])) == 4

@@ -17,13 +17,13 @@ import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
 from voronerf.ops._core.backends import BackendUnavailable
-from voronerf.ops._core.unchanged import unchanged
+from voronerf.ops._core.unchanged import Never, unchanged
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.call_cache import CachedCall
 from voronerf.router.cells import refuse_statistics
@@ -54,6 +54,22 @@ _LIBRARY_FOLDERS = tuple(
 )
 
 
+class _Checked(NamedTuple):
+    """The parameters at the last check, replaced as a whole since other threads may read it.
+
+    Attributes:
+        k: The number of cells.
+        shapes: The names, shapes and dtypes of one cell's parameters.
+        statistics: The submodules that mix the samples of a batch in training.
+        unchanged: A guard of the parameters and parts.
+    """
+
+    k: int
+    shapes: list[Any]
+    statistics: list[nn.Module]
+    unchanged: Any
+
+
 class Dispatch:
     """The plans of a router's calls. A copy of a router starts without plans."""
 
@@ -69,10 +85,7 @@ class Dispatch:
         self.plans: dict[Any, list[CallPlan]] = {}  # by key: one plan for each trace, the latest first
         self._refused_inputs: dict[Any, tuple[set[Source], str]] = {}  # values that cannot be inputs, and why
         self.cached: dict[Any, CachedCall] = {}  # by `call_key`
-        self._parts: Any = unchanged()  # guard of the parameters and parts at the last call
-        self._k = 0  # number of cells at the last call
-        self._cell_shapes: list[Any] = []  # names, shapes and dtypes of one cell's parameters
-        self._statistics: list[nn.Module] = []  # submodules that mix the samples of a batch in training
+        self._checked = _Checked(0, [], [], Never())
         self._subclasses: set[Any] = set()  # (method, tensor types) that work with plain tensors
         self._warned: set[str] = set()
         self._latest_ways: dict[str, dict[str, str]] = {}
@@ -125,8 +138,8 @@ class Dispatch:
             options: The user's options.
             frozen: The mask of frozen cells, bool [k], which are evaluated without gradients; None for no cells.
         """
-        self._check_parameters(call, grouping.k, options.names)
-        refuse_statistics(self._statistics)
+        checked = self._check_parameters(call, grouping.k, options.names)
+        refuse_statistics(checked.statistics)
         call = self._plain(call)
         plan = self._plan(call, grouping, options)
         if frozen is None or not torch.is_grad_enabled() or not call.layout.n:
@@ -163,38 +176,41 @@ class Dispatch:
 
     def find(self, key: Any, k: int) -> CachedCall | None:
         """Returns the cached call of a key, or None if the module has changed (not checked during compilation)."""
-        entry = self.cached.get(key)
+        entry, checked = self.cached.get(key), self._checked
         if entry is None or torch.compiler.is_compiling():
             return entry
-        if is_watched() or k != self._k:
+        if is_watched() or k != checked.k:
             return None
         if not entry.unchanged.holds():
-            if not self._parts.holds() or entry.plan.watch.changed():
+            if not checked.unchanged.holds() or entry.plan.watch.changed():
                 return None
             self._guard(entry)  # new values are equal, new parameters are of the same kind
         return entry
 
     def _guard(self, entry: CachedCall) -> None:
-        entry.unchanged = unchanged()
-        self._note_parts(entry.unchanged, entry.module)
-        entry.plan.watch.note(entry.unchanged)
+        guard = self._guard_of(entry.module)
+        entry.plan.watch.note(guard)
+        entry.unchanged = guard
 
     @staticmethod
-    def _note_parts(guard: Any, module: nn.Module) -> None:
-        """Adds a module's parameters and submodules to the objects that a guard checks."""
+    def _guard_of(module: nn.Module) -> Any:
+        """Makes a guard of a module's parameters and submodules."""
+        guard = unchanged()
         for part, name, _ in owned_parameters(module):
             guard.kind(part._parameters, name)
         for part in parts_of(module).values():
             if part._modules:
                 guard.contents(part._modules)
+        return guard
 
-    def _check_parameters(self, call: Call, k: int, names: Collection[str]) -> None:
+    def _check_parameters(self, call: Call, k: int, names: Collection[str]) -> _Checked:
         """Raises TypeError if the module lacks parameters, and ValueError if stacked ones are not [k, ...].
 
         With a parametrisation or another shape, kernels would access memory outside of the parameters.
         """
-        if k == self._k and self._parts.holds():
-            return
+        checked = self._checked
+        if k == checked.k and checked.unchanged.holds():
+            return checked
         named = dict(call.module.named_parameters())
         if lost := [name for name in names if name not in named]:
             raise TypeError(
@@ -209,11 +225,12 @@ class Dispatch:
                     f"{list(p.shape)}"
                 )
         cell_shapes = [(name, p.shape[id(p) in cells :], p.dtype) for name, p in named.items()]
-        if cell_shapes != self._cell_shapes:
+        if cell_shapes != checked.shapes:
             self.forget()
-        self._cell_shapes, self._k, self._parts = cell_shapes, k, unchanged()
-        self._statistics = [p for p in parts_of(call.module).values() if isinstance(p, nn.modules.batchnorm._BatchNorm)]
-        self._note_parts(self._parts, call.module)
+        parts = parts_of(call.module).values()
+        statistics: list[nn.Module] = [p for p in parts if isinstance(p, nn.modules.batchnorm._BatchNorm)]
+        checked = self._checked = _Checked(k, cell_shapes, statistics, self._guard_of(call.module))
+        return checked
 
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
         """Returns the plan for calls of this kind; a first call, or a call with changed constants, makes a plan."""
@@ -254,7 +271,8 @@ class Dispatch:
             refused = self._refused_inputs.setdefault(key, (set(), probe.refused))[0]
             refused.update(*(other.sources - new_plan.fused.inputs.sources for other in inputs))
         old_plans = set(map(id, self.plans.get(key, [])))
-        self.cached = {call_key: other for call_key, other in self.cached.items() if id(other.plan) not in old_plans}
+        cached = list(self.cached.items())  # another thread may add a call
+        self.cached = {call_key: other for call_key, other in cached if id(other.plan) not in old_plans}
         if plans and [way.name for way in plans[0].ways] == [way.name for way in ways]:
             new_plan.choices, new_plan.lost_timings = plans[0].choices, plans[0].lost_timings
         self.plans[key] = (
@@ -302,7 +320,7 @@ class Dispatch:
         n, k = call.layout.n, grouping.k
         ways = [way for way in plan.ways if k > 1 or not isinstance(way, Grouped)]
         if plan.skip:
-            plan.skip -= not recorded()
+            plan.skip = max(plan.skip - (not recorded()), 0)  # another thread may have counted it
             ways = ways[-1:]
         if not plan.measured or len(ways) == 1 or n < FEWEST:
             return ways[0], ways[0].why

@@ -165,6 +165,12 @@ def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
     _FROZEN[module] = frozen, [slice(*pair) for pair in pairs]
 
 
+def _frozen_modules() -> list[tuple[nn.Module, Tensor, list[slice]]]:
+    """Lists the routed modules in ``_FROZEN``, to which another thread may add a module meanwhile."""
+    pairs = [(module, _FROZEN.get(module)) for key in _FROZEN.keyrefs() if (module := key()) is not None]
+    return [(module, *frozen) for module, frozen in pairs if frozen is not None]
+
+
 def keep_frozen(optimizer: torch.optim.Optimizer) -> None:
     """Makes each step of an optimiser restore the parameters and the state of frozen cells.
 
@@ -197,7 +203,7 @@ def keep_frozen(optimizer: torch.optim.Optimizer) -> None:
 
 
 def _frozen_parameters(optimizer: torch.optim.Optimizer) -> list[tuple[Tensor, Tensor]]:
-    frozen = {id(p): mask for module, (mask, _) in _FROZEN.items() for p in cell_parameters(module)}
+    frozen = {id(p): mask for module, mask, _ in _frozen_modules() for p in cell_parameters(module)}
     every = (p for group in optimizer.param_groups for p in group["params"]) if frozen else ()
     return [(p, frozen[id(p)]) for p in every if id(p) in frozen]
 
@@ -239,6 +245,6 @@ class FrozenRows:
 def trained_parts(parameters: Sequence[Tensor]) -> list[list[Any]]:
     """Lists, for each parameter, the slices of its first dimension that optimisers may change."""
     parts: dict[int, list[Any]] = {}
-    for module, (_, pieces) in _FROZEN.items() if _FROZEN else ():
+    for module, _, pieces in _frozen_modules():
         parts.update((id(parameter), pieces) for parameter in cell_parameters(module))
     return [parts.get(id(parameter), [...]) for parameter in parameters]

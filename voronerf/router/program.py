@@ -114,6 +114,38 @@ def _steps_of(function: Callable[..., Any], width: int) -> tuple[Program, tuple[
     return program, tuple(tuple(tensor.shape[1:]) for tensor in tensors_of(result))
 
 
+class _Looked(NamedTuple):
+    """The result of :meth:`FieldProgram.look`, replaced as a whole since other threads may read it.
+
+    Attributes:
+        field: The field; None before the first call.
+        program: The program, or the reason why it is unknown.
+        ray_program: The program with a direction for each ray.
+        unchanged: A guard of the field's attributes and parts.
+    """
+
+    field: nn.Module | None
+    program: CellProgram | str
+    ray_program: Program | None
+    unchanged: Any
+
+
+class _Activation(NamedTuple):
+    """The activation of a field, replaced as a whole since other threads may read it.
+
+    Attributes:
+        key: The field, its activation, and the shapes of the activation's arguments.
+        steps: The activation's program and the shapes of its results; None if there is none.
+        watch: The attributes that the activation reads.
+        unchanged: A guard of these attributes.
+    """
+
+    key: Any
+    steps: tuple[Program, tuple[tuple[int, ...], ...]] | None
+    watch: Watch
+    unchanged: Any
+
+
 class FieldProgram:
     """The program of a field with a method ``program``, which returns a :class:`CellProgram`.
 
@@ -123,14 +155,8 @@ class FieldProgram:
     """
 
     def __init__(self) -> None:
-        self._program: CellProgram | str = "its program is unknown until the first call"
-        self._seen_field: nn.Module | None = None  # the field whose program is cached
-        self._ray_program: Program | None = None  # the program with a direction for each ray
-        self._unchanged: Any = Never()
-        self._steps_key: Any = None  # field, activation and shapes of ``_steps``
-        self._steps: tuple[Program, tuple[tuple[int, ...], ...]] | None = None  # activation's program, result shapes
-        self._watch: Watch | None = None  # watches the attributes that the activation reads
-        self._steps_unchanged: Any = Never()
+        self._looked = _Looked(None, "its program is unknown until the first call", None, Never())
+        self._activation: _Activation | None = None
 
     def __reduce__(self) -> tuple[type[FieldProgram], tuple[()]]:
         return FieldProgram, ()
@@ -144,54 +170,65 @@ class FieldProgram:
 
     def look(self, field: nn.Module) -> CellProgram | str:
         """Returns the program of a field's layers, with its activation, or the reason why it is unknown."""
+        return self._look(field).program
+
+    def _look(self, field: nn.Module) -> _Looked:
+        looked = self._looked
         if torch.compiler.is_compiling():  # the last program is assumed to hold
-            return self._program
-        if field is not self._seen_field or not self._unchanged.holds():
-            self._seen_field = field
+            return looked
+        if field is not looked.field or not looked.unchanged.holds():
             name, field_type, parts = type(field).__name__, cast(Any, type(field)), [*parts_of(field).values()]
-            self._program = f"{name} computes more than its program"
+            program: CellProgram | str = f"{name} computes more than its program"
+            ray_program, guard = None, unchanged()
             if _describes(field_type) and "forward" not in vars(field) and all(map(_is_plain, parts)):
-                self._program = _checked(name, cast(Any, field).program())
-                ids = {id(p if p._base is None else p._base) for p in self._program.parameters}
+                with torch.inference_mode(False):  # turns gradients on, too: later calls use views of parameters
+                    program = _checked(name, cast(Any, field).program())
+                ids = {id(p if p._base is None else p._base) for p in program.parameters}
                 if any(id(p) not in ids for p in cell_parameters(field)):
-                    self._program = f"{name} has cell parameters that its program does not use"
-            if isinstance(self._program, CellProgram):
-                self._ray_program = _by_ray(self._program.program.text, self._program.reads)
-            self._unchanged = guard = unchanged()
+                    program = f"{name} has cell parameters that its program does not use"
+            if isinstance(program, CellProgram):
+                ray_program = _by_ray(program.program.text, program.reads)
+                for p in program.parameters:
+                    if p._base is not None:  # a view keeps the memory that `p.data = values` replaces
+                        guard.layout(p._base)
             guard.attributes(field_type, ["forward", "program"])
             for part in parts:
                 guard.contents(vars(part))
                 for value in vars(part).values():
                     if isinstance(value, (dict, list, set)):  # such as parameters, submodules and hooks
                         guard.contents(value)
-        return self._program
+            looked = self._looked = _Looked(field, program, ray_program, guard)
+        return looked
 
     def with_activation(self, field: nn.Module) -> CellProgram | str:
         """Returns the program with the activation as steps, or the reason why there is none."""
         layers = self.look(field)
         if isinstance(layers, str) or layers.activate is None:
             return layers
-        key = field, layers.activate, layers.shapes
-        if key != self._steps_key or (not self._steps_unchanged.holds() and cast(Watch, self._watch).changed()):
-            self._steps_key, self._steps, reads = key, None, set[tuple[int, str]]()
+        key, known = (field, layers.activate, layers.shapes), self._activation
+        if known is None or key != known.key or (not known.unchanged.holds() and known.watch.changed()):
+            steps: tuple[Program, tuple[tuple[int, ...], ...]] | None = None
+            reads = set[tuple[int, str]]()
             with contextlib.suppress(Exception), outside():  # if tracing fails, PyTorch computes the activation
                 double = cast(Any, Double(field, reads).module).program()
                 reads.clear()
                 traced, parts = _steps_of(double.activate, layers.shapes[0][0]), [*parts_of(field).values()]
                 if not any(name in parts[place]._parameters for place, name in reads):
-                    self._steps = traced
-            self._watch, self._steps_unchanged = Watch.of(field, reads, Inputs()), Never()
-        if not self._steps_unchanged.holds():
-            self._steps_unchanged = unchanged()
-            cast(Watch, self._watch).note(self._steps_unchanged)
-        if self._steps is None:
+                    steps = traced
+            known = _Activation(key, steps, Watch.of(field, reads, Inputs()), Never())
+        if not known.unchanged.holds():
+            guard = unchanged()
+            known.watch.note(guard)
+            known = self._activation = known._replace(unchanged=guard)
+        if known.steps is None:
             return f"activate of {type(field).__name__} cannot be written as steps of a program"
-        steps, shapes = self._steps
-        return CellProgram(_with_steps(layers.program.text, steps.text), layers.reads, shapes, layers.parameters)
+        program, shapes = known.steps
+        return CellProgram(_with_steps(layers.program.text, program.text), layers.reads, shapes, layers.parameters)
 
     def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None) -> Any:
         """Returns the results of a call with its ``coords`` or labels; None if the program is unknown."""
-        layers = self.look(router.module)
+        looked = self._look(router.module)
+        layers = looked.program
         if isinstance(layers, str) or len(args) > len(_NAMES) or kwargs.keys() - set(_NAMES):
             return None
         named = {**dict.fromkeys(_NAMES), **dict(zip(_NAMES, args)), **kwargs}
@@ -208,7 +245,7 @@ class FieldProgram:
         elif ray_index is None:
             check_shape(_OP, "directions", directions, ("n", 3), {"n": positions.shape[0]})
         else:
-            program = cast(Program, self._ray_program)
+            program = cast(Program, looked.ray_program)
         k, parameters = router.num_cells, layers.parameters
         if all(p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)):  # cells share all parameters
             parameters = [parameters[0].expand(k, *parameters[0].shape), *parameters[1:]]
