@@ -742,6 +742,24 @@ def test_second_derivatives_where_rows_have_no_gradient() -> None:
         torch.testing.assert_close(ours, exact, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("wanted", [(0,), (1,), (0, 1)])
+def test_gradients_of_some_tables_of_a_product(wanted: tuple[int, ...]) -> None:
+    """The gradient of one table needs the features of the other table alone."""
+    b = Builder()
+    x, y, grid = b.input(3), b.input(3), b.grid(GRID.text)
+    tables = [b.parameter(*GRID.table_shape) for _ in range(2)]
+    product = b.binary("mul", *(b.encode("hash", at, grid, table) for at, table in zip((x, y), tables)))
+    program, generator = b.program([product]), torch.Generator().manual_seed(0)
+    rows = [torch.rand(40, 3, generator=generator) for _ in range(2)]
+    values, results = [torch.randn(1, *shape, generator=generator) for shape in program.parameters], []
+    for backend in ("reference", "native"):
+        leaves = [value.clone().requires_grad_(i in wanted) for i, value in enumerate(values)]
+        (out,) = grouped_program(rows, leaves, offsets_of([10, 30]), program=program, backend=backend)
+        results.append(torch.autograd.grad(out.sin().sum(), [leaves[i] for i in wanted]))
+    for ours, exact in zip(*results, strict=True):
+        torch.testing.assert_close(ours, exact, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("products", ["float32", "bfloat16"])
 def test_shapes_of_a_gpu_that_is_not_there(products):
     """A run with fake tensors on a GPU device returns fake results with the right shapes; it works without a GPU."""
