@@ -7,10 +7,12 @@ import io
 import math
 import random
 import sys
+import threading
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 from unittest import mock
 
@@ -23,7 +25,7 @@ from torch.nn.utils.parametrizations import weight_norm
 from torch.utils._pytree import tree_structure
 from torch.utils.checkpoint import checkpoint
 
-from voronerf import VoronoiRouter
+from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
 from voronerf.router import dispatch
 
 sys.path.append(str(Path(__file__).parents[1] / "router"))
@@ -33,6 +35,8 @@ WAYS = ("fastest", "fused", "grouped", "loop")
 #: The numbers of samples in a call, to choose from.
 SAMPLES = (0, 1, 1, 2, 7, 8, 41, 300)
 MOST_CELLS = 12
+MANY_CELLS = 2048  # from this number on, a diagram keeps an index of its centres
+LIBRARY = str(Path(dispatch.__file__).parents[1])
 
 
 class Changing(nn.Module):
@@ -163,6 +167,7 @@ class Kind:
         twice: Whether second derivatives are compared; a custom function may have none.
         plain: Whether the field has no checkpoint inside, so that transforms and checkpoints accept it.
         per_ray: Whether the last argument may have one row per ray.
+        leads: Whether samples may have several leading dimensions.
     """
 
     make: Callable[[], nn.Module]
@@ -172,10 +177,15 @@ class Kind:
     twice: bool = True
     plain: bool = True
     per_ray: bool = False
+    leads: bool = True
 
 
 def layers() -> nn.Module:
     return nn.Sequential(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, 8), nn.ReLU(), nn.Linear(8, 4))
+
+
+def radiance() -> nn.Module:
+    return NeRF(width=8, depth=2, view_directions=False)
 
 
 def weights_of_functions() -> nn.Module:
@@ -195,6 +205,7 @@ KINDS = {
     "rays": Kind(OfRays, (3, 3), per_ray=True),
     "weight norm": Kind(weights_of_functions),
     "custom": Kind(Custom, share="encoder.*", twice=False),
+    "program": Kind(radiance, leads=False),
     "checkpoint": Kind(Again, twice=False, plain=False),
 }
 
@@ -232,11 +243,65 @@ class Sequence:
             "share": [self.kind.share] if self.kind.share and rng.random() < 0.3 else [],
             "methods": self.kind.methods,
         }
-        self.router = VoronoiRouter(self.kind.make(), torch.rand(rng.randrange(1, 7), 3), coords="first3", **options)
+        k = MANY_CELLS if rng.random() < 0.2 else rng.randrange(1, 7)
+        self.router = VoronoiRouter(self.kind.make(), torch.rand(k, 3), coords="first3", **options)
         self.events = [f"{name} in {self.router.num_cells} cells, {options}"]
         self.forms = [rng.random() for _ in range(3)]  # seeds of calls that differ only in their samples
         self.differ()
         self.states = [copy.deepcopy(self.router.state_dict())]
+        if rng.random() < 0.3:
+            self.interrupted()
+        elif rng.random() < 0.3:
+            self.together()
+
+    def interrupted(self) -> None:
+        """Raises KeyboardInterrupt in the first call, at a random line of the library."""
+        left = int(10 ** self.rng.uniform(0, 4))
+        self.events.append(f"interrupted at line {left}")
+
+        def trace(frame: FrameType, event: str, value: Any) -> Any:
+            nonlocal left
+            if not frame.f_code.co_filename.startswith(LIBRARY):
+                return None
+            left -= event == "line"
+            if not left:
+                raise KeyboardInterrupt
+            return trace
+
+        _, args = self.arguments((41,), self.rng)
+        sys.settrace(trace)
+        try:
+            ask(self)
+            self.router(*args)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            sys.settrace(None)
+
+    def together(self) -> None:
+        """Makes the first calls in three threads at the same time, and compares their results."""
+        self.events.append("three threads")
+        start, faults, old = threading.Barrier(3), list[Exception](), sys.getswitchinterval()
+
+        def run(flat: list[Tensor], args: list[Tensor]) -> None:
+            try:
+                start.wait(20)
+                ask(self)
+                for _ in range(2):
+                    found = self._tensors(self.router(*args), "forward", (41,))
+                    self._compare("value of a thread", found, self._expected("forward", flat)[0])
+            except Exception as error:
+                faults.append(error)
+
+        threads = [threading.Thread(target=run, args=self.arguments((41,), self.rng)) for _ in range(3)]
+        sys.setswitchinterval(1e-6)
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        sys.setswitchinterval(old)
+        if faults:
+            raise faults[0]
 
     def step(self) -> None:
         """Calls the router or changes it."""
@@ -246,8 +311,10 @@ class Sequence:
             change = self.rng.choice(CHANGES)
             if isinstance(self.router.module, Changing) and self.rng.random() < 0.5:
                 change = attribute
-            self.events.append(change.__name__)
-            change(self)
+            inside = change in INSIDE and self.rng.random() < 0.3
+            self.events.append(f"{change.__name__}{' in inference mode' * inside}")
+            with torch.inference_mode(inside):
+                change(self)
 
     def differ(self) -> None:
         """Adds different noise to the parameters of each cell."""
@@ -313,12 +380,14 @@ class Sequence:
             self._compare("value", found, expected)
             gradients = self._gradients(loss(found, x), [*[x] * x.requires_grad, *parameters.values()])
 
-        leaves = [dict(module.named_parameters())[name[7:]] for name in parameters for module in modules]
+        leaves = [module.get_parameter(name[7:]) for name in parameters for module in modules.values()]
         wanted = self._gradients(loss(expected, leaf), [*[leaf] * leaf.requires_grad, *leaves])
         first, rest = wanted[: leaf.requires_grad], wanted[leaf.requires_grad :]
         for i, parameter in enumerate(parameters.values()):
-            of_cells = torch.stack(rest[i * len(modules) : (i + 1) * len(modules)])
-            first.append(of_cells if of_cells.shape == parameter.shape else of_cells.sum(0))  # shared by all cells
+            rows = torch.stack(rest[i * len(modules) : (i + 1) * len(modules)])
+            is_shared = parameter.shape == rows.shape[1:]
+            number = torch.tensor([*modules])
+            first.append(rows.sum(0) if is_shared else torch.zeros_like(parameter).index_copy(0, number, rows))
         self._compare("gradient", gradients, first)
 
     def _gradients(self, total: Tensor, leaves: list[Tensor]) -> list[Tensor]:
@@ -328,6 +397,8 @@ class Sequence:
 
     def _lead(self, rng: random.Random) -> tuple[int, ...]:
         n = self.rng.choice(SAMPLES)
+        if not self.kind.leads:
+            return (n,)
         lead = rng.choice([(n,), (n,), (n, 1), (1, n), (n // 2, 2) if n in (0, 8, 300) else (n,)])
         return lead if len(lead) == 1 or lead[0] != lead[1] or lead == (1, 1) else (n,)
 
@@ -355,18 +426,23 @@ class Sequence:
             raise Failed(f"{method} gives {result}, not {tree_structure(plain)} of {shapes}")
         return tensors(result)
 
-    def _expected(self, method: str, flat: list[Tensor]) -> tuple[list[Tensor], list[nn.Module]]:
-        """Returns the results of the loop over masks, and the module of each cell; frozen cells have no gradient."""
-        router, results = self.router, list[Tensor]()
-        cells, frozen = router.assign(flat[0][:, :3].detach()), router.frozen
-        modules = [router.cell(i) for i in range(router.num_cells)]
-        for i, module in enumerate(modules):
+    def _expected(self, method: str, flat: list[Tensor]) -> tuple[list[Tensor], dict[int, nn.Module]]:
+        """Returns the results of the loop over masks, and the modules by cell; frozen cells have no gradient.
+
+        Cells are found without the library.
+        """
+        router, results, x = self.router, list[Tensor](), flat[0][:, :3].detach().double()
+        if router.diagram.depth > 1 or router.num_cells < MANY_CELLS:
+            cells = router.assign(flat[0][:, :3].detach())
+        else:
+            cells = torch.cdist(x, router.diagram.centres.double()).argmin(1)
+        frozen, modules = router.frozen, {i: router.cell(i) for i in cells.unique().tolist()}
+        for i, module in modules.items():
             rows = (cells == i).nonzero()[:, 0]
-            if len(rows):
-                parts = tensors(getattr(module, method)(*[a[rows] for a in flat]))
-                parts = [part.detach() for part in parts] if frozen[i] else parts
-                results = results or [part.new_zeros(len(cells), *part.shape[1:]) for part in parts]
-                results = [whole.index_copy(0, rows, part) for whole, part in zip(results, parts, strict=True)]
+            parts = tensors(getattr(module, method)(*[a[rows] for a in flat]))
+            parts = [part.detach() for part in parts] if frozen[i] else parts
+            results = results or [part.new_zeros(len(cells), *part.shape[1:]) for part in parts]
+            results = [whole.index_copy(0, rows, part) for whole, part in zip(results, parts, strict=True)]
         return results, modules
 
     def _compare(self, what: str, found: list[Tensor], expected: list[Tensor]) -> None:
@@ -400,6 +476,8 @@ def subdivide(s: Sequence) -> None:
         points = torch.rand(200, 3, dtype=s.router.diagram.centres.dtype)
         s.router.subdivide(2, min_samples=2, points=points)
         s.differ()
+    elif s.router.num_cells == MANY_CELLS and s.router.diagram.depth == 1:
+        s.router.subdivide(VoronoiDiagram(torch.cat([s.router.diagram.centres, torch.rand(9, 3)])))
 
 
 def save(s: Sequence) -> None:
@@ -410,10 +488,20 @@ def load(s: Sequence) -> None:
     s.router.load_state_dict(s.rng.choice(s.states))
 
 
+def ask(s: Sequence) -> None:
+    s.router.program(*s.arguments((41,), s.rng)[1], trace=s.rng.random() < 0.5)
+
+
 def data(s: Sequence) -> None:
     s.router.unfreeze()  # writing to frozen cells is an error
     parameter = s.rng.choice(list(s.router.parameters()))
     parameter.data = parameter.data * 0.9
+
+
+def written(s: Sequence) -> None:
+    """Writes past the version counter into a buffer, such as the centres."""
+    buffer = s.rng.choice([b for b in s.router.buffers() if b.is_floating_point()])
+    buffer.data.mul_(s.rng.uniform(0.7, 1.3))
 
 
 def inplace(s: Sequence) -> None:
@@ -473,6 +561,8 @@ def options(s: Sequence) -> None:
 
 
 CHANGES = (
-    *(mode, freeze, unfreeze, subdivide, save, load, data, inplace, attribute, attribute, copied, stored, dtype),
-    *(halves, requires, learn, cell, options),
+    *(mode, freeze, unfreeze, subdivide, save, load, data, written, inplace, attribute, attribute, copied, stored),
+    *(dtype, halves, requires, learn, cell, ask, options),
 )
+#: Changes that may happen in inference mode; others make tensors by torch alone, which are then of inference mode.
+INSIDE = {mode, freeze, unfreeze, subdivide, save, load, written, inplace, copied, cell, ask, options}

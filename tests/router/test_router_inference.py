@@ -1,4 +1,4 @@
-"""What a router keeps of a call or a change under inference mode, later calls with gradients can use."""
+"""Later calls with gradients can use all that a router keeps of a call or a change under inference mode."""
 
 from __future__ import annotations
 
