@@ -127,7 +127,8 @@ class VoronoiRouter(nn.Module):
             samples, also with ``fuse``.
         fuse: A promise that ``forward`` depends only on its arguments and on the state of its submodules. The network
             is traced and runs as one operation; if this is impossible, an error names the line. Changed numbers,
-            attributes and buffers take effect.
+            attributes and buffers take effect, except writes by ``buffer.data`` or in inference mode to buffers above 1
+            MiB or on a GPU; write these by ``buffer.copy_(...)``.
         way: "fastest" times the ways on a part of the first batch of each kind of call and each size (within a factor
             of four). It keeps the fused way unless another one is clearly faster in three measurements, at least a
             second apart. "fused", "grouped" and "loop" choose a way without timing; if this way is impossible, the next

@@ -1,8 +1,7 @@
 """The constants of a traced ``forward``: attributes and buffers of its module, and arguments that are not tensors.
 
 A trace stores their values. Each call compares the stored values with the current ones, so that a schedule that sets
-``module.progress`` takes effect. Writes through ``tensor.data`` into a buffer on a GPU, or of more than 1 MiB, are not
-noticed; write such a buffer itself, for example by ``buffer.copy_(...)``.
+``module.progress`` takes effect. In buffers on a GPU or above 1 MiB, writes by ``buffer.data`` are not noticed.
 """
 
 from __future__ import annotations
