@@ -648,7 +648,7 @@ FAULTS = (
         "test_call_cache.py",
     ),
     _router(
-        "The cells of a method are the caller's labels",
+        "Methods keep the cells of labels that the caller has overwritten",
         "router.py",
         "positions = positions.clone() if keeps else positions",
         "positions = positions",

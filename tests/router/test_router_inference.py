@@ -153,18 +153,20 @@ def test_uses_after_inference_mode(name: str, change: str) -> None:
 
 @pytest.mark.parametrize("name", ["fused", "grouped"])
 def test_labels_of_methods_are_not_the_callers(name: str) -> None:
-    """Labels that the caller overwrites after a call do not change the cells of the next method."""
+    """Labels that the caller overwrites after a call change the cells of a next method only if it gets them."""
     options: Any = {"fuse": True, "way": "fused"} if name == "fused" else {"way": "grouped"}
     router, x = VoronoiRouter(Heads(), 3, methods=["density"], **options), points(60)
     with torch.no_grad():
         router.module.net[0].bias.add_(torch.arange(3.0)[:, None])
     labels = torch.arange(60, dtype=torch.int32) % 3
-    expected = router.density(x, cells=labels)["sigma"]
+    one, other = (router.density(x, cells=cells)["sigma"] for cells in (labels, torch.zeros_like(labels)))
     for _ in range(2):
-        passed = labels.clone()
-        router(x, cells=passed)
-        passed.zero_()
-        torch.testing.assert_close(router.density(x, cells=labels)["sigma"], expected)
+        for overwrites in (True, False):
+            passed = labels.clone()
+            router(x, cells=passed)
+            passed.zero_()
+            found = router.density(x, cells=passed if overwrites else labels)["sigma"]
+            torch.testing.assert_close(found, other if overwrites else one)
 
 
 def test_a_reservoir_of_inference_mode_takes_samples() -> None:
