@@ -683,6 +683,13 @@ FAULTS = (
         "if False:  #",
         "test_program_arguments.py",
     ),
+    _router(
+        "A module that is computed again is observed where a checkpoint keeps tensors",
+        "double.py",
+        "with _unobserved_hooks() if mode else contextlib.nullcontext(), mode",
+        "with mode",
+        "test_router_transforms.py",
+    ),
     _python(
         "A write by tensor.data is not noticed",
         "ops/_core/unchanged.py",

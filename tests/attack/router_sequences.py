@@ -167,7 +167,7 @@ class Kind:
         twice: Whether second derivatives are compared; a custom function may have none.
         plain: Whether the field has no checkpoint inside, so that transforms and checkpoints accept it.
         per_ray: Whether the last argument may have one row per ray.
-        leads: Whether samples may have several leading dimensions.
+        leads: Whether samples may have several leading dimensions, and be tensors of inference mode in training.
     """
 
     make: Callable[[], nn.Module]
@@ -335,7 +335,7 @@ class Sequence:
         method = rng.choice(("forward", *router.methods))
         flat, args = (flat[:1], args[:1]) if method != "forward" else (flat, args)
         x = args[0].requires_grad_(way in ("func", "twice") or rng.random() < 0.5)
-        if way == "plain" and not x.requires_grad and rng.random() < 0.3:
+        if way == "plain" and not x.requires_grad and kind.leads and rng.random() < 0.3:
             way = "of inference mode"
             with torch.inference_mode():
                 args = [a.clone() for a in args]
@@ -397,6 +397,8 @@ class Sequence:
 
     def _lead(self, rng: random.Random) -> tuple[int, ...]:
         n = self.rng.choice(SAMPLES)
+        if self.router.num_cells >= MANY_CELLS:
+            n = min(n, 41)  # the gradient of a loop in a transform has a tensor of all cells for each cell
         if not self.kind.leads:
             return (n,)
         lead = rng.choice([(n,), (n,), (n, 1), (1, n), (n // 2, 2) if n in (0, 8, 300) else (n,)])

@@ -89,6 +89,33 @@ class Picky(nn.Module):
         return self.b(h)
 
 
+class Scaling(torch.autograd.Function):
+    """A function that saves a tensor for its backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.exp()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        return gradient * ctx.saved_tensors[0].exp()
+
+
+class Scaled(nn.Linear):
+    def forward(self, x: Tensor) -> Tensor:
+        return Scaling.apply(super().forward(x))
+
+
+@pytest.mark.parametrize("options", [{"fuse": True, "way": "fused"}, {"way": "grouped"}, {"way": "loop"}])
+def test_a_checkpoint_around_a_custom_function_that_saves_tensors(options: Any, generator: torch.Generator) -> None:
+    router, x = router_of(Scaled(3, 2), generator, **options), torch.rand(60, 3, generator=generator)
+    for _ in range(2):
+        result = gradients(lambda x: checkpoint(router, x, use_reentrant=False), router, x)
+        torch.testing.assert_close(result, gradients(router, router, x))
+    assert router.explain().startswith(f"forward: {'cell by cell' if options['way'] == 'loop' else options['way']}")
+
+
 def test_a_checkpoint_around_batches_of_which_some_cannot_be_grouped(generator: torch.Generator) -> None:
     router = router_of(Picky(), generator, way="grouped")
     for sign in (1, -1, -1, 1, -1, 1, 1, -1):

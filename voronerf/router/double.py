@@ -115,7 +115,7 @@ class Double:
         placed, versions, results = list[tuple[dict[str, Any], str, Any]](), list[int](), []
         items = items_of(self._containers)
         try:
-            with mode or contextlib.nullcontext():
+            with _unobserved_hooks() if mode else contextlib.nullcontext(), mode or contextlib.nullcontext():
                 for rows, parameters in zip(parts, values, strict=True):
                     placed = self.fill(parameters)
                     versions = versions or _versions(placed)
@@ -223,6 +223,23 @@ def _recording_class(
     metaclass: Any = type(kind)
     recording: type[nn.Module] = metaclass(kind.__name__, (Unregistered, kind), names)
     return recording
+
+
+def _unobserved_hooks() -> Any:
+    """Returns a context in which function modes do not see what saved-tensor hooks call.
+
+    A hook of ``torch.utils.checkpoint`` calls ``detach`` where a custom autograd function saves a tensor.
+    """
+    hooks: Any = torch._C._autograd._top_saved_tensors_default_hooks(False)
+    if hooks is None:
+        return contextlib.nullcontext()
+    pack, unpack = hooks
+
+    def unobserved(tensor: Tensor) -> Any:
+        with torch._C.DisableTorchFunction():
+            return pack(tensor)
+
+    return torch.autograd.graph.saved_tensors_hooks(unobserved, unpack)
 
 
 def _versions(placed: list[tuple[dict[str, Any], str, Any]]) -> list[int]:
