@@ -511,13 +511,13 @@ FAULTS = (
     _recording(
         "an interrupted recording stays on",
         "ops/_core/recording.py",
-        "            self.__exit__()\n",
-        "            pass\n",
+        "        finally:\n            self._end()\n",
+        "        finally:\n            pass\n",
     ),
     _recording(
         "torch's flags stay after an interrupt",
-        "ops/_core/recording.py",
-        "vars(_python_dispatch).update(self._flags)",
+        "ops/_core/modes.py",
+        "vars(_python_dispatch).update(flags)",
         "pass",
     ),
     Fault(

@@ -8,6 +8,7 @@ entries of a sample become columns of a new value of the program.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -17,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from voronerf.ops._core.modes import run_within
 from voronerf.ops._core.program import PARAMETER, VALUE, Builder, Columns
 from voronerf.router.axes import Axis
 from voronerf.router.grouped import find
@@ -415,8 +417,7 @@ class Lowering:
                 return copied
 
             args, kwargs = map_tensors((args, kwargs), copy)
-            with mode:
-                result = function(*args, **kwargs)
+            result = run_within(mode, functools.partial(function, *args, **kwargs))
             if function in _EMPTY:
                 result.zero_()
         return result, args, mode.of_result

@@ -27,10 +27,10 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils import _python_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from voronerf.ops._core.active import active
+from voronerf.ops._core.modes import run_within
 from voronerf.ops._core.rows import Count, RowCount
 
 #: The spare rows of memory: n // SPARE + SOME for a recorded run of n rows.
@@ -38,7 +38,6 @@ SPARE, SOME = 4, 64
 _NEW = ("aten::new_empty", "aten::empty")
 _HARMLESS = ("aten::promote_types", "aten::result_type")
 _KINDS = {torch.Tag.pointwise, torch.Tag.nondeterministic_seeded}
-_set_flag = getattr(_python_dispatch, "set_is_in_mode_without_ignore_compile_internals", None)  # newer torch
 _PASSED_OVER = (str(Path(torch.__file__).absolute().parent), str(Path(__file__).absolute()))
 
 
@@ -110,9 +109,6 @@ class Recording(TorchDispatchMode):
         self._views: dict[Tensor, Tensor] = {}
         self._held: dict[int, _Held] = {}  # by the id of the object
         self._is_paused = False  # whether torch operations run without an inspection
-        # Torch's record of its active modes, before this mode: their number, and flags for its compiler.
-        self._modes = torch._C._len_torch_dispatch_stack()
-        self._flags = {name: value for name, value in vars(_python_dispatch).items() if name.startswith("_is_in_")}
         self.obstacle: str | None = None
 
     @classmethod
@@ -128,23 +124,20 @@ class Recording(TorchDispatchMode):
         return self
 
     def __exit__(self, *error: Any) -> None:
-        """Ends the recording. Unlike torch's method, it can be called again after an interrupt."""
+        super().__exit__(*error)
+        self._end()
+
+    def _end(self) -> None:
         active.recording = active.vary = None
         self._calls.end()
-        while torch._C._len_torch_dispatch_stack() > self._modes:
-            torch._C._pop_torch_dispatch_stack(None)
-        vars(_python_dispatch).update(self._flags)
-        if _set_flag is not None:
-            _set_flag(self._flags["_is_in_any_mode_without_ignore_compile_internals"])
         self._refuse(self._calls.obstacle)
 
     def record(self, function: Callable[[], Any]) -> Any:
-        """Runs a function and records its calls. The recording also ends if Ctrl-C interrupts :meth:`__exit__`."""
+        """Runs a function and records its calls. Unlike the context, it also ends if Ctrl-C interrupts its end."""
         try:
-            with self:
-                return function()
+            return run_within(self, function)
         finally:
-            self.__exit__()
+            self._end()
 
     @contextlib.contextmanager
     def _paused(self) -> Iterator[None]:
