@@ -61,12 +61,12 @@ bool adam_step(const py::type& rule_class, const py::type& guard_class, const py
   of_rules.resize(static_cast<size_t>(PySequence_Fast_GET_SIZE(rules)));
   for (size_t i = 0; i < of_rules.size(); ++i) {
     PyObject* const rule = PySequence_Fast_GET_ITEM(rules, static_cast<Py_ssize_t>(i));
-    if (reinterpret_cast<PyObject*>(Py_TYPE(rule)) != rule_class.ptr()) return false;
+    if (reinterpret_cast<PyObject*>(Py_TYPE(rule)) != rule_class.ptr() || !has_entries(rule, 5)) return false;
     if (!load_rule(rule, scalars, of_rules[i])) return false;
   }
   of_guard = {};
   if (guard != Py_None) {  // a Guard: (skip, skipped, in_a_row, scale, limit)
-    if (reinterpret_cast<PyObject*>(Py_TYPE(guard)) != guard_class.ptr()) return false;
+    if (reinterpret_cast<PyObject*>(Py_TYPE(guard)) != guard_class.ptr() || !has_entries(guard, 5)) return false;
     double limit = 0;
     if (PyTuple_GET_ITEM(guard, 3) != Py_None || !number(PyTuple_GET_ITEM(guard, 4), limit)) return false;
     of_guard.limit = static_cast<float>(limit);

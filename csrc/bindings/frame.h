@@ -50,6 +50,12 @@ inline Recording*& recorded() {  // the active recording of the calling thread, 
 void refuse(Recording& recording, const std::string& why);
 bool add_tensor(Recording& recording, PyObject* tensor);
 
+// Returns whether the object is a tuple of `count` entries. The class of a named tuple does not tell its length:
+// tuple.__new__(Class, ()) has no entries.
+inline bool has_entries(PyObject* object, size_t count) {
+  return PyTuple_Check(object) && PyTuple_GET_SIZE(object) == static_cast<Py_ssize_t>(count);
+}
+
 // The Python references that a call holds, released when it ends.
 class Frame {
  public:
@@ -252,11 +258,11 @@ class Frame {
 
   // Returns whether the object is a named tuple with the type's members.
   static bool is_one(const Type& type, PyObject* object) {
+    if (!has_entries(object, type.members.size())) return false;
     if (Py_TYPE(object) == type.known_class) return true;
-    if (!PyTuple_Check(object)) return false;
     PyObject* const names = PyObject_GetAttrString(object, "_fields");
     if (names == nullptr) return PyErr_Clear(), false;
-    bool same = PyTuple_Check(names) && PyTuple_GET_SIZE(names) == static_cast<Py_ssize_t>(type.members.size());
+    bool same = has_entries(names, type.members.size());
     for (size_t i = 0; same && i < type.members.size(); ++i) {
       PyObject* const name = PyTuple_GET_ITEM(names, static_cast<Py_ssize_t>(i));
       same = PyUnicode_Check(name) && PyUnicode_CompareWithASCIIString(name, type.members[i].name.c_str()) == 0;

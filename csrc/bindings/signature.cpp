@@ -53,6 +53,7 @@ struct Argument {
   bool positive = false, interval = false, open = false;
   py::tuple choices;
   py::object kind_of;
+  size_t entries = 0;  // the number of entries of kind_of, if it is a named tuple
 };
 
 // The state of a call while its arguments are checked.
@@ -354,6 +355,7 @@ class Signature {
     } else if (kind == "instance") {
       argument.kind = Kind::instance;
       argument.kind_of = rule;
+      if (py::hasattr(rule, "_fields")) argument.entries = py::len(rule.attr("_fields"));
     }
     return argument;
   }
@@ -433,7 +435,8 @@ class Signature {
           return choice.ptr() == value || PyUnicode_Compare(choice.ptr(), value) == 0;
         });
       case Argument::Kind::instance:
-        return reinterpret_cast<PyObject*>(Py_TYPE(value)) == argument.kind_of.ptr();
+        if (reinterpret_cast<PyObject*>(Py_TYPE(value)) != argument.kind_of.ptr()) return false;
+        return argument.entries == 0 || has_entries(value, argument.entries);
       default:
         return true;
     }

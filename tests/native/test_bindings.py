@@ -49,6 +49,11 @@ def test_what_does_not_fit_a_signature_is_refused() -> None:
     with pytest.raises(TypeError, match=r"^Encoding: x is not of type const float32\*$"):
         compiled.encode(compiled.Encoding(x=points.double(), variances=None, **sizes), torch.empty(4, 9), cpu)
     refuses("unexpected keyword argument 'y'", compiled.Encoding, y=points, variances=None, **sizes, error=TypeError)
+    whole = compiled.Encoding(x=points, variances=None, **sizes)
+    compiled.encode(whole, torch.empty(4, 9), cpu)
+    for count in range(len(whole)):  # the class is known from the call above
+        with pytest.raises(TypeError, match="incompatible function arguments"):
+            compiled.encode(tuple.__new__(compiled.Encoding, whole[:count]), torch.empty(4, 9), cpu)
 
 
 def test_an_instruction_set_that_is_not_there_is_refused() -> None:

@@ -102,7 +102,7 @@ def test_refuses_what_would_be_read_out_of_bounds():
         "adam: step must be a dense tensor, got a sparse_coo one": {
             "rules": [rule._replace(step=torch.zeros(()).to_sparse())]
         },
-        "adam: rules must hold a Rule for each parameter, got tuple": {"rules": [tuple(rule)]},
+        "adam: rules[0] must be a Rule, got tuple": {"rules": [tuple(rule)]},
         "adam: guard must be a Guard, got Tensor": {"guard": torch.ones(())},
         "adam: learning_rate must be a number, got str": {"rules": [rule._replace(learning_rate="x")]},
         "adam: betas must be a number, got Tensor": {"rules": [rule._replace(betas=(0.9, torch.tensor(0.9)))]},

@@ -8,6 +8,7 @@ from helpers import refuses
 from torch.utils._pytree import tree_leaves, tree_map
 
 from voronerf import ops
+from voronerf.ops._core import backends
 from voronerf.ops._core.cases import Draw, cases
 
 POINTS = torch.rand(4, 3)
@@ -85,3 +86,39 @@ def test_runs_that_are_not_of_the_samples_are_refused(op, backend):
         if op == "run_gradients":
             arguments["answers"] = torch.zeros(len(change) - 1, 6)
         refuses(f"{op}: run_offsets must strictly ascend from 0 to", getattr(ops, op), **arguments, backend=backend)
+
+
+def short_tuples(value):
+    """Yields (description of the error, changed value) for named tuples in a value with fewer entries than fields."""
+    if hasattr(value, "_fields"):
+        kind = type(value)
+        for count in range(len(value)):
+            rule = f"must have the {len(value)} entries of (a )?{kind.__name__}, got {count}$"
+            yield rule, tuple.__new__(kind, value[:count])
+    elif isinstance(value, list):
+        for index, entry in enumerate(value):
+            for rule, short in short_tuples(entry):
+                yield rf"\[{index}\] {rule}", [*value[:index], short, *value[index + 1 :]]
+
+
+@pytest.mark.parametrize(
+    ("op", "name"),
+    [
+        ("adam", "rules"),
+        ("adam", "guard"),
+        ("draw_pixels", "known_pixels"),
+        ("draw_pixels", "runs"),
+        ("run_sums", "samples"),
+        ("run_gradients", "samples"),
+    ],
+)
+def test_named_tuples_with_fewer_entries_than_fields(op, name):
+    """``tuple.__new__`` makes such tuples; reading the missing entries in C++ would crash."""
+    calls = (cases()[op].make(Draw(seed, free=True), 5) for seed in range(99))
+    call = next(call for call in calls if call.get(name))
+    rules = [*short_tuples(call[name])]
+    assert len(rules) > 2
+    for backend in (*backends.implemented(op), "auto"):
+        for rule, short in rules:
+            with pytest.raises(ValueError, match=rf"^{op}: {name} ?{rule}"):
+                getattr(ops, op)(**{**call, name: short}, backend=backend)

@@ -382,10 +382,18 @@ def check_interval(op: str, name: str, value: float, low: float, high: float, ru
 
 
 def check_kind(op: str, name: str, value: object, kind: type) -> None:
-    """Raises TypeError unless ``value`` is an instance of a class of this library."""
+    """Raises TypeError unless ``value`` is an instance of a class of this library.
+
+    Raises ValueError for a named tuple with fewer entries than its class, as ``tuple.__new__`` makes it.
+    """
+    article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOM" else "a "
     if not isinstance(value, kind):
-        article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOM" else "a "
         raise TypeError(f"{op}: {name} must be {article}{kind.__name__}, got {type(value).__name__}")
+    fields = getattr(kind, "_fields", ())
+    if fields and isinstance(value, tuple) and len(value) != len(fields):
+        raise ValueError(
+            f"{op}: {name} must have the {len(fields)} entries of {article}{kind.__name__}, got {len(value)}"
+        )
 
 
 def check_flag(op: str, name: str, value: bool) -> None:

@@ -15,6 +15,7 @@ from voronerf.ops._core.checks import (
     check_dtype,
     check_flag,
     check_interval,
+    check_kind,
     check_number,
     check_same_device,
     check_shape,
@@ -153,15 +154,13 @@ def _check_all(
     if not _are_lists(_OP, lists, "rules", rules):
         return
     checked: Any = None
-    for rule in rules:
-        if not isinstance(rule, Rule):
-            raise TypeError(f"{_OP}: rules must hold a Rule for each parameter, got {type(rule).__name__}")
+    for index, rule in enumerate(rules):
+        check_kind(_OP, f"rules[{index}]", rule, Rule)
         if checked is None or any(part is not previous for part, previous in zip(rule[1:], checked[1:])):
             _check_rule(rule, parameters[0])  # equal rules in a row are checked once
         checked = rule
     if guard is not None:
-        if not isinstance(guard, Guard):
-            raise TypeError(f"{_OP}: guard must be a Guard, got {type(guard).__name__}")
+        check_kind(_OP, "guard", guard, Guard)
         check_number(_OP, "limit", guard.limit)
     if loss is not None and guard is None:
         raise ValueError(f"{_OP}: loss must come with a guard, got none")
