@@ -4,12 +4,10 @@ import contextlib
 import io
 import itertools
 import json
-import re
 import runpy
 import subprocess
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -59,13 +57,6 @@ def same(first, second):
     return all(
         a is b or (a is not None and b is not None and torch.equal(a, b)) for a, b in zip(first, second, strict=True)
     )
-
-
-def anonymous_memory():
-    """Returns this process's anonymous memory (pages that no file backs) in bytes; skips the test except on Linux."""
-    if sys.platform != "linux":
-        pytest.skip("reads /proc, which only Linux has")
-    return 1024 * int(re.search(r"RssAnon:\s+(\d+)", Path("/proc/self/status").read_text())[1])
 
 
 def on_any_number_of_threads(run, counts=(1, 2, 3)):

@@ -193,8 +193,6 @@ def open_run(
 ) -> Run:
     """Opens a run that ``voronerf train`` has written.
 
-    On the CPU, the networks are mapped from the checkpoint's file: the system reads their pages on first use.
-
     Args:
         path: The run directory.
         scene: The scene, if it is loaded already.

@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
@@ -168,7 +168,7 @@ def read_weights(files: list[Path]) -> dict[str, Tensor]:
     for file in files:
         try:
             if file.suffix == ".safetensors":
-                tensors = load_file(file)
+                tensors = load(file.read_bytes())  # not mapped: the file may be cut short while the weights are in use
             else:
                 tensors = torch.load(file, map_location="cpu", weights_only=True)
             named = [(name, tensor) for name, tensor in tensors.items() if isinstance(tensor, Tensor)]

@@ -176,8 +176,6 @@ def no_run(path: Path, file: str) -> str:
 def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
     """Reads a checkpoint onto the CPU.
 
-    Its tensors are mapped from the file, so that the system can drop unused pages.
-
     Args:
         path: The file.
         keep: Function that takes a tensor's name, and returns whether to read and verify the tensor. The other tensors
@@ -195,7 +193,8 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
                 raise CheckpointError(f"{path}: not a {FORMAT} file, its format is {metadata.get('format')!r}")
             sums = parse_json(metadata["checksums"])
             names = [*file.keys()]
-            tensors = {name: file.get_tensor(name) for name in names if keep(name)}
+            # Copied: a mapped file that is cut short would end the process by SIGBUS when its pages are read.
+            tensors = {name: file.get_tensor(name).clone() for name in names if keep(name)}
         if missing := sorted(sums.keys() ^ {*names, _VALUES}):
             raise CheckpointError(f"{path}: a damaged checkpoint, {missing[0]} or its checksum is missing")
         checked = {name: _checksum(tensor) for name, tensor in tensors.items()}
