@@ -104,6 +104,7 @@ def write_named(folder, name, file, pictures="images", size=SIZE):
         ("C:\\a\\{}.jpg", "b/{}.png", False),
         ("IMG_{}.JPG", "image{:03d}.png", True),
         ("/home/someone/gone/{}.jpg", "{:03d}.png", True),
+        pytest.param("9" * 5000 + "{}.jpg", "{:03d}.png", True, id="more digits than int takes"),
     ],
 )
 def test_images_are_found_by_their_names_or_else_by_their_order(tmp_path, name, file, order):

@@ -190,8 +190,8 @@ def _files_in_order(source: Path, images: ImageFolder, names: Sequence[str], all
 
 def _in_numeric_order(paths: Sequence[Path | str]) -> bool:
     """Returns whether sorted paths are in numeric order, too, such as 9 before 10."""
-    parts = [re.split(r"(\d+)", str(path)) for path in paths]
-    keys = [[int(part) if part.isdecimal() else part for part in pieces] for pieces in parts]
+    parts = [re.split(r"0*(\d+)", str(path)) for path in paths]  # at odd places numbers, which may be too long for int
+    keys = [[(len(part) * (place % 2), part) for place, part in enumerate(pieces)] for pieces in parts]
     return keys == sorted(keys)
 
 
