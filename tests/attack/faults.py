@@ -825,6 +825,13 @@ FAULTS = (
         "tests/app/scenes/test_process.py",
     ),
     _python(
+        "Masks drawn on turned photographs are taken as they are stored",
+        "app/scenes/gather.py",
+        "drawn(image, size, header.turns)",
+        "drawn(image, size, 0)",
+        "tests/app/scenes/test_process.py",
+    ),
+    _python(
         "Runs are aligned by a mirror image",
         "town/editing.py",
         "torch.sign(torch.linalg.det(u) * torch.linalg.det(v))",

@@ -1,6 +1,7 @@
 """Tests of `voronerf process` on rendered images of two textured walls, and on simulated mapper results."""
 
 import contextlib
+import io
 import itertools
 import json
 import os
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import refuses
-from PIL import Image
+from PIL import Image, ImageOps
 from scene_files import write_images
 
 from voronerf.app.cli import main
@@ -712,6 +713,19 @@ def test_masks_go_along(tmp_path, monkeypatch, files, names, line):
     for folder in (masks, tmp_path / "out/colmap/masks"):
         for name in names:
             assert (np.asarray(Image.open(folder / f"{name}.png").convert("L")) == np.asarray(half())).all()
+
+
+@pytest.mark.parametrize("tag", [6, 8])
+def test_masks_drawn_on_turned_photographs_lie_as_the_photographs_are_stored(tmp_path, monkeypatch, tag):
+    exif, photograph, upright = Image.Exif(), io.BytesIO(), half()
+    exif[0x0112] = tag
+    picture(1).save(photograph, "JPEG", exif=exif)
+    upright.getexif()[0x0112] = tag
+    files = {**numbered("{}.jpg"), "1.jpg": photograph.getvalue(), "masks/1.png": ImageOps.exif_transpose(upright)}
+    gathered(tmp_path, monkeypatch, files)
+    assert Image.open(tmp_path / "in/masks/1.png").size == (20, 32)
+    for name in ("masks", "colmap/masks"):
+        assert (np.asarray(Image.open(tmp_path / f"out/{name}/1.jpg.png").convert("L")) == np.asarray(half())).all()
 
 
 @pytest.mark.parametrize(
