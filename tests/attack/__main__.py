@@ -16,10 +16,10 @@ import input_files
 import interrupts
 import mutate
 import op_attacks
+import process_attacks
 import rank_attacks
 import router_sequences
 import run_attacks
-import scene_attacks
 import step_sequences
 import store_attacks
 import torch
@@ -39,7 +39,7 @@ PARTS = {
         (Part("kills", training_attacks.killed_training, 300, 1, prepare=input_files.prepare_scenes), 20, 1),
         (Part("ranks", rank_attacks.harmed_ranks, 600), 16, 0),
         (Part("bits", run_attacks.flipped_bit, 60, 20, prepare=input_files.prepare_runs), 500, 15),
-        (Part("scenes", scene_attacks.stranger_scene, 60, 1, prepare=input_files.prepare_photographs), 150, 4),
+        (Part("scenes", process_attacks.stranger_files, 60, 1, prepare=input_files.prepare_photographs), 300, 6),
         (Part("runs", run_attacks.stranger_run, 60, 1, prepare=input_files.prepare_runs), 150, 4),
         (Part("stores", store_attacks.harmed_store, 60, 1, prepare=input_files.prepare_scenes), 150, 4),
         (Part("clients", viewer_attacks.hostile_client, 60, 1, prepare=input_files.prepare_runs), 150, 2),

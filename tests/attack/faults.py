@@ -827,8 +827,8 @@ FAULTS = (
     _python(
         "Masks drawn on turned photographs are taken as they are stored",
         "app/scenes/gather.py",
-        "drawn(image, size, header.turns)",
-        "drawn(image, size, 0)",
+        "drawn(image, header.size, header.turns)",
+        "drawn(image, header.size, 0)",
         "tests/app/scenes/test_process.py",
     ),
     _python(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shlex
@@ -16,7 +17,7 @@ from PIL import Image
 from voronerf.nerf.cameras import orbit_cameras
 
 sys.path.append(str(Path(__file__).parents[1] / "app" / "scenes"))
-from scene_files import write_colmap, write_images, write_llff
+from scene_files import write_colmap, write_images, write_llff, write_walls
 
 #: Options of a short training.
 TINY = shlex.split(
@@ -28,6 +29,8 @@ FIELDS = {
     "nerf": shlex.split("--field nerf --no-occupancy"),
     "hashgrid": shlex.split("--field-options log2_entries=10 levels=3"),
 }
+#: Options of a short `voronerf process`.
+FEATURES = ("--max-features", "300")
 #: The pose of the cameras, which look at the origin from 4 units away.
 POSE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1]]
 SIDE = 16
@@ -64,6 +67,23 @@ def prepare_photographs(inputs: Path) -> None:
             write_llff(inputs / name, poses, (SIDE, SIDE), 20.0, (2.5, 5.5))
         else:
             write_colmap(inputs / name, poses, [(SIDE, SIDE)] * 9, points, binary=name == "colmap")
+    if importlib.util.find_spec("pycolmap") is not None:
+        prepare_process(inputs)
+
+
+def prepare_process(inputs: Path) -> None:
+    """Writes photographs, half of them with masks, and the folder of a `voronerf process` that stopped at its end."""
+    views = orbit_cameras(40, radius=4, elevation=35, width=240, height=180, focal=200)[:8]
+    write_walls(inputs / "photographs", views)
+    (inputs / "photographs" / "masks").mkdir()
+    for number in range(4):
+        mask = Image.new("L", (240, 180), 255)
+        mask.paste(0, (0, 0, 20, 180))
+        mask.save(inputs / "photographs" / "masks" / f"{number:02} a.png")
+    status, _, err = commands.run("process", inputs / "photographs", inputs / "stopped", *FEATURES)
+    if status != 0:
+        raise RuntimeError(err)
+    shutil.rmtree(inputs / "stopped" / "sparse")  # written last
 
 
 def prepare_runs(inputs: Path) -> None:

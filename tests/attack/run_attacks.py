@@ -55,7 +55,6 @@ def flipped_bit(rng: random.Random, folder: Path, inputs: Path) -> str:
     older = load_checkpoint(checkpoint_paths(run)[1])
     # Half of the damage hits the header, a small part of the file with the most structure.
     bit = rng.randrange(8 * min(len(data), 6000 if rng.random() < 0.5 else len(data)))
-    path.unlink()  # loaded tensors may map the file
     path.write_bytes(flipped(data, bit) if rng.random() < 0.7 else damaged(rng, data))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

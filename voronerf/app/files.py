@@ -137,20 +137,37 @@ def _finite(value: Any) -> Any:
 JSON_LIMIT = 2**25
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, kind: type = object) -> Any:
     """Returns the contents of a JSON file.
 
+    Args:
+        path: The file.
+        kind: The type of the contents, dict or list; default any.
+
     Raises:
-        ValueError: When the file is too large or not JSON; the message names the file.
+        ValueError: When the file is too large or not JSON, or its contents have another type; the message names the
+            file.
         OSError: When the file cannot be read.
     """
+    text = _read_text(path)
+    try:
+        value = parse_json(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: is not JSON: {error}") from None
+    if not isinstance(value, kind):
+        raise ValueError(f"{path}: must be {'an object' if kind is dict else 'a list'}, got {value!r:.60}")
+    return value
+
+
+def _read_text(path: Path) -> str:
+    """Returns the text of a JSON file, or of a file with JSON lines."""
     with open(path, "rb") as file:
         data = file.read(JSON_LIMIT + 1)
     if len(data) > JSON_LIMIT:
         size = path.stat().st_size
         raise ValueError(f"{path}: must be at most {JSON_LIMIT / 2**20:g} MiB of JSON, got {size / 2**20:.1f}")
     try:
-        return parse_json(data.decode("utf-8-sig"))
+        return data.decode("utf-8-sig")
     except ValueError as error:
         raise ValueError(f"{path}: is not JSON: {error}") from None
 
@@ -171,12 +188,12 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     """Returns the objects of a file with one JSON object per line; [] if there is no file.
 
     Raises:
-        ValueError: When a line is not a JSON object; the message names the file and the line.
+        ValueError: When the file is too large, or a line is not a JSON object; the message names the file and the line.
     """
     if not path.is_file():
         return []
     values = []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    for number, line in enumerate(_read_text(path).splitlines(), 1):
         try:
             value = parse_json(line)
         except ValueError as error:

@@ -52,6 +52,38 @@ def write_capture(folder, cameras, **entries):
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 20.0, **entries, "frames": frames[::-1]}))
 
 
+def write_walls(folder, views):
+    """Writes images, named "00 a.png" and so on, of a textured floor and a wall behind it; COLMAP finds their cameras.
+
+    The cameras ``views`` stand around the origin.
+    """
+    folder.mkdir(exist_ok=True)
+    generator = np.random.default_rng(0)
+    floor, wall = _texture(generator), _texture(generator)
+    back = views.origins.mean(0)[:2] / views.origins.mean(0)[:2].norm()
+    for index in range(len(views)):
+        rays = views.image_rays(index)
+        origin, direction = rays.origins.double(), rays.directions.double()
+        to_floor = (-1 - origin[:, 2]) / direction[:, 2]
+        to_wall = (-2 - origin[:, :2] @ back.double()) / (direction[:, :2] @ back.double())
+        to_floor, to_wall = (torch.where(t > 0, t, 1e3) for t in (to_floor, to_wall))
+        point = (origin + torch.minimum(to_floor, to_wall)[:, None] * direction).numpy()
+        side = point[:, 0] * float(back[1]) - point[:, 1] * float(back[0])
+        u = np.where(to_floor < to_wall, point[:, 0], side)
+        v = np.where(to_floor < to_wall, point[:, 1], point[:, 2])
+        column, row = ((np.clip(x / 8 + 0.5, 0, 0.999) * 512).astype(int) for x in (u, v))
+        grey = np.where(to_floor < to_wall, floor[row, column], wall[row, column])
+        Image.fromarray(grey.reshape(views.height, views.width)).convert("RGB").save(folder / f"{index:02} a.png")
+
+
+def _texture(generator):
+    """Returns a random grey texture, uint8 [512, 512], with detail at several scales."""
+    total = np.zeros((512, 512))
+    for size in (16, 32, 64, 128, 256):
+        total += np.kron(generator.normal(size=(size, size)), np.ones((512 // size, 512 // size))) / size**0.25
+    return np.clip(128 + 45 * total, 0, 255).astype(np.uint8)
+
+
 def rewrite(folder, change, name="transforms", **options):
     """Applies a function to the contents of a transforms file; returns the changed contents."""
     path = folder / f"{name}.json"

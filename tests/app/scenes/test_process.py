@@ -19,7 +19,7 @@ import pytest
 import torch
 from helpers import refuses
 from PIL import Image, ImageOps
-from scene_files import write_images
+from scene_files import write_images, write_walls
 
 from voronerf.app.cli import main
 from voronerf.app.scenes import SceneError, gather, load_scene, process
@@ -36,33 +36,11 @@ def cameras():
     return orbit_cameras(40, radius=4.0, elevation=35.0, width=WIDTH, height=HEIGHT, focal=FOCAL)[:COUNT]
 
 
-def pattern(generator):
-    """Returns a random grey texture, uint8 [512, 512], with detail at several scales."""
-    total = np.zeros((512, 512))
-    for size in (16, 32, 64, 128, 256):
-        total += np.kron(generator.normal(size=(size, size)), np.ones((512 // size, 512 // size))) / size**0.25
-    return np.clip(128 + 45 * total, 0, 255).astype(np.uint8)
-
-
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
     """A folder of images of a floor and a wall behind it."""
-    folder, generator = tmp_path_factory.mktemp("walls"), np.random.default_rng(0)
-    floor, wall, views = pattern(generator), pattern(generator), cameras()
-    back = views.origins.mean(0)[:2] / views.origins.mean(0)[:2].norm()
-    for index in range(COUNT):
-        rays = views.image_rays(index)
-        origin, direction = rays.origins.double(), rays.directions.double()
-        to_floor = (-1 - origin[:, 2]) / direction[:, 2]
-        to_wall = (-2 - origin[:, :2] @ back.double()) / (direction[:, :2] @ back.double())
-        to_floor, to_wall = (torch.where(t > 0, t, 1e3) for t in (to_floor, to_wall))
-        point = (origin + torch.minimum(to_floor, to_wall)[:, None] * direction).numpy()
-        side = point[:, 0] * float(back[1]) - point[:, 1] * float(back[0])
-        u = np.where(to_floor < to_wall, point[:, 0], side)
-        v = np.where(to_floor < to_wall, point[:, 1], point[:, 2])
-        column, row = ((np.clip(x / 8 + 0.5, 0, 0.999) * 512).astype(int) for x in (u, v))
-        grey = np.where(to_floor < to_wall, floor[row, column], wall[row, column])
-        Image.fromarray(grey.reshape(HEIGHT, WIDTH)).convert("RGB").save(folder / f"{index:02} a.png")
+    folder = tmp_path_factory.mktemp("walls")
+    write_walls(folder, cameras())
     return folder
 
 

@@ -9,7 +9,7 @@ import torch
 from helpers import refuses, same
 from safetensors.torch import save_file
 
-from voronerf.app.files import read_json_lines, write_text
+from voronerf.app.files import JSON_LIMIT, read_json_lines, write_text
 from voronerf.app.train.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -156,3 +156,5 @@ def test_text_is_replaced_whole_and_broken_lines_of_json_are_named(tmp_path):
     refuses("metrics.jsonl: line 2 is not JSON", read_json_lines, path)
     write_text(path, '{"step": 1}\n[1]\n')
     refuses("metrics.jsonl: line 2 must be an object, got [1]", read_json_lines, path)
+    os.truncate(path, JSON_LIMIT + 1)  # the file has a hole, which takes no space on the disk
+    refuses("metrics.jsonl: must be at most 32 MiB of JSON, got 32.0", read_json_lines, path)

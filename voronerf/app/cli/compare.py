@@ -74,12 +74,9 @@ def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise ConfigError(no_run(run, "config.json"))
     metrics = read_metrics(run)
     ended = (run / "summary.json").is_file()
-    figures = read_json(run / "summary.json") if ended else metrics[-1] if metrics else {}
-    settings = read_json(run / "config.json")
-    scores = read_json(run / "eval.json") if (run / "eval.json").is_file() else {}
-    for file, value in (("summary.json", figures), ("config.json", settings), ("eval.json", scores)):
-        if not isinstance(value, dict):
-            raise ValueError(f"{run / file}: must be an object, got {value!r:.60}")
+    figures = read_json(run / "summary.json", dict) if ended else metrics[-1] if metrics else {}
+    settings = read_json(run / "config.json", dict)
+    scores = read_json(run / "eval.json", dict) if (run / "eval.json").is_file() else {}
     if not figures and is_town(run):
         figures = count_parts(run)
     if "psnr" not in figures and isinstance(views := scores.get("views"), list):

@@ -12,11 +12,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import CONVERTED, HEIF, SUFFIXES, listed_images
-from voronerf.app.scenes.images import UNREADABLE, drawn, read_header, read_image
+from voronerf.app.scenes.images import UNREADABLE, Header, drawn, read_header, read_image
 from voronerf.app.scenes.soundness import some_of
 
 #: Container formats of videos. Playlists are excluded, since they name other files.
@@ -204,6 +206,27 @@ def _remove_repeats(folder: Path) -> list[str]:
     return repeats
 
 
+def read_mask(path: Path, name: str, header: Header) -> NDArray[np.bool_]:
+    """Reads the mask of an image: bool [h, w], oriented like the stored image, False where the mask is black.
+
+    Args:
+        path: the mask file.
+        name: the name of the image, for errors.
+        header: the header of the image.
+    """
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            upright = header.size[::-1] if header.turns % 2 else header.size
+            if image.size not in (header.size, upright):
+                size, actual = (" x ".join(map(str, sides)) for sides in (header.size, image.size))
+                raise SceneError(f"{path}: is {actual} pixels, {name} is {size}")
+            return drawn(image, header.size, header.turns)
+    except SceneError:
+        raise
+    except UNREADABLE as error:
+        raise SceneError(f"{path}: cannot be read: {error}") from None
+
+
 def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callable[[str], None]) -> None:
     """Writes the masks of copied images to ``masks``, under the names that COLMAP expects: `0.jpg.png` for `0.jpg`.
 
@@ -219,20 +242,12 @@ def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callab
     count = 0
     for copy, path in copied.items():
         name, header = path.relative_to(folder), read_header(copy)
-        size = header.size
         named = [place / end for place in places for end in (f"{name}.png", name.with_suffix(".png"))]
         named += [path.parent / "masks" / end for end in (f"{path.name}.png", f"{path.stem}.png")]
         mask = next((file for file in named if file.is_file()), None)
         if mask is None:
             continue
-        try:
-            with Image.open(mask, formats=FORMATS) as image:
-                kept = drawn(image, size, header.turns)
-        except UNREADABLE as error:
-            raise SceneError(f"{mask}: cannot be read: {error}") from None
-        if kept.shape != size[::-1]:
-            high, wide = kept.shape
-            raise SceneError(f"{mask}: is {wide} x {high} pixels, {path.name} is {size[0]} x {size[1]}")
+        kept = read_mask(mask, path.name, header)
         masks.mkdir(exist_ok=True)
         Image.fromarray(kept).save(masks / f"{copy.name}.png")
         count += 1

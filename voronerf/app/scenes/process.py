@@ -25,7 +25,7 @@ import shutil
 import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -50,9 +50,17 @@ from voronerf.app.scenes.folds import (
     trusted_pairs,
     wide_pairs,
 )
-from voronerf.app.scenes.gather import Progress, emptied, gather
+from voronerf.app.scenes.gather import Progress, emptied, gather, read_mask
 from voronerf.app.scenes.images import read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
+from voronerf.app.scenes.results import (
+    check_database,
+    check_files,
+    check_model,
+    named_errors,
+    read_pairs,
+    read_result,
+)
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
 from voronerf.app.scenes.transforms import Shot, write_transforms
 from voronerf.app.wording import did_you_mean
@@ -222,8 +230,9 @@ def process(
     stages = Stages(pycolmap, work, images, progress)
     if masks.is_dir() or any(read_header(path).alpha for path in files):
         _write_masks(files, masks, work / "masks")
-    _match(stages, sizes, settings)
-    matches = _read_matches(stages)
+    with named_errors("pycolmap: matches"):
+        _match(stages, sizes, settings)
+        matches = _read_matches(stages)
     still, pairs = still_pairs(matches)
     if still > STILL * pairs:
         say(
@@ -267,12 +276,13 @@ def _begin(out: Path, settings: Settings) -> Path:
     work = out / "colmap"
     record = work / "settings.json"
     if record.is_file():
-        stored, wanted = json.loads(record.read_text()), settings._asdict()
+        check_files(out)
+        stored, wanted = read_result(record, dict), settings._asdict()
         if changed := [name for name, value in wanted.items() if stored.get(name) != value]:
             name = changed[0]
             raise SceneError(
-                f"{work}: was started with --{name.replace('_', '-')} {stored.get(name)}, got {wanted[name]}; give "
-                "the same value, or another folder"
+                f"{work}: was started with --{name.replace('_', '-')} {stored.get(name)!s:.60}, got {wanted[name]}; "
+                "give the same value, or another folder"
             )
         if (out / "sparse" / "0").exists():
             raise SceneError(f"{out}: is a scene already")
@@ -314,17 +324,9 @@ class Stages:
         """Runs a stage in parts, between which it reports progress and can be stopped; COLMAP skips finished items."""
         for first in range(0, len(items), size):
             self.progress(name, first, len(items))
-            with _named_errors(name):
+            with named_errors(f"pycolmap: {name}"):
                 work(items[first : first + size])
         self.progress(name, len(items), len(items))
-
-
-@contextlib.contextmanager
-def _named_errors(stage: str) -> Iterator[None]:
-    try:
-        yield
-    except (RuntimeError, ValueError) as error:
-        raise SceneError(f"pycolmap: {stage}: {' '.join(str(error).split())[:300]}") from None
 
 
 def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
@@ -364,11 +366,13 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
         stages.in_parts(name, sorted(pairs, key=lambda pair: [block[image] for image in pair]), PART, match_part)
         listed.unlink(missing_ok=True)
 
+    if database.is_file():
+        check_database(colmap, database, names)
     tried, some = stages.work / "tried.db", names[:: -(-len(names) // TRIED)]
-    tried.unlink(missing_ok=True)
+    _remove_database(tried)
     extraction.sift.first_octave = 0
     stages.progress("features", 0, len(names))
-    with _named_errors("features"):
+    with named_errors("pycolmap: features"):
         extract(some, tried)
     with colmap.Database.open(tried) as opened:
         if opened.num_keypoints() < len(some) * settings.max_features / 4:
@@ -387,11 +391,13 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
         if settings.matching == "auto" and len(names) > FEW_IMAGES:
             few, chosen = stages.work / "few.db", stages.work / "pairs.json"
             if not chosen.is_file():
-                if not few.is_file():
+                if few.is_file():
+                    check_database(colmap, few, names)
+                else:
                     _keep_largest(colmap, database, few, LARGEST_FEATURES)
                 match(few, "pairs", pairs)
                 write_text(chosen, json.dumps(_choose_pairs(colmap, few)))
-            pairs = [(a, b) for a, b in json.loads(chosen.read_text())]
+            pairs = read_pairs(chosen, names)
     match(database, "matches", pairs)
 
 
@@ -472,10 +478,8 @@ def _read_matches(stages: Stages) -> Matches:
 
 
 def _keep_pairs(colmap: Any, database: Path, pairs: Collection[Pair]) -> Path:
-    """Copies a database with only the matches of ``pairs``, and returns the copy's path; an existing copy is kept."""
+    """Copies a database with only the matches of ``pairs``, and returns the copy's path."""
     kept = database.with_name("trusted.db")
-    if kept.is_file():
-        return kept
     part = _copied(database, kept.with_suffix(".part"))
     with colmap.Database.open(part) as opened:
         numbers = {image.name: image.image_id for image in opened.read_all_images()}
@@ -533,10 +537,10 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Se
         thread.start()
         while thread.is_alive():
             thread.join(0.5)
-            logs = sorted(stages.work.glob(f"{LOG}*")) if mapper == "global" else []
+            logs = sorted(stages.work.glob(f"{LOG}*.{os.getpid()}")) if mapper == "global" else []
             started = BEGINS.findall(logs[-1].read_text(errors="replace")) if logs else []
             stages.progress(": ".join((f"{mapper} mapping {again}".rstrip(), *started[-1:])), len(placed), 0)
-        with _named_errors("mapping"):
+        with named_errors("pycolmap: mapping"):
             for failure in errors:
                 raise failure
         os.replace(part, folder)
@@ -545,12 +549,15 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Se
         return None
     largest = max(models, key=lambda path: len(read_model(path).images))
     model = read_model(largest)
+    check_model(model, matches.features)
     lost = _lost(model)
     images = [image for image in model.images if image.name not in lost]
     origins = torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images]))
     bounds = [bound for image in images if (bound := depth_bounds(image, points_seen(image, model))) is not None]
     faults = camera_faults(origins, torch.tensor(bounds), ((image.camera.lens, image.camera.width) for image in images))
-    error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())
+    _keep_model(largest)
+    with named_errors(f"pycolmap: {largest}"):
+        error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())
     side = max(max(image.camera.width, image.camera.height) for image in model.images)
     if error > max(LARGEST_ERROR, ERROR_SHARE * side):
         faults.append(f"its points are off by {error:.2f} pixels")
@@ -587,29 +594,37 @@ def _contradiction(model: Model) -> str:
 
 def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
     """Writes the cameras, images and points of a model, without its lost images."""
-    reconstruction = colmap.Reconstruction(model.folder)
-    for image in list(reconstruction.images.values()):
-        if image.name in model.lost:
-            reconstruction.deregister_frame(image.frame_id)
     part = emptied(folder.with_name(f".{folder.name}"))
-    reconstruction.write_binary(part)
-    for path in part.iterdir():
-        if path.stem not in FILES:  # removes files of rigs: each image has its pose
-            path.unlink()
+    with named_errors(f"pycolmap: {model.folder}"):
+        reconstruction = colmap.Reconstruction(model.folder)
+        for image in list(reconstruction.images.values()):
+            if image.name in model.lost:
+                reconstruction.deregister_frame(image.frame_id)
+        reconstruction.write_binary(part)
+    _keep_model(part)
     os.replace(part, folder)
+
+
+def _keep_model(folder: Path) -> None:
+    """Removes the files of rigs beside the cameras, images and points of a model: each image has its pose."""
+    for path in folder.iterdir():
+        if path.stem not in FILES:
+            path.unlink()
 
 
 def _write_masks(files: Sequence[Path], masks: Path, folder: Path) -> None:
     """Writes masks in COLMAP's format: black where an image is transparent, or black in its mask in ``masks``."""
     if folder.is_dir():
+        for path in files:  # COLMAP would decode other formats and any size
+            if read_header(mask := folder / f"{path.name}.png").size != read_header(path).size:
+                raise SceneError(f"{mask}: must have as many pixels as {path.name}")
         return
     part = emptied(folder.with_name(f".{folder.name}"))
     for path in files:
         pixels = read_image(path, 1)
         opaque = pixels[..., 3] >= OPAQUE if pixels.shape[-1] == 4 else np.ones(pixels.shape[:2], dtype=bool)
         if (mask := masks / f"{path.name}.png").is_file():
-            with Image.open(mask) as drawn:
-                opaque &= np.asarray(drawn)
+            opaque &= read_mask(mask, path.name, read_header(path))
         Image.fromarray(opaque).save(part / f"{path.name}.png")
     os.replace(part, folder)
 
@@ -629,8 +644,13 @@ def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
 
 
 def _copied(database: Path, part: Path) -> Path:
-    """Copies a database, and first removes leftover files, since SQLite would replay an old write-ahead log."""
-    for leftover in part.parent.glob(f"{part.name}*"):
-        leftover.unlink()
+    """Copies a database in place of an existing one, and returns the path of the copy."""
+    _remove_database(part)
     shutil.copyfile(database, part)
     return part
+
+
+def _remove_database(path: Path) -> None:
+    """Removes a database and its write-ahead log, which SQLite would replay into the next database of this name."""
+    for file in path.parent.glob(f"{path.name}*"):
+        file.unlink()
