@@ -53,6 +53,7 @@ class Training:
         self.router = VoronoiRouter(field, torch.rand(cells, 3) - 0.5, coords="first3", **options)
         grid = OccupancyGrid.for_training(BOX, 32, resolution=16)
         grid.density[:6] = grid.occupied[:6] = 0
+        grid.settled = 0  # random images teach the field nothing
         self.sampler = sampler(grid, 32)
         shown = self.router if own is None else DirectionPerSample(self.router)
         terms = [SparseDepth(0.3), SmoothDepth(0.1), Surface(distortion=0.1, orientation=0.2)]

@@ -7,17 +7,22 @@ import torch
 from helpers import refuses, render_image, renderer_of, seeded
 
 from voronerf import HashGridField, NeRF, VoronoiRouter
+from voronerf.app.scenes import builtin_scene
 from voronerf.nerf import (
+    Adam,
     Batch,
     Cameras,
     Contraction,
     Occupancy,
     OccupancyGrid,
     Perspective,
+    RayBatches,
     RayLoss,
     Rays,
+    Renderer,
     SparseDepth,
     Stratified,
+    TrainingStep,
     intersect_box,
     orbit_cameras,
     render_rays,
@@ -125,6 +130,50 @@ def test_a_ray_has_a_part_of_its_strata_while_the_grid_settles():
     for step, strata in ((sampler.settling_steps - 1, 16 // SETTLING_PART), (sampler.settling_steps, 16)):
         sampler.step_pre_backward(Ball(), step, seeded(0))
         assert len(sampler.sample(rays, torch.zeros(1), torch.ones(1), jitter=True).depths) == sampler.strata == strata
+
+
+def fog_with(density, ball=0.0):
+    """Returns a field of the ``density`` that rises by a tenth along x, with a ball of another density."""
+
+    def field(positions, directions, ray_index):
+        fog = density * (1 + 0.05 * positions[:, 0])
+        return positions, torch.where(positions.norm(dim=-1) < 0.7, ball, fog) if ball else fog
+
+    return field
+
+
+def test_a_grid_learns_only_from_a_field_that_tells_empty_space():
+    grid, inside = OccupancyGrid(BOX, 8, threshold=1.0), torch.ones(8, 8, 8, dtype=torch.bool)
+    inside[2:6, 2:6, 2:6] = False
+    cases = [(0.0, 0.0, False), (0.5, 0.0, False), (1.0, 0.0, False), (2.0, 0.0, False)]  # almost uniform
+    cases += [(0.1, 0.9, False), (0.5, 2.0, False), (0.1, 4.0, True)]  # the ball, or most of it, is below the threshold
+    cases += [(0.1, torch.nan, True), (0.1, torch.inf, True)]
+    for density, ball, learns in cases:
+        assert grid.can_learn_from(fog_with(density, ball)) is learns, (density, ball)
+    assert grid.can_learn_from(Ball()) and not grid.can_learn_from(Ball(), fixed=~inside)
+    sampler = Occupancy(grid, 16, empty=~inside)
+    sampler.step_pre_backward(Ball(), sampler.settling_steps, seeded(0))
+    assert sampler.settling and grid.settled is None
+    sphere = OccupancyGrid.for_training(None, 16, contraction=Contraction(torch.zeros(3), 1.0))
+    assert not sphere.can_learn_from(fog_with(0.1)) and sphere.can_learn_from(fog_with(0.1, 4.0))
+
+
+def test_a_grid_waits_for_a_field_with_a_low_learning_rate():
+    """Regression: after a fixed number of steps, the grid became empty, and the field learnt nothing."""
+    scene = builtin_scene(16, train_views=20, test_views=1)
+    side = float((scene.box[1] - scene.box[0]).max())
+    densities = {"density_scale": 200 / side, "initial_density": 2 / side}
+    torch.manual_seed(0)
+    field = HashGridField(16, levels=4, log2_entries=12, finest=32, box=tuple(scene.box.tolist()), **densities)
+    router = VoronoiRouter(field, torch.zeros(1, 3), share=["features"])
+    sampler = Occupancy(OccupancyGrid.for_training(scene.box, 256, resolution=16), 256)
+    where = {"near": scene.near, "far": scene.far, "box": scene.box, "background": WHITE}
+    batches = RayBatches(scene.train.cameras, scene.train.images, **where)
+    loss, optimizer = RayLoss(Renderer({"field": router}, sampler)), Adam.of({"field": router}, lr=1e-3)
+    step = TrainingStep(batches, loss, optimizer, generator=seeded(0))
+    losses = [float(step(64, GROUP, at=at).loss) for at in range(0, 640, GROUP)]
+    assert sampler.grid.settled > 100 and 0.1 < sampler.grid.share < 0.6
+    assert sum(losses[-5:]) < sum(losses[:5]) / 2
 
 
 @pytest.mark.parametrize(

@@ -399,21 +399,26 @@ def test_a_second_optimizer_learns(field):
     assert same(*moved) and all(not torch.equal(*moved[0][i : i + 3 : 2]) for i in (1, 3))
 
 
+@pytest.mark.parametrize("settled", [0, 64])
 @pytest.mark.parametrize("steps", [6, 7, 10, 32])
-def test_any_number_of_steps_of_a_call_keeps_averages_and_decay(steps):
-    """The grid also starts to learn at the right step, even in the middle of a call."""
+def test_any_number_of_steps_of_a_call_keeps_averages_and_decay(steps, settled):
+    """The grid also starts to learn at the right step, even in the middle of a call or after its field has learnt."""
     results = []
     for calls in (96 // steps * [steps] + [96 % steps], 96 * [1]):
         training, done = Training(cells=2), 0
-        training.optimizer.average = 0.9
+        training.optimizer.average, answers = 0.9, iter([False, False, True])  # asked at the steps 40, 48 and 64
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 40)
+            if settled:
+                training.sampler.grid.settled = None
+                patch.setattr(OccupancyGrid, "can_learn_from", lambda *_, answers=answers, **__: next(answers))
             for count in filter(None, calls):
                 training.step(64, count, at=done)
                 done += count
         with training.optimizer.averaged():
             shown = [p.detach().clone() for p in training.router.parameters()]
         results.append([*shown, *training.everything()])
+        assert training.sampler.grid.settled == settled
     assert same(*results)
 
 

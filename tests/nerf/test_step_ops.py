@@ -57,6 +57,7 @@ def test_a_step_computes_in_ops_alone(contracted):
     contraction, box = Contraction(torch.zeros(3), 1.0), torch.tensor([[-1.0] * 3, [1.0] * 3])
     contraction = contraction if contracted else None
     grid = OccupancyGrid.for_training(None if contracted else box, 32, contraction=contraction, resolution=16)
+    grid.settled = 0
     space, empty = Space(contraction=contraction, full_gradient=1.0), torch.rand(16**3) < 0.2
     sampler, random = Occupancy(grid, 32, space=space, empty=empty), seeded(0)
     loss = RayLoss(Renderer({"field": router}, sampler), terms=[SparseDepth(0.003), SmoothDepth(0.1)])

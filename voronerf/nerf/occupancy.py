@@ -50,6 +50,10 @@ HIDDEN = 1e-3  # a sample is hidden if at most this fraction of the light reache
 # A hole is an empty voxel whose 3 x 3 x 3 block has at least HOLE_NEIGHBOURS occupied voxels, and whose density is at
 # least HOLE_DENSITY times the threshold at each of HOLE_POINTS random points.
 HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 9, 2, 2.0
+#: A field can tell empty space once its densities have a mean deviation of at least `CONTRAST` times their mean, and at
+#: most the fraction `LOST` of the density lies below the grid's threshold; both are measured at `CONTRAST_POINTS`
+#: points. The deviation of an untrained field is below 0.01.
+CONTRAST, LOST, CONTRAST_POINTS = 0.25, 0.5, 4096
 
 
 @replayed
@@ -64,6 +68,7 @@ class OccupancyGrid:
         occupied: bool [x, y, z], density >= threshold.
         threshold: The minimum density of an occupied voxel, in the unit of `density`.
         contraction: The contraction that maps world space to the space of the box, or None.
+        settled: The training step from which `Occupancy` updates the grid; None before.
 
     Examples:
         >>> import torch
@@ -112,6 +117,7 @@ class OccupancyGrid:
         self.box = box.detach().to(device=device, dtype=torch.float32).clone()
         self.threshold = float(threshold)
         self.contraction = contraction
+        self.settled: int | None = None
         self._numbers = None if contraction is None else contraction.numbers.to(self.box)
         self.density = torch.full(shape, remembered * self.threshold, device=self.box.device)
         self.occupied = torch.ones(shape, dtype=torch.bool, device=self.box.device)
@@ -187,6 +193,40 @@ class OccupancyGrid:
         place += 0.5 if uniforms is None else uniforms.T
         low, high = self.box[:, :, None]
         return torch.lerp(low, high, place / shape[:, None]).T.contiguous()
+
+    @torch.no_grad()
+    def can_learn_from(self, field: Field, *, fixed: Tensor | None = None) -> bool:
+        """Returns whether a field has learnt to tell empty space from the rest. Waits for the device.
+
+        A field that has learnt little is almost uniform, and its density may be below the threshold everywhere. If the
+        grid were updated from this field, all voxels would become empty, and the field is not trained in empty voxels.
+        So the field's densities must differ from place to place, and most of its density must lie in voxels that stay
+        occupied.
+
+        Args:
+            field: The field, which is called without gradients.
+            fixed: bool [x, y, z], voxels that do not count; None for none.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import OccupancyGrid
+            >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 16, threshold=1.0)
+            >>> def fog(positions, directions, ray_index):
+            ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+            >>> def ball(positions, directions, ray_index):
+            ...     return torch.ones_like(positions), torch.where(positions.norm(dim=-1) < 0.5, 10.0, 0.5)
+            >>> grid.can_learn_from(fog), grid.can_learn_from(ball)
+            (False, True)
+        """
+        uniforms = torch.rand(CONTRAST_POINTS, 3, generator=torch.Generator().manual_seed(0)).to(self.box)
+        points = torch.lerp(self.box[0], self.box[1], uniforms)
+        if fixed is not None:
+            points = points[~fixed.view(-1)[self.voxels(points).long()]]
+        density = density_of(field, points).nan_to_num().double()
+        stored = density if self.contraction is None else density * self.contraction.stretch(points)
+        lost = stored[stored < self.threshold].sum()
+        contrast = (density - density.mean()).abs().mean() >= CONTRAST * density.mean()
+        return bool(contrast & (lost <= LOST * stored.sum()) & (stored.sum() > 0))
 
     @torch.no_grad()
     def update(
@@ -337,6 +377,7 @@ class OccupancyGrid:
             "density": self.density.clone(),
             "occupied": self.occupied.clone(),
             "threshold": torch.tensor(self.threshold, dtype=torch.float64),
+            "settled": torch.tensor(-1 if self.settled is None else self.settled),
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -346,7 +387,7 @@ class OccupancyGrid:
             ValueError: An entry is missing or has a wrong shape.
         """
         other = OccupancyGrid.from_state(state, contraction=self.contraction, device=self.box.device)
-        self.box, self.threshold = other.box, other.threshold
+        self.box, self.threshold, self.settled = other.box, other.threshold, other.settled
         self.density, self.occupied = other.density, other.occupied
 
     @staticmethod
@@ -376,6 +417,8 @@ class OccupancyGrid:
         grid = OccupancyGrid(state["box"], density.shape, threshold=threshold, contraction=contraction, device=device)
         grid.density.copy_(density)
         grid.occupied.copy_(occupied)
+        settled = int(state.get("settled", 0))  # earlier versions settled after a fixed number of steps
+        grid.settled = None if settled < 0 else settled
         return grid
 
 

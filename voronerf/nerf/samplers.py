@@ -41,9 +41,9 @@ from voronerf.ops.resample import resample
 COARSE_SHARE = 0.1
 #: The divisor of the number of strata per ray in the first steps, while an occupancy grid is not updated yet.
 SETTLING_PART = 4
-#: The number of first steps in which a grid over space contracted to a ball (`Contraction`) is not updated; other grids
-#: use `WARMUP_STEPS`. An untrained field has low densities everywhere, so an updated grid would become empty, and the
-#: field is not trained in empty voxels. The more samples a step has, the sooner the whole grid would be empty.
+#: The least number of first steps in which a grid over space contracted to a ball (`Contraction`) is not updated; other
+#: grids use `WARMUP_STEPS`. After these steps, the grid still waits until the field has learnt enough, which takes the
+#: longer the lower the learning rate is: see `OccupancyGrid.can_learn_from`.
 SETTLING_STEPS = 400
 #: The fraction of voxels that are evaluated at random before each `GROUP` of steps, and the maximum number of these
 #: voxels: about the number of samples of a few steps.
@@ -90,7 +90,7 @@ class Sampler:
         samples: s, the number of samples per ray in the first pass.
         space: The coordinates in which rays are sampled and the field is evaluated.
         backend: The backend of the ops.
-        settling_steps: The number of first training steps in which the grid is not updated.
+        settling_steps: The least number of first training steps in which the grid is not updated.
 
     Args:
         samples: s, the number of samples per ray in the first pass, at least 1.
@@ -288,7 +288,8 @@ class Stratified(Sampler):
 class Occupancy(Sampler):
     """A stratified sampler that skips the empty voxels of a grid, so rays differ in their number of samples.
 
-    In a training the grid learns from the samples of each step. Before each `GROUP` of steps the field is evaluated in
+    In a training the grid learns from the samples of each step, once `settling_steps` are done and the field can tell
+    empty space from the rest (`OccupancyGrid.can_learn_from`). Before each `GROUP` of steps the field is evaluated in
     random voxels, which restores voxels that were emptied by mistake.
 
     Attributes:
@@ -351,7 +352,7 @@ class Occupancy(Sampler):
 
     @property
     def settling_steps(self) -> int:  # type: ignore[override]
-        """The number of first training steps in which the grid is not updated."""
+        """The least number of first training steps in which the grid is not updated."""
         return SETTLING_STEPS if isinstance(self.grid.contraction, Contraction) else WARMUP_STEPS
 
     @property
@@ -433,9 +434,13 @@ class Occupancy(Sampler):
 
     def step_pre_backward(self, field: Field, step: int, generator: torch.Generator) -> None:
         """Evaluates random voxels; see :meth:`Sampler.step_pre_backward`."""
-        self.settling = step < self.settling_steps
         if step == 0:
             self._leave_empty()  # the grid was reset
+        first, grid = self.settling_steps, self.grid
+        if grid.settled is None and step >= first and (step == first or step % schedule.GROUP == 0):
+            with evaluating(field):
+                grid.settled = step if grid.can_learn_from(field, fixed=self.empty) else None
+        self.settling = step < first or grid.settled is None
         if not self.evaluates_at(step):
             return
         voxels = self.grid.occupied.numel()
@@ -446,7 +451,8 @@ class Occupancy(Sampler):
 
     def evaluates_at(self, step: int) -> bool:
         """Returns True before each `GROUP` of steps once the grid has settled; see :meth:`Sampler.evaluates_at`."""
-        return step >= self.settling_steps and step % schedule.GROUP == 0
+        settled = step >= self.settling_steps and self.grid.settled is not None
+        return settled and step % schedule.GROUP == 0
 
     def steps_per_update(self, step: int) -> int:
         """Returns the number of steps until the grid has settled; later, until the next evaluation of voxels.

@@ -8,9 +8,8 @@ import math
 #: the revisited voxels change only between such groups. Longer groups gain little: 3 % of the time is spent between
 #: groups.
 GROUP = 16
-#: The maximum number of warm-up steps, in which the learning rate rises. Densities stay low while the rate is small.
-#: The densities that an occupancy grid stores decay within eight to thirty steps, so all voxels would become empty for
-#: good. The grid is therefore updated only after the warm-up.
+#: The maximum number of warm-up steps, in which the learning rate rises. An occupancy grid is updated only after the
+#: warm-up, since densities stay low while the rate is small.
 WARMUP_STEPS = 100
 #: The longest warm-up as a fraction of the training.
 WARMUP = 0.02

@@ -171,14 +171,17 @@ def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
     assert same(tensors(config.out), tensors(tmp_path / "whole"))
 
 
+@pytest.mark.parametrize("stop_at", [7, 15])  # before and after the grid has settled
 @pytest.mark.parametrize("contraction", ["none", "sphere"])
-def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, contraction):
+def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, contraction, stop_at):
+    monkeypatch.setattr("voronerf.nerf.occupancy.CONTRAST", 0.022)
     monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 2)
     for name in ("SETTLING_STEPS", "WARMUP_STEPS"):
         monkeypatch.setattr(f"voronerf.nerf.samplers.{name}", 5)
     monkeypatch.setattr("voronerf.nerf.schedule.FILL", 1.5)  # the number of rays varies
     settings = {"contraction": contraction, "precision": "fp32" if contraction == "none" else "bf16"}
-    saved = assert_resumes(tmp_path, scene, 15, occupancy=True, field="hashgrid", depth=1, **settings)
+    saved = assert_resumes(tmp_path, scene, stop_at, occupancy=True, field="hashgrid", depth=1, **settings)
+    assert saved["occupancy.settled"] == (8 if contraction == "none" else 10)
     assert len(saved["occupancy.density"].unique()) > 1
 
 

@@ -10,7 +10,7 @@ from tiny_runs import Each, small, steps_of
 from voronerf.app.evaluate.scores import evaluate, mean_scores
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import TrainConfig, build
-from voronerf.app.train.start import why_nothing_is_learnt
+from voronerf.app.train.start import JUDGED, judged_at, why_nothing_is_learnt
 from voronerf.nerf import Batch, Rays, RenderOutput
 from voronerf.nerf.volume import Samples
 
@@ -43,6 +43,13 @@ def test_a_start_that_failed_begins_again_and_learns(scene, monkeypatch):
     assert len(state.strategy.reservoir) == 0 and state.learning_rate() < 0.1 * state.config.lr
     steps_of(state, 100)
     assert len(said) == 1 and state.sampler.grid.share == 1 and state.loss < 0.03
+
+
+def test_a_start_is_judged_after_its_grid_has_settled(scene):
+    state = build(small(occupancy=True), scene)
+    assert judged_at(state) == state.sampler.settling_steps + JUDGED
+    state.sampler.grid.settled = 512
+    assert judged_at(state) == 512 + JUDGED
 
 
 def weight(state):

@@ -224,6 +224,7 @@ def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch):
 
     # The upper half of the box is empty, so the field is never evaluated there.
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 0)
+    monkeypatch.setattr(OccupancyGrid, "can_learn_from", lambda *_, **__: True)
     for method in ("update", "observe"):
         monkeypatch.setattr(OccupancyGrid, method, only_below)
     summary = trained(small(tmp_path, split_at=(0.9,), occupancy=True), scene)
@@ -242,6 +243,7 @@ def test_a_grid_settles_before_it_learns(scene, monkeypatch, contraction, settli
     monkeypatch.setattr("voronerf.nerf.samplers.SETTLING_STEPS", 4)
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 2)
     monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 1)
+    monkeypatch.setattr(OccupancyGrid, "can_learn_from", lambda *_, **__: True)
     state = build(small(contraction=contraction, occupancy=True, cells=()), scene)
     new, learnt, most = state.sampler.grid.density.clone(), [], []
     sample = state.sampler.sample

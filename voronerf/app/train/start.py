@@ -64,7 +64,8 @@ def steps_to_judgement(state: State) -> int:
 
 def judged_at(state: State) -> int:
     """Returns the step after which a start is judged; 0 if it is not judged."""
-    return 0 if state.sampler.grid is None else state.began + state.sampler.settling_steps + JUDGED
+    grid, first = state.sampler.grid, state.sampler.settling_steps
+    return 0 if grid is None else state.began + max(first, grid.settled or 0) + JUDGED
 
 
 def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
