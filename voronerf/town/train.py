@@ -257,7 +257,7 @@ def train(
                     raise diverged(
                         town.out,
                         f"the gradients of {state.skipped_in_a_row} consecutive steps are not finite",
-                        state.step,
+                        state,
                     )
         for callback in callbacks:
             callback.after_step(first)
@@ -283,7 +283,7 @@ def save(town: Town) -> None:
     try:
         for number, state in town.states.items():
             if not all_finite(state.optimizer):
-                raise diverged(town.out, "parameters or moments of Adam are not finite", state.step)
+                raise diverged(town.out, "parameters or moments of Adam are not finite", state)
             save_checkpoint(folder / names[number], snapshot(state))
     except OSError as error:
         failure = error

@@ -163,7 +163,7 @@ def test_a_diverged_run_ends_with_its_last_checkpoint(tmp_path, scene, harm):
                 (parameter if harm == "weights" else state.optimizer.state[parameter]["exp_avg_sq"]).fill_(torch.inf)
 
     state, checkpoints = build(small(tmp_path, steps=60), scene), Checkpoints(tmp_path, interval=1e-9)
-    said = r"not finite, at step \d+; try a smaller --lr; the last checkpoint is unchanged"
+    said = r"not finite, at step \d+; .* too high, try --lr 0.005; the last checkpoint is unchanged"
     with pytest.raises(TrainingError, match=said):
         run(state, [Divergence(tmp_path), checkpoints, Each(spoil)])
     checkpoints.writer.wait()
@@ -183,9 +183,18 @@ def test_a_run_that_diverges_before_its_first_checkpoint_ends(tmp_path, scene):
     ("psnrs", "lr", "settled", "said"),
     [
         ([12.0, 20.0, 17.0], None, True, None),
-        ([12.0, 20.0, 14.9], 0.1, False, "psnr fell from 20.00 to 14.90 dB: .* too high, try --lr 0.02$"),
+        ([12.0, 20.0, 14.9], 0.1, False, "psnr fell from 20.00 to 14.90 dB: .* too high, try --lr 0.02, the default$"),
+        ([20.0, 14.9], 0.004, False, "psnr fell from .* too high, try --lr 0.001$"),
         ([3.0], 1.0, False, None),
-        ([3.0], 1.0, True, "nothing is learnt: psnr is 3.00 dB, where a single colour gives 9.00; .* try --lr 0.02$"),
+        (
+            [3.0],
+            1.0,
+            True,
+            "nothing is learnt: psnr is 3.00 dB, where a single colour gives 9.00; .* too high, try --lr 0.02, .*",
+        ),
+        ([11.9], 1.0, True, "little is learnt: psnr is 11.90 dB, .* 9.00; .* too high, try --lr 0.02, the default$"),
+        ([8.9], 1e-3, True, "nothing is learnt: .* too low, try --lr 0.02, the default, or cameras, near and far"),
+        ([12.1], 1e-3, True, None),
         ([8.9, 8.9], None, True, "nothing is learnt: .* try --lr 0.005, or cameras, near and far do not fit"),
         ([None, 9.5], None, True, None),
     ],

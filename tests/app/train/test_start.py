@@ -60,11 +60,14 @@ def test_every_new_start_is_another_draw(scene, monkeypatch):
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 1)
     monkeypatch.setattr("voronerf.app.train.start.JUDGED", 1)
     monkeypatch.setattr("voronerf.app.train.start.why_nothing_is_learnt", lambda batch, output: "planted")
-    state = build(small(occupancy=True, cells=()), scene)
+    said = []
+    state = replace(build(small(occupancy=True, cells=(), lr=1.0), scene), on_event=said.append)
     drawn = [weight(state)]
     steps_of(state, 8, Each(lambda s: s.step in (2, 4, 6) and drawn.append(weight(s))))
     assert [stage.started_at_step for stage in state.stages] == [0, 2, 4, 6]
     assert not any(torch.equal(a, b) for a, b in itertools.combinations(drawn, 2))
+    advice = "the learning rate is probably too high, try --lr 0.02, the default"
+    assert said[2] == f"nothing is learnt by step 6: planted; restart 3 of 3 with another seed; {advice}"
 
 
 def test_a_start_of_one_colour_has_failed():

@@ -25,6 +25,7 @@ from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.loop import Callback, TrainingError
 from voronerf.app.train.resume import snapshot
 from voronerf.app.train.run_directory import read_metrics
+from voronerf.app.train.start import rate_advice, usual_rate
 from voronerf.app.train.state import State
 from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.split import MIN_SAMPLES, SplitDone
@@ -49,6 +50,9 @@ PATIENCE = 10
 COLLAPSE = 5.0
 #: From this step on, but only in the second half of a run, the PSNR is compared with the PSNR of a single colour.
 SETTLED = 100
+#: With another learning rate than the default, a training has learnt little if its PSNR is less than this number of dB
+#: above the PSNR of a single colour.
+LITTLE = 3.0
 
 
 class Checkpoints(Callback):
@@ -102,7 +106,7 @@ class Checkpoints(Callback):
             OSError: When the previous checkpoint could not be written.
         """
         if not all_finite(state.optimizer):
-            raise diverged(self.out, "parameters or moments of Adam are not finite", state.step)
+            raise diverged(self.out, "parameters or moments of Adam are not finite", state)
         if not self.described:  # not earlier, so that a run whose first step fails leaves no files
             write_text(self.out / "config.json", state.config.to_json())
             write_scene(self.out / "scene.json", state.scene)
@@ -127,14 +131,14 @@ class Divergence(Callback):
         """Raises TrainingError after `PATIENCE` consecutive skipped steps."""
         if state.skipped_in_a_row >= PATIENCE:
             raise diverged(
-                self.out, f"the gradients of {state.skipped_in_a_row} consecutive steps are not finite", state.step
+                self.out, f"the gradients of {state.skipped_in_a_row} consecutive steps are not finite", state
             )
 
 
-def diverged(out: Path, reason: str, step: int) -> TrainingError:
+def diverged(out: Path, reason: str, state: State) -> TrainingError:
     """Returns the error of a training that cannot continue."""
     remark = "the last checkpoint is unchanged" if checkpoint_paths(out) else "there is no checkpoint"
-    return TrainingError(f"{out}: {reason}, at step {step}; try a smaller --lr; {remark}")
+    return TrainingError(f"{out}: {reason}, at step {state.step}; {rate_advice(state.config, lower=True)}; {remark}")
 
 
 def all_finite(optimizer: torch.optim.Optimizer) -> bool:
@@ -337,15 +341,14 @@ def why_scores_are_poor(
     *earlier, now = (math.nan if line["psnr"] is None else line["psnr"] for line in metrics if line.get("part", 1) == 1)
     best = max((psnr for psnr in earlier if math.isfinite(psnr)), default=-math.inf)
     assert config.lr is not None
-    usual = config.field_type.learning_rate(config.network_options)
-    rate = usual if config.lr > usual else config.lr / 4
+    usual = usual_rate(config)
     if best - now > COLLAPSE:
-        return f"psnr fell from {best:.2f} to {now:.2f} dB: the learning rate is probably too high, try --lr {rate:.2g}"
-    if settled and not now > one_colour:
+        return f"psnr fell from {best:.2f} to {now:.2f} dB: {rate_advice(config, lower=True)}"
+    if settled and not now > one_colour + (config.lr != usual) * LITTLE:
         other_causes = "" if config.lr > usual else ", or cameras, near and far do not fit the images"
         return (
-            f"nothing is learnt: psnr is {now:.2f} dB, where a single colour gives {one_colour:.2f}; the learning rate "
-            f"is probably too high, try --lr {rate:.2g}{other_causes}"
+            f"{'little' if now > one_colour else 'nothing'} is learnt: psnr is {now:.2f} dB, where a single colour "
+            f"gives {one_colour:.2f}; {rate_advice(config)}{other_causes}"
         )
     return None
 

@@ -10,13 +10,14 @@ from dataclasses import replace
 import torch
 
 from voronerf.app.train.build import make_grid, make_routers
+from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.state import State
 from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.step import StepOutput
 from voronerf.nerf.volume import Batch, RenderOutput
 
-#: The number of steps from the first update of the occupancy grid (after `Sampler.settling_steps`) to the check of a
-#: start, and the maximum number of restarts of a training.
+#: The number of steps from the first update of the occupancy grid (without an update, from `Sampler.settling_steps`) to
+#: the check of a start, and the maximum number of restarts of a training.
 JUDGED, DRAWS = 100, 3
 #: The increment of the networks' seed with each restart.
 STRIDE = 1_000_003
@@ -53,7 +54,23 @@ def judge_start(state: State, last: StepOutput) -> None:
     state.optimizer.state.clear()
     state.strategy.forget()
     state.begin_again()
-    state.report(f"nothing is learnt by step {state.step}: {fault}; restart {draw} of {DRAWS} with another seed")
+    advice = "" if config.lr == usual_rate(config) else f"; {rate_advice(config)}"
+    state.report(
+        f"nothing is learnt by step {state.step}: {fault}; restart {draw} of {DRAWS} with another seed{advice}"
+    )
+
+
+def usual_rate(config: TrainConfig) -> float:
+    """Returns the default learning rate of a configuration's field."""
+    return config.field_type.learning_rate(config.network_options)
+
+
+def rate_advice(config: TrainConfig, *, lower: bool = False) -> str:
+    """Returns advice on a learning rate with which a training fails; ``lower`` if only a lower rate can help."""
+    rate, usual = float(config.lr or 0), usual_rate(config)
+    fault = "low" if rate < usual and not lower else "high"
+    better = f"{usual:.2g}, the default" if rate > usual or fault == "low" else f"{rate / 4:.2g}"
+    return f"the learning rate is probably too {fault}, try --lr {better}"
 
 
 def steps_to_judgement(state: State) -> int:
