@@ -159,20 +159,21 @@ class Recording(TorchDispatchMode):
     def count(self, source: Callable[[], int]) -> int:
         """Returns the number of rows of this run; replays call ``source`` for the number before each run."""
         with self._paused():
-            count = self._new_count(torch.tensor([source()]), source)
+            memory = torch.empty(1, dtype=torch.int64)
+        ctypes.c_int64.from_address(memory.data_ptr()).value = source()
+        count = self._new_count(memory, source)
         self._counts.append(count)
         return RowCount.of(count)
 
     def computed(self, memory: Tensor) -> int:
         """Returns the number of rows that a call has written into ``memory``, int64 [1]."""
-        with self._paused():
-            if memory.dtype is not torch.int64:  # a number on a GPU: calls on a GPU are not recorded
-                self._refuse("a number of rows is not int64")
-                return int(memory)
-            return RowCount.of(self._new_count(memory, None))
+        if memory.dtype is not torch.int64:  # a number on a GPU: calls on a GPU are not recorded
+            self._refuse("a number of rows is not int64")
+            return int(memory)
+        return RowCount.of(self._new_count(memory, None))
 
     def _new_count(self, memory: Tensor, source: Callable[[], int] | None) -> Count:
-        rows = int(memory)
+        rows = ctypes.c_int64.from_address(memory.data_ptr()).value
         self._refuse("there are no rows" if rows == 0 else "")
         count = Count(memory, rows + rows // SPARE + SOME, source)
         self._rows[count] = rows
@@ -181,8 +182,10 @@ class Recording(TorchDispatchMode):
     def vary(self, value: Callable[[], float]) -> Tensor:
         """Returns a number that varies from run to run, float32 []."""
         with self._paused():
-            number = torch.tensor(value(), dtype=torch.float32)
-        self._numbers.append((ctypes.c_float.from_address(number.data_ptr()), number, value))
+            number = torch.empty((), dtype=torch.float32)
+        memory = ctypes.c_float.from_address(number.data_ptr())
+        memory.value = value()
+        self._numbers.append((memory, number, value))
         return number
 
     def take(self, tensor: Tensor) -> Tensor:
