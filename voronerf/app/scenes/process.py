@@ -367,7 +367,7 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
         listed.unlink(missing_ok=True)
 
     if database.is_file():
-        check_database(colmap, database, names)
+        check_database(colmap, database, sizes)
     tried, some = stages.work / "tried.db", names[:: -(-len(names) // TRIED)]
     _remove_database(tried)
     extraction.sift.first_octave = 0
@@ -392,7 +392,7 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
             few, chosen = stages.work / "few.db", stages.work / "pairs.json"
             if not chosen.is_file():
                 if few.is_file():
-                    check_database(colmap, few, names)
+                    check_database(colmap, few, sizes)
                 else:
                     _keep_largest(colmap, database, few, LARGEST_FEATURES)
                 match(few, "pairs", pairs)

@@ -7,7 +7,7 @@ Therefore all files are read once in Python's thread before COLMAP continues wit
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,13 @@ from voronerf.app.scenes.folds import Pair
 
 #: The number of columns of SIFT's descriptors.
 DESCRIPTOR = 128
+#: The tables of a database whose rows are matrices: the bytes of a number, and the possible numbers of columns.
+MATRICES = {
+    "keypoints": (4, (2, 4, 6)),
+    "descriptors": (1, (DESCRIPTOR,)),
+    "matches": (4, (2,)),
+    "two_view_geometries": (4, (2,)),
+}
 
 
 @contextlib.contextmanager
@@ -57,13 +64,18 @@ def read_pairs(path: Path, names: Collection[str]) -> list[Pair]:
     return [(a, b) for a, b in pairs]
 
 
-def check_database(colmap: Any, path: Path, names: Collection[str]) -> None:
-    """Raises SceneError unless a database has whole features and matches, and only of images with these names."""
+def check_database(colmap: Any, path: Path, sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Raises SceneError unless a database has whole features and matches, and only of the images in ``sizes``.
+
+    ``sizes`` maps the images' names to their sizes. Some of COLMAP's solvers crash for positions far from an image.
+    """
 
     def check(holds: bool, rule: str) -> None:
         if not holds:
             raise SceneError(f"{path}: {rule}; without this file, the same command computes it again")
 
+    for table, wrong in _wrong_matrices(path).items():
+        check(wrong is None, f"{table} must have whole matrices, got {wrong} rows and columns")
     counts: dict[int, int] = {}
     with named_errors(str(path)), colmap.Database.open(path) as opened:
         cameras = {camera.camera_id for camera in opened.read_all_cameras()}
@@ -71,19 +83,40 @@ def check_database(colmap: Any, path: Path, names: Collection[str]) -> None:
         frames = {frame.frame_id for frame in opened.read_all_frames() if frame.rig_id in rigs}
         for image in opened.read_all_images():
             name = f"image {image.name!r:.60}"
-            check(image.name in names, f"{name} must be in the folder of images")
+            check(image.name in sizes, f"{name} must be in the folder of images")
             check(image.camera_id in cameras and image.frame_id in frames, f"{name} must have a camera in a rig")
             places = opened.read_keypoints(image.image_id)
             descriptors = opened.read_descriptors(image.image_id).data
-            whole = len(descriptors) == len(places) and descriptors.size == DESCRIPTOR * len(places)
-            whole = whole and bool(np.isfinite(places).all())
-            check(whole, f"{name} must have finite features, each with a descriptor of {DESCRIPTOR} numbers")
+            inside = (places[:, :2] >= 0) & (places[:, :2] <= max(sizes[image.name]))
+            check(bool(inside.all() and np.isfinite(places).all()), f"{name} must have finite features in the image")
+            check(len(descriptors) == len(places), f"{name} must have a descriptor of each feature")
             counts[image.image_id] = len(places)
         geometries = zip(*opened.read_two_view_geometries())
         matches = [*zip(*opened.read_all_matches()), *((pair, each.inlier_matches) for pair, each in geometries)]
     for pair, rows in matches:
         most = [counts.get(number, 0) for number in colmap.pair_id_to_image_pair(pair)]
         check(bool((rows < np.array(most)).all()), "matches must be of features of two images")
+
+
+def _wrong_matrices(path: Path) -> dict[str, tuple[Any, Any] | None]:
+    """Returns the rows and columns of a wrong matrix in each table of a database, or None for a sound table.
+
+    COLMAP allocates and copies them before it compares their size with the stored bytes, and not in all cases.
+    """
+    import sqlite3  # some Pythons lack it
+
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as opened:
+            tables = {name for (name,) in opened.execute("SELECT name FROM sqlite_master")} & MATRICES.keys()
+            wrong = {}
+            for table in sorted(tables):
+                size, columns = MATRICES[table]
+                shape = f"rows BETWEEN 0 AND {2**31} AND (rows = 0 OR cols IN ({', '.join(map(str, columns))}))"
+                whole = f"{shape} AND coalesce(length(CAST(data AS BLOB)), 0) = rows * cols * {size}"
+                wrong[table] = opened.execute(f"SELECT rows, cols FROM {table} WHERE ({whole}) IS NOT 1").fetchone()
+            return wrong
+    except sqlite3.Error as error:
+        raise SceneError(f"{path}: {error}") from None
 
 
 def check_model(model: ColmapModel, names: Collection[str]) -> None:
