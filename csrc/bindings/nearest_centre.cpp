@@ -13,7 +13,6 @@ VN_BINDINGS(module) {
   module.plain("index_centres", &index_centres_cpu<float>);
   module.plain("index_centres", &index_centres_cpu<double>);
   module.plain("centre_index_words", &centre_index_words);
-  module.plain("same_bits", &same_bits);
 }
 
 }  // namespace voronerf

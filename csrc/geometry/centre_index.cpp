@@ -3,7 +3,6 @@
 #include "geometry/centre_index.h"
 
 #include <algorithm>
-#include <cstring>
 #include <limits>
 #include <memory>
 
@@ -162,10 +161,6 @@ class Builder {
 }  // namespace
 
 int64_t centre_index_words(int64_t k, int d, int bytes) { return centre_index_shape(k, d, bytes).words; }
-
-bool same_bits(const float* one, const float* other, int64_t count) {
-  return std::memcmp(one, other, static_cast<size_t>(count) * sizeof(float)) == 0;
-}
 
 template <typename T>
 void index_centres_cpu(const T* centres, int32_t* index, int64_t k, int d, int threads) {

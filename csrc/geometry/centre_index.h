@@ -60,9 +60,6 @@ int64_t centre_index_words(int64_t k, int d, int bytes);
 template <typename T>
 void index_centres_cpu(const T* centres, int32_t* index, int64_t k, int d, int threads);
 
-// Returns whether two arrays hold the same bits.
-bool same_bits(const float* one, const float* other, int64_t count);
-
 // Writes the nearest centre of each of the points [n,d] to cells [n], on the calling thread.
 VN_DECLARE_FOR_ISA(void search_index(const float* points, const int32_t* index, int32_t* cells, int64_t n,
                                      const CentreIndexShape& shape, int d))
