@@ -413,17 +413,19 @@ class TrainingStep:
                 del self._segments[name]  # these segments lie between other hooks
             self._note_dependencies()  # before the hooks, which may change them
         self._last, hook_results = SegmentResult({}), dict[str, Any]() if batch is None else {"batch": batch}
+        has_called = False  # whether a hook of this step has been called since the dependencies were checked
         for python, name, stages in self._groups:
             if python:
                 for stage in stages:
                     hook_results |= self._call_stage(stage, {"rays": rays, **hook_results})
+                has_called = True
                 continue
             segment, earlier = self._segments.setdefault(name, Segment()), self._last if self._last.value else {}
             run, times = (
                 functools.partial(self._run_stages, stages),
                 steps if self._draws and len(self._groups) == 1 else 1,
             )
-            if len(self._groups) > 1 and not self._dependencies.holds():  # a hook of this step has changed them
+            if has_called and not self._dependencies.holds():
                 earlier = self._last.now(self._last.value)
                 self._last = SegmentResult(run(rays, earlier, hook_results))
             else:
