@@ -421,10 +421,8 @@ class TrainingStep:
                 has_called = True
                 continue
             segment, earlier = self._segments.setdefault(name, Segment()), self._last if self._last.value else {}
-            run, times = (
-                functools.partial(self._run_stages, stages),
-                steps if self._draws and len(self._groups) == 1 else 1,
-            )
+            run = functools.partial(self._run_stages, stages)
+            times = steps if self._draws and len(self._groups) == 1 else 1
             if has_called and not self._dependencies.holds():
                 earlier = self._last.now(self._last.value)
                 self._last = SegmentResult(run(rays, earlier, hook_results))
