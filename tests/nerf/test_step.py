@@ -1,5 +1,6 @@
 """Tests of training steps that are recorded and replayed."""
 
+import contextlib
 import gc
 import threading
 import weakref
@@ -539,3 +540,22 @@ def test_no_rays_are_refused_as_ever():
         training.step(0)
     training.train(4)
     assert "replayed" in training.step.explain()
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        lambda training: training.router(torch.rand(9, 3), torch.rand(9, 3)),
+        lambda training: training.router.load_state_dict(training.router.state_dict()),
+    ],
+)
+def test_steps_after_inference_mode(before):
+    """A router of 2,048 cells, which keeps an index, trains after a call or a change in inference mode."""
+    results = []
+    for mode in (torch.inference_mode, contextlib.nullcontext):
+        training = Training(cells=2048)
+        with mode():
+            before(training)
+        results.append([*training.train(4), *(each for each in training.everything() if each is not None)])
+        assert "recorded and replayed" in training.step.explain()
+    assert same(*results)
