@@ -175,8 +175,10 @@ def test_a_recording_has_calls_of_which_modes_hear_nothing():
     assert torch.equal(recording.now(cells), nearest_centre(others, centres))
 
 
-def test_an_interrupted_recording_ends():
+def test_an_interrupted_recording_ends(monkeypatch):
     """Ctrl-C at any place of a recording leaves no mode of torch and no recording on, and stays KeyboardInterrupt."""
+    for name in [name for name in vars(_python_dispatch) if name.startswith("_is_in_")]:
+        monkeypatch.setattr(_python_dispatch, name, False)  # other tests may have left torch's flags
     points, centres, flags = torch.rand(5, 3), torch.rand(4, 3), dict(vars(_python_dispatch))
 
     def record():
@@ -184,7 +186,7 @@ def test_an_interrupted_recording_ends():
         recording.record(lambda: nearest_centre(recording.take(points), centres).add(1))
         return recording
 
-    assert record().obstacle is None and not any(flags[name] for name in flags if name.startswith("_is_in_"))
+    assert record().obstacle is None and vars(_python_dispatch) == flags
     with Interrupt() as counting:
         record()
     for place in range(1, counting.places):
@@ -196,6 +198,19 @@ def test_an_interrupted_recording_ends():
         nearest_centre(points, centres)
         assert sys.getrefcount(points) == before, place
     assert counting.places > 100 and record().replay(1, inputs=[points]) == 1
+
+
+def test_recordings_in_two_threads_leave_no_flags(monkeypatch):
+    """The recording that begins first ends first, so the other one has seen its flags."""
+    flags = [name for name in vars(_python_dispatch) if name.startswith("_is_in_")]
+    for name in flags:
+        monkeypatch.setattr(_python_dispatch, name, False)
+    begun, other = threading.Event(), threading.Event()
+    first = threading.Thread(target=lambda: Recording().record(lambda: (begun.set(), other.wait(60))))
+    first.start()
+    begun.wait(60)
+    Recording().record(lambda: (other.set(), first.join(60)))
+    assert len(flags) > 0 and not any(getattr(_python_dispatch, name) for name in flags)
 
 
 def test_an_active_recording_owns_itself():

@@ -16,10 +16,12 @@ _set_flag = getattr(_python_dispatch, "set_is_in_mode_without_ignore_compile_int
 def run_within(mode: TorchDispatchMode, function: Callable[[], T]) -> T:
     """Runs a function within a mode. The mode also ends if Ctrl-C interrupts the end of torch's context.
 
-    Otherwise the mode would see all further calls of the thread, and torch's compiler would skip all functions.
+    Otherwise the mode would see all further calls of the thread, and torch's compiler would skip all functions. It
+    would also do so after modes in several threads at once.
     """
     modes = torch._C._len_torch_dispatch_stack()
-    flags = {name: value for name, value in vars(_python_dispatch).items() if name.startswith("_is_in_")}
+    # Modes belong to a thread, but their flags to the process: another thread may have set them.
+    flags = {name: modes > 0 and value for name, value in vars(_python_dispatch).items() if name.startswith("_is_in_")}
     try:
         with mode:
             return function()
