@@ -11,7 +11,7 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.recording import Recording, entries_of, mapped
-from voronerf.router.double import Unregistered
+from voronerf.router.double import observed_class
 
 T = TypeVar("T", bound=type)
 
@@ -111,29 +111,18 @@ def note_attributes(guard: Any, parts: Iterable[Any]) -> list[tuple[Any, set[str
 
 def noting_reads(reads: Iterable[tuple[Any, set[str]]], function: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a function; for each (object, names) it adds to ``names`` the attributes that are read from the object."""
-    kinds = [(part, type(part)) for part, _ in reads]
+    names, kinds = {id(part): names for part, names in reads}, [(part, type(part)) for part, _ in reads]
+
+    def read(part: Any, name: str) -> None:
+        names[id(part)].update((name, *(object.__getattribute__(part, name) if name == "__dict__" else ())))
+
     try:
-        for part, names in reads:
-            object.__setattr__(part, "__class__", _noting_class(type(part), names))
+        for part, kind in kinds:
+            object.__setattr__(part, "__class__", observed_class(kind, read))
         return function(*arguments)
     finally:
         for part, kind in kinds:
             object.__setattr__(part, "__class__", kind)
-
-
-def _noting_class(kind: Any, names: set[str]) -> type:
-    """Makes a subclass of the same memory layout that notes the attributes which are read."""
-
-    class Unlisted(type(kind)):  # type: ignore[misc]
-        def mro(cls) -> list[type]:  # before ``kind``, whose ``__init_subclass__`` may register the subclass
-            return [cls, Unregistered, *kind.__mro__]
-
-    def getattribute(self: Any, name: str) -> Any:
-        names.update((name, *(object.__getattribute__(self, name) if name == "__dict__" else ())))
-        return kind.__getattribute__(self, name)
-
-    members = {"__module__": kind.__module__, "__qualname__": kind.__qualname__, "__getattribute__": getattribute}
-    return Unlisted(kind.__name__, (kind,), members)
 
 
 class Stage(NamedTuple):

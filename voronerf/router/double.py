@@ -12,7 +12,7 @@ import operator
 import sys
 import types
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
@@ -190,12 +190,8 @@ def _twin(part: nn.Module, place: int, reads: set[tuple[int, str]] | None, write
     return twin
 
 
-class Unregistered:
-    """A base class whose ``__init_subclass__`` does nothing.
-
-    Many classes register their subclasses in ``__init_subclass__``. Subclasses that record accesses to attributes must
-    not appear in such a registry.
-    """
+class _Unregistered:
+    """A class whose ``__init_subclass__`` does nothing."""
 
     __slots__ = ()
 
@@ -203,25 +199,44 @@ class Unregistered:
         pass
 
 
+def observed_class(kind: Any, read: Callable[[Any, str], None], write: Callable[[str], None] | None = None) -> Any:
+    """Makes a subclass of the same memory layout that reports accesses to attributes.
+
+    Many classes register their subclasses in ``__init_subclass__``; this subclass does not appear in such a registry.
+
+    Args:
+        kind: The class.
+        read: A function of the object and a name, called before each read of an attribute.
+        write: A function of a name, called before each assignment to an attribute; None for no call.
+    """
+
+    class Unlisted(type(kind)):  # type: ignore[misc]
+        def mro(cls) -> list[type]:
+            return [cls, _Unregistered, *kind.__mro__]
+
+    def getattribute(self: Any, name: str) -> Any:
+        read(self, name)
+        return kind.__getattribute__(self, name)
+
+    def set_attribute(self: Any, name: str, value: Any) -> None:
+        write(name)  # type: ignore[misc]
+        kind.__setattr__(self, name, value)
+
+    members = {"__module__": kind.__module__, "__qualname__": kind.__qualname__, "__getattribute__": getattribute}
+    return Unlisted(kind.__name__, (kind,), members if write is None else {**members, "__setattr__": set_attribute})
+
+
 def _recording_class(
     kind: type[nn.Module], place: int, reads: set[tuple[int, str]], writes: dict[Any, Any]
 ) -> type[nn.Module]:
     """Makes a subclass that records accesses to attributes; see :class:`Double`."""
 
-    def getattribute(self: nn.Module, name: str) -> Any:
-        reads.add((place, name))
-        return kind.__getattribute__(self, name)
-
-    def set_attribute(self: nn.Module, name: str, value: Any) -> None:
+    def write(name: str) -> None:
         if (place, name) in reads:
-            frame = sys._getframe(1)
+            frame = sys._getframe(2)
             writes.setdefault((place, name), (frame.f_code.co_filename, frame.f_lineno))
-        kind.__setattr__(self, name, value)
 
-    names: dict[str, Any] = {"__module__": kind.__module__, "__qualname__": kind.__qualname__}
-    names |= {"__getattribute__": getattribute, "__setattr__": set_attribute}
-    metaclass: Any = type(kind)
-    recording: type[nn.Module] = metaclass(kind.__name__, (Unregistered, kind), names)
+    recording: type[nn.Module] = observed_class(kind, lambda _, name: reads.add((place, name)), write)
     return recording
 
 
