@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from voronerf import MLP, Layer, VoronoiRouter, grouped_mlp, nearest_centre
 from voronerf.app.files import json_text, write_text
-from voronerf.ops import sparse_depth_gradient
+from voronerf.ops import rendered_gradient
 from voronerf.ops._core import native
 
 CELLS, WIDTH = 16, 64
@@ -72,11 +72,10 @@ def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
         "public": lambda _: nearest_centre(points, centres),
         "compiled": lambda _: native.compiled.nearest_centre(points, centres, None, cells, 8, 4, 3, 0, cpu),
     }
-    loss, gradient, offsets = torch.zeros(()), torch.zeros(2, 4), torch.tensor([0, 2], dtype=torch.int32)
+    raw, of_depth, offsets = torch.rand(2, 2, 4), torch.ones(1), torch.tensor([0, 2], dtype=torch.int32)
     along = torch.tensor([6.9, 1e3]), torch.tensor([1.0, 2]), torch.full((2,), 0.1), torch.full((2,), 0.5)
-    arguments = *along, offsets, torch.tensor([2.0])
-    contenders["sparse_depth_gradient, 8 tensors"] = {
-        "public": lambda _: sparse_depth_gradient(loss, gradient, *arguments, factor=1.0, activated=True)
+    contenders["rendered_gradient, 8 tensors"] = {
+        "public": lambda _: rendered_gradient(*raw, *along, offsets, of_depth=of_depth, activated=True)
     }
     for n in (16, 256, 4096, 65536):
         plain, x = network(), torch.rand(n, 3)

@@ -13,12 +13,10 @@ from __future__ import annotations
 from typing import Any
 
 import warp as wp
-from torch import Tensor
 
 from voronerf.kernels._launch import array, filled, launch
 from voronerf.ops._core.declare import declared
 from voronerf.ops.composite.reference import check_ray_offsets
-from voronerf.ops.render_loss.autograd import register
 from voronerf.ops.render_loss.reference import robust_error
 
 wp.set_module_options({"enable_backward": False})
@@ -178,14 +176,9 @@ def _density_kernel(inputs: Inputs, density: wp.array(dtype=wp.float32)) -> None
     density[i] = _density_of(inputs.raw[i, 3], inputs.scale, inputs.activated)
 
 
-def render_loss(raw: Tensor, *others: Any) -> list[Tensor]:
+@declared("render_loss").custom_op("render_loss_warp")
+def render_loss(arguments: Any, results: Any) -> None:
     """Applies activations, compositing and the error; see ``voronerf.ops.render_loss``."""
-    *parts, _ = _render_loss(raw.float(), *others)
-    return parts
-
-
-@declared("render_loss_gradient").custom_op("render_loss_warp")
-def _render_loss(arguments: Any, results: Any) -> None:
     raw, target, m, r = arguments.raw, arguments.target, arguments.m, arguments.r
     check_ray_offsets("render_loss", arguments.ray_offsets, m)
     for of_strays in (results.weights, results.gradient):  # samples that belong to no ray
@@ -198,7 +191,3 @@ def _render_loss(arguments: Any, results: Any) -> None:
     launch(_render_loss_kernel, r, [inputs, filled(Outputs(), **outputs)], raw)
     launch(_density_kernel, m, [inputs, array(results.density, raw)], raw)
     results.loss.copy_(robust_error(results.error.double(), arguments.robust).mean() / 3)
-
-
-register(_render_loss)
-render_loss_gradient = _render_loss

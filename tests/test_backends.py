@@ -248,7 +248,7 @@ def test_auto_takes_warp_on_cuda_where_native_is_missing(monkeypatch: pytest.Mon
     absent = lambda backend, device: "built without CUDA" if backend == "native" and device.type == "cuda" else None  # noqa: E731
     monkeypatch.setattr(backends, "missing", absent)
     choose = backends._choose_once.__wrapped__
-    for op in ("nearest_centre", "cell_sort", "grouped_mlp", "render_loss_gradient"):
+    for op in ("nearest_centre", "cell_sort", "grouped_mlp", "render_loss"):
         kind = torch.int32 if op == "cell_sort" else torch.float32
         assert choose(op, "auto", "cuda", None, kind) == "warp"
         assert choose(op, "auto", "cpu", None, kind) == "native"

@@ -120,26 +120,24 @@ def loss_work(b: int, m: int, device: torch.device) -> Work:
     deltas = torch.rand(m, generator=draw).to(device) / 16
     target, background = torch.rand(2, b, 3, generator=draw).to(device)
 
-    def results(loss: Callable[..., Tensor], raw: Tensor) -> Results:
-        leaf = raw.detach().requires_grad_()
-        value = loss(leaf)
-        return [value.detach(), *torch.autograd.grad(value, leaf)]
+    def contender(results: Callable[..., Results]) -> Contender:
+        return Contender(lambda call: results(sets[call % count]))
 
-    def contender(loss: Callable[..., Tensor]) -> Contender:
-        return Contender(lambda call: results(loss, sets[call % count]))
-
-    def by_ours(raw: Tensor, backend: str = "reference") -> Tensor:
+    def by_ours(raw: Tensor, backend: str = "reference") -> Results:
         lengths, aim, behind = (x.to(raw.dtype) for x in (deltas, target, background))
         options = {"background": behind, "density_scale": SCALE, "backend": backend}
-        return ops.render_loss(raw, lengths, offsets, aim, **options).loss
+        result = ops.render_loss(raw, lengths, offsets, aim, **options)
+        return [result.loss, result.gradient]
 
-    def by_composite(raw: Tensor) -> Tensor:
+    def by_composite(raw: Tensor) -> Results:
+        raw = raw.detach().requires_grad_()
         colour, sigma = torch.sigmoid(raw[:, :3]), SCALE * F.softplus(raw[:, 3])
         depths = torch.zeros_like(deltas)
         seen = ops.composite(sigma, colour, depths, deltas, ray_offsets=offsets, background=background).colour
-        return F.mse_loss(seen, target)
+        loss = F.mse_loss(seen, target)
+        return [loss.detach(), *torch.autograd.grad(loss, raw)]
 
-    exact = results(by_ours, sets[0].double())
+    exact = by_ours(sets[0].double())
     return Work(
         lambda backend: contender(functools.partial(by_ours, backend=backend)),
         {

@@ -1,4 +1,4 @@
-// The check of ray offsets, and the transmittance of a whole ray.
+// The check of ray offsets.
 #pragma once
 
 #include <cstdint>
@@ -18,14 +18,6 @@ inline void check_ray_offsets(const std::string& op, const int32_t* offsets, int
     }
     before = offsets[i];
   }
-}
-
-// Returns the transmittance of a whole ray, 1 minus the sum of its samples' weights.
-template <typename In>
-double light_left(const In& in, int64_t ray) {
-  double left = 1.0;
-  for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) left -= static_cast<double>(in.weights[i]);
-  return left;
 }
 
 }  // namespace voronerf

@@ -2,8 +2,7 @@
 // and of w_j * dL/dw_j, where w_j are the weights. The first sum plus the transmittance of the whole ray is the
 // transmittance behind the sample, so no exponential of an optical depth is recomputed. The second sum is subtracted in
 // the gradient of the sample's optical depth. Rays are independent, so results do not depend on the number of threads.
-// Colours are activated only if a gradient needs them. The slope of the softplus is a sigmoid, whose exp takes half the
-// time of the expm1 of density_slope.h.
+// A ray without gradients is left out; colours are activated only if a gradient needs them.
 #include "rays/rendered_gradient.h"
 
 #include <cmath>
@@ -19,18 +18,31 @@ float sigmoid(float x) { return 1.0f / (1.0f + std::exp(-x)); }
 
 float entry(const float* values, int64_t i) { return values == nullptr ? 0.0f : values[i]; }
 
+// Returns whether the colour of a sample has a gradient of its own.
+bool is_coloured(const RenderedGradient& in, int64_t i) {
+  const float* of_rgb = in.of_rgb == nullptr ? nullptr : in.of_rgb + 3 * i;
+  return of_rgb != nullptr && (of_rgb[0] != 0.0f || of_rgb[1] != 0.0f || of_rgb[2] != 0.0f);
+}
+
 void learn_ray(const RenderedGradient& in, int64_t ray, float* gradient) {
-  const bool coloured = in.of_colour != nullptr || in.of_rgb != nullptr;
   float of_colour[3], of_light = entry(in.of_opacity, ray);  // gradients per unit of weight
+  bool ray_coloured = false, learns = of_light != 0.0f || entry(in.of_depth, ray) != 0.0f;
   for (int k = 0; k < 3; ++k) {
     of_colour[k] = entry(in.of_colour, 3 * ray + k);
+    ray_coloured |= of_colour[k] != 0.0f;
     of_light -= of_colour[k] * entry(in.background, in.background_per_ray ? 3 * ray + k : k);
   }
   const double hidden = in.hidden > 0.0f ? static_cast<double>(in.hidden) : -1.0;
-  double through = light_left(in, ray), behind = 0.0;
+  double through = 1.0, behind = 0.0;
+  for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) {
+    through -= static_cast<double>(in.weights[i]);
+    learns |= entry(in.of_weights, i) != 0.0f || entry(in.of_density, i) != 0.0f || is_coloured(in, i);
+  }
+  if (!learns && !ray_coloured) return;
   for (int64_t i = in.offsets[ray + 1]; i-- > in.offsets[ray];) {
     float rgb[3], of_weight = of_light + entry(in.of_weights, i);
     if (in.of_depth != nullptr) of_weight += in.of_depth[ray] * in.depths[i];
+    const bool coloured = ray_coloured || is_coloured(in, i);
     for (int k = 0; coloured && k < 3; ++k) {
       const float raw = in.raw[4 * i + k];
       rgb[k] = in.activated ? raw : sigmoid(raw);

@@ -303,12 +303,12 @@ FAULTS = (
         "in.pixels[i] >= all)",
         "in.pixels[i] > all)",
     ),
-    _kernel(
-        "sparse_depth_gradient",
-        "light of 0.001 has a gradient",
-        "rays/sparse_depth.cpp",
-        "<= in.nearby * distance + in.deltas[i];",
-        "< in.nearby * distance;",
+    Fault(
+        "sparse_depth_loss: samples whose ends reach the point are not near it",
+        "csrc/rays/ray_losses.cpp",
+        "<= in.nearby * in.distances[ray] + in.deltas[i];",
+        "< in.nearby * in.distances[ray];",
+        ("tests/attack/test_blocks.py", "tests/ops/test_ray_losses.py", "-k", "sparse_depth_loss"),
     ),
     _kernel(
         "adam",

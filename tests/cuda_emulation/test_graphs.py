@@ -13,7 +13,7 @@ from step_training import Scaled, Training
 
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
-from voronerf.nerf import SplitStrategy, batches, replayed, terms
+from voronerf.nerf import SplitStrategy, batches, loss, replayed, terms
 from voronerf.ops.keep_heaviest import reference
 
 pytestmark = pytest.mark.native
@@ -28,9 +28,10 @@ def on_device(monkeypatch):
     monkeypatch.setattr(reference, "check_range", lambda *_: None)  # the check reads only on a CPU
     for place, op in (
         (batches, "unseen_rays"),
-        (terms, "sparse_depth_gradient"),
-        (terms, "smooth_depth_gradient"),
-        (terms, "surface_gradient"),
+        (terms, "sparse_depth_loss"),
+        (terms, "smooth_depth_loss"),
+        (terms, "surface_loss"),
+        (loss, "rendered_gradient"),
     ):  # ops without CUDA kernels
         monkeypatch.setattr(place, op, in_torch(getattr(place, op)))
 

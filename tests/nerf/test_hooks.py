@@ -98,7 +98,7 @@ class Anneal:
     def add(self, along, batch):
         self.factor += 0.01
         along.loss.add_(self.factor * along.density.mean())
-        along.gradient[:, 3] += self.factor / len(along.density)
+        along.slopes.density.add_(self.factor / len(along.density))
 
 
 def clear(seen, batch):
@@ -369,7 +369,7 @@ class Optional(SparseDepth):
             setattr(self, name, value)
 
     def add(self, along, batch):
-        along.gradient.mul_(getattr(self, next(iter(self.nested))) * self.nested["gain"])
+        along.slopes.density.add_(1e-3 * getattr(self, next(iter(self.nested))) * self.nested["gain"])
 
 
 @pytest.mark.parametrize("change", [lambda term: setattr(term, "gain", 2.0), lambda term: term.nested.update(gain=3.0)])

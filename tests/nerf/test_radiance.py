@@ -17,10 +17,9 @@ from voronerf.nerf.fields.nerf import MipNeRF
 from voronerf.nerf.fields.radiance import RadianceField
 from voronerf.nerf.occupancy import density_of
 from voronerf.nerf.radiance import Radiance, radiance_of
+from voronerf.ops.composite.reference import ray_spans
+from voronerf.ops.ray_losses.reference import smooth_depth, sparse_depth, surface
 from voronerf.ops.render_loss.reference import robust_error
-from voronerf.ops.smooth_depth_gradient.reference import smooth_depth_loss
-from voronerf.ops.sparse_depth_gradient.reference import sparse_depth_loss
-from voronerf.ops.surface_gradient.reference import surface_losses
 
 pytestmark = pytest.mark.native
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -179,15 +178,14 @@ def test_equals_a_rendering_that_torch_differentiates(name, monkeypatch):
     arguments = {"background": batch.background, "jitter": True, "generator": seeded(3)}
     seen = separate.renderer.render(batch.rays, batch.near, batch.far, **arguments)[-1]
     samples = seen.samples
-    along = seen.weights, samples.depths, samples.deltas, samples.ray_offsets
+    weights, depths, deltas, offsets = seen.weights, samples.depths, samples.deltas, samples.ray_offsets
     error = (seen.colour - batch.target).square().sum(-1)[:28]
-    disparity = torch.zeros(64).index_add(0, samples.ray_index.long(), seen.weights / samples.depths)
-    expected = robust_error(error, 0.05).sum() / 192 + 0.3 * sparse_depth_loss(*along, batch.sparse_depths).mean()
-    expected = expected + 0.2 * smooth_depth_loss(disparity, seen.opacity, batch.far, 12) + term_of_all(seen, batch)
-    lengths = samples.depths, samples.deltas, samples.ray_offsets, batch.near, batch.far
-    opacities, lit = -torch.expm1(-seen.density * samples.deltas), torch.ones_like(seen.density, dtype=torch.bool)
-    spread, fallen = surface_losses(seen.weights, opacities, *lengths, lit)
-    expected = expected + 0.4 * spread.mean() + 0.3 * fallen.mean()
+    expected = robust_error(error, 0.05).sum() / 192 + term_of_all(seen, batch)
+    expected = expected + 0.3 * sparse_depth(weights, depths, deltas, offsets, batch.sparse_depths)
+    expected = expected + 0.2 * smooth_depth(weights, depths, offsets, batch.far, 12)
+    opacities, lit = -torch.expm1(-seen.density * deltas), torch.ones_like(seen.density, dtype=torch.bool)
+    rays = ray_spans(offsets, len(weights)), lit, batch.near, batch.far
+    expected = expected + surface(weights, opacities, depths, deltas, *rays, (0.4, 0.3))
     expected.backward()
     for own in results:
         for part, other in zip(own, [expected.detach(), *(p.grad for p in router.parameters())], strict=True):

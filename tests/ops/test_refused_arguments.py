@@ -49,7 +49,7 @@ def test_inference_tensors(backend):
         ops.grouped_linear(points, offsets, weight, backend=backend)
 
 
-@pytest.mark.parametrize("op", ["render_loss_gradient", "run_gradients"])
+@pytest.mark.parametrize("op", ["render_loss", "run_gradients"])
 @pytest.mark.parametrize("inside", [True, False])
 def test_ops_that_differentiate_inside_take_inference_tensors(op, inside):
     with torch.inference_mode():

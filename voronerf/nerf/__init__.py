@@ -14,7 +14,7 @@ from voronerf.nerf.sampling import stratified_depths
 from voronerf.nerf.segment import replayed
 from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
-from voronerf.nerf.terms import LossAlongRays, RayValues, SmoothDepth, SparseDepth, Surface, Term
+from voronerf.nerf.terms import LossAlongRays, RayValues, Slopes, SmoothDepth, SparseDepth, Surface, Term
 from voronerf.nerf.volume import Batch, RayColours, Rendered, RenderOutput, Samples, Space
 
 __all__ = [
@@ -43,6 +43,7 @@ __all__ = [
     "Renderer",
     "Sampler",
     "Samples",
+    "Slopes",
     "SmoothDepth",
     "Space",
     "SparseDepth",

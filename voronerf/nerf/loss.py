@@ -13,7 +13,7 @@ from voronerf.nerf.occupancy import HIDDEN
 from voronerf.nerf.radiance import Radiance, radiance_of, router_of
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.segment import Stage, in_python, replayed, run_stages
-from voronerf.nerf.terms import LossAlongRays, RayValues, Term, stages_of
+from voronerf.nerf.terms import LossAlongRays, RayValues, Slopes, Term, stage_of
 from voronerf.nerf.volume import (
     Batch,
     Rendered,
@@ -27,7 +27,8 @@ from voronerf.nerf.volume import (
 from voronerf.ops._core import backends
 from voronerf.ops._core.derivatives import run_backward, with_gradients
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
-from voronerf.ops.render_loss import render_loss_gradient
+from voronerf.ops.render_loss import RenderLoss, render_loss
+from voronerf.ops.rendered_gradient import rendered_gradient
 
 
 @replayed
@@ -119,13 +120,12 @@ class RayLoss:
             name, python = f"{type(sampler).__name__}.sample", in_python(sampler, "sample")
             sample = Stage(name, functools.partial(self._sample, generator), ("batch",), python)
             evaluate = Stage("evaluate", functools.partial(self._evaluate, field), ("batch", "samples"))
-        terms = [stage for number, term in enumerate(self.terms) for stage in stages_of(number, term, now)]
-        return [
-            sample,
-            evaluate,
-            *terms,
-            Stage("learn", functools.partial(self._learn, backward), ("along", "learning")),
-        ]
+        terms = [stage_of(term, now) for term in self.terms]
+        if terms:
+            along = Stage("along", self._along, ("outputs", "rendered", "samples"))
+            terms = [along, *terms, Stage("gradient", self._add_slopes, ("along", "rendered", "batch"))]
+        learn = Stage("learn", functools.partial(self._learn, backward), ("rendered", "samples", "learning"))
+        return [sample, evaluate, *terms, learn]
 
     def why_not_fused(self) -> str | None:
         """Returns the reason why networks, colours, loss and gradients are not fused; None if they are.
@@ -153,8 +153,9 @@ class RayLoss:
         network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index)
         tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
         # A sample that almost no light reaches has a negligible gradient and is left out of the backward pass.
-        along = self._along(tape.raw, field.rule, batch, samples, HIDDEN)
-        return {"along": along, "learning": (self._learn_fused, tape)}
+        outputs = tape.raw, field.rule, HIDDEN
+        rendered = self._render(*outputs, batch, samples)
+        return {"outputs": outputs, "rendered": rendered, "learning": (self._learn_fused, tape, samples)}
 
     def _sample_passes(self, generator: torch.Generator | None, batch: Batch) -> dict[str, Any]:
         renderer = self.renderer
@@ -171,16 +172,20 @@ class RayLoss:
         """Does the same as `_evaluate` for networks that torch differentiates."""
         values = evaluate_field(self.renderer.field, batch.rays, samples, self.renderer.sampler.space)
         raw = torch.cat((values[0], values[1][:, None]), 1).detach()
-        along = self._along(raw, {"activated": True}, batch, samples, 0.0)
-        return {"along": along, "learning": (self._learn_unfused, values, batch, before)}
+        outputs = raw, {"activated": True}, 0.0
+        rendered = self._render(*outputs, batch, samples)
+        return {
+            "outputs": outputs,
+            "rendered": rendered,
+            "learning": (self._learn_unfused, values, batch, samples, before),
+        }
 
-    def _along(self, raw: Tensor, rule: dict[str, Any], batch: Batch, samples: Samples, hidden: float) -> LossAlongRays:
+    def _render(self, raw: Tensor, rule: dict[str, Any], hidden: float, batch: Batch, samples: Samples) -> RenderLoss:
         """Computes the loss of the colours and its gradient with respect to the raw outputs."""
-        backend = self.renderer.backend
         for name in ("target", "background"):
             if (colours := getattr(batch, name)) is not None and colours.requires_grad:
                 raise ValueError(f"RayLoss: {name} must not require a gradient; only the networks are trained")
-        result, gradient = render_loss_gradient(
+        return render_loss(
             raw,
             samples.deltas,
             samples.ray_offsets,
@@ -190,34 +195,61 @@ class RayLoss:
             robust=self.robust,
             hidden=hidden,
             triples=batch.unseen,
-            backend=backend,
+            backend=self.renderer.backend,
         )
-        rendered = result.colour, result.weights, result.density, result.error
-        return LossAlongRays(result.loss, gradient, raw, rule, *rendered, samples, hidden, backend)
 
-    def _learn(self, backward: bool, along: LossAlongRays, learning: tuple[Any, ...]) -> dict[str, Any]:
+    def _along(
+        self, outputs: tuple[Tensor, dict[str, Any], float], rendered: RenderLoss, samples: Samples
+    ) -> dict[str, Any]:
+        loss, colour, weights, density, error, _ = rendered
+        rays = Slopes.zeros(weights, error), colour, weights, density, error, samples
+        return {"along": LossAlongRays(loss, *rays, *outputs, self.renderer.backend)}
+
+    def _add_slopes(self, along: LossAlongRays, rendered: RenderLoss, batch: Batch) -> None:
+        """Carries the gradients that terms have added to the slopes back along the rays, to the raw outputs."""
+        samples = along.samples
+        rendered_gradient(
+            rendered.gradient,
+            along.raw,
+            along.density,
+            samples.depths,
+            samples.deltas,
+            along.weights,
+            samples.ray_offsets,
+            background=batch.background,
+            **{f"of_{name}": slope for name, slope in along.slopes._asdict().items()},
+            **along.rule,
+            hidden=along.hidden,
+            backend=along.backend,
+        )
+
+    def _learn(
+        self, backward: bool, rendered: RenderLoss, samples: Samples, learning: tuple[Any, ...]
+    ) -> dict[str, Any]:
         learn, *arguments = learning
-        loss = learn(*arguments, along, not backward)
-        rendered = along.error, along.weights, along.density, along.samples, along.colour
-        return {"output": RenderOutput(loss, *rendered)}
+        loss = learn(*arguments, rendered, not backward)
+        rays = rendered.error, rendered.weights, rendered.density, samples, rendered.colour
+        return {"output": RenderOutput(loss, *rays)}
 
-    def _learn_fused(self, tape: Tape, along: LossAlongRays, defer: bool) -> Tensor:
+    def _learn_fused(self, tape: Tape, samples: Samples, rendered: RenderLoss, defer: bool) -> Tensor:
         if (full := self.renderer.sampler.space.full_gradient) is not None:
-            along.gradient.mul_(gradient_factors(along.samples.depths, full)[:, None])
-        return tape.backward(along.loss, along.gradient, defer=defer)
+            rendered.gradient.mul_(gradient_factors(samples.depths, full)[:, None])
+        return tape.backward(rendered.loss, rendered.gradient, defer=defer)
 
     def _learn_unfused(
         self,
         values: tuple[Tensor, Tensor],
         batch: Batch,
+        samples: Samples,
         before: Sequence[Rendered],
-        along: LossAlongRays,
+        rendered: RenderLoss,
         defer: bool,
     ) -> Tensor:
         """Passes the gradients of colours and densities to the networks, and adds the losses of earlier passes."""
-        loss = with_gradients(along.loss, values, [along.gradient[:, :3], along.gradient[:, 3]])
+        gradient = rendered.gradient
+        loss = with_gradients(rendered.loss, values, [gradient[:, :3], gradient[:, 3]])
         if before:
-            last = composite_rays(*values, batch.far, along.samples, batch.background, along.backend)
+            last = composite_rays(*values, batch.far, samples, batch.background, self.renderer.backend)
             with_target = len(batch.rays) - 3 * batch.unseen
             for first in before:
                 target = torch.cat((batch.target[:with_target], first.colour[with_target:].detach()))

@@ -1,4 +1,4 @@
-"""Terms of the loss of rays; each term adds to the loss, and to its gradient along the rays.
+"""Terms of the loss of rays; each term adds to the loss, and to its gradients with respect to the rendered values.
 
 r rays, m samples of all rays (packed).
 """
@@ -6,7 +6,7 @@ r rays, m samples of all rays (packed).
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -14,69 +14,88 @@ from torch import Tensor
 
 from voronerf.nerf.segment import Stage, in_python, replayed
 from voronerf.nerf.volume import Batch, Samples, normalised
+from voronerf.ops._core.rows import new_zeros, rows_of
 from voronerf.ops.formulas import activate
-from voronerf.ops.rendered_gradient import rendered_gradient
-from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
-from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
-from voronerf.ops.surface_gradient import surface_gradient
+from voronerf.ops.ray_losses import smooth_depth_loss, sparse_depth_loss, surface_loss
+
+
+class Slopes(NamedTuple):
+    """The gradients of a loss with respect to the values of rays and samples, to which a :class:`Term` adds in place.
+
+    `voronerf.ops.rendered_gradient` carries the sums of all terms to the networks.
+
+    Attributes:
+        colour: [r, 3], with respect to the colours of the rays.
+        opacity: [r], with respect to the opacities of the rays.
+        depth: [r], with respect to the depths of the rays, the sums of weights times depths.
+        weights: [m], with respect to the contributions of the samples to their rays.
+        rgb: [m, 3], with respect to the colours of the samples.
+        density: [m], with respect to the densities at the samples, except through the weights.
+
+    Examples:
+        >>> from voronerf.nerf import Slopes
+        >>> Slopes._fields
+        ('colour', 'opacity', 'depth', 'weights', 'rgb', 'density')
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    weights: Tensor
+    rgb: Tensor
+    density: Tensor
+
+    @classmethod
+    def zeros(cls, weights: Tensor, error: Tensor) -> Slopes:
+        """Returns zeros for samples with ``weights`` [m] and rays with an ``error`` [r]."""
+        m, r = rows_of(weights), rows_of(error)
+        of_rays = new_zeros(error, r, 3), new_zeros(error, r), new_zeros(error, r)
+        return cls(*of_rays, new_zeros(weights, m), new_zeros(weights, m, 3), new_zeros(weights, m))
 
 
 class LossAlongRays(NamedTuple):
-    """The loss of rays and its gradient with respect to the raw network outputs: the input of a :class:`Term`.
+    """The loss of rays, and the values of rays and samples: the input of a :class:`Term`.
 
     Attributes:
         loss: [], the loss, to which terms add.
-        gradient: [m, 4], the gradient with respect to ``raw``, to which terms add.
-        raw: [m, 4], the outputs of the networks: colour and density, before their activations or, with the rule
-            ``activated``, after them.
-        rule: The option that tells `voronerf.ops.render_loss` how to read ``raw``: ``density_scale`` or ``activated``.
+        slopes: The gradients with respect to the values below, to which terms add.
         colour: [r, 3], the colours of the rays, background included.
         weights: [m], contributions of the samples to their rays.
         density: [m], the density at each sample per scene unit.
         error: [r], the squared error of the colour of each ray, summed over the channels.
         samples: The samples at which the networks were evaluated.
-        hidden: A sample whose transmittance is at most this value is hidden, and needs no gradient.
+        raw: [m, 4], the outputs of the networks: colour and density, before their activations or, with the rule
+            ``activated``, after them.
+        rule: The option that tells `voronerf.ops.render_loss` how to read ``raw``: ``density_scale`` or ``activated``.
+        hidden: A sample whose transmittance is at most this value is hidden, and gets no gradient.
         backend: The backend of the ops.
 
     Examples:
         >>> from voronerf.nerf import LossAlongRays
         >>> LossAlongRays._fields[:4]
-        ('loss', 'gradient', 'raw', 'rule')
+        ('loss', 'slopes', 'colour', 'weights')
     """
 
     loss: Tensor
-    gradient: Tensor
-    raw: Tensor
-    rule: dict[str, Any]
+    slopes: Slopes
     colour: Tensor
     weights: Tensor
     density: Tensor
     error: Tensor
     samples: Samples
+    raw: Tensor
+    rule: dict[str, Any]
     hidden: float
     backend: str
-
-    def add_gradient(self, batch: Batch, **slopes: Tensor) -> None:
-        """Backpropagates gradients of rendered values into ``gradient``; see `voronerf.ops.rendered_gradient`.
-
-        Args:
-            batch: The rays.
-            slopes: The gradients with respect to ``colour`` [r, 3], ``opacity`` [r], unnormalised ``depth`` [r],
-                ``weights`` [m], ``rgb`` [m, 3] and ``density`` [m].
-        """
-        samples = self.samples
-        lengths = self.density, samples.depths, samples.deltas, self.weights, samples.ray_offsets
-        options: dict[str, Any] = {"hidden": self.hidden, **self.rule, "backend": self.backend}
-        options |= {f"of_{name}": slope for name, slope in slopes.items()}
-        rendered_gradient(self.gradient, self.raw, *lengths, background=batch.background, **options)
 
 
 class Term(Protocol):
     """A term of :class:`RayLoss` that computes its own gradient.
 
     Each step calls it once, after the evaluation of the networks and the colour loss, and before the backward pass.
-    Terms are called in their order. A class that is `replayed` is recorded with the step; any other class is called in
-    Python.
+    Terms are called in their order. A term computes gradients with respect to the values of rays and samples; one op
+    carries the gradients of all terms back along the rays. A class that is `replayed` is recorded with the step; any
+    other class is called in Python.
 
     Examples:
         >>> import torch
@@ -87,7 +106,7 @@ class Term(Protocol):
         ...     def add(self, along, batch):
         ...         self.factor += 0.01
         ...         along.loss.add_(self.factor * along.density.mean())
-        ...         along.gradient[:, 3].add_(self.factor / len(along.density))  # for activated outputs
+        ...         along.slopes.density.add_(self.factor / len(along.density))
         >>> loss = RayLoss(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8)), terms=[Thin()])
         >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
         >>> output = loss(Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3)))
@@ -96,10 +115,10 @@ class Term(Protocol):
     """
 
     def add(self, along: LossAlongRays, batch: Batch) -> None:
-        """Adds, in place, to ``along.loss`` and to ``along.gradient``.
+        """Adds, in place, to ``along.loss`` and to the tensors of ``along.slopes``.
 
         Args:
-            along: The rendered rays; a term changes only their loss and gradient.
+            along: The rendered rays; a term changes only their loss and slopes.
             batch: The rays; the last ``3 * batch.unseen`` have no target colour.
         """
 
@@ -108,7 +127,7 @@ class Term(Protocol):
 class SparseDepth:
     """A loss on light that does not come from the points of a sparse model.
 
-    See `voronerf.ops.sparse_depth_gradient`.
+    See `voronerf.ops.sparse_depth_loss`.
 
     Args:
         factor: The factor on the mean of this loss over the rays through points.
@@ -126,16 +145,16 @@ class SparseDepth:
         """See :class:`Term`; a batch without points adds nothing."""
         samples, points = along.samples, batch.sparse_depths
         if points is not None:
-            lengths = along.density, samples.depths, samples.deltas, along.weights, samples.ray_offsets
-            arguments = along.loss, along.gradient, *lengths, points
-            sparse_depth_gradient(*arguments, factor=self.factor, **along.rule, backend=along.backend)
+            lengths = samples.depths, samples.deltas, along.weights, samples.ray_offsets
+            arguments = along.loss, along.slopes.weights, *lengths, points
+            sparse_depth_loss(*arguments, factor=self.factor, backend=along.backend)
 
 
 @replayed
 class SmoothDepth:
     """A loss on depths that are not locally planar, for triples of neighbouring rays that no training pixel shows.
 
-    The triples are the last rays of a batch (``Batch.unseen``). See `voronerf.ops.smooth_depth_gradient`.
+    The triples are the last rays of a batch (``Batch.unseen``). See `voronerf.ops.smooth_depth_loss`.
 
     Args:
         factor: The factor on the mean of this loss over the triples of rays.
@@ -153,15 +172,14 @@ class SmoothDepth:
         """See :class:`Term`; a batch without unseen rays adds nothing."""
         samples = along.samples
         if batch.unseen:
-            lengths = along.density, samples.depths, samples.deltas, along.weights, samples.ray_offsets
-            arguments = along.loss, along.gradient, *lengths, batch.far
-            options: dict[str, Any] = {"hidden": along.hidden, **along.rule, "backend": along.backend}
-            smooth_depth_gradient(*arguments, triples=batch.unseen, factor=self.factor, **options)
+            rays = samples.depths, along.weights, samples.ray_offsets, batch.far
+            options: dict[str, Any] = {"factor": self.factor, "backend": along.backend}
+            smooth_depth_loss(along.loss, along.slopes.weights, *rays, triples=batch.unseen, **options)
 
 
 @replayed
 class Surface:
-    """A loss on the light of a ray that does not come from one surface; see `voronerf.ops.surface_gradient`.
+    """A loss on the light of a ray that does not come from one surface; see `voronerf.ops.surface_loss`.
 
     Args:
         distortion: The factor on the distortion loss of mip-NeRF 360, a mean over the rays.
@@ -179,11 +197,11 @@ class Surface:
 
     def add(self, along: LossAlongRays, batch: Batch) -> None:
         """See :class:`Term`."""
-        samples = along.samples
-        lengths = along.density, samples.depths, samples.deltas, along.weights, samples.ray_offsets
-        arguments = along.loss, along.gradient, *lengths, batch.near, batch.far
-        options: dict[str, Any] = {"hidden": along.hidden, **along.rule, "backend": along.backend}
-        surface_gradient(*arguments, distortion=self.distortion, orientation=self.orientation, **options)
+        samples, slopes = along.samples, along.slopes
+        rays = samples.depths, samples.deltas, along.weights, samples.ray_offsets, batch.near, batch.far
+        factors = {"distortion": self.distortion, "orientation": self.orientation}
+        options: dict[str, Any] = {**factors, "hidden": along.hidden, "backend": along.backend}
+        surface_loss(along.loss, slopes.weights, slopes.density, *rays, **options)
 
 
 class RayValues:
@@ -249,67 +267,33 @@ class RayValues:
         return samples
 
 
-class DifferentiatedTerm:
-    """A term that torch differentiates: a function of `RayValues` and their `Batch`.
-
-    Only the function itself runs in Python and is differentiated by torch. A replayable op then backpropagates the
-    resulting gradients to the networks' outputs.
+def stage_of(term: Term | Callable[[RayValues, Batch], Tensor], now: Callable[[Any], Any]) -> Stage:
+    """Returns the stage that reads the results named "along" and "batch" and adds a term to the loss.
 
     Args:
-        function: The function, which returns a scalar.
-    """
-
-    def __init__(self, function: Callable[[RayValues, Batch], Tensor]) -> None:
-        self.function = function
-
-    def differentiate(self, now: Callable[[Any], Any], along: LossAlongRays, batch: Batch) -> dict[str, Tensor]:
-        """Adds the term to the loss, and returns the term's gradients.
-
-        Args:
-            now: Function that cuts recorded tensors to the rows of the present step.
-            along: The rendered rays.
-            batch: The rays.
-
-        Returns:
-            The gradients with respect to the attributes of `RayValues` that the function has read, by name.
-        """
-        values = RayValues(along, batch, now)
-        with torch.enable_grad():
-            term = self.function(values, now(batch))
-        if not isinstance(term, Tensor) or term.dim():
-            got = list(term.shape) if isinstance(term, Tensor) else repr(term)[:60]
-            raise ValueError(f"RayLoss: a term must give a scalar tensor, got {got}")
-        now(along.loss).add_(term.detach())
-        if not (term.requires_grad and values.leaves):
-            return {}
-        slopes = torch.autograd.grad(term, [*values.leaves.values()], allow_unused=True)
-        return {name: slope for name, slope in zip(values.leaves, slopes, strict=True) if slope is not None}
-
-    def backpropagate(self, along: LossAlongRays, batch: Batch, slopes: Mapping[str, Tensor]) -> None:
-        """Backpropagates the gradients of `differentiate` to the raw outputs."""
-        if slopes:
-            along.add_gradient(batch, **slopes)
-
-
-def stages_of(number: int, term: Term | Callable[[RayValues, Batch], Tensor], now: Callable[[Any], Any]) -> list[Stage]:
-    """Returns the stages that read the results named "along" and "batch" and add a term to the loss.
-
-    Args:
-        number: The index of the term.
         term: The term of :class:`RayLoss`.
         now: Function that cuts recorded tensors to the rows of the present step, for stages that run in Python.
     """
+    reads = "along", "batch"
     if hasattr(term, "add"):
-        return [Stage(f"{type(term).__name__}.add", term.add, ("along", "batch"), in_python(term, "add"))]
-    differentiated, slopes = DifferentiatedTerm(term), f"slopes {number}"
+        return Stage(f"{type(term).__name__}.add", term.add, reads, in_python(term, "add"))
     name = getattr(term, "__qualname__", type(term).__qualname__)
-    return [
-        Stage(
-            name,
-            lambda *seen: {slopes: differentiated.differentiate(now, *seen)},
-            ("along", "batch"),
-            python=True,
-            lazy=True,
-        ),
-        Stage("gradients", differentiated.backpropagate, ("along", "batch", slopes)),
-    ]
+    return Stage(name, functools.partial(_add_differentiated, term, now), reads, python=True, lazy=True)
+
+
+def _add_differentiated(
+    term: Callable[[RayValues, Batch], Tensor], now: Callable[[Any], Any], along: LossAlongRays, batch: Batch
+) -> None:
+    """Adds a term that torch differentiates: a function of `RayValues` and their `Batch` that returns a scalar."""
+    values = RayValues(along, batch, now)
+    with torch.enable_grad():
+        added = term(values, now(batch))
+    if not isinstance(added, Tensor) or added.dim():
+        got = list(added.shape) if isinstance(added, Tensor) else repr(added)[:60]
+        raise ValueError(f"RayLoss: a term must give a scalar tensor, got {got}")
+    now(along.loss).add_(added.detach())
+    if added.requires_grad and values.leaves:
+        slopes = torch.autograd.grad(added, [*values.leaves.values()], allow_unused=True)
+        for name, slope in zip(values.leaves, slopes, strict=True):
+            if slope is not None:
+                now(getattr(along.slopes, name)).add_(slope)

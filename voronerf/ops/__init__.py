@@ -34,18 +34,16 @@ from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import index_centres, nearest_centre
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.pixel_rays import PixelRays, pixel_rays
+from voronerf.ops.ray_losses import smooth_depth_loss, sparse_depth_loss, surface_loss
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
 from voronerf.ops.ray_runs.reference import OwnSamples
-from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradient
+from voronerf.ops.render_loss import RenderLoss, render_loss
 from voronerf.ops.render_opaque import RenderedRays, render_opaque
 from voronerf.ops.rendered_gradient import rendered_gradient
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.routed_program import routed_program
-from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
-from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.spherical_harmonics import spherical_harmonics
-from voronerf.ops.surface_gradient import surface_gradient
 from voronerf.ops.unseen_rays import unseen_rays
 
 __all__ = [
@@ -87,7 +85,6 @@ __all__ = [
     "own_samples",
     "pixel_rays",
     "render_loss",
-    "render_loss_gradient",
     "render_opaque",
     "rendered_gradient",
     "resample",
@@ -95,10 +92,10 @@ __all__ = [
     "routed_program",
     "run_gradients",
     "run_sums",
-    "smooth_depth_gradient",
-    "sparse_depth_gradient",
+    "smooth_depth_loss",
+    "sparse_depth_loss",
     "spherical_harmonics",
-    "surface_gradient",
+    "surface_loss",
     "unseen_rays",
 ]
 

@@ -330,8 +330,8 @@ def check_backend(config: TrainConfig, device: torch.device) -> None:
     """Looks up every op of a step, so that a backend that cannot train fails before any file is written."""
     ops = ["pixel_rays", "nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", "adam"]
     if config.occupancy:
-        ops += ["march_rays", "observe_occupancy", "forward_with_tape", "render_loss_gradient"]
-        ops += ["sparse_depth_gradient"] if config.sparse_depth else []
+        ops += ["march_rays", "observe_occupancy", "forward_with_tape", "render_loss"]
+        ops += ["sparse_depth_loss", "rendered_gradient"] if config.sparse_depth else []
     ops += ["resample"] if SAMPLERS[config.sampling].passes > 1 else []
     for op in ops:
         backends.resolve(op, backend=config.backend, device=device, dtype=torch.float32)

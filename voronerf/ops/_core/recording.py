@@ -212,6 +212,13 @@ class Recording(TorchDispatchMode):
         self._register(whole, rows.count)
         return whole[: int(rows)]
 
+    def zeroed(self, tensor: Tensor) -> Tensor:
+        """Fills a tensor's rows with zeros in each run, and returns the tensor."""
+        from voronerf.ops._core import native
+
+        self._compiled.zero_rows(tensor, tensor[:1].numel(), self.rows_of(tensor), native.cpu())
+        return tensor
+
     def _register(self, whole: Tensor, count: Count | None = None) -> Tensor:
         address = whole.untyped_storage().data_ptr()
         self._memory[address] = _Memory(whole, count)

@@ -91,6 +91,14 @@ def new_empty(like: Tensor, *shape: int, dtype: torch.dtype | None = None) -> Te
     return memory
 
 
+def new_zeros(like: Tensor, *shape: int) -> Tensor:
+    """Allocates memory as :func:`new_empty` does, and fills it with zeros, in each run of a recording."""
+    if active.recording is None:
+        return like.new_zeros(shape)
+    zeros: Tensor = active.recording.zeroed(new_empty(like, *shape))
+    return zeros
+
+
 def read_count(memory: Tensor) -> int:
     """Reads a number of rows that a call has computed, int64 [1]. Replays read it again from this memory."""
     if active.recording is None:

@@ -103,12 +103,21 @@ def packed_light(optical: Tensor, ray_offsets: Tensor) -> tuple[Tensor, Tensor]:
 
     The index of samples outside all rays is 0 or r + 1.
     """
-    rays, row = ray_offsets.shape[0] - 1, torch.arange(optical.shape[0], device=optical.device)
+    ray, first, last = ray_spans(ray_offsets, optical.shape[0])
+    return _packed_in_front(optical, first, last), ray
+
+
+def ray_spans(ray_offsets: Tensor, m: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns for each packed sample the index of its ray plus 1, and its ray's first and last sample, int64 [m].
+
+    The index of samples outside all rays is 0 or r + 1; such a sample is a ray of its own. The last sample is excluded.
+    """
+    rays, row = ray_offsets.shape[0] - 1, torch.arange(m, device=ray_offsets.device)
     ray = torch.searchsorted(ray_offsets.long(), row, right=True)
     inside = (ray > 0) & (ray <= rays)
     first = torch.where(inside, ray_offsets[(ray - 1).clamp(0, rays)], row)
     last = torch.where(inside, ray_offsets[ray.clamp(0, rays)], row + 1)
-    return _packed_in_front(optical, first, last), ray
+    return ray, first, last
 
 
 def _in_front(optical: Tensor) -> Tensor:
@@ -128,8 +137,17 @@ def _packed_in_front(optical: Tensor, first: Tensor, last: Tensor) -> Tensor:
     reduce the precision of the running sum for later rays.
     """
     limit = 128.0 if optical.dtype == torch.float32 else 768.0
-    before = _RaySum.apply(optical.double().clamp(max=limit), first, last, False)
+    before = sums_in_front(optical.clamp(max=limit), first, last)
     return torch.exp(-before).to(optical.dtype)
+
+
+def sums_in_front(values: Tensor, first: Tensor, last: Tensor) -> Tensor:
+    """Returns the sums of values [m] over the samples in front of each sample on its ray, float64 [m].
+
+    ``first`` and ``last`` are results of `ray_spans`. A value that is not finite spoils only its own ray.
+    """
+    sums: Tensor = _RaySum.apply(values.double(), first, last, False)
+    return sums
 
 
 class _RaySum(torch.autograd.Function):

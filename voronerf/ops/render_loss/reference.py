@@ -1,4 +1,4 @@
-"""The loss of rendered rays, from the outputs of the networks. r rays, m samples of all rays (packed)."""
+"""The loss of rendered rays and its gradient, from networks' outputs. r rays, m samples of all rays (packed)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from voronerf.ops.formulas import activate
 
 
 class RenderLoss(NamedTuple):
-    """The result of `render_loss`. Only the loss has gradients.
+    """The result of `render_loss`.
 
     Attributes:
         loss: [], the mean squared error of the colours, or the robust error.
@@ -21,14 +21,15 @@ class RenderLoss(NamedTuple):
         weights: [m], the rendering weight of each sample.
         density: [m], the density of each sample.
         error: [r], the squared error of the colour of each ray, summed over the channels; 0 for unseen rays.
+        gradient: [m, 4], the gradient of the loss with respect to ``raw``.
 
     Examples:
         >>> import torch
         >>> from voronerf.ops import render_loss
         >>> offsets = torch.tensor([0, 2, 4], dtype=torch.int32)  # two rays of two samples
         >>> result = render_loss(torch.zeros(4, 4), torch.ones(4), offsets, torch.zeros(2, 3), density_scale=1.0)
-        >>> result.weights.shape, result.error.shape
-        (torch.Size([4]), torch.Size([2]))
+        >>> result.weights.shape, result.error.shape, result.gradient.shape
+        (torch.Size([4]), torch.Size([2]), torch.Size([4, 4]))
     """
 
     loss: Annotated[Tensor, "wide []"]
@@ -36,38 +37,32 @@ class RenderLoss(NamedTuple):
     weights: Annotated[Tensor, "wide [m]"]
     density: Annotated[Tensor, "wide [m]"]
     error: Annotated[Tensor, "wide [r]"]
+    gradient: Annotated[Tensor, "same [m, 4]"]
 
 
-def render_loss(
-    raw: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor,
-    target: Tensor,
-    background: Tensor | None,
-    density_scale: float,
-    activated: bool,
-    hidden: float,
-    robust: float,
-    triples: int,
-) -> RenderLoss:
+@torch.inference_mode(False)
+@torch.enable_grad()
+def render_loss(raw: Tensor, *arguments: Any) -> RenderLoss:
     """Applies activations, compositing and the error; see ``voronerf.ops.render_loss``."""
-    raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
-    check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
-    first = len(target) - 3 * triples
-    if hidden and raw.requires_grad:
-        _, density = activate(raw.detach(), density_scale, activated)
+    deltas, ray_offsets, target, background, *rule, hidden, robust, triples = map(saveable, arguments)
+    leaf = saveable(raw.detach()).requires_grad_()
+    check_ray_offsets("render_loss", ray_offsets, leaf.shape[0])
+    learning, first = leaf.to(torch.promote_types(leaf.dtype, torch.float32)), len(target) - 3 * triples
+    if hidden:
+        _, density = activate(learning.detach(), *rule)
         dark = packed_light(optical_depth(density, deltas), ray_offsets)[0] <= hidden
-        raw = torch.where(dark[:, None], raw.detach(), raw)
-    if triples and raw.requires_grad:  # avoids a host read of the offset
-        unseen = torch.arange(len(raw), device=raw.device) >= ray_offsets[first]
-        raw = torch.where(unseen[:, None], raw.detach(), raw)
-    colours, density = activate(raw, density_scale, activated)
+        learning = torch.where(dark[:, None], learning.detach(), learning)
+    if triples:  # avoids a host read of the offset
+        unseen = torch.arange(len(learning), device=raw.device) >= ray_offsets[first]
+        learning = torch.where(unseen[:, None], learning.detach(), learning)
+    colours, density = activate(learning, *rule)
     seen = composite(density, colours, deltas, deltas, ray_offsets, background)
     error = (seen.colour - target).square().sum(-1)
     if triples:
         error = F.pad(error[:first], (0, 3 * triples))
-    rest = (seen.colour, seen.weights, density, error)
-    return RenderLoss(robust_error(error, robust).mean() / 3, *(part.detach() for part in rest))
+    loss = robust_error(error, robust).mean() / 3
+    (gradient,) = torch.autograd.grad(loss, leaf)
+    return RenderLoss(*(part.detach() for part in (loss, seen.colour, seen.weights, density, error, gradient)))
 
 
 def robust_error(error: Tensor, robust: float) -> Tensor:
@@ -88,12 +83,3 @@ def scaled(op: str, arguments: Any) -> Any:
     if scale is not None:
         raise ValueError(f"{op}: density_scale must not be given for activated values, got {scale}")
     return arguments._replace(density_scale=1.0)
-
-
-@torch.inference_mode(False)
-@torch.enable_grad()
-def render_loss_gradient(raw: Tensor, *others: Any) -> tuple[Tensor, ...]:
-    """Returns the result of `render_loss`, and the gradient of the loss with respect to ``raw``."""
-    raw = saveable(raw.detach()).requires_grad_()
-    result = render_loss(raw, *(saveable(value) for value in others))
-    return result.loss.detach(), *result[1:], torch.autograd.grad(result.loss, raw)[0]
