@@ -1,0 +1,51 @@
+"""Draws valid arguments of ``render_loss`` for the tests, and lists invalid arguments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from cases import Arguments, Case, Draw
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    r, dtype = draw.among("rays", 9, 0, 1, 2, 33), draw.dtype()
+    wide = torch.promote_types(dtype, torch.float32)
+    call: Arguments = {"raw": draw.normal(n, 4, dtype=dtype), "deltas": draw.uniform(n, dtype=wide)}
+    if n > 40 * r:  # short strata, so light reaches the end of a long ray
+        call["deltas"] = 0.01 * call["deltas"]
+    call |= {"ray_offsets": draw.offsets(n, r), "target": draw.uniform(r, 3, dtype=wide)}
+    if draw.among("activated", False, True):
+        call["activated"] = True
+        call["raw"][:, 3].relu_()
+    else:
+        call["density_scale"] = 3.0
+    triples = min(draw.number("triples", 0, 0, r // 3), r // 3)
+    of_all, of_rays = draw.uniform(3, dtype=wide), draw.uniform(r, 3, dtype=wide)
+    return {
+        **call,
+        "background": draw.among("background", of_rays, of_all, None),
+        "hidden": draw.among("hidden", 1e-3, 0.5),
+        "robust": draw.among("robust", 0.0, 0.05),
+        "triples": triples,
+    }
+
+
+def _make_plain(draw: Draw, n: int) -> Arguments:
+    pinned = {"activated": draw.among("activated", False, True), "triples": draw.number("triples", 0, 0, 3)}
+    return _make(Draw(n, dtype=torch.float32, **pinned), n)
+
+
+_BOTH: dict[str, Any] = {
+    "kinds": {"": {}, "activated": {"activated": True}, "unseen": {"triples": 2}},
+    "refused": {
+        "density_scale must be given unless the values are activated, got None": {"density_scale": None},
+        "density_scale must not be given for activated values, got 3.0": {"activated": True},
+        "density_scale must be positive, got 0.0": {"density_scale": 0.0},
+        "hidden must lie in [0, 1), got 1.0": {"hidden": 1.0},
+        "triples must be at most a third of the 9 rays, got 4": {"triples": 4},
+    },
+}
+CASE = Case(_make, differentiable=True, hostile="numbers", **_BOTH)
+CASES = {"render_loss": CASE, "render_loss_gradient": Case(_make_plain, traced=False, **_BOTH)}
