@@ -54,6 +54,7 @@ def near(one: Any, other: Any, allowed: float = 1e-5, absolute: float = 1e-6) ->
 def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     """Returns the names of the cases and their check functions, which raise on errors."""
     import torch
+    from cases import CASES, Draw
     from emulated_networks import (
         ALLOWED,
         BRANCHED,
@@ -73,17 +74,15 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     import voronerf
     from voronerf.nerf.fields import NeRF
     from voronerf.ops._core import backends
-    from voronerf.ops._core.cases import Draw
-    from voronerf.ops._core.cases import cases as every_case
     from voronerf.ops._core.layers import MLP, POSITIONS, Layer
     from voronerf.ops.cell_sort.native import sort as sort_cells
     from voronerf.ops.cell_sort.reference import cell_sort as specified
 
-    where, cases_of_ops = torch.device(device), every_case()
+    where = torch.device(device)
 
     def of_case(op: str, pins: dict[str, Any]) -> None:
         """Compares a call of the op's declared case with the reference, in float64 if the op has gradients."""
-        case, outcomes = cases_of_ops[op], []
+        case, outcomes = CASES[op], []
         made = case.make(Draw(1, **pins), 200)
         for backend in ("native", "reference"):
             wide = case.differentiable and backend == "reference"
@@ -206,10 +205,10 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         *(
             (f"{op} {kind}".strip(), functools.partial(of_case, op, pins))
             for op in backends.ops("native", "cuda")
-            if cases_of_ops[op].comparable
+            if CASES[op].comparable
             for kind, pins in (
-                *cases_of_ops[op].kinds.items(),
-                *((", ".join(f"{name}={value}" for name, value in p.items()), p) for p in cases_of_ops[op].on_devices),
+                *CASES[op].kinds.items(),
+                *((", ".join(f"{name}={value}" for name, value in p.items()), p) for p in CASES[op].on_devices),
             )
         ),
         *(

@@ -33,7 +33,8 @@ from typing import Any
 from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), *(str(ROOT / place) for place in ("benchmarks/gpu", "benchmarks", "tests/cuda_emulation"))]
+for place in ("tests/ops", "tests/cuda_emulation", "benchmarks", "benchmarks/gpu", ""):
+    sys.path.insert(0, str(ROOT / place))
 
 from gpu_cases import CHECKED, RACING, captured_steps, captured_trainings, small_cases  # noqa: E402
 from gpu_journal import Case, Journal, one_by_one, settling  # noqa: E402

@@ -4,9 +4,8 @@ import blocks
 import op_attacks
 import pytest
 import torch
+from cases import Draw
 from pages import at_page_end
-
-from voronerf.ops._core.cases import Draw
 
 COMPARED = [op for op, case in op_attacks.CASES.items() if case.comparable]
 

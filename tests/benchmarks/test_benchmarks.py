@@ -15,6 +15,7 @@ from helpers import read_json
 from ops import (
     alternatives,
     case,
+    cases_any,
     cases_foreign,
     cases_hash,
     cases_lookup,
@@ -28,7 +29,6 @@ from ops import (
 from ops.case import NotApplicable
 
 import voronerf
-from voronerf.ops._core import cases as of_ops
 from voronerf.ops._core import native
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -97,11 +97,11 @@ def test_instruction_set_is_forced_and_put_back():
 def test_every_operation_has_rows_in_both_modes():
     for arguments in ([], ["--quick"]):
         cases = throughput.chosen_cases(throughput.parse(arguments))
-        assert {case.op for case in cases} == {op for op, case in of_ops.cases().items() if case.comparable}
+        assert {case.op for case in cases} == {op for op, case in cases_any.CASES.items() if case.comparable}
         keys = [case.key for case in cases]
         assert len(set(keys)) == len(keys)
     both = {(case.op, case.direction) for case in throughput.chosen_cases(throughput.parse([]))}
-    differentiable = {op for op, case in of_ops.cases().items() if case.differentiable}
+    differentiable = {op for op, case in cases_any.CASES.items() if case.differentiable}
     assert {op for op, direction in both if direction == "forward+backward"} == differentiable
 
 

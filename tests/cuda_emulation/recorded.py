@@ -8,6 +8,8 @@ that makes it, (), its arguments).
 from __future__ import annotations
 
 import itertools
+import sys
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -20,8 +22,10 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 from voronerf import ops
 from voronerf.ops._core import backends
 from voronerf.ops._core import native as _native
-from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops.cell_sort.native import sort as sort_cells
+
+sys.path.append(str(Path(__file__).parents[1] / "ops"))  # for cases
+from cases import CASES, Draw
 
 # The precision of products, and KiB of shared memory. The ops' cases have 227 KiB, where each warp has its own rows.
 # With less memory, four warps share rows or, if even these do not fit, values are in the workspace (device memory).
@@ -76,7 +80,7 @@ def as_array(tensor: Tensor) -> np.ndarray:
 
 def call_case(op: str, pins: dict[str, Any], n: int) -> None:
     """Runs a call of an op's declared case, and its gradients."""
-    case = cases()[op]
+    case = CASES[op]
     given = tree_map_only(Tensor, Tensor.clone, case.make(Draw(1, **pins), n))
     leaves = [x for x in tree_leaves(given) if isinstance(x, Tensor) and x.is_floating_point()]
     for leaf in leaves if case.differentiable else ():
@@ -96,16 +100,16 @@ def recorded() -> list[tuple[int, str, list[Any]]]:
             recorder = Recorder(_native.compiled, loaded)
             with mock.patch.object(_native, "compiled", recorder):
                 run(*arguments)
-        records.append((shared * 1024, cases()[op].hostile, recorder.calls))
+        records.append((shared * 1024, CASES[op].hostile, recorder.calls))
 
     for op in backends.ops("native", "cuda"):
         # Sanitizers cost time for every thread, so kinds with a lookup by an index are left out. The cases
         # ``on_devices`` of nearest_centre have such lookups.
-        kinds = (pins for kind, pins in cases()[op].kinds.items() if kind != "by an index")
-        for pins in (*kinds, *cases()[op].on_devices):
-            record(op, call_case, op, pins, cases()[op].device_rows)
+        kinds = (pins for kind, pins in CASES[op].kinds.items() if kind != "by an index")
+        for pins in (*kinds, *CASES[op].on_devices):
+            record(op, call_case, op, pins, CASES[op].device_rows)
     for (precision, shared), kind in itertools.product(NETWORKS, ("", "hashed")):
-        pins = {**cases()["grouped_mlp"].kinds[kind], "dtype": getattr(torch, precision)}
+        pins = {**CASES["grouped_mlp"].kinds[kind], "dtype": getattr(torch, precision)}
         record("grouped_mlp", call_case, "grouped_mlp", pins, 64, shared=shared)
     # These are counting and radix sorts. Keys of 4 bytes would need 65,535 cells with a thread each: too many for a
     # sanitizer.

@@ -17,9 +17,9 @@ from voronerf import HashGrid
 from voronerf.ops import grouped_program
 from voronerf.ops._core.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
 from voronerf.ops.grouped_program import native as plans
-from voronerf.ops.grouped_program.case import GRID, encoded, every_step, smooth
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "ops"))
+from cases.grouped_program import GRID, encoded, every_step, smooth
 from test_grouped_program import NUMBERS, arguments, check, derivatives, offsets_of, random_program
 
 KIB = 1024

@@ -2,13 +2,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from cases import CASES, Draw
 from op_cases import refused
 
 from voronerf import ops
 from voronerf.ops._core import checks
-from voronerf.ops._core.cases import Draw, cases
-
-CASES = cases()
 
 
 def test_shape_binds_letters():

@@ -1,8 +1,8 @@
 """Rules for every op: it compiles to one graph for any size, takes any strides and sizes, refuses wrong arguments, and
 its custom ops pass opcheck.
 
-Each kind of arguments in an op's case (``voronerf/ops/<op>/case.py``) is a test. The test file of an op tests rules of
-this op alone, such as its formula.
+Each kind of arguments in an op's case (``cases/<op>.py``) is a test. The test file of an op tests rules of this op
+alone, such as its formula.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from unittest import mock
 
 import pytest
 import torch
+from cases import CASES, Draw
 from helpers import on_any_number_of_threads
 from op_cases import FLOATS, need, refused, strided
 from tolerances import assert_as_exact
@@ -24,10 +25,8 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 
 from voronerf import ops
 from voronerf.ops._core import backends, checks
-from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops._core.declare import declared
 
-CASES = cases()
 KINDS = [
     (op, kind)
     for op, case in CASES.items()

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from cases.grouped_program import GRID, encoded, every_step
 from helpers import refuses
 from programs import ByPrograms
 from programs import derivatives as of_every_order
@@ -23,7 +24,6 @@ from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.program import FUNCTIONS, PARAMETER, VALUE, Builder, Columns, Program, Step, gradient
 from voronerf.ops._core.tolerances import agree
 from voronerf.ops.grouped_program import native as plans
-from voronerf.ops.grouped_program.case import GRID, encoded, every_step
 from voronerf.ops.grouped_program.reference import cells_of
 
 NUMBERS = {"softplus": (3.0, 20.0), "sine": (1.7, 0.3), "clamp": (-0.5, 0.6), "power": (1.5, 0.0), "affine": (2.0, 1.0)}

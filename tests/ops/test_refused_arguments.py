@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from cases import CASES, Draw
 from helpers import refuses
 from torch.utils._pytree import tree_leaves, tree_map
 
 from voronerf import ops
 from voronerf.ops._core import backends
-from voronerf.ops._core.cases import Draw, cases
 
 POINTS = torch.rand(4, 3)
 
@@ -53,7 +53,7 @@ def test_inference_tensors(backend):
 @pytest.mark.parametrize("inside", [True, False])
 def test_ops_that_differentiate_inside_take_inference_tensors(op, inside):
     with torch.inference_mode():
-        call = cases()[op].make(Draw(3), 7)
+        call = CASES[op].make(Draw(3), 7)
         call = tree_map(lambda value: value.clone() if isinstance(value, torch.Tensor) else value, call)
     with torch.inference_mode(inside):
         results = [tree_leaves(getattr(ops, op)(**call, backend=backend)) for backend in ("reference", "native")]
@@ -63,7 +63,7 @@ def test_ops_that_differentiate_inside_take_inference_tensors(op, inside):
 
 @pytest.mark.op("hash_encode")
 def test_cells_without_a_table_are_refused_by_every_backend(backend):
-    call = {**cases()["hash_encode"].make(Draw(0), 7)}
+    call = {**CASES["hash_encode"].make(Draw(0), 7)}
     table, cells = torch.rand(2, *call["grid"].table_shape), torch.tensor([0, 1, 2, 0, 0, 0, 0], dtype=torch.int32)
     message = "hash_encode: cells must lie in 0 to 1, got values from 0 to 2"
     refuses(message, ops.hash_encode, call["positions"], table, call["grid"], cells=cells, backend=backend)
@@ -73,7 +73,7 @@ def test_cells_without_a_table_are_refused_by_every_backend(backend):
 @pytest.mark.parametrize("backend", ["reference", "native"])
 def test_runs_that_are_not_of_the_samples_are_refused(op, backend):
     """If the last run had no samples, the op would read the ray of a sample that does not exist."""
-    call = cases()[op].make(Draw(3), 9)
+    call = CASES[op].make(Draw(3), 9)
     offsets = call["samples"].run_offsets
     for change in (
         torch.cat([offsets, offsets[-1:]]),
@@ -114,7 +114,7 @@ def short_tuples(value):
 )
 def test_named_tuples_with_fewer_entries_than_fields(op, name):
     """``tuple.__new__`` makes such tuples; reading the missing entries in C++ would crash."""
-    calls = (cases()[op].make(Draw(seed, free=True), 5) for seed in range(99))
+    calls = (CASES[op].make(Draw(seed, free=True), 5) for seed in range(99))
     call = next(call for call in calls if call.get(name))
     rules = [*short_tuples(call[name])]
     assert len(rules) > 2

@@ -4,13 +4,13 @@ import itertools
 
 import pytest
 import torch
+from cases import Draw
+from cases.render_opaque import CASE
 from helpers import on_any_number_of_threads
 from op_cases import refused
 
 from voronerf import MLP, Layer
 from voronerf.ops import render_opaque
-from voronerf.ops._core.cases import Draw
-from voronerf.ops.render_opaque.case import CASE
 
 pytestmark = pytest.mark.op("render_opaque")
 MOVED = ("origins", "directions", "near", "far")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.ops._core.cases import Arguments, Case, Draw
+from cases import Arguments, Case, Draw
 
 # Diagram 0 has three centres. Diagrams 1 and 2 refine its last two; diagram 3 refines a centre of diagram 2.
 _OFFSETS = torch.tensor([0, 3, 5, 7, 10], dtype=torch.int32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.ops._core.cases import Arguments, Case, Draw
+from cases import Arguments, Case, Draw
 
 
 def _make(draw: Draw, n: int) -> Arguments:

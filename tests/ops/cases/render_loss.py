@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from voronerf.ops._core.cases import Arguments, Case, Draw
+from cases import Arguments, Case, Draw
 
 
 def _make(draw: Draw, n: int) -> Arguments:

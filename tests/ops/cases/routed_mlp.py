@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.ops._core.cases import Arguments, Case, Draw
-from voronerf.ops.grouped_mlp.case import GAUSSIANS, network
-from voronerf.ops.locate_cell.case import tree
+from cases import Arguments, Case, Draw
+from cases.grouped_mlp import GAUSSIANS, network
+from cases.locate_cell import tree
 from voronerf.ops.nearest_centre import index_centres
 
 

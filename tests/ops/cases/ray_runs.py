@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.ops._core.cases import Arguments, Case, Draw
+from cases import Arguments, Case, Draw
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_sums
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from voronerf.ops._core.cases import Arguments, Case, Draw
+from cases import Arguments, Case, Draw
 from voronerf.ops.composite.reference import composite
 
 

@@ -1,8 +1,8 @@
-"""The test case of an op: it makes valid arguments of the op, and lists arguments that the op must refuse.
+"""The test cases of the ops: a case makes valid arguments of an op, and lists arguments that the op must refuse.
 
-Each op has a case, ``voronerf/ops/<op>/case.py``. The case parametrises the tests of every op, the random calls of
-``make attack`` (tests/attack), the runs under sanitizers, on the emulated and on a real GPU, and the benchmark. n is
-the number of points, samples or rays of a call.
+``<op>.py`` of this folder defines ``CASE``, or a dict ``CASES`` for a folder of several ops. The cases parametrise the
+tests of every op, the random calls of ``make attack`` (tests/attack), the runs under sanitizers, on the emulated and on
+a real GPU, and the benchmark. n is the number of points, samples or rays of a call.
 """
 
 from __future__ import annotations
@@ -134,10 +134,8 @@ class Case:
     hostile: str = ""
 
 
-def cases() -> dict[str, Case]:
-    """Returns the case of every op, by name. The case module of a folder with several ops has a dict ``CASES``."""
-    cases_by_op = {}
-    for op in backends.ops():
-        module = importlib.import_module(f"voronerf.ops.{backends.folder(op)}.case")
-        cases_by_op[op] = getattr(module, "CASES", {}).get(op) or module.CASE
-    return cases_by_op
+CASES: dict[str, Case] = {}
+"""The case of every op, by name."""
+for _op in backends.ops():
+    _module = importlib.import_module(f"cases.{backends.folder(_op)}")
+    CASES[_op] = getattr(_module, "CASES", {}).get(_op) or _module.CASE
