@@ -11,8 +11,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# The layers from the bottom up: the library (ops to nerf), the application, training in territories (town). A "room" is
-# a member of a layer. A module may import from its own room and from rooms of lower layers.
+# The layers from the bottom up: the library (ops to nerf), the application, scenes made of several runs (editing). A
+# "room" is a member of a layer. A module may import from its own room and from rooms of lower layers.
 LAYERS = (
     {"ops._core"},
     {"ops", "kernels"},
@@ -26,7 +26,7 @@ LAYERS = (
     {"app.run", "app"},
     {"app.export", "app.web"},
     {"app.viewer"},
-    {"town"},
+    {"editing"},
     {"app.cli", "app.nerfstudio"},  # entry points: the commands, and nerfstudio's method
     {"__init__", "__main__"},
 )
@@ -91,7 +91,7 @@ def faults(source: str, module: str) -> list[str]:
             wrong.append(f"{module}:{line} imports {name}, which belongs to no layer")
         elif LEVEL[target] > LEVEL[importer]:
             wrong.append(f"{module}:{line} imports {name} from a layer above")
-        if target == "town" and importer not in ("town", "app.cli"):
+        if target == "editing" and importer not in ("editing", "app.cli"):
             wrong.append(f"{module}:{line} imports {name}, of which the table of commands alone knows")
         if name.endswith("._C") and not module.startswith("voronerf.ops._core.native"):
             wrong.append(f"{module}:{line} imports the compiled module, which only native may")
@@ -123,8 +123,8 @@ def test_backends_alone_choose() -> None:
         ("from ..train import loop", "voronerf.app.scenes.blender", "from a layer above"),
         ("from voronerf.ops._core import _C", "voronerf.ops.nearest_centre", "only native may"),
         ("from voronerf.ops.pixel_rays.reference import pixel_rays", "voronerf.nerf.rays", "that only ops read"),
-        ("def f():\n    from voronerf.ops.resample import reference", "voronerf.town.rays", "that only ops read"),
-        ("import voronerf.town.parts", "voronerf.app.nerfstudio.model", "the table of commands alone knows"),
+        ("def f():\n    from voronerf.ops.resample import reference", "voronerf.editing.parts", "that only ops read"),
+        ("import voronerf.editing.parts", "voronerf.app.nerfstudio.model", "the table of commands alone knows"),
         ("import numpy", "voronerf.nerf.loss", "nerf may import torch"),
         ("import voronerf", "voronerf.ops.nearest_centre", "from a layer above"),
         ("import torch", "voronerf.attic", "belongs to no layer"),

@@ -26,7 +26,7 @@ def state():
     return dict(os.environ), gc.isenabled(), gc.get_threshold(), gc.get_freeze_count(), handlers, threads
 torch.optim.Adam([torch.nn.Parameter(torch.ones(1))])  # torch's first one sets variables of its compiler
 before = state()
-import voronerf.nerf, voronerf.router, voronerf.app.cli, voronerf.app.train, voronerf.town
+import voronerf.nerf, voronerf.router, voronerf.app.cli, voronerf.app.train, voronerf.editing
 from voronerf import VoronoiRouter
 assert state() == before
 field = torch.nn.Sequential(torch.nn.Linear(3, 64), torch.nn.ReLU(), torch.nn.Linear(64, 4))

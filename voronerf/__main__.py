@@ -1,4 +1,4 @@
-"""``python -m voronerf``: the command line, for torchrun too."""
+"""``python -m voronerf``: the command line."""
 
 import sys
 

@@ -12,7 +12,6 @@ VN_BINDINGS(module) {
   module.cuda("adam", VN_CUDA(adam_cuda));
   module.cuda("adam_workspace", VN_CUDA(adam_workspace_cuda));
   module.cpu("average", VN_CPU(average_cpu));
-  module.cpu("add", VN_CPU(add_cpu));
 }
 
 }  // namespace voronerf

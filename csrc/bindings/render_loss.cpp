@@ -10,8 +10,6 @@ VN_STRUCT(RenderLossOutputs, loss, colour, weights, density, error, gradient);
 
 VN_BINDINGS(module) {
   module.cpu("render_loss", VN_CPU(render_loss_cpu));
-  module.cpu("run_sums", VN_CPU(run_sums_cpu));
-  module.cpu("run_gradients", VN_CPU(run_gradients_cpu));
   module.cuda("render_loss", VN_CUDA(render_loss_cuda));
 }
 

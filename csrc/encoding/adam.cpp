@@ -90,12 +90,4 @@ void average_cpu(float* const* averages, const float* const* parameters, const f
   });
 }
 
-void add_cpu(const float* const* gradients, float* const* totals, const std::vector<int64_t>& sizes, int threads) {
-  for_blocks(sizes, threads, [&](size_t i, int64_t begin, int64_t end) {
-    const float* __restrict__ gradient = gradients[i];
-    float* __restrict__ total = totals[i];
-    for (int64_t j = begin; j < end; ++j) total[j] += gradient[j];
-  });
-}
-
 }  // namespace voronerf

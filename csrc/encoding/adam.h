@@ -37,9 +37,6 @@ void adam_cpu(const std::vector<AdamRule>& rules, float* const* parameters, cons
 void average_cpu(float* const* averages, const float* const* parameters, const float* share,
                  const std::vector<int64_t>& sizes, int threads);
 
-// Adds gradients to totals.
-void add_cpu(const float* const* gradients, float* const* totals, const std::vector<int64_t>& sizes, int threads);
-
 // adam_cuda makes a step in two launches per 36 parameters. adam_workspace_cuda returns the size, in floats, of its
 // workspace for `count` parameters.
 int64_t adam_workspace_cuda(int64_t count);

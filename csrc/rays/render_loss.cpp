@@ -37,18 +37,4 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
   *out.loss = static_cast<float>(sum / (3.0 * static_cast<double>(in.r)));
 }
 
-void run_sums_cpu(const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
-                  float* sums, Isa isa, int threads) {
-  parallel_blocks(in.r, kRenderLossRays, threads, [&](int64_t begin, int64_t end) {
-    VN_FOR_ISA(isa, run_sums_block(in, depths, ray_index, density, sums, begin, end))
-  });
-}
-
-void run_gradients_cpu(const RenderLossInputs& in, const float* answers, float* gradient, float* weights,
-                       float* importance, Isa isa, int threads) {
-  parallel_blocks(in.r, kRenderLossRays, threads, [&](int64_t begin, int64_t end) {
-    VN_FOR_ISA(isa, run_gradients_block(in, answers, gradient, weights, importance, begin, end))
-  });
-}
-
 }  // namespace voronerf

@@ -39,14 +39,4 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
 // Does not reject offsets that decrease or exceed m, and accesses no memory out of range.
 void render_loss_cuda(const RenderLossInputs& in, const RenderLossOutputs& out, void* stream);
 
-// These functions compute render_loss in two halves, for runs (pieces of rays). Here offsets and r describe the runs;
-// target, background and triples are unused. run_sums_cpu computes partial sums [r,6]: colour as if nothing were in
-// front, optical depth, depth of the first sample, ray. The answers [r,6] come from whole rays: the gradient of the
-// loss with respect to the ray's colour, the loss due to light from behind the run, the optical depth in front, the
-// error of the ray. `importance` is the error times the weights.
-void run_sums_cpu(const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
-                  float* sums, Isa isa, int threads);
-void run_gradients_cpu(const RenderLossInputs& in, const float* answers, float* gradient, float* weights,
-                       float* importance, Isa isa, int threads);
-
 }  // namespace voronerf

@@ -16,8 +16,6 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-constexpr int64_t kRunSums = 6;  // size of a partial sum, and of an answer
-
 // The sums along the rays of a task.
 struct Sums {
   double front[kRenderLossRays], behind[kRenderLossRays], light[3][kRenderLossRays];
@@ -31,10 +29,10 @@ VN_INLINE F32 only(Bits lanes, F32 value) { return reinterpret_cast<F32>(lanes &
 VN_INLINE void forward(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to,
                        int64_t first, int64_t count, bool together, Chunk& chunk, Sums& sums) {
   activate(in, first, count, chunk);
-  if (out.density != nullptr) put(out.density + first, chunk.density, count);
+  put(out.density + first, chunk.density, count);
   pass(in, from, to, first, count, sums.front, chunk);
   weigh(count, chunk);
-  if (out.weights != nullptr) put(out.weights + first, chunk.weights, count);
+  put(out.weights + first, chunk.weights, count);
   for (int64_t i = 0; i < count; i += kLanes) {
     for (int k = 0; k < 3; ++k) store(chunk.shade[k] + i, load(chunk.weights + i) * load(chunk.rgb[k] + i));
   }
@@ -75,14 +73,6 @@ VN_INLINE void compare(const RenderLossInputs& in, const RenderLossOutputs& out,
     }
     out.error[ray] = has_target(in, ray) ? error : 0.0f;
     sums.behind[ray - from] = behind;
-  }
-}
-
-// Reads the answers that runs receive from their whole rays.
-VN_INLINE void hear(const float* answers, int64_t from, int64_t to, Sums& sums) {
-  for (int64_t run = from; run < to; ++run) {
-    for (int k = 0; k < 3; ++k) sums.slopes[k][run - from] = answers[kRunSums * run + k];
-    sums.behind[run - from] = static_cast<double>(answers[kRunSums * run + 3]);
   }
 }
 
@@ -151,23 +141,16 @@ VN_INLINE void reset(int64_t rays, Sums& sums) {
   }
 }
 
-// Renders the rays of one call of each_chunk. With `answers`, the rays are runs.
-VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& out, const float* answers, int64_t from,
-                           int64_t to, Chunk& chunk, Sums& sums) {
+// Renders the rays of one call of each_chunk.
+VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to,
+                           Chunk& chunk, Sums& sums) {
   const int64_t begin = in.offsets[from], end = in.offsets[to];
   const bool together = end - begin <= kChunk;
   reset(to - from, sums);
-  for (int64_t run = from; answers != nullptr && run < to; ++run) {
-    sums.front[run - from] = static_cast<double>(answers[kRunSums * run + 4]);
-  }
   for (int64_t first = begin; first < end; first += kChunk) {
     forward(in, out, from, to, first, end - first < kChunk ? end - first : kChunk, together, chunk, sums);
   }
-  if (answers != nullptr) {
-    hear(answers, from, to, sums);
-  } else {
-    compare(in, out, from, to, sums);
-  }
+  compare(in, out, from, to, sums);
   if (!has_target(in, from)) {
     for (int64_t i = 4 * begin; i < 4 * end; ++i) out.gradient[i] = 0.0f;
     return;
@@ -184,41 +167,7 @@ VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& 
 void render_loss_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {
   Chunk chunk;
   Sums sums;
-  each_chunk(in, begin, end, [&](int64_t from, int64_t to) { render_rays(in, out, nullptr, from, to, chunk, sums); });
-}
-
-void run_sums_block(const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
-                    float* sums, int64_t begin, int64_t end) {
-  Chunk chunk;
-  Sums summed;
-  const RenderLossOutputs out{nullptr, nullptr, nullptr, density, nullptr, nullptr};
-  each_chunk(in, begin, end, [&](int64_t from, int64_t to) {
-    reset(to - from, summed);
-    for (int64_t first = in.offsets[from]; first < in.offsets[to]; first += kChunk) {
-      const int64_t left = in.offsets[to] - first;
-      forward(in, out, from, to, first, left < kChunk ? left : kChunk, true, chunk, summed);
-    }
-    for (int64_t run = from; run < to; ++run) {
-      float* const sum = sums + kRunSums * run;
-      for (int k = 0; k < 3; ++k) sum[k] = static_cast<float>(summed.light[k][run - from]);
-      sum[3] = static_cast<float>(summed.front[run - from]);
-      sum[4] = depths[in.offsets[run]];
-      sum[5] = static_cast<float>(ray_index[in.offsets[run]]);
-    }
-  });
-}
-
-void run_gradients_block(const RenderLossInputs& in, const float* answers, float* gradient, float* weights,
-                         float* importance, int64_t begin, int64_t end) {
-  Chunk chunk;
-  Sums sums;
-  const RenderLossOutputs out{nullptr, nullptr, weights, nullptr, nullptr, gradient};
-  each_chunk(in, begin, end, [&](int64_t from, int64_t to) { render_rays(in, out, answers, from, to, chunk, sums); });
-  for (int64_t run = begin; run < end; ++run) {
-    for (int64_t i = in.offsets[run]; i < in.offsets[run + 1]; ++i) {
-      importance[i] = weights[i] * answers[kRunSums * run + 5];
-    }
-  }
+  each_chunk(in, begin, end, [&](int64_t from, int64_t to) { render_rays(in, out, from, to, chunk, sums); });
 }
 
 void render_loss_strays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {

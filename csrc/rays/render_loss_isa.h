@@ -10,10 +10,6 @@ constexpr int64_t kRenderLossRays = 64;  // the maximum number of rays in a call
 // Either all rays [begin, end) have a target, or none of them has.
 VN_DECLARE_FOR_ISA(void render_loss_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin,
                                          int64_t end))
-VN_DECLARE_FOR_ISA(void run_sums_block(const RenderLossInputs& in, const float* depths, const int32_t* ray_index,
-                                       float* density, float* sums, int64_t begin, int64_t end))
-VN_DECLARE_FOR_ISA(void run_gradients_block(const RenderLossInputs& in, const float* answers, float* gradient,
-                                            float* weights, float* importance, int64_t begin, int64_t end))
 // Handles samples without a ray: computes their density, and zeros their weights and gradient.
 VN_DECLARE_FOR_ISA(void render_loss_strays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin,
                                            int64_t end))

@@ -17,7 +17,6 @@ import interrupts
 import mutate
 import op_attacks
 import process_attacks
-import rank_attacks
 import router_sequences
 import run_attacks
 import step_sequences
@@ -37,7 +36,6 @@ PARTS = {
         (Part("interrupts", interrupts.interrupted_step, 60, 20, peak=2 * MEMORY), 1000, 12),
         (Part("routers", router_sequences.random_sequence, 60, 10), 500, 6),
         (Part("kills", training_attacks.killed_training, 300, 1, prepare=input_files.prepare_scenes), 20, 1),
-        (Part("ranks", rank_attacks.harmed_ranks, 600), 16, 0),
         (Part("bits", run_attacks.flipped_bit, 60, 20, prepare=input_files.prepare_runs), 500, 15),
         (Part("scenes", process_attacks.stranger_files, 60, 1, prepare=input_files.prepare_photographs), 300, 6),
         (Part("runs", run_attacks.stranger_run, 60, 1, prepare=input_files.prepare_runs), 150, 4),
@@ -77,8 +75,6 @@ def main() -> int:
         for name in options.parts or PARTS:
             part, long, short = PARTS[name]
             count = options.count or (short if options.short else long)
-            if not count:  # too slow for the short run
-                continue
             folder = Path(scratch) / getattr(part.prepare, "__name__", "nothing")  # parts may share the folder
             if not folder.exists():
                 prepare(part, folder)

@@ -29,9 +29,7 @@ class Fault:
 
 def _kernel(op: str, what: str, file: str, line: str, wrong: str) -> Fault:
     """Returns a fault in an op's kernel, which the op's tests or the tests of all ops should detect."""
-    own = ("tests/town/test_sums.py",) if op in ("own_samples", "compose_runs") else (f"tests/ops/test_{op}.py",)
-    words = f"{op} or test_sums" if "town" in own[0] else op
-    tests = ("tests/attack/test_blocks.py", *own, "tests/ops/test_every_op.py", "-k", words)
+    tests = ("tests/attack/test_blocks.py", f"tests/ops/test_{op}.py", "tests/ops/test_every_op.py", "-k", op)
     return Fault(f"{op}: {what}", f"csrc/{file}", line, wrong, tests)
 
 
@@ -253,20 +251,6 @@ FAULTS = (
         "rays/render_loss_isa.cpp",
         "const Bits seen = ~(light <= splat(hidden));",
         "const Bits seen = light > splat(hidden);",
-    ),
-    _kernel(
-        "own_samples",
-        "runs of curved rays go on across cells",
-        "rays/ray_runs.cpp",
-        "(in.curved || cell != out.cells[count - 1])",
-        "cell != out.cells[count - 1]",
-    ),
-    _kernel(
-        "compose_runs",
-        "runs of a ray that begin alike change places",
-        "rays/ray_runs.cpp",
-        "return start(a) < start(b);",
-        "return start(a) < start(b) || (start(a) == start(b) && a > b);",
     ),
     _kernel(
         "resample",
@@ -833,10 +817,10 @@ FAULTS = (
     ),
     _python(
         "Runs are aligned by a mirror image",
-        "town/editing.py",
+        "editing/edits.py",
         "torch.sign(torch.linalg.det(u) * torch.linalg.det(v))",
         "1.0",
-        "tests/town/test_editing.py",
+        "tests/editing/test_edits.py",
     ),
     _python(
         "A resumed training forgets how many steps were left out",
@@ -889,11 +873,11 @@ FAULTS = (
     ),
     _python(
         "A placed part keeps the densities of its own scale",
-        "town/parts.py",
+        "editing/parts.py",
         "density if self.frame.is_identity else density / self.frame.scale",
         "density",
-        "tests/town/test_parts.py",
-        "tests/town/test_editing.py",
+        "tests/editing/test_parts.py",
+        "tests/editing/test_edits.py",
     ),
     _python(
         "Steps of a parameter in parts are counted for each of them",

@@ -16,8 +16,12 @@ import torch
 import voronerf
 
 PAGES = Path(__file__).resolve().parents[2] / "docs" / "reference"
-PACKAGES = ("voronerf", *(f"voronerf.{name}" for name in ("ops", "diagram", "router", "nerf", "nerf.fields", "town")))
-PACKAGES += ("voronerf.app", *(f"voronerf.app.{name}" for name in ("scenes", "train", "evaluate", "render", "export")))
+PACKAGES = ("voronerf", *(f"voronerf.{name}" for name in ("ops", "diagram", "router", "nerf", "nerf.fields")))
+PACKAGES += (
+    "voronerf.editing",
+    "voronerf.app",
+    *(f"voronerf.app.{name}" for name in ("scenes", "train", "evaluate", "render", "export")),
+)
 
 
 def resolve(path: str) -> Any:

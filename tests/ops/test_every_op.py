@@ -320,7 +320,7 @@ def test_refuses(op, message):
     case = CASES[op]
     name, arguments = case.call or op, case.make(Draw(), 6)
     getattr(ops, name)(**arguments)
-    kinds = "an integer|an MLP|OwnSamples|True|a (number|tensor|list|function|HashGrid)"
+    kinds = "an integer|an MLP|True|a (number|tensor|list|function|HashGrid)"
     of_types = re.search(f"dtype|must be ({kinds})", message)
     with refused(TypeError if of_types else ValueError, f"{name}: {message}"):
         getattr(ops, name)(**{**arguments, **case.refused[message]})

@@ -81,7 +81,6 @@ class RayBatches:
         unseen: The largest offset of an unseen ray's origin from a camera, along each axis; 0 for no unseen rays.
             Unseen rays have no target colour; they serve loss terms such as `SmoothDepth`. The last rays of a batch of
             n rays are n * `UNSEEN` triples of neighbouring unseen rays. Must be 0 with a box.
-        views: int64, the indices of the pictures to draw from; None for all.
         cones: Whether the rays have radii.
         fetch: Function that is called with the pixels, int64 [r], of a batch before they are read; for images on disk.
         device: The device of the batches; None for the device of the images.
@@ -110,7 +109,6 @@ class RayBatches:
         masks: Tensor | None = None,
         sparse: tuple[Tensor, Tensor] | None = None,
         unseen: float = 0.0,
-        views: Tensor | None = None,
         cones: bool = False,
         fetch: Callable[[Tensor], None] | None = None,
         device: torch.device | str | None = None,
@@ -126,22 +124,19 @@ class RayBatches:
             message = "RayBatches: unseen must be 0 with a box, since unseen rays may miss it"
             raise ValueError(f"{message}, got {unseen}")
         self.unseen = unseen
-        self.useful = self._useful_pixels(masks, views)
+        self.useful = self._useful_pixels(masks)
         self.sparse = None
         if sparse is not None:
             pixels, distances = (tensor.to(self.place) for tensor in sparse)
-            if views is not None:
-                in_views = torch.isin(pixels // (cameras.width * cameras.height), views.to(self.place))
-                pixels, distances = pixels[in_views], distances[in_views]
             self.sparse = (pixels, distances) if len(pixels) else None
 
-    def _useful_pixels(self, masks: Tensor | None, views: Tensor | None) -> PixelRuns | None:
+    def _useful_pixels(self, masks: Tensor | None) -> PixelRuns | None:
         """Returns the pixels to draw from; None for all pixels."""
         cameras = self.cameras
-        if self.box is None and masks is None and cameras.sizes is None and views is None:
+        if self.box is None and masks is None and cameras.sizes is None:
             return None
         runs = []
-        for image in range(len(cameras)) if views is None else views.tolist():
+        for image in range(len(cameras)):
             width, height = cameras.size(image)
             chosen = torch.ones(height, width, dtype=torch.bool, device=self.place)
             if masks is not None:

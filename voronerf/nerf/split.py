@@ -115,12 +115,11 @@ replayed(SampleReservoir)
 class Strategy:
     """The base class of rules for splitting cells in a training; this class itself never splits a cell.
 
-    Before each step the training loop checks :meth:`is_due`. If it can postpone splits, it also checks
-    :meth:`has_samples`.
-    If a split is due, the loop calls :meth:`step_pre_backward`, the only hook that may change networks and optimiser.
-    After the optimiser, each step calls :meth:`step_post_backward`, which may change only the strategy itself. The
-    tensors that the hook receives belong to the step, and must be read before the hook returns. A replayed step calls
-    the hooks that a subclass overrides, and replays the other hooks.
+    Before each step the training loop checks :meth:`is_due`. If a split is due, the loop calls
+    :meth:`step_pre_backward`, the only hook that may change networks and optimiser. After the optimiser, each step
+    calls :meth:`step_post_backward`, which may change only the strategy itself. The tensors that the hook receives
+    belong to the step, and must be read before the hook returns. A replayed step calls the hooks that a subclass
+    overrides, and replays the other hooks.
 
     Attributes:
         inherit: Whether new cells start as copies of their parent.
@@ -144,10 +143,6 @@ class Strategy:
     def is_due(self, fraction: float, step: int) -> bool:
         """Returns whether the next split is due; the arguments are as in :meth:`step_pre_backward`."""
         return False
-
-    def has_samples(self) -> bool:
-        """Returns whether enough samples were kept for the next split."""
-        return True
 
     def step_pre_backward(
         self, optimizer: torch.optim.Optimizer | None, fraction: float, step: int
@@ -259,10 +254,6 @@ class SplitStrategy(Strategy):
     def remaining(self) -> int:
         """The number of splits of the plan that are still to be made."""
         return len(self.plan) - self.splits
-
-    def has_samples(self) -> bool:
-        """Returns whether the first split has at least one kept sample per child; always True for later splits."""
-        return self.splits > 0 or len(self.reservoir) >= (self.planned.children if self.planned else 0)
 
     def is_due(self, fraction: float, step: int) -> bool:
         """Returns whether the next split is due; the arguments are as in :meth:`step_pre_backward`."""

@@ -155,7 +155,7 @@ class TrainingStep:
         self._start_anew()
 
     def _start_anew(self) -> None:
-        self._segments, self._unchanged, self._is_running = dict[str, Segment](), False, False
+        self._segments, self._is_running = dict[str, Segment](), False
         self._rays = self._backoff = self._eager_steps = 0  # for captures, as in `Segment`
         self._forget()
 
@@ -259,67 +259,6 @@ class TrainingStep:
                 self._run_or_replay_hook("after", functools.partial(self.optimizer.after_step, at))
         return output
 
-    # Segments of a step that an outer loop runs, with host code in between --------------------------------------------
-
-    def begin(self, at: int) -> None:
-        """Begins a step whose segments are run by an outer loop, with host code in between.
-
-        Calls the sampler's ``step_pre_backward``. The loop then calls :meth:`run_segment` for each segment, and then
-        :meth:`end`.
-
-        Args:
-            at: The number of steps done before.
-        """
-        evaluates, pre_backward = self.loss.renderer.sampler.evaluates_at(at), self._pre_backward(at)
-        if not evaluates:
-            pre_backward()  # may change the sampler
-        self._unchanged = self._is_unchanged()
-        if not self._unchanged:
-            self._forget()
-            self._obstacle = self._standing_obstacle() or ("it runs on a GPU" if self._on_gpu() else "")
-            if not self._obstacle:
-                self._note_dependencies()
-        if evaluates:
-            self.run_segment("before", pre_backward)
-        self.optimizer.zero_grad(set_to_none=True)
-
-    def draw(self, rays: int) -> Batch:
-        """Draws a batch of ``rays`` rays."""
-        draw = functools.partial(self.batches.draw, generator=self.generator)
-        result = self.run_segment("rays", draw, rays) if not self._draws_in_python() else SegmentResult(draw(rays))
-        return cast(Batch, result.now(result.value))
-
-    def run_segment(self, name: str, function: Callable[..., Any], *arguments: Any) -> SegmentResult:
-        """Runs or replays a segment of a step, see :class:`Segment`.
-
-        Args:
-            name: The name of the segment, the same in each step.
-            function: The function, which does the same in each step apart from its arguments.
-            arguments: The arguments of the segment.
-        """
-        if self._obstacle:
-            return SegmentResult(
-                function(*(each.now(each.value) if isinstance(each, SegmentResult) else each for each in arguments))
-            )
-        run = functools.partial(noting_reads, self._reads, function)
-        return self._segments.setdefault(name, Segment())(run, *arguments)
-
-    def end(self, at: int, output: RenderOutput, *gradients: SegmentResult) -> None:
-        """Ends a step of segments: updates optimiser, sampler and split strategy.
-
-        Args:
-            at: The number of steps done, including this step.
-            output: The result of the step, with the loss.
-            gradients: The segments that have computed gradients of parameters; if none, the optimiser is not called.
-        """
-        if gradients:
-            self.run_segment(f"update of {len(gradients)}", self._update, output.loss, *gradients)
-        for stage in self._post_backward_stages():
-            stage.function(output)
-        self.optimizer.steps_done = at
-        if at % schedule.GROUP == 0:
-            self.run_segment("after", functools.partial(self.optimizer.after_step, at))
-
     # Stages of a step -------------------------------------------------------------------------------------------------
 
     def _stages(self, field: Radiance) -> list[Stage]:
@@ -345,7 +284,7 @@ class TrainingStep:
     def _draws_in_python(self) -> bool:
         return in_python(self.batches, "draw") or getattr(self.batches, "fetch", None) is not None
 
-    def _update(self, loss: Tensor, *gradients: Any) -> None:
+    def _update(self, loss: Tensor) -> None:
         self.optimizer.update(self.guard, None if self.guard is None else loss)
 
     def _update_and_hold(self, output: RenderOutput) -> dict[str, Any]:
@@ -464,7 +403,7 @@ class TrainingStep:
     def _run_or_replay_hook(self, name: str, function: Callable[[], None]) -> None:
         """Calls a hook before or after a step, or replays the compiled calls that were recorded in the hook."""
         if self._last.recording is not None and self._is_unchanged():
-            self.run_segment(name, function)
+            self._segments.setdefault(name, Segment())(functools.partial(noting_reads, self._reads, function))
         else:
             function()
 

@@ -7,7 +7,6 @@ distances in world units along unit directions, densities per unit length.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -55,22 +54,6 @@ class Samples(NamedTuple):
     def positions(self) -> Tensor:
         """The points, or the means of the Gaussians, [m, 3]."""
         return self.inputs if self.inputs.shape[1] == 3 else self.inputs[:, :3]
-
-    def counted(self) -> Samples:
-        """Returns only the samples that belong to rays; the host waits for the number of these samples."""
-        if self.rows is None:
-            return self
-        count = int(self.rows)
-        return self._selected(lambda values: values[:count], self.ray_offsets)
-
-    def part(self, rows: Tensor) -> Samples:
-        """Returns the samples that the mask `rows`, bool [m], selects; rays without samples stay in the batch."""
-        counts = torch.nn.functional.pad(rows.cumsum(0, dtype=torch.int32), (1, 0))
-        chosen = rows.nonzero()[:, 0]
-        return self._selected(lambda values: values.index_select(0, chosen), counts.index_select(0, self.ray_offsets))
-
-    def _selected(self, take: Callable[[Tensor], Tensor], offsets: Tensor) -> Samples:
-        return Samples(take(self.inputs), take(self.ray_index), offsets, take(self.depths), take(self.deltas))
 
     def by_ray(self, values: Tensor) -> Tensor:
         """Reshapes values [m, ...] to [r, s, ...] if all rays have s samples; else returns them unchanged."""

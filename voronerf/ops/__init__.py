@@ -35,8 +35,6 @@ from voronerf.ops.nearest_centre import index_centres, nearest_centre
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 from voronerf.ops.ray_losses import smooth_depth_loss, sparse_depth_loss, surface_loss
-from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
-from voronerf.ops.ray_runs.reference import OwnSamples
 from voronerf.ops.render_loss import RenderLoss, render_loss
 from voronerf.ops.render_opaque import RenderedRays, render_opaque
 from voronerf.ops.rendered_gradient import rendered_gradient
@@ -54,7 +52,6 @@ __all__ = [
     "KnownPixels",
     "Layer",
     "March",
-    "OwnSamples",
     "PixelRays",
     "PixelRuns",
     "RenderLoss",
@@ -65,7 +62,6 @@ __all__ = [
     "average",
     "balance_centres",
     "cell_sort",
-    "compose_runs",
     "composite",
     "draw_pixels",
     "draw_points",
@@ -82,7 +78,6 @@ __all__ = [
     "march_rays",
     "nearest_centre",
     "observe_occupancy",
-    "own_samples",
     "pixel_rays",
     "render_loss",
     "render_opaque",
@@ -90,8 +85,6 @@ __all__ = [
     "resample",
     "routed_mlp",
     "routed_program",
-    "run_gradients",
-    "run_sums",
     "smooth_depth_loss",
     "sparse_depth_loss",
     "spherical_harmonics",

@@ -1,6 +1,6 @@
 """Formulas in plain PyTorch that the reference implementations share with the rest of the library.
 
-r rays, m samples of all rays (packed), q runs of samples, c colours, n points, s strata of a ray.
+r rays, m samples of all rays (packed), n points, s strata of a ray.
 """
 
 from __future__ import annotations
@@ -181,60 +181,3 @@ def _heaviest(wave: Wave, most: int) -> tuple[Tensor, Tensor]:
     table[:, wave.ray_index.long() * most + row] = torch.stack((weights, wave.depths))
     weight, column = table[0].reshape(-1, most).max(dim=1)
     return weight, table[1].reshape(-1, most).gather(1, column[:, None])[:, 0]
-
-
-class Composed(NamedTuple):
-    """Rays composited from runs of samples. A run is a sequence of consecutive samples of a ray."""
-
-    colour: Tensor  # [r, c], without a background
-    through: Tensor  # [r], the transmittance of each ray's runs together
-    optical_in_front: Tensor  # [q], the optical depth in front of each run
-    place: Tensor  # int64 [q], the index of each run in a flat table with one row for each ray
-    width: int  # the number of columns of the table
-
-    @property
-    def front(self) -> Tensor:
-        """Returns the transmittance in front of each run, [q]."""
-        return torch.exp(-self.optical_in_front)
-
-    def loss_behind(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
-        """Returns the part of the loss that is due to light from behind each run, [q], to first order.
-
-        Args:
-            colour: [q, c], the colours of the runs.
-            ray: int64 [q], the rays of the runs.
-            slopes: [r, c], the gradient of the loss with respect to each ray's colour, background included.
-            background: [r, c], the colours behind the rays.
-        """
-        table = slopes.new_zeros(len(slopes), self.width)
-        table.view(-1)[self.place] = self.front * (slopes[ray] * colour).sum(1)
-        table = torch.cat((table[:, 1:], (self.through * (slopes * background).sum(1))[:, None]), 1)
-        return table.flip(1).cumsum(1).flip(1).view(-1)[self.place]
-
-
-def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed:
-    """Composites rays from their runs, with torch operations that autograd differentiates.
-
-    Args:
-        colour: [q, c], the unoccluded colours of the runs.
-        optical: [q], the optical depths of the runs.
-        ray: int64 [q], the ray of each run, ascending; the runs of a ray are in order from near to far.
-        rays: The number of rays, r.
-    """
-    counts = torch.bincount(ray, minlength=rays)
-    slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
-    width = int(counts.max()) if len(ray) else 1
-    place = ray * width + slot
-    table = optical.new_zeros(rays, width)
-    table.view(-1)[place] = optical
-    # Shifting the terms makes the cumulative sum exclusive. Subtracting each run's own term from an inclusive sum would
-    # give inf - inf for an opaque run.
-    before = F.pad(table[:, :-1], (1, 0)).cumsum(1).view(-1)[place]
-    total = colour.new_zeros(rays, colour.shape[1]).index_add(0, ray, torch.exp(-before)[:, None] * colour)
-    return Composed(total, torch.exp(-table.sum(1)), before, place, width)
-
-
-def along_rays(ray: Tensor, start: Tensor) -> Tensor:
-    """Returns int64 [q], the order that sorts runs by ray, then by start (>= 0)."""
-    bits = start.float().view(torch.int32)  # floats >= 0 sort like their bits
-    return ((ray << 32) + bits).argsort(stable=True)

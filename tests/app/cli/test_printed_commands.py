@@ -19,7 +19,7 @@ from scene_files import write_blender
 
 from voronerf.app.cli import main
 from voronerf.app.cli.parsing import parse
-from voronerf.app.cli.program import COMMANDS, TRAININGS
+from voronerf.app.cli.program import COMMANDS
 from voronerf.app.render.paths import CameraPath, write_camera_path
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import ConfigError
@@ -29,14 +29,13 @@ ROOT = Path(__file__).resolve().parents[3]
 #: All pages except the changelog, which names removed commands.
 PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "SECURITY")), *(ROOT / "docs").rglob("*.md")]
 #: The first words of commands in pages.
-PROGRAMS = ("voronerf", "torchrun", "python", "make", "pip", "ns-train", "tensorboard")
+PROGRAMS = ("voronerf", "python", "make", "pip", "ns-train", "tensorboard")
 #: Programs of other projects.
 FOREIGN = ("tensorboard", "ns-train")
 #: Option values that make a command quick.
 SHORT = {"--budget": "0.1", "--frames": "2", "--resolution": "8", "--count": "20"}
 ADDED = {
     "train": ("--budget",),
-    "train-territories": ("--budget",),
     "render": ("--frames",),
     "export": ("--resolution", "--count"),
 }
@@ -45,9 +44,8 @@ STAND_INS = {
     "DIR": "scene",
     "DATA": "scene",
     "OUT": "scene",
-    "builtin-city:8x8": "scene",
     "RUN": "run",
-    "TOWN": "made",
+    "JOINED": "made",
     "FILE": "path.json",
     "FILE.json": "path.json",
 }
@@ -102,9 +100,7 @@ EVERY = sorted({command for found in (*COLLECTED.values(), MESSAGES) for command
 def arguments_of(command):
     """Returns the arguments of a `voronerf` command as a list of words, or None for another program."""
     parts = shlex.split(command.replace("...", ""), comments=True)
-    if parts[0] == "torchrun":
-        parts = parts[parts.index("voronerf") :] if "voronerf" in parts else None
-    return parts[1:] if parts and parts[0] == "voronerf" else None
+    return parts[1:] if parts[0] == "voronerf" else None
 
 
 def test_there_are_commands_to_look_at():
@@ -121,7 +117,7 @@ def test_a_printed_command_is_one(command, capsys):
         if "--help" in others:
             others = []
         numbers = [re.sub("^(FLOAT|SECONDS|N|X)$", "1", word) for word in others]
-        wants_run = name in COMMANDS and name not in ("train", "train-territories", "demo", "info")
+        wants_run = name in COMMANDS and name not in ("train", "demo", "info")
         if name in COMMANDS and (numbers or not wants_run):  # a bare name only mentions the command
             try:
                 parse(name, COMMANDS[name], numbers)
@@ -139,7 +135,7 @@ def test_a_printed_command_is_one(command, capsys):
         table = (ROOT / "pyproject.toml").read_text().partition("optional-dependencies]")[2]
         assert extras <= set(re.findall(r"^(\w+) = \[", table, re.MULTILINE))
     else:
-        assert program in FOREIGN or program == "torchrun"
+        assert program in FOREIGN
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +158,7 @@ def shortened(name, parts):
         return parts
     for option in ADDED.get(name, ()):
         parts += [] if option in parts else [option, SHORT[option]]
-    if name in TRAININGS and "--data" not in parts and "--resume" not in parts:
+    if name == "train" and "--data" not in parts and "--resume" not in parts:
         parts += ["--data", "scene"]
     return parts
 

@@ -123,7 +123,6 @@ def test_wrong_words_are_one_line(fails, command, said):
         ("train R --steps 5", "train --data R --steps 5"),
         ("train --steps 5 'my photos'", "train --steps 5 --data 'my photos'"),
         ("train --data=R S", "train --data=R --out S"),
-        ("train-territories R --territories 2", "train-territories --data R --territories 2"),
         ("train R --eval_views 3", "train --data R --eval_views 3"),
         ("demo y", "demo --out y"),
         ("eval R S --lpips x", "eval R --data S --lpips x"),

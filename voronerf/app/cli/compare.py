@@ -15,7 +15,7 @@ from voronerf.app.train.callbacks import views_of
 from voronerf.app.train.checkpoint import last_checkpoint, no_run
 from voronerf.app.train.config import ConfigError
 from voronerf.app.train.run_directory import check_folders, read_metrics
-from voronerf.town.run import is_town, open_parts
+from voronerf.editing.run import has_parts, open_parts
 
 #: Rows of the table: the name in summary.json, the heading, and the decimals.
 FIGURES = (
@@ -77,7 +77,7 @@ def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     figures = read_json(run / "summary.json", dict) if ended else metrics[-1] if metrics else {}
     settings = read_json(run / "config.json", dict)
     scores = read_json(run / "eval.json", dict) if (run / "eval.json").is_file() else {}
-    if not figures and is_town(run):
+    if not figures and has_parts(run):
         figures = count_parts(run)
     if "psnr" not in figures and isinstance(views := scores.get("views"), list):
         figures |= {**scores, "views": len(views)}
@@ -87,7 +87,7 @@ def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def count_parts(run: Path) -> dict[str, Any]:
     """Returns the numbers of cells and parameters of a run of several parts."""
     parts = open_parts(run, last_checkpoint(run))
-    networks = {id(network): network.checkpoint for part in parts for network in part.networks}
+    networks = {id(part.network): part.network.checkpoint for part in parts}
     sizes = (value.numel() for network in networks.values() for value in network.group("router.module").values())
     return {"cells": parts.num_cells, "parameters": sum(sizes)}
 

@@ -23,9 +23,9 @@ from voronerf.app.train.callbacks import counted
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.run_directory import choose_directory
 from voronerf.app.web import export_web
+from voronerf.editing import open_run as open_parts
+from voronerf.editing import place
 from voronerf.nerf.cameras import Cameras, orbit_cameras
-from voronerf.town import editing
-from voronerf.town import open_run as open_town
 
 #: Pixels along a side of the images, the pictures and the video.
 SIZE = 400
@@ -65,9 +65,9 @@ def show(run: Path, scene: Scene, scores: dict[str, Any], budget: float) -> None
     score = f"{scores['psnr']:.1f} dB after {budget:g} s"
     save_picture(run / "turn.png", next(frames(opened, around, [FRAMES // 8], score)))
     write_video(run / "turn.mp4", frames(opened, around, tracked(range(FRAMES), "the video"), score), FPS)
-    editing.place(run, run, TOP, run / "placed", scale=SCALE)
+    place(run, run, TOP, run / "placed", scale=SCALE)
     above = turn(FRAMES, height=0.3, distance=1.25)
-    image = open_town(run / "placed", scene=scene).render(above, FRAMES // 8, heaviest=False)
+    image = open_parts(run / "placed", scene=scene).render(above, FRAMES // 8, heaviest=False)
     save_picture(run / "placed.png", picture_of_colour(image.colour))
     path = sys.argv[0] if Path(sys.argv[0]).name == "voronerf" else "python -m voronerf"  # or .venv/bin/voronerf
     program = "voronerf" if shutil.which("voronerf") else path

@@ -15,8 +15,8 @@ from voronerf.app.run import Run, open_run, read_crop
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.config import ConfigError, check_backend_name
-from voronerf.town.run import is_town
-from voronerf.town.run import open_run as open_parts
+from voronerf.editing.run import has_parts
+from voronerf.editing.run import open_run as open_parts
 
 #: Six numbers of a box, or the box that the viewer has saved.
 Crop = tuple[float, float, float, float, float, float] | Literal["saved"] | None
@@ -53,7 +53,7 @@ class Opening:
         """Opens a run of any kind."""
         check_counts(downscale=self.downscale)
         check_backend_name(self.backend)
-        opener: Callable[..., Run] = open_parts if is_town(run) else open_run
+        opener: Callable[..., Run] = open_parts if has_parts(run) else open_run
         accepted = inspect.signature(opener).parameters
         with busy(f"opening {run}"):
             return opener(run, scene=scene, **{name: value for name, value in vars(self).items() if name in accepted})

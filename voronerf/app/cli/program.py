@@ -24,6 +24,7 @@ from voronerf import __version__
 from voronerf.app.cli.compare import compare
 from voronerf.app.cli.demo import demo
 from voronerf.app.cli.display import console, one_line, say
+from voronerf.app.cli.editing import cut, join, place
 from voronerf.app.cli.eval import evaluate_run
 from voronerf.app.cli.export import export
 from voronerf.app.cli.info import info
@@ -31,7 +32,6 @@ from voronerf.app.cli.parsing import parse
 from voronerf.app.cli.process import process
 from voronerf.app.cli.render import render
 from voronerf.app.cli.suggest import argument_names
-from voronerf.app.cli.town import cut, join, place, train_territories
 from voronerf.app.cli.train import WHAT_TO_TRY, train, with_stored_settings
 from voronerf.app.cli.view import view
 from voronerf.app.train.config import ConfigError
@@ -55,7 +55,6 @@ NO_MEMORY = (
 #: The function that ``voronerf NAME`` runs; its arguments are the options, its docstring is the help.
 COMMANDS: dict[str, Callable[..., int]] = {
     "train": train,
-    "train-territories": train_territories,
     "eval": evaluate_run,
     "render": render,
     "export": export,
@@ -68,9 +67,6 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
     "process": process,
 }
-
-#: The training commands; they take stored settings, and write a checkpoint when they are stopped.
-TRAININGS = ("train", "train-territories")
 
 
 def run(args: list[str] | None = None) -> int:
@@ -91,8 +87,7 @@ def run(args: list[str] | None = None) -> int:
             signal.signal(signal.SIGINT, signal.default_int_handler)
     warnings.showwarning = _show_warning
     threading.excepthook = _show_thread_error
-    ends_with_checkpoint = bool(args) and args[0] in TRAININGS
-    with contextlib.nullcontext() if ends_with_checkpoint else _exit_on_sigterm():
+    with contextlib.nullcontext() if args[:1] == ["train"] else _exit_on_sigterm():  # a training ends by a checkpoint
         try:
             status = _run(args)
         except SystemExit:
@@ -182,7 +177,7 @@ def parse_command(name: str = "--help", *words: str) -> Callable[[], int]:
             hint = "see voronerf --help"
         raise ConfigError(f"there is no command {name}; {hint}")
     command = COMMANDS[name]
-    return parse(name, with_stored_settings(command, list(words)) if name in TRAININGS else command, words)
+    return parse(name, with_stored_settings(command, list(words)) if name == "train" else command, words)
 
 
 def _show_commands() -> int:

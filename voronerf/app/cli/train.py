@@ -152,10 +152,10 @@ def train(
     return 0 if summary["complete"] else 130
 
 
-def continuation(command: str, config: TrainConfig) -> str:
+def continuation(config: TrainConfig) -> str:
     """Returns the command line that continues a stopped run."""
     assert config.out is not None
-    words = [*command.split(), "--resume", "--out", str(config.out)]
+    words = ["voronerf", "train", "--resume", "--out", str(config.out)]
     for option, path in (("--data", config.data), ("--lpips", config.lpips)):
         if path is not None and is_outside(config.out, path):
             words += [option, str(path)]
@@ -238,7 +238,7 @@ def run_training(
                     checkpoints.on_end(state)
                     raise
         if not scores.summary["complete"]:
-            say(f"stopped; continue with: {continuation('voronerf train', config)}")
+            say(f"stopped; continue with: {continuation(config)}")
             return scores.summary
         if panels is None:
             panels = scores.affordable(config.budget, PANELS)

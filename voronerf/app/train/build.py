@@ -56,7 +56,6 @@ def build(
     config: TrainConfig,
     scene: Scene,
     *,
-    batches: RayBatches | None = None,
     on_event: Callable[[str], None] | None = None,
     speed: float = 1.0,
 ) -> State:
@@ -65,7 +64,6 @@ def build(
     Args:
         config: The settings.
         scene: The scene that ``config.data`` names.
-        batches: The batches of rays; None for rays of all training views of the scene.
         on_event: Called with a line of text for each split, evaluation and checkpoint.
         speed: The machine's speed, for the defaults of a training with a budget: see
             :func:`voronerf.app.train.defaults.machine_speed`.
@@ -103,9 +101,7 @@ def build(
         space_before(scene, grid, contraction) if grid is not None and isinstance(contraction, Contraction) else None
     )
     renderer = make_renderer(config, scene, routers, grid=grid, empty=empty)
-    if batches is None:
-        unseen = unseen_move(scene, renderer.sampler.space) if config.occupancy else 0.0
-        batches = make_batches(config, scene, unseen=unseen)
+    unseen = unseen_move(scene, renderer.sampler.space) if config.occupancy else 0.0
     optimizer = Adam.of(
         routers,
         lr=float(config.lr or 0),
@@ -135,7 +131,7 @@ def build(
         ray_loss=RayLoss(renderer, terms=terms, robust=ROBUST if photographs else 0.0),
         optimizer=optimizer,
         strategy=strategy,
-        batches=batches,
+        batches=make_batches(config, scene, unseen=unseen),
         generator=generator,
         draws=draws,
         scaler=torch.amp.GradScaler(device.type, enabled=config.precision == "fp16"),
@@ -146,8 +142,8 @@ def build(
     )
 
 
-def make_batches(config: TrainConfig, scene: Scene, views: Tensor | None = None, *, unseen: float = 0.0) -> RayBatches:
-    """Returns ray batches of a scene's training views, or of ``views``, int64; for ``unseen`` see `RayBatches`."""
+def make_batches(config: TrainConfig, scene: Scene, *, unseen: float = 0.0) -> RayBatches:
+    """Returns ray batches of a scene's training views; for ``unseen`` see `RayBatches`."""
     train, device = scene.train, torch.device(config.device)
     images = train.images if train.on_disk else train.images.to(device)
     return RayBatches(
@@ -160,7 +156,6 @@ def make_batches(config: TrainConfig, scene: Scene, views: Tensor | None = None,
         masks=train.masks,
         sparse=train.sparse_depth if config.sparse_depth else None,
         unseen=unseen,
-        views=views,
         cones=config.field_type.cones,
         fetch=Pages(images).fetch if train.on_disk else None,
         device=device,

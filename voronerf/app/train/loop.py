@@ -98,16 +98,15 @@ def train(
         state.add_seconds(clock() - started)
 
 
-def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool = False) -> None:
+def prepare(state: State, callbacks: Sequence[Callback] = ()) -> None:
     """Prepares the next steps: makes a split that is due, and sets the learning rate.
 
     Args:
         state: The state between two steps.
         callbacks: The callbacks to call after a split.
-        patient: Whether a split without enough samples waits; otherwise it is an error.
     """
     strategy, optimizer = state.strategy, state.optimizer
-    if strategy.is_due(state.fraction, state.step) and (not patient or strategy.has_samples()):
+    if strategy.is_due(state.fraction, state.step):
         done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
         if done is not None:
             state.begin_stage(done)

@@ -484,7 +484,7 @@ class Declaration:
     def _struct(self, kind: Any, others: dict[str, Any], source: Any) -> Source:
         values = [others.get(name, name) for name in kind._fields]
         names = [value for value in values if isinstance(value, str)]
-        if unknown := [name for name in names if not hasattr(source, name.partition(".")[0])]:
+        if unknown := [name for name in names if not hasattr(source, name)]:
             raise NameError(
                 f"{self.name}: {kind.__name__} must only have members that are arguments, letters or results, "
                 f"got {unknown}"

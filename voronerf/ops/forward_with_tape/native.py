@@ -82,18 +82,11 @@ class _NativeTape(Tape):
 
 
 def _add_gradients(parameters: Sequence[Tensor], slopes: Sequence[Tensor]) -> None:
-    totals, added = list[Tensor](), list[Tensor]()
     for parameter, slope in zip(parameters, slopes, strict=True):
-        total = parameter.grad
-        if total is None:
+        if parameter.grad is None:
             parameter.grad = slope
-        elif total.is_cpu and total.is_contiguous():
-            totals.append(total)
-            added.append(slope)
         else:
-            total.add_(slope)
-    if totals:  # a call of the compiled module, which a recording can replay
-        native.compiled.add(added, totals, [total.numel() for total in totals], native.cpu())
+            parameter.grad.add_(slope)
 
 
 def _takes_gradients(parameter: Tensor) -> bool:

@@ -38,7 +38,7 @@ class Similarity:
 
     Examples:
         >>> import torch
-        >>> from voronerf.town.geometry import Similarity
+        >>> from voronerf.editing.geometry import Similarity
         >>> move = Similarity.of((1.0, 0, 0), degrees=(0, 0, 90), scale=2)
         >>> move.points(torch.tensor([[1.0, 0, 0]])).round(decimals=3)
         tensor([[1., 2., 0.]])
@@ -123,7 +123,7 @@ class Solid:
 
     Examples:
         >>> import torch
-        >>> from voronerf.town.geometry import Solid
+        >>> from voronerf.editing.geometry import Solid
         >>> box = Solid.box((0, 0, 0), (1, 2, 3))
         >>> box.holds(torch.tensor([[0.5, 1.5, 2.5], [0.5, 2.5, 0]]))
         tensor([ True, False])

@@ -22,35 +22,34 @@ from torch import Tensor, nn
 from voronerf import ops
 from voronerf.app.train.build import as_field
 from voronerf.diagram import VoronoiDiagram
+from voronerf.editing.geometry import Similarity, Solid
+from voronerf.editing.network import StoredRouter
 from voronerf.nerf.contraction import Contraction
-from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import StoredRouter
 
 
 class Part(nn.Module):
     """A diagram with networks in its leaves, placed in a scene by a frame of its own.
 
-    Usually one router has the networks of all leaves. A training in territories makes several routers, each with its
-    own tables. Leaves whose cells were cut away have no network; space is empty there.
+    Leaves whose cells were cut away have no network; space is empty there.
 
     Args:
-        networks: The stored routers; router i has the networks of the leaves with ``owner == i``, in ascending order.
-        diagram: A diagram with l leaves; None for the diagram of the only router.
-        owner: int [l], the network of each leaf, -1 for none; None if all leaves have the only network.
+        network: The stored router, which has the networks of the kept leaves in ascending order.
+        diagram: A diagram with l leaves; None for the diagram of the router.
+        kept: bool [l], whether each leaf has a network; None if all leaves have one.
         frame: The similarity from the part's frame to the scene.
         contraction: The contraction of the part's space, or None.
         region: Solids in the part's frame; the part covers their intersection.
         layer: 0 for the scene, 1 or more for objects on top of it.
     """
 
-    owner: Tensor
+    kept: Tensor
     number: Tensor
 
     def __init__(
         self,
-        networks: Sequence[StoredRouter],
+        network: StoredRouter,
         diagram: VoronoiDiagram | None = None,
-        owner: Tensor | None = None,
+        kept: Tensor | None = None,
         *,
         frame: Similarity | None = None,
         contraction: Contraction | None = None,
@@ -58,22 +57,18 @@ class Part(nn.Module):
         layer: int = 0,
     ) -> None:
         super().__init__()
-        self.networks = tuple(networks)
-        self.diagram = networks[0].diagram if diagram is None else diagram
-        leaves, device = self.diagram.num_cells, self.diagram.centres.device
-        owner = torch.zeros(leaves, dtype=torch.int32) if owner is None else owner.int()
-        if owner.shape != (leaves,):
-            raise ValueError(f"Part: owner must have shape [{leaves}], got {list(owner.shape)}")
-        counts = [int((owner == i).sum()) for i in range(len(networks))]
-        sizes = [network.diagram.num_cells for network in networks]
-        if counts != sizes or int(owner.max()) >= len(counts):
-            raise ValueError(
-                f"Part: owner must name as many leaves of each router as it has cells, {sizes}, got {counts}"
-            )
-        kept = owner >= 0
-        self.register_buffer("owner", owner.to(device))
-        self.register_buffer("number", torch.where(kept, kept.cumsum(0) - 1, -1).int().to(device))
+        self.network, self.diagram = network, network.diagram if diagram is None else diagram
+        leaves, cells, device = self.diagram.num_cells, network.diagram.num_cells, self.diagram.centres.device
+        kept = torch.ones(leaves, dtype=torch.bool) if kept is None else kept.bool()
+        if kept.shape != (leaves,):
+            raise ValueError(f"Part: kept must have shape [{leaves}], got {list(kept.shape)}")
         self.num_cells = int(kept.sum())
+        if self.num_cells != cells:
+            raise ValueError(
+                f"Part: kept must mark as many leaves as the router has cells, {cells}, got {self.num_cells}"
+            )
+        self.register_buffer("kept", kept.to(device))
+        self.register_buffer("number", torch.where(kept, kept.cumsum(0) - 1, -1).int().to(device))
         self.frame, self.contraction, self.region = frame or Similarity(), contraction, tuple(region)
         self.layer = layer
 
@@ -82,61 +77,48 @@ class Part(nn.Module):
         """The centres of the part's cells in scene coordinates, [cells, 3]."""
         centres = self.diagram.leaf_centres
         centres = self.frame.points(centres if self.contraction is None else self.contraction.inverse(centres))
-        return centres[self.owner >= 0]
+        return centres[self.kept]
 
     def changed(self, **changes: Any) -> Part:
         """Returns a copy with other values of some of the constructor's arguments."""
-        names = ("networks", "diagram", "owner", "frame", "contraction", "region", "layer")
+        names = ("network", "diagram", "kept", "frame", "contraction", "region", "layer")
         return Part(**{**{name: getattr(self, name) for name in names}, **changes})
 
     def keep(self, cells: Tensor) -> Part | None:
         """Returns the part with only the networks of ``cells``, int64 [c]; None if no cell is kept."""
         if len(cells) == self.num_cells:
             return self
-        kept = torch.zeros(self.num_cells, dtype=torch.bool, device=self.owner.device)
-        kept[cells] = True
-        owner, networks = torch.full_like(self.owner, -1), list[StoredRouter]()
-        for index, network in enumerate(self.networks):
-            leaves = (self.owner == index).nonzero()[:, 0]
-            inside = kept[self.number[leaves].long()]
-            if bool(inside.any()):
-                owner[leaves[inside]] = len(networks)
-                networks.append(network if bool(inside.all()) else network.part(inside.nonzero()[:, 0]))
-        return self.changed(networks=networks, owner=owner) if networks else None
+        if not len(cells):
+            return None
+        chosen, kept = torch.zeros(self.num_cells, dtype=torch.bool, device=self.kept.device), self.kept.clone()
+        chosen[cells] = True
+        kept[self.kept] = chosen
+        return self.changed(network=self.network.part(chosen.nonzero()[:, 0]), kept=kept)
 
     def open(self) -> None:
-        """Makes the routers of all networks, as submodules."""
-        self.routers = nn.ModuleList(network.router for network in self.networks)
+        """Makes the router of the networks, as a submodule."""
+        self.router = self.network.router
 
     def find(self, local: Tensor, backend: str = "auto") -> tuple[Tensor, Tensor]:
         """Returns the leaves, int64 [n], of points [n, 3] in the part's frame, and a mask of covered points, [n]."""
         points = local if self.contraction is None else self.contraction.points(local)
         leaf = self.diagram.locate(points, backend=backend).long()
-        covered = self.owner[leaf] >= 0
+        covered = self.kept[leaf]
         for solid in self.region:
             covered &= solid.holds(local)
         return leaf, covered
 
-    def evaluate(self, local: Tensor, leaf: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+    def evaluate(self, local: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the colours [m, 3] and the densities [m], per scene unit, of points that the part covers.
 
         Args:
             local: [m, 3], the points in the part's frame.
-            leaf: int64 [m], the leaf of each point.
             directions: [r, 3], the rays' directions in the scene.
             ray_index: int32 [m], the ray of each point.
         """
         points = local if self.contraction is None else self.contraction.points(local)
         directions = self.frame.inverse.directions(directions)
-        if len(self.networks) == 1:
-            colour, density = as_field(self.networks[0].router)(points, directions, ray_index)
-        else:
-            colour, density, owner = local.new_zeros(len(local), 3), local.new_zeros(len(local)), self.owner[leaf]
-            for number, network in enumerate(self.networks):
-                rows = (owner == number).nonzero()[:, 0]
-                if len(rows):
-                    values = as_field(network.router)(points[rows], directions, ray_index[rows])
-                    colour, density = (x.to(y).index_copy(0, rows, y) for x, y in zip((colour, density), values))
+        colour, density = as_field(self.network.router)(points, directions, ray_index)
         return colour, density if self.frame.is_identity else density / self.frame.scale
 
 
@@ -237,7 +219,7 @@ class Parts(nn.Module):
         for layer in range(len(self.layers)):
             colour, density = torch.zeros_like(under), torch.zeros_like(below)
             for claim in self.claims(layer, positions):
-                values = self[claim.part].evaluate(claim.local, claim.leaf, directions, ray_index[claim.rows])
+                values = self[claim.part].evaluate(claim.local, directions, ray_index[claim.rows])
                 colour, density = (
                     full.to(part).index_copy(0, claim.rows, part) for full, part in zip((colour, density), values)
                 )

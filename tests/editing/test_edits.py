@@ -13,15 +13,15 @@ import pytest
 import torch
 from helpers import refuses, trained
 
-from voronerf import town
+from voronerf import editing
 from voronerf.app import open_run
 from voronerf.app.cli import main
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.scenes.record import read_scene, write_scene
 from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, checkpoint_path, load_checkpoint, save_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.town import Similarity, Solid, editing
-from voronerf.town.parts import Parts
+from voronerf.editing import Similarity, Solid, edits
+from voronerf.editing.parts import Parts
 
 SMALL = ("log2_entries=10", "levels=4")
 
@@ -31,8 +31,8 @@ def coarse_grids():
     """Coarsens the occupancy grids that are built for runs without one, to save time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(importlib.import_module("voronerf.app.train.build"), "PICTURE_RESOLUTION", 24)
-        patch.setattr(editing, "PICTURE_RESOLUTION", 24)
-        patch.setattr(editing, "MOST_VOXELS", 1 << 16)
+        patch.setattr(edits, "PICTURE_RESOLUTION", 24)
+        patch.setattr(edits, "MOST_VOXELS", 1 << 16)
         yield
 
 
@@ -59,18 +59,18 @@ def opened(runs, scene):
 
 
 def joined_run(runs, out, frames=None):
-    town.join([run.path for run in runs], out, frames=frames)
-    return town.open_run(out, scene=runs[0].scene)
+    editing.join([run.path for run in runs], out, frames=frames)
+    return editing.open_run(out, scene=runs[0].scene)
 
 
 def cut_run(run, kept, out, outside=False):
-    town.cut(run.path, kept, out, outside=outside)
-    return town.open_run(out, scene=run.scene)
+    editing.cut(run.path, kept, out, outside=outside)
+    return editing.open_run(out, scene=run.scene)
 
 
 def placed_run(run, thing, at, out, scale=1.0):
-    town.place(run.path, thing.path, at, out, scale=scale)
-    return town.open_run(out, scene=run.scene)
+    editing.place(run.path, thing.path, at, out, scale=scale)
+    return editing.open_run(out, scene=run.scene)
 
 
 def in_region(part, points):
@@ -110,7 +110,7 @@ def test_runs_of_different_fields_are_joined(opened, runs, tmp_path) -> None:
 def test_a_joined_run_is_the_same_when_opened_again(opened, tmp_path, scene) -> None:
     frames = [Similarity(), Similarity.of((0.5, 0, 0), (0, 0, 45), 0.8)]
     first = joined_run(opened, tmp_path / "joined", frames=frames)
-    again = town.open_run(tmp_path / "joined", scene=scene)
+    again = editing.open_run(tmp_path / "joined", scene=scene)
     assert torch.equal(first.render(0).colour, again.render(0).colour)
     assert torch.equal(first.scene.box, again.scene.box) and again.scene.box[1, 0] > scene.box[1, 0]
     assert again.config.samples[0] > 16
@@ -124,7 +124,7 @@ def test_a_joined_run_is_joined_and_cut_again(opened, tmp_path) -> None:
     assert len([*four.router]) == 4 and four.router.num_cells == 2 * pair.router.num_cells
     files = list((tmp_path / "four" / "checkpoints").glob("networks-*"))
     assert len(files) == 2  # networks in two places are stored once
-    assert four.router[0].networks[0] is four.router[2].networks[0]
+    assert four.router[0].network is four.router[2].network
     low, high = pair.router[1].frame.points(opened[1].scene.box)
     back = cut_run(four, Solid.box(low.tolist(), high.tolist()), tmp_path / "back")
     assert len([*back.router]) < 4 and any(
@@ -141,7 +141,7 @@ def test_the_grid_has_all_that_the_grids_of_the_runs_have(opened, tmp_path) -> N
     joined = joined_run(opened, tmp_path / "joined", frames=frames)
     grid = joined.renderer.occupancy
     for run, frame in zip(opened, frames, strict=True):
-        run_grid = editing.Source.of(run.path).grid
+        run_grid = edits.Source.of(run.path).grid
         full = run_grid.occupied.view(-1).nonzero()[:, 0]
         points = run_grid.points(full, torch.rand(len(full), 3))
         assert grid.occupied.view(-1)[grid.voxels(frame.points(points)).long()].all()
@@ -169,7 +169,7 @@ def test_a_region_is_cut_exactly(opened, tmp_path) -> None:
 def test_cells_are_cut(opened, tmp_path) -> None:
     run = opened[1]
     kept = cut_run(run, [1, 2], tmp_path / "kept")
-    assert kept.router.num_cells == 2 and kept.router[0].networks[0].router.module.trunk[0].weight.shape[0] == 2
+    assert kept.router.num_cells == 2 and kept.router[0].network.router.module.trunk[0].weight.shape[0] == 2
     rest = cut_run(run, [1, 2], tmp_path / "rest", outside=True)
     assert rest.router.num_cells == run.router.num_cells - 2
     refuses("--cells must be numbers of 0..", lambda: cut_run(run, [99], tmp_path / "no"), error=ConfigError)
@@ -215,21 +215,21 @@ def test_damaged_networks_are_named(opened, tmp_path, scene, what: str) -> None:
         assert data.count(path.name.encode()) >= 1
         index.write_bytes(data.replace(path.name.encode(), b"../" + path.name.encode()[3:]))
     with pytest.raises(CheckpointError, match=r"networks-|last\.safetensors"):
-        town.open_run(tmp_path / "run", scene=scene)
+        editing.open_run(tmp_path / "run", scene=scene)
 
 
 def test_a_full_disk_leaves_nothing(opened, tmp_path, monkeypatch) -> None:
     def full(path, checkpoint):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr("voronerf.town.run.save_checkpoint", full)
+    monkeypatch.setattr("voronerf.editing.run.save_checkpoint", full)
     with pytest.raises(OSError, match=r"No space left on device.*joined"):
         joined_run(opened, tmp_path / "joined")
     assert not list(tmp_path.iterdir())
 
 
 def test_a_command_that_is_ended_leaves_nothing(runs, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(editing, "write_scene", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr(edits, "write_scene", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
     with pytest.raises(SystemExit) as ended:
         main(["cut", str(runs[0]), "--cells", "0", "--out", str(tmp_path / "out")])
     assert ended.value.code == 128 + signal.SIGTERM and not list(tmp_path.iterdir())
@@ -281,9 +281,9 @@ def test_what_cannot_be_joined(runs, tmp_path) -> None:
         ([one, endless], "must have bounds to be joined"),
         ([one, black], "must have the background of first, white, got none"),
     ):
-        refuses(said, town.join, settings, tmp_path / "no", error=ConfigError)
-    refuses("there is no checkpoint in it", town.join, [one, tmp_path], tmp_path / "no", error=CheckpointError)
-    refuses("an object must have bounds", town.place, one, endless, (0, 0, 0), tmp_path / "no", error=ConfigError)
+        refuses(said, editing.join, settings, tmp_path / "no", error=ConfigError)
+    refuses("there is no checkpoint in it", editing.join, [one, tmp_path], tmp_path / "no", error=CheckpointError)
+    refuses("an object must have bounds", editing.place, one, endless, (0, 0, 0), tmp_path / "no", error=ConfigError)
     assert not (tmp_path / "no").exists()
 
 
@@ -291,13 +291,13 @@ def test_what_cannot_be_joined(runs, tmp_path) -> None:
 def test_pictures_are_where_the_joined_run_has_their_cameras(opened, scene, tmp_path) -> None:
     frames = [Similarity.of((3, 0, 0), (0, 0, 90), 0.5), Similarity.of((0, 0, 1), (40, 0, 0))]
     joined = joined_run(opened, tmp_path / "joined", frames=frames)
-    moved = editing.moved_cameras(scene.test.cameras, frames[0]).poses
+    moved = edits.moved_cameras(scene.test.cameras, frames[0]).poses
     assert torch.allclose(joined.scene.test.cameras.poses, moved, atol=1e-5)
     assert torch.equal(joined.scene.test.images, scene.test.images)
     record = read_scene(tmp_path / "joined" / "scene.json")
     assert record.test.names == tuple(f"{i}-{name}" for i in (0, 1) for name in scene.test.names)
     other = replace(scene, test=replace(scene.test, names=("a", "b")))
-    assert torch.equal(town.open_run(joined.path, scene=other).scene.test.cameras.poses, scene.test.cameras.poses)
+    assert torch.equal(editing.open_run(joined.path, scene=other).scene.test.cameras.poses, scene.test.cameras.poses)
 
 
 def test_a_run_of_parts_is_neither_opened_nor_trained_as_one_of_a_training(opened, tmp_path, scene) -> None:
@@ -309,8 +309,8 @@ def test_a_run_of_parts_is_neither_opened_nor_trained_as_one_of_a_training(opene
 
 def test_runs_are_aligned_by_shared_images(scene) -> None:
     frame = Similarity.of((1, 2, 3), (10, 20, 30), 1.7)
-    moved = with_cameras(scene, lambda cameras: editing.moved_cameras(cameras, frame.inverse))
-    fitted, error, count = editing.align(scene, moved, "run")
+    moved = with_cameras(scene, lambda cameras: edits.moved_cameras(cameras, frame.inverse))
+    fitted, error, count = edits.align(scene, moved, "run")
     assert count == 8 and error < 1e-5
     assert abs(fitted.scale - 1.7) < 1e-5 and torch.allclose(fitted.translation, frame.translation, atol=1e-4)
     others = replace(
@@ -318,11 +318,11 @@ def test_runs_are_aligned_by_shared_images(scene) -> None:
     )
     refuses(
         "at least 3 images of the same names in both runs, got 0",
-        lambda: editing.align(scene, others, "run"),
+        lambda: edits.align(scene, others, "run"),
         error=ConfigError,
     )
     line = with_cameras(scene, lambda cameras: placed(cameras, torch.arange(len(cameras))[:, None] * torch.ones(3)))
-    refuses("not on one line", lambda: editing.align(line, line, "run"), error=ConfigError)
+    refuses("not on one line", lambda: edits.align(line, line, "run"), error=ConfigError)
 
 
 @pytest.mark.parametrize("degrees", [(10, 20, 30), (200, 20, 30), (10, 200, 30), (10, 20, 200)])
@@ -330,8 +330,8 @@ def test_cameras_of_one_height_are_aligned_without_a_mirror(scene, degrees) -> N
     """Coplanar cameras are aligned by a rotation, although a reflection would fit them as well."""
     frame = Similarity.of((1, 2, 3), degrees, 1.7)
     flat = with_cameras(scene, lambda cameras: placed(cameras, cameras.origins * torch.tensor([1.0, 1, 0])))
-    moved = with_cameras(flat, lambda cameras: editing.moved_cameras(cameras, frame))
-    fitted, error, _ = editing.align(moved, flat, "run")
+    moved = with_cameras(flat, lambda cameras: edits.moved_cameras(cameras, frame))
+    fitted, error, _ = edits.align(moved, flat, "run")
     assert error < 1e-5 and torch.allclose(fitted.rotation, frame.rotation, atol=1e-4)
 
 
@@ -384,7 +384,9 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
     assert "cells in 2 parts" in capsys.readouterr().out
     moves = ["--move", "2", "2.5 0 0 0 0 0 1", "--move", "3", "5 0 0 0 0 0 1"]
     assert main(["join", one, two, one, "--out", str(tmp_path / "three"), *moves]) == 0
-    frames = [part.frame for part in town.open_run(tmp_path / "three", scene=read_scene(runs[0] / "scene.json")).router]
+    frames = [
+        part.frame for part in editing.open_run(tmp_path / "three", scene=read_scene(runs[0] / "scene.json")).router
+    ]
     assert [frame.translation.tolist() for frame in frames] == [[0, 0, 0], [2.5, 0, 0], [5, 0, 0]]
     assert main(["join", one, two, "--out", str(tmp_path / "aligned"), "--align"]) == 0
     assert "8 images in common" in capsys.readouterr().out

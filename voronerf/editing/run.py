@@ -1,13 +1,12 @@
 """Reads and writes runs of several parts.
 
-A run directory with the file ``town.json`` has several parts. Its checkpoint has the tensors ``part-N.diagram.*`` and
-``part-N.owner`` of each part, and the occupancy grid. ``values["parts"]`` has the placement of each part, and names the
-files of its networks, which are checkpoints in the same folder.
+A run directory with the file ``parts.json`` has several parts. Its checkpoint has the tensors ``part-N.diagram.*`` and
+``part-N.kept`` of each part, and the occupancy grid. ``values["parts"]`` has the placement of each part, and names the
+file of its networks, a checkpoint in the same folder.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.app.files import read_json
 from voronerf.app.run import Run, shown_scene
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import placed, read_scene
@@ -32,75 +30,50 @@ from voronerf.app.train.checkpoint import (
 from voronerf.app.train.config import TrainConfig, check_samples
 from voronerf.app.train.run_directory import check_folders
 from voronerf.diagram import VoronoiDiagram
+from voronerf.editing.geometry import Similarity, Solid
+from voronerf.editing.network import StoredRouter, config_of
+from voronerf.editing.parts import Part, Parts
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy, Sampler, Stratified
 from voronerf.nerf.volume import Space
-from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import StoredRouter, config_of
-from voronerf.town.parts import Part, Parts
 
 #: The file that marks the directory of a run of several parts.
-TOWN = "town.json"
+PARTS = "parts.json"
 
 
-def is_town(run: Path) -> bool:
+def has_parts(run: Path) -> bool:
     """Returns whether a run directory holds a run of several parts."""
-    return (run / TOWN).is_file()
-
-
-def stored_territories(run: Path) -> int | None:
-    """Returns the number of territories in which a run was trained, or None if the run does not store it."""
-    values = read_json(run / TOWN) if is_town(run) else None
-    count = values.get("territories") if isinstance(values, dict) else None
-    return count if isinstance(count, int) and count > 0 else None
+    return (run / PARTS).is_file()
 
 
 def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGrid | None) -> None:
-    """Writes one file for each network, even if several parts share it, and then the run's checkpoint."""
-    folder, names = checkpoint_path(run).parent, dict[int, str]()
-    for network in (network for part in parts for network in part.networks):
+    """Writes one file for each router, even if several parts share it, and then the run's checkpoint."""
+    folder, names, placements = checkpoint_path(run).parent, dict[int, str](), list[dict[str, Any]]()
+    tensors: dict[str, Tensor] = {} if grid is None else {f"occupancy.{k}": v for k, v in grid.state_dict().items()}
+    for number, part in enumerate(parts):
+        network = part.network
         if id(network) not in names:
             names[id(network)] = name = f"networks-{len(names)}.safetensors"
             save_checkpoint(folder / name, network.stored())
-    placements = [place_of(part, [names[id(network)] for network in part.networks]) for part in parts]
-    cells = [(part.diagram, part.owner) for part in parts]
-    save_checkpoint(checkpoint_path(run), index_of(config, cells, placements, grid))
+        tensors |= {f"part-{number}.diagram.{name}": value for name, value in part.diagram.state_dict().items()}
+        tensors[f"part-{number}.kept"] = part.kept
+        placements.append(place_of(part, names[id(network)]))
+    tensors = {name: value.cpu().clone() for name, value in tensors.items()}
+    save_checkpoint(checkpoint_path(run), Checkpoint(tensors, {"config": config.to_values(), "parts": placements}))
 
 
-def place_of(part: Part, files: Sequence[str]) -> dict[str, Any]:
+def place_of(part: Part, file: str) -> dict[str, Any]:
     """Returns the placement of a part, as stored in a checkpoint's values."""
     sphere = part.contraction
     return {
-        "networks": list(files),
+        "networks": file,
         "frame": part.frame.to_values(),
         "region": [solid.to_values() for solid in part.region],
         "layer": part.layer,
         "contraction": None if sphere is None else {"centre": sphere.centre.tolist(), "radius": sphere.radius},
     }
-
-
-def index_of(
-    config: TrainConfig,
-    cells: Sequence[tuple[VoronoiDiagram, Tensor]],
-    placed: list[dict[str, Any]],
-    grid: OccupancyGrid | None,
-) -> Checkpoint:
-    """Makes the checkpoint of a run of parts, without the networks, which have their own files.
-
-    Args:
-        config: The settings of the run.
-        cells: (diagram, owner) of each part; owner is the network of each leaf.
-        placed: The placement of each part, see :func:`place_of`.
-        grid: The occupancy grid, or None.
-    """
-    tensors: dict[str, Tensor] = {} if grid is None else {f"occupancy.{k}": v for k, v in grid.state_dict().items()}
-    for number, (diagram, owner) in enumerate(cells):
-        tensors |= {f"part-{number}.diagram.{name}": value for name, value in diagram.state_dict().items()}
-        tensors[f"part-{number}.owner"] = owner
-    tensors = {name: value.cpu().clone() for name, value in tensors.items()}
-    return Checkpoint(tensors, {"config": config.to_values(), "parts": placed})
 
 
 def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> Parts:
@@ -109,17 +82,17 @@ def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "
     parts = []
     for index, values in enumerate(checkpoint.values["parts"]):
         try:
-            for name in values["networks"]:
-                if Path(name).name != name:
-                    raise ValueError(f"networks must be files beside the checkpoint, got {name!r:.100}")
-                if name not in networks:
-                    stored = load_checkpoint(checkpoint_path(run).with_name(name), keep=is_shown)
-                    networks[name] = StoredRouter(stored, device, backend)
+            name = values["networks"]
+            if Path(name).name != name:
+                raise ValueError(f"networks must be a file beside the checkpoint, got {name!r:.100}")
+            if name not in networks:
+                stored = load_checkpoint(checkpoint_path(run).with_name(name), keep=is_shown)
+                networks[name] = StoredRouter(stored, device, backend)
             sphere = values["contraction"]
             part = Part(
-                [networks[name] for name in values["networks"]],
+                networks[name],
                 VoronoiDiagram.from_state(checkpoint.group(f"part-{index}"), "diagram.").to(device),
-                checkpoint.tensors[f"part-{index}.owner"],
+                checkpoint.tensors[f"part-{index}.kept"],
                 frame=Similarity(**values["frame"]),
                 contraction=None
                 if sphere is None
@@ -145,7 +118,7 @@ def open_run(
     device: str = "cpu",
     backend: str = "auto",
 ) -> Run:
-    """Opens a run of several parts: one that was joined, cut or placed, or trained in territories.
+    """Opens a run of several parts: one that was joined, cut or placed.
 
     Args:
         path: The run directory.
@@ -163,7 +136,7 @@ def open_run(
         SceneError: The scene cannot be read.
 
     Examples:
-        >>> from voronerf.town import open_run
+        >>> from voronerf.editing import open_run
         >>> def first_picture(joined):
         ...     return open_run(joined).render(0).colour
     """

@@ -24,13 +24,13 @@ from voronerf.app.train.build import PICTURE_RESOLUTION, ask_everywhere, make_pi
 from voronerf.app.train.checkpoint import checkpoint_paths, is_shown, last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.wording import as_typed
+from voronerf.editing.geometry import Similarity, Solid
+from voronerf.editing.network import StoredRouter, config_of
+from voronerf.editing.parts import Part, Parts
+from voronerf.editing.run import PARTS, has_parts, open_parts, write_parts
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import OPACITY, OccupancyGrid
-from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import StoredRouter, config_of
-from voronerf.town.parts import Part, Parts
-from voronerf.town.run import TOWN, is_town, open_parts, write_parts
 
 #: The maximum number of voxels of a joined grid; a grid that would have more gets larger voxels.
 MOST_VOXELS = 1 << 22
@@ -58,7 +58,7 @@ class Source:
             raise ConfigError(f"{run}: must hold a run with the record of its scene, scene.json")
         config, scene, state = config_of(checkpoint), read_scene(record), checkpoint.group("occupancy")
         grid = OccupancyGrid.from_state(state) if state else None
-        if is_town(run):
+        if has_parts(run):
             return cls(name, config, scene, open_parts(run, checkpoint), grid)
         if config.field_type.cones:
             raise ConfigError(f"{name}: --field {config.field} cannot be joined or cut: its cones cross borders")
@@ -68,7 +68,7 @@ class Source:
         if config.sampling != "stratified":
             network = StoredRouter.of(network.router, config)
         if contraction is not None:
-            return cls(name, config, scene, Parts([Part([network], contraction=contraction)]), None)
+            return cls(name, config, scene, Parts([Part(network, contraction=contraction)]), None)
         region = []
         if scene.box is not None:
             low, high = scene.box.tolist()
@@ -76,7 +76,7 @@ class Source:
             if grid is None:
                 config = replace(config, sampling="stratified")
                 grid = make_picture_grid(config, scene, make_renderer(config, scene, {"field": network.router}))
-        return cls(name, config, scene, Parts([Part([network], region=region)]), grid)
+        return cls(name, config, scene, Parts([Part(network, region=region)]), grid)
 
 
 def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Similarity] | None = None) -> Source:
@@ -97,7 +97,7 @@ def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Simila
         OSError: The new run cannot be written; no files are left.
 
     Examples:
-        >>> from voronerf.town import Similarity, join
+        >>> from voronerf.editing import Similarity, join
         >>> def beside_each_other(east, west, out):
         ...     return join([east, west], out, frames=[Similarity(), Similarity.of((2.0, 0, 0))])
     """
@@ -129,7 +129,7 @@ def cut(run: Path | str, keep: Solid | Sequence[int], out: Path | str, *, outsid
         OSError: The new run cannot be written; no files are left.
 
     Examples:
-        >>> from voronerf.town import Solid, cut
+        >>> from voronerf.editing import Solid, cut
         >>> def ball_of(run, out):
         ...     return cut(run, Solid(ball=(0, 0, 0.4, 0.5)), out)
     """
@@ -171,7 +171,7 @@ def place(
         OSError: The new run cannot be written; no files are left.
 
     Examples:
-        >>> from voronerf.town import place
+        >>> from voronerf.editing import place
         >>> def on_the_ground(garden, statue, out):
         ...     return place(garden, statue, (0.2, -0.1, 0), out, scale=0.5)
     """
@@ -550,7 +550,7 @@ def _write(source: Source, out: Path) -> Source:
         partial.mkdir()
         config = replace(source.config, out=out)
         write_parts(partial, config, source.parts, source.grid)
-        write_text(partial / TOWN, json_text({"parts": len(source.parts.parts)}) + "\n")
+        write_text(partial / PARTS, json_text({"parts": len(source.parts.parts)}) + "\n")
         write_text(partial / "config.json", config.to_json())
         write_scene(partial / "scene.json", source.scene)
         os.replace(partial, out)

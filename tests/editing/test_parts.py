@@ -10,11 +10,11 @@ from helpers import refuses
 
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
 from voronerf.app.train.config import TrainConfig
+from voronerf.editing.geometry import Similarity, Solid
+from voronerf.editing.network import StoredRouter
+from voronerf.editing.parts import Part, Parts
 from voronerf.nerf import Contraction
 from voronerf.nerf.fields import HashGridField
-from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import StoredRouter
-from voronerf.town.parts import Part, Parts
 
 
 @pytest.fixture
@@ -49,8 +49,8 @@ def queries(n: int = 500, width: float = 2.0):
     return points, directions, torch.randint(0, 20, (n,), dtype=torch.int32)
 
 
-def part_of(router: VoronoiRouter, diagram: VoronoiDiagram | None = None, owner=None, **placed) -> Part:
-    return Part([StoredRouter.of(router, TrainConfig())], diagram, owner, **placed)
+def part_of(router: VoronoiRouter, diagram: VoronoiDiagram | None = None, kept=None, **placed) -> Part:
+    return Part(StoredRouter.of(router, TrainConfig()), diagram, kept, **placed)
 
 
 def close(a: torch.Tensor, b: torch.Tensor) -> bool:
@@ -131,24 +131,12 @@ def test_solids_move_with_their_frames(torch_seed) -> None:
     refuses("planes of four numbers, or a ball", lambda: Solid())
 
 
-def test_leaves_of_several_routers(torch_seed) -> None:
-    router, inputs = hashed(4), queries(width=1.0)
-    owner = torch.tensor([1, 0, 1, 1])
-    networks = [StoredRouter.of(router.part((owner == i).nonzero()[:, 0]), TrainConfig()) for i in (0, 1)]
-    parts = Parts([Part(networks, router.diagram, owner)]).eval()
-    result, wanted = parts(*inputs), router(*inputs)
-    assert close(result[0], wanted[0]) and close(result[1], wanted[1])
-    assert torch.equal(parts.assign(inputs[0]), router.assign(inputs[0]))
-    fewer = parts[0].keep(torch.tensor([1, 2]))
-    assert [network.router.num_cells for network in fewer.networks] == [1, 1]
-
-
 def test_cells_that_are_cut_away_show_nothing_and_leave_the_others(torch_seed) -> None:
     router, inputs = hashed(6), queries(width=1.0)
     part = part_of(router).keep(torch.tensor([1, 4]))
     assert (
         part.num_cells == 2
-        and part.networks[0].router.num_cells == 2
+        and part.network.router.num_cells == 2
         and part_of(router).keep(torch.tensor([], dtype=torch.int64)) is None
     )
     colour, density = Parts([part]).eval()(*inputs)
@@ -156,7 +144,7 @@ def test_cells_that_are_cut_away_show_nothing_and_leave_the_others(torch_seed) -
     kept = (cells == 1) | (cells == 4)
     assert torch.equal(colour[kept], wanted[0][kept]) and torch.equal(density[kept], wanted[1][kept])
     assert not density[~kept].any()
-    assert part.keep(torch.tensor([1])).owner.tolist() == [-1, -1, -1, -1, 0, -1]
+    assert part.keep(torch.tensor([1])).kept.tolist() == [False, False, False, False, True, False]
 
 
 def test_a_hole_goes_to_the_nearest_part_that_speaks(torch_seed) -> None:
@@ -190,6 +178,6 @@ def test_a_contracted_part_is_asked_in_its_own_space(torch_seed) -> None:
 
 
 def test_what_a_part_refuses(torch_seed) -> None:
-    refuses("owner must have shape [3]", lambda: part_of(plain(3), owner=torch.zeros(2)))
-    refuses("owner must name as many leaves", lambda: part_of(plain(3), VoronoiDiagram(torch.rand(4, 3))))
+    refuses("kept must have shape [3]", lambda: part_of(plain(3), kept=torch.zeros(2)))
+    refuses("kept must mark as many leaves", lambda: part_of(plain(3), VoronoiDiagram(torch.rand(4, 3))))
     refuses("at least one in layer 0", lambda: Parts([part_of(plain(1), layer=1)]))
