@@ -6,7 +6,6 @@
 #include <algorithm>
 #include <optional>
 
-#include "bindings/adam_call.h"
 #include "bindings/frame.h"
 #include "bindings/program_call.h"
 #include "bindings/signature.h"
@@ -283,8 +282,6 @@ constexpr const char* kStub =
     "                 asked: bool) -> list[Tensor] | None: ...\n"
     "\n"
     "def signature(op: str, rows: Sequence[Any], positional: int, more: dict[str, Any]) -> Any: ...\n"
-    "def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool: ...\n"
-    "def adam_step(rule: type, guard: type, *given: Any) -> bool: ...\n"
     "def way_of(arguments: tuple[Any, ...]) -> int: ...\n"
     "def know_calls(objects: dict[str, Any]) -> None: ...\n"
     "def know_torch(dtypes: dict[str, torch.dtype], classes: tuple[type, ...], exchange: Any) -> None: ...\n";
@@ -409,7 +406,6 @@ void bind_all(PyObject* python) {
       .def_property_readonly("obstacle", &Recording::obstacle);
   bind_signatures(bound);
   bind_program_calls(bound);
-  bind_adam_step(bound);
   // know_torch takes Python objects of torch, with which this module is not linked: the dtypes by name, the classes of
   // plain tensors, and the capsule of torch's DLPack exchange API (tensor_view.h) or None.
   bound.def("know_torch", [](const py::dict& names, const py::tuple& classes, const py::object& exchange) {

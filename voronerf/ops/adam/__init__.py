@@ -11,7 +11,6 @@ from torch import Tensor
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
 from voronerf.ops._core.checks import (
-    alike,
     check_dtype,
     check_flag,
     check_interval,
@@ -83,26 +82,12 @@ def adam(
         >>> (table[0] != 0).tolist()
         [False, True, False]
     """
-    arguments = rules, parameters, gradients, means, squares, guard, loss
-    if _makes_step(parameters, backend) and backends.compiled().adam_step(Rule, Guard, *arguments):
-        return
-    _check_all(*arguments)
+    _check_all(rules, parameters, gradients, means, squares, guard, loss)
     if not rules:
         return
     loss = None if loss is None else loss.detach()
     run = backends.resolve(_OP, backend=backend, device=parameters[0].device, dtype=torch.float32)
     run(rules, parameters, [gradient.contiguous() for gradient in gradients], means, squares, guard, loss)
-
-
-def _makes_step(parameters: Any, backend: str) -> bool:
-    """Returns whether the compiled module makes the whole step and also checks the arguments.
-
-    It does so for the native backend outside ``torch.compile``. ``parameters`` is not yet checked.
-    """
-    first = parameters[0] if isinstance(parameters, (list, tuple)) and parameters else None
-    if not isinstance(first, Tensor) or torch.compiler.is_dynamo_compiling():
-        return False
-    return backends.chosen(_OP, first.device, torch.float32, backend=backend) == "native"
 
 
 def average(
@@ -196,8 +181,6 @@ def _check_lists(
     All tensors must be contiguous, except in one list: ``read`` is the name of this list without its plural s, or empty
     if there is no such list.
     """
-    if alike([*lists.values()], [name[:-1] != read for name in lists], [value for _, value in scalars]):
-        return
     for tensors in zip(*lists.values(), strict=True):
         _check(op, {name[:-1]: tensor for name, tensor in zip(lists, tensors, strict=True)}, read)
     name, first = next(iter(lists.items()))
