@@ -101,8 +101,7 @@ VN_INLINE void hash_entries(const HashVectorAxis* axes, const GridLevel& level, 
 // Computes the corners of a level. kAlong: weights of the derivative along the direction. kSlopes: weights of the
 // derivatives with respect to each scaled coordinate.
 template <bool kAlong, bool kSlopes>
-VN_INLINE void hash_corners(const HashEncoding& in, const GridLevel& level, const HashPlaces& places, int64_t rows,
-                            HashCorners& to) {
+VN_INLINE void hash_corners(const GridLevel& level, const HashPlaces& places, int64_t rows, HashCorners& to) {
   for (int64_t i = 0; i < rows; i += kLanes) {
     HashVectorAxis axes[3];
     for (int axis = 0; axis < 3; ++axis) {
