@@ -282,6 +282,7 @@ constexpr const char* kStub =
     "                 asked: bool) -> list[Tensor] | None: ...\n"
     "\n"
     "def signature(op: str, rows: Sequence[Any], positional: int, more: dict[str, Any]) -> Any: ...\n"
+    "def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool: ...\n"
     "def way_of(arguments: tuple[Any, ...]) -> int: ...\n"
     "def know_calls(objects: dict[str, Any]) -> None: ...\n"
     "def know_torch(dtypes: dict[str, torch.dtype], classes: tuple[type, ...], exchange: Any) -> None: ...\n";

@@ -539,6 +539,7 @@ void bind_signatures(py::module_& module) {
   py::class_<Rules>(module, "Rules", py::module_local())
       .def(py::init<const py::sequence&, const std::vector<std::string>&>())
       .def("__call__", &Rules::check);
+  module.def("alike", &alike);
   module.def("way_of", [](const py::tuple& arguments) { return way_of(arguments.ptr()); });
   module.def("signature", [](const py::str& op, const py::sequence& rows, int positional, const py::dict& more) {
     static PyMethodDef definition = {

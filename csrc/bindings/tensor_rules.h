@@ -1,6 +1,7 @@
 // The rules for the tensors of a call, from voronerf/ops/_core/checks.py and the signatures of declare.py.
 #pragma once
 
+#include <algorithm>
 #include <map>
 #include <string>
 #include <vector>
@@ -179,5 +180,36 @@ class Rules {
   std::vector<Letters::Size> defaults_;  // of rows (letter, number)
   std::vector<int> asked_;
 };
+
+// Returns whether the lists have equally many tensors, with equal shapes at each place. All tensors must be float32 and
+// on one device, tensors in lists marked in `written` must be contiguous, and the scalars must be tensors [].
+inline bool alike(const py::sequence& lists, const std::vector<bool>& written, const py::list& scalars) {
+  std::vector<TensorView> first;
+  for (size_t i = 0; i < lists.size(); ++i) {
+    const py::object list = lists[i];
+    if (!PyList_Check(list.ptr()) && !PyTuple_Check(list.ptr())) return false;
+    const auto count = static_cast<size_t>(PySequence_Fast_GET_SIZE(list.ptr()));
+    if (i == 0) first.resize(count);
+    if (count != first.size()) return false;
+    for (size_t j = 0; j < count; ++j) {
+      PyObject* const tensor = PySequence_Fast_GET_ITEM(list.ptr(), static_cast<Py_ssize_t>(j));
+      TensorView view;
+      if (!view.look(tensor) || view.dtype() != kFloat32) return false;
+      if (i == 0) first[j] = view;
+      const TensorView& expected = first[j];
+      if (view.dimensions != expected.dimensions ||
+          !std::equal(view.shape, view.shape + view.dimensions, expected.shape)) {
+        return false;
+      }
+      if (view.device_type != first[0].device_type || view.device_index != first[0].device_index) return false;
+      if (written.at(i) && (!view.is_contiguous() || is_negative(tensor))) return false;
+    }
+  }
+  return !first.empty() && std::all_of(scalars.begin(), scalars.end(), [&first](const py::handle& scalar) {
+    TensorView view;
+    return view.look(scalar.ptr()) && view.dimensions == 0 && view.dtype() == kFloat32 && !is_negative(scalar.ptr()) &&
+           view.device_type == first[0].device_type && view.device_index == first[0].device_index;
+  });
+}
 
 }  // namespace voronerf

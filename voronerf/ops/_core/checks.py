@@ -291,6 +291,17 @@ def _compiled(make: Callable[..., Rows], *arguments: Any) -> tuple[list[str], Ca
     return letters, native.Rules([tuple(row) for row in rules], letters)
 
 
+def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool:
+    """Returns whether several lists of tensors match, so that the compiled module can work on them.
+
+    The tensors at one index of the lists must have one shape. All tensors, and ``scalars`` of shape [], must be float32
+    and on one device, and tensors of the ``written`` lists must be contiguous. The result is also False if only
+    Python can check the tensors.
+    """
+    native = None if torch.compiler.is_dynamo_compiling() else backends.compiled()
+    return native is not None and native.alike(lists, written, scalars)
+
+
 def _letters(rows: Rows) -> list[str]:
     shapes = [[row.letter] if isinstance(row, Default) else row.shape for row in rows]
     entries = [entry for shape in shapes for entry in shape if isinstance(entry, str)]

@@ -11,6 +11,7 @@ from torch import Tensor
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
 from voronerf.ops._core.checks import (
+    alike,
     check_dtype,
     check_flag,
     check_interval,
@@ -181,6 +182,8 @@ def _check_lists(
     All tensors must be contiguous, except in one list: ``read`` is the name of this list without its plural s, or empty
     if there is no such list.
     """
+    if alike([*lists.values()], [name[:-1] != read for name in lists], [value for _, value in scalars]):
+        return
     for tensors in zip(*lists.values(), strict=True):
         _check(op, {name[:-1]: tensor for name, tensor in zip(lists, tensors, strict=True)}, read)
     name, first = next(iter(lists.items()))
