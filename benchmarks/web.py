@@ -2,9 +2,7 @@
 
     python benchmarks/web.py --runs runs/lego runs/bonsai runs/demo --pixels 100 --json benchmarks/results/web.json
 
-It needs Debian's packages chromium and chromium-driver, and selenium. The speed on a GPU is modelled: the shader's
-operations in a frame, divided by the GPU's operations a second. The operations are the sum of the `COSTS` of network
-steps, strata and samples, averaged over five views.
+It needs Debian's packages chromium and chromium-driver, and selenium.
 """
 
 from __future__ import annotations
@@ -31,12 +29,7 @@ from voronerf.app.cli.opening import Opening
 from voronerf.app.files import json_text, read_json, write_text
 from voronerf.app.run import Run
 from voronerf.app.web import export_web
-from voronerf.app.web.shader import fours
-from voronerf.nerf import Cameras, Occupancy
-from voronerf.nerf.radiance import Radiance, radiance_of
-from voronerf.nerf.samplers import FINE_WAVE, OPAQUE
-from voronerf.ops import composite
-from voronerf.ops.formulas import Wave, walk
+from voronerf.nerf import Cameras
 
 FLAGS = """--headless=new --no-sandbox --enable-unsafe-webgpu --use-webgpu-adapter=swiftshader
 --enable-features=Vulkan --use-vulkan=swiftshader --use-angle=swiftshader --no-first-run
@@ -47,16 +40,9 @@ voronerf.started.then(() => voronerf.picture(camera)).then(
   (bytes) => done(btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""))),
   (error) => done(`error: ${error}`));
 """
-#: Pixels along each side of a frame, and the distance in pixels between counted rays.
-FRAME, APART = 800, 5
 VIEWS = 5
 #: The page's window while pictures are requested, so small that drawing the window takes no time.
 SMALL = {"width": 40, "height": 40, "deviceScaleFactor": 1, "mobile": False}
-#: Operations of the shader besides matrix products: a 4 x 4 block (8 conversions from float16), a corner of a hash grid
-#: (weight, index and sum), a centre, a stratum of a ray, a contraction, a sample (colour and weight), and a sine or
-#: cosine.
-COSTS = {"block": 8, "corner": 18, "centre": 9, "stratum": 45, "contraction": 20, "sample": 60, "wave": 12}
-RATES = (1, 5, 20)  # TFLOP/s
 
 
 @dataclass(frozen=True)
@@ -151,76 +137,6 @@ def compared(run: Run, driver: Any, pixels: int) -> dict[str, Any]:
     }
 
 
-def walked(run: Run, view: int) -> tuple[int, int]:
-    """Returns the numbers of strata and samples of a frame, estimated from every `APART`th pixel along both axes."""
-    sampler, scene, cameras = run.renderer.sampler, run.scene, run.scene.test.cameras
-    assert isinstance(sampler, Occupancy)
-    side, (width, height) = FRAME // APART, cameras.size(view)
-    focal = float(cameras.intrinsics[view, :2].mean()) * side / max(width, height)
-    lens = torch.tensor([[focal, focal, side / 2, side / 2]])
-    whole = Cameras(cameras.poses[[view]], lens, side, side)
-    rays, near, far = whole.image_rays_between(0, near=scene.near, far=scene.far, box=scene.box)
-    hit = (far > near).nonzero()[:, 0]
-    rays, near, far = rays[hit], near[hit], far[hit]
-    stops, samples = torch.zeros(len(hit), dtype=torch.int32), 0
-
-    def look(live: Tensor, start: Tensor | None) -> Wave:
-        nonlocal samples
-        now = rays[live]
-        found, stop = sampler.march(now, near[live], far[live], start=start, max_samples=FINE_WAVE, picture=True)
-        rgb, sigma = run.renderer.field(found.inputs, now.directions, found.ray_index)
-        samples += len(sigma)
-        stops[live] = stop
-        seen = composite(sigma, rgb, found.depths, found.deltas, ray_offsets=found.ray_offsets)
-        return Wave(seen, found.ray_index, found.ray_offsets, found.depths, stop)
-
-    with torch.no_grad():
-        walk(look, far, sampler.picture_samples, FINE_WAVE, OPAQUE, None, False)
-    return APART**2 * int(stops.sum()), APART**2 * samples
-
-
-def counted(run: Run) -> dict[str, Any]:
-    """Returns the numbers of strata, samples, operations and bytes of a frame, averaged over `VIEWS` views."""
-    radiance = radiance_of(run.renderer.field)
-    assert isinstance(radiance, Radiance)
-    views = np.linspace(0, len(run.scene.test.cameras) - 1, VIEWS).round().astype(int).tolist()
-    strata, samples = np.mean([walked(run, view) for view in views], axis=0)
-    of_sample, bytes_of_sample = costs(run, radiance)
-    of_stratum = COSTS["stratum"] + (COSTS["contraction"] if run.renderer.contraction is not None else 0)
-    operations = strata * of_stratum + samples * of_sample
-    rates = {f"frames_per_second_{rate}_tflops": rate * 1e12 / operations for rate in RATES}
-    return {
-        "strata_per_pixel": strata / FRAME**2,
-        "samples_per_pixel": samples / FRAME**2,
-        "operations_per_sample": of_sample,
-        "gflop_per_frame": operations / 1e9,
-        "gb_asked_per_frame": (strata * 4 + samples * bytes_of_sample + 16 * FRAME**2) / 1e9,
-        **rates,
-    }
-
-
-def costs(run: Run, radiance: Radiance) -> tuple[int, int]:
-    """Returns the operations of a sample and the bytes that it reads, mostly from a cache."""
-    operations, read, program = COSTS["sample"], 0, radiance.networks.program
-    for step in program.steps:
-        if step.op == "linear":
-            blocks = fours(step.width) * fours(step.operands[0].width)
-            operations += blocks * (2 * 16 + COSTS["block"])
-            read += 32 * blocks
-        elif step.op == "encode" and step.name == "hash":
-            features = step.width
-            levels = len(run.renderer.field.module.layers.grid.rows)  # type: ignore[attr-defined]
-            operations += 8 * (levels * COSTS["corner"] + 2 * features)
-            read += 8 * 2 * features
-        elif step.op == "encode":
-            operations += COSTS["wave"] * step.width
-        else:
-            operations += step.width
-    diagram = run.diagram
-    met = len(diagram.centres) / max(len(diagram.child_offsets) - 1, 1) * diagram.depth
-    return round(operations + COSTS["centre"] * met), round(read + 16 * met)
-
-
 def main(options: Options) -> None:
     """Measures and prints each run."""
     stored = read_json(options.json)["results"] if options.json is not None and options.json.is_file() else []
@@ -235,11 +151,10 @@ def main(options: Options) -> None:
                 row = {"run": path.name, "file_mb": size / 1e6, "cells": packed.scene["cells"]}
                 row |= {"trained_seconds": run.config.budget, "first_picture_seconds": seconds}
                 row |= compared(run, driver, options.pixels)
-            row |= counted(run)
             results[path.name] = row
             print(json_text(row, indent=1), flush=True)
             if options.json is not None:
-                about = metadata(costs=COSTS, frame=f"{FRAME} x {FRAME}", views=VIEWS)
+                about = metadata(views=VIEWS)
                 found = {"metadata": about, "results": list(results.values())}
                 write_text(options.json, json_text(found, indent=1) + "\n")
 

@@ -27,14 +27,13 @@ _PRIME_Y, _PRIME_Z = wp.constant(wp.uint32(2654435761)), wp.constant(wp.uint32(8
 
 @wp.struct
 class Grid:
-    """The grid's constants: box, interpolation, features per level, number of tables, entries of a table.
+    """The grid's constants: box, features per level, number of tables, entries of a table.
 
     ``numbers`` [levels, 2] holds scale and shift; ``sizes`` [levels, 4] holds side, entries, offset and hashed flag.
     """
 
     low: wp.vec3
     inverse: wp.vec3
-    smooth: wp.bool
     along: wp.bool
     features: wp.int32
     entries: wp.int32
@@ -48,7 +47,7 @@ class Grid:
 class Place:
     """The voxel of a point on a level: the indices of the lower corner, and the weights of the upper corner.
 
-    ``upper`` holds the upper corner's weight on each axis, ``slope`` and ``bend`` the weight's first two derivatives.
+    ``upper`` holds the upper corner's weight on each axis, ``slope`` the weight's derivative.
     """
 
     x: wp.int32
@@ -56,7 +55,6 @@ class Place:
     z: wp.int32
     upper: wp.vec3
     slope: wp.vec3
-    bend: wp.vec3
 
 
 @wp.func
@@ -76,16 +74,9 @@ def _place(positions: wp.array2d(dtype=wp.float32), i: wp.int32, level: wp.int32
         corner = wp.float32(0.0)
         if where > 0.0:  # not NaN
             corner = wp.floor(where)
-        t = where - corner
         corners[axis] = corner
-        if grid.smooth:
-            result.upper[axis] = t * t * (3.0 - 2.0 * t)
-            result.slope[axis] = slope * 6.0 * t * (1.0 - t)
-            result.bend[axis] = slope * slope * (6.0 - 12.0 * t)
-        else:
-            result.upper[axis] = t
-            result.slope[axis] = slope
-            result.bend[axis] = wp.float32(0.0)
+        result.upper[axis] = where - corner
+        result.slope[axis] = slope
     result.x = wp.int32(corners[0])
     result.y = wp.int32(corners[1])
     result.z = wp.int32(corners[2])
@@ -205,17 +196,14 @@ def _positions_kernel(
                 product += gradient[i, level * grid.features + f] * table[row, f]
             at = _of_corner(place.upper, corner, wp.float32(1.0))
             slope = _of_corner(place.slope, corner, wp.float32(0.0))
-            bend = _of_corner(place.bend, corner, wp.float32(0.0))
             for axis in range(3):
                 b = (axis + 1) % 3
                 c = (axis + 2) % 3
                 change = slope[axis] * at[b] * at[c]
                 if grid.along:
-                    change = direction[i, axis] * bend[axis] * at[b] * at[c] + slope[axis] * (
-                        direction[i, b] * slope[b] * at[c] + direction[i, c] * slope[c] * at[b]
-                    )
+                    change = slope[axis] * (direction[i, b] * slope[b] * at[c] + direction[i, c] * slope[c] * at[b])
                 # Outside the box the gradient is 0, even if a product is NaN.
-                if place.slope[axis] != 0.0 or place.bend[axis] != 0.0:
+                if place.slope[axis] != 0.0:
                     total[axis] = total[axis] + change * product
     for axis in range(3):
         of_positions[i, axis] = total[axis]
@@ -256,7 +244,7 @@ def _inputs(arguments: Hashed, table: Tensor) -> tuple[list[object], list[object
     levels, grid = HashGrid.parse(arguments.grid), Grid()
     low, high = levels.box
     grid.low, grid.inverse = wp.vec3(*low), wp.vec3(*(1 / (b - a) for a, b in zip(low, high)))
-    grid.smooth, grid.along = levels.interpolation == "smoothstep", direction is not None
+    grid.along = direction is not None
     grid.features, grid.entries, grid.several = levels.features, arguments.table.shape[-2], cells is not None
     grid.tables = arguments.table.shape[0]
     numbers, sizes = _levels(arguments.grid, positions.device)

@@ -247,7 +247,6 @@ PLOTS: dict[str, Callable[[Path, Sequence[Row]], Path]] = {
     "cell-count": counts,
     "at-size": curves,
     "seams": curves,
-    "nested-2d": curves,
     "balance": balance,
 }
 
@@ -259,6 +258,4 @@ def draw(name: str, rows: Sequence[Row], folder: Path) -> list[Path]:
         found.append(PLOTS[name](folder / f"{name}.png", rows))
     if name in SHEETS and rows:
         found.append(sheet(folder / f"{name}-pictures.png", rows, folder, SHEETS[name]))
-    if name == "nested-2d":
-        found.append(folder / "nested-2d-pictures.png")
     return [path for path in found if path is not None and path.is_file()]

@@ -19,7 +19,7 @@ from typing import Any
 import tyro
 from harness import metadata
 
-from paper import balance, nested
+from paper import balance
 from paper.experiments import EXPERIMENTS
 from paper.report import ABOUT, write_report
 from paper.runs import Run, Settings, default_scenes, failure, results, train_missing
@@ -42,10 +42,7 @@ def trainings(name: str, settings: Settings) -> list[Run]:
 def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]:
     """Writes an experiment's JSON from its trainings; returns {metadata, results}."""
     described = {"benchmark": "paper", "experiment": name, "budget_seconds": settings.budget, "seeds": settings.seeds}
-    if name == "nested-2d":
-        described["scenes"] = list(settings.scene or default_scenes())
-        rows = nested.nested(settings, say)
-    elif name == "balance":
+    if name == "balance":
         described["scenes"] = list(settings.scene or default_scenes())
         rows = balance.measure(runs, settings.backend, say)
     else:

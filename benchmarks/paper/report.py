@@ -17,8 +17,6 @@ Row = dict[str, Any]
 ABOUT = {
     **{name: experiment.about for name, experiment in EXPERIMENTS.items()},
     "balance": "How evenly 16 cells share the importance, before and after balancing, over 100 diagrams.",
-    "nested-2d": "A picture fitted by networks of places in the plane, split three times into four where it is wrong: "
-    "one network, one of as many parameters as all cells have, nested cells.",
 }
 PLACES = {"psnr": 2, "ssim": 4, "lpips": 4, "psnr_of_mean_error": 2}
 SIZES = ("cells", "width", "parameters", "steps")

@@ -6,14 +6,12 @@
 #include <algorithm>
 #include <optional>
 
-#include "bindings/adam_call.h"
 #include "bindings/frame.h"
 #include "bindings/program_call.h"
 #include "bindings/signature.h"
 #include "bindings/unchanged.h"
 #include "common/cuda_device.h"
 #include "common/parallel.h"
-#include "common/trace.h"
 
 namespace voronerf {
 
@@ -48,25 +46,9 @@ py::object to_python(const Type* type, const Result& result) {
   }
 }
 
-// A traced call (common/trace.h).
-struct Traced {
-  const std::string* name;
-  double seconds;
-  Trace regions;
-};
-bool tracing = false;
-std::vector<Traced> traced_calls;
-
-// Calls the C++ function, and traces the call if tracing is on. The caller may have released the GIL.
+// Calls the C++ function. The caller may have released the GIL.
 void call(const Loaded& loaded, Result& result) {
-  Trace regions;
-  if (tracing) trace = &regions;
-  const double began = tracing ? Trace::now() : 0.0;
   loaded.bound->call(loaded.bound->function, loaded.values.places(), &result);
-  if (tracing) {
-    trace = nullptr;
-    traced_calls.push_back({&loaded.function->name, Trace::now() - began, regions});
-  }
 }
 
 }  // namespace
@@ -107,16 +89,15 @@ class Recording {
     calls_.push_back(std::move(loaded));
   }
 
-  // Replays the calls [first, last) `times` times in a row, on `threads` threads; while tracing is on, on one thread.
-  // Before each replay, each of `places` receives the next `bytes` bytes of the random numbers at the address `drawn`.
-  // Returns the number of complete replays: the replay stops before a call whose rows would exceed the memory of its
-  // tensors.
+  // Replays the calls [first, last) `times` times in a row, on `threads` threads. Before each replay, each of `places`
+  // receives the next `bytes` bytes of the random numbers at the address `drawn`. Returns the number of complete
+  // replays: the replay stops before a call whose rows would exceed the memory of its tensors.
   int replay(int threads, int times, size_t first, size_t last, std::uintptr_t drawn,
              const std::vector<std::uintptr_t>& places, size_t bytes) {
     const py::gil_scoped_release released;
     int repeats = 0;
     std::exception_ptr failure;
-    with_team(tracing ? 1 : threads, [&] {
+    with_team(threads, [&] {
       try {
         for (; repeats < times; ++repeats) {
           for (const std::uintptr_t place : places) {
@@ -302,11 +283,9 @@ constexpr const char* kStub =
     "\n"
     "def signature(op: str, rows: Sequence[Any], positional: int, more: dict[str, Any]) -> Any: ...\n"
     "def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool: ...\n"
-    "def adam_step(rule: type, guard: type, *given: Any) -> bool: ...\n"
     "def way_of(arguments: tuple[Any, ...]) -> int: ...\n"
     "def know_calls(objects: dict[str, Any]) -> None: ...\n"
-    "def know_torch(dtypes: dict[str, torch.dtype], classes: tuple[type, ...], exchange: Any) -> None: ...\n"
-    "def trace(on: bool) -> list[tuple[str, float, int, float, list[float]]]: ...\n";
+    "def know_torch(dtypes: dict[str, torch.dtype], classes: tuple[type, ...], exchange: Any) -> None: ...\n";
 
 // The stub of the module for type checkers (voronerf/ops/_core/_C.pyi). Declaring a struct or an enumeration also adds
 // its class or its names to the module.
@@ -428,7 +407,6 @@ void bind_all(PyObject* python) {
       .def_property_readonly("obstacle", &Recording::obstacle);
   bind_signatures(bound);
   bind_program_calls(bound);
-  bind_adam_step(bound);
   // know_torch takes Python objects of torch, with which this module is not linked: the dtypes by name, the classes of
   // plain tensors, and the capsule of torch's DLPack exchange API (tensor_view.h) or None.
   bound.def("know_torch", [](const py::dict& names, const py::tuple& classes, const py::object& exchange) {
@@ -436,19 +414,6 @@ void bind_all(PyObject* python) {
       dtypes()[py::cast<std::string>(entry.first)] = py::reinterpret_borrow<py::object>(entry.second).release().ptr();
     }
     know_tensors(classes.ptr(), exchange.ptr());
-  });
-  // trace(on) switches the tracing of calls on or off. It returns the calls traced since the last call of trace, as
-  // tuples: name, seconds, number of parallel regions, seconds in these regions, and their estimated seconds for each
-  // number of threads in Trace::kTeams.
-  bound.def("trace", [](bool on) {
-    tracing = on;
-    py::list calls;
-    for (const Traced& call : std::exchange(traced_calls, {})) {
-      py::list shared;
-      for (const double seconds : call.regions.shared) shared.append(seconds);
-      calls.append(py::make_tuple(*call.name, call.seconds, call.regions.regions, call.regions.inside, shared));
-    }
-    return calls;
   });
   const std::string text = declarations.stub();
   bound.attr("stub") = text;

@@ -8,7 +8,7 @@ namespace voronerf {
 
 VN_NAMES(TableType, "float32", "bfloat16", "float16");
 VN_STRUCT(GridLevel, scale, shift, side, entries, offset, hashed);
-VN_STRUCT(HashGrid, levels, low, high, features, smooth);
+VN_STRUCT(HashGrid, levels, low, high, features);
 VN_STRUCT(HashInputs, positions, direction, table, type, cells, n, tables, entries);
 
 }  // namespace voronerf

@@ -8,8 +8,6 @@
 #include <cstdint>
 #include <exception>
 
-#include "common/trace.h"
-
 #ifdef VN_STD_THREADS
 #include <thread>
 #include <vector>
@@ -26,12 +24,7 @@ namespace voronerf {
 // thread. The body must not throw.
 template <typename Body>
 void parallel(int threads, const Body& body) {
-  if (threads <= 1) {
-    if (trace != nullptr) trace->begin();
-    body(0);
-    if (trace != nullptr) trace->end();
-    return;
-  }
+  if (threads <= 1) return body(0);
   if (Team::current() != nullptr) return Team::current()->run(threads, body);
 #ifdef VN_STD_THREADS
   std::vector<std::thread> others;
@@ -71,7 +64,6 @@ class Items {
 
   // Takes the next run of a thread, items [begin, end). Returns false if no run is left.
   bool take(int thread, int64_t& begin, int64_t& end) {
-    if (trace != nullptr) trace->run();
     for (int i = 0; i < parts_; ++i) {
       Part& part = of_[(thread + i) % parts_];
       if (part.next.load(std::memory_order_relaxed) >= part.end) continue;

@@ -36,7 +36,7 @@ __device__ __forceinline__ Corners corners_of(const HashEncoding& in, int64_t po
   corners.directed = in.in.direction != nullptr;
 #pragma unroll
   for (int axis = 0; axis < 3; ++axis) {
-    corners.axes[axis] = hash_axis(places[axis].place, level, in.smooth);
+    corners.axes[axis] = hash_axis(places[axis].place, level);
     corners.along[axis] = corners.directed ? places[axis].slope * in.in.direction[3 * point + axis] : 0.0f;
   }
   return corners;

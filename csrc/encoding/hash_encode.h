@@ -13,13 +13,12 @@
 
 namespace voronerf {
 
-// A hash grid: its levels, its box from `low` to `high`, the features of each level, and whether the interpolation is
-// smoothstep (else linear). It corresponds to HashGrid in voronerf/ops/_core/grids.py.
+// A hash grid: its levels, its box from `low` to `high`, and the features of each level. It corresponds to HashGrid in
+// voronerf/ops/_core/grids.py.
 struct HashGrid {
   std::vector<GridLevel> levels;
   std::vector<float> low, high;
   int64_t features;
-  bool smooth;
 };
 
 inline HashEncoding hash_encoding(const HashInputs& in, const HashGrid& grid) {
@@ -27,7 +26,6 @@ inline HashEncoding hash_encoding(const HashInputs& in, const HashGrid& grid) {
   result.in = in;
   result.count = static_cast<int32_t>(grid.levels.size());
   result.features = static_cast<int32_t>(grid.features);
-  result.smooth = grid.smooth;
   for (int32_t i = 0; i < result.count; ++i) result.levels[i] = grid.levels[static_cast<std::size_t>(i)];
   for (std::size_t axis = 0; axis < 3; ++axis) {
     result.low[axis] = grid.low[axis];

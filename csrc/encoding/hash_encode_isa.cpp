@@ -62,9 +62,9 @@ template <bool kSlopes>
 VN_INLINE void corners_of(const HashEncoding& in, const GridLevel& level, const HashPlaces& places, int64_t rows,
                           HashCorners& corners) {
   if (in.in.direction != nullptr) {
-    hash_corners<true, kSlopes>(in, level, places, rows, corners);
+    hash_corners<true, kSlopes>(level, places, rows, corners);
   } else {
-    hash_corners<false, kSlopes>(in, level, places, rows, corners);
+    hash_corners<false, kSlopes>(level, places, rows, corners);
   }
 }
 

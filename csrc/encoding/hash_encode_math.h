@@ -1,9 +1,8 @@
 // Arithmetic of the hash encoding for one point and one level, and the structs that describe a call. The CPU's vector
 // form is in hash_encode_tile.h.
 //
-// The weights of the eight corners around a point are products of one factor for each axis: w(t) or 1 - w(t), where t
-// is the distance from the lower corner and w(t) is t or t^2 (3 - 2 t). Derivatives use the same corners with other
-// factors.
+// The weights of the eight corners around a point are products of one factor for each axis: t or 1 - t, where t is the
+// distance from the lower corner. Derivatives use the same corners with other factors.
 #pragma once
 
 #include <cstdint>
@@ -40,7 +39,6 @@ struct HashEncoding {
   HashInputs in;
   GridLevel levels[kMaxHashLevels];
   int32_t count, features;
-  bool smooth;
   float low[3], inverse[3];
 };
 
@@ -57,12 +55,12 @@ VN_HD HashPlace hash_place(float x, float low, float inverse) {
 }
 
 // One axis of a level: the lower corner, and for both the lower and the upper corner the factor of the weight and its
-// first and second derivatives with respect to the scaled coordinate.
+// derivative with respect to the scaled coordinate.
 struct HashAxis {
   uint32_t corner;
-  float at[2], slope[2], bend[2];
+  float at[2], slope[2];
 };
-VN_HD HashAxis hash_axis(float place, const GridLevel& level, bool smooth) {
+VN_HD HashAxis hash_axis(float place, const GridLevel& level) {
   // The product and the sum are rounded separately, as in the reference, so that the corners are the same.
 #ifdef __CUDA_ARCH__
   const float where = __fadd_rn(__fmul_rn(place, level.scale), level.shift);
@@ -72,12 +70,8 @@ VN_HD HashAxis hash_axis(float place, const GridLevel& level, bool smooth) {
   HashAxis axis;
   axis.corner = where == where ? static_cast<uint32_t>(where) : 0u;  // never negative
   const float t = where - static_cast<float>(axis.corner);
-  const float w = smooth ? t * t * (3.0f - 2.0f * t) : t;
-  const float d = smooth ? level.scale * (6.0f * t * (1.0f - t)) : level.scale;
-  const float e = smooth ? level.scale * level.scale * (6.0f - 12.0f * t) : 0.0f;
-  axis.at[0] = 1.0f - w, axis.at[1] = w;
-  axis.slope[0] = -d, axis.slope[1] = d;
-  axis.bend[0] = -e, axis.bend[1] = e;
+  axis.at[0] = 1.0f - t, axis.at[1] = t;
+  axis.slope[0] = -level.scale, axis.slope[1] = level.scale;
   return axis;
 }
 
@@ -106,8 +100,7 @@ VN_HD float hash_weight_slope(const HashAxis* axes, bool directed, const float* 
   const HashAxis &a = axes[i], &b = axes[j], &c = axes[k];
   const int x = corner[i], y = corner[j], z = corner[k];
   if (!directed) return a.slope[x] * (b.at[y] * c.at[z]);
-  return along[i] * a.bend[x] * (b.at[y] * c.at[z]) +
-         a.slope[x] * (along[j] * b.slope[y] * c.at[z] + b.at[y] * (along[k] * c.slope[z]));
+  return a.slope[x] * (along[j] * b.slope[y] * c.at[z] + b.at[y] * (along[k] * c.slope[z]));
 }
 
 }  // namespace voronerf

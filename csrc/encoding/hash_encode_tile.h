@@ -59,14 +59,13 @@ VN_INLINE void hash_places(const HashEncoding& in, int64_t first, int64_t rows, 
   }
 }
 
-// The vector form of HashAxis. `along` is the slope times the direction, `bend` the second derivative times the
-// direction.
+// The vector form of HashAxis. `along` is the slope times the direction.
 struct HashVectorAxis {
   HashWords corner;
-  F32 at[2], slope[2], along[2], bend[2];
+  F32 at[2], slope[2], along[2];
 };
 
-VN_INLINE HashVectorAxis hash_vector_axis(F32 place, F32 along, const GridLevel& level, bool smooth) {
+VN_INLINE HashVectorAxis hash_vector_axis(F32 place, F32 along, const GridLevel& level) {
   const F32 one = splat(1.0f), zero = splat(0.0f), scale = splat(level.scale);
   const F32 where = place * scale + splat(level.shift);
   // `where` is not negative, so the conversion rounds down. NaN converts to the smallest integer.
@@ -75,16 +74,9 @@ VN_INLINE HashVectorAxis hash_vector_axis(F32 place, F32 along, const GridLevel&
   const F32 t = where - __builtin_convertvector(below, F32);
   HashVectorAxis axis;
   axis.corner = reinterpret_cast<HashWords>(below);
-  F32 w = t, d = scale, e = zero;
-  if (smooth) {
-    w = t * t * (splat(3.0f) - (t + t));
-    d = scale * (splat(6.0f) * t * (one - t));
-    e = scale * scale * (splat(6.0f) - splat(12.0f) * t);
-  }
-  axis.at[0] = one - w, axis.at[1] = w;
-  axis.slope[0] = zero - d, axis.slope[1] = d;
-  axis.along[1] = along * d, axis.along[0] = zero - axis.along[1];
-  axis.bend[1] = along * e, axis.bend[0] = zero - axis.bend[1];
+  axis.at[0] = one - t, axis.at[1] = t;
+  axis.slope[0] = zero - scale, axis.slope[1] = scale;
+  axis.along[1] = along * scale, axis.along[0] = zero - axis.along[1];
   return axis;
 }
 
@@ -109,12 +101,11 @@ VN_INLINE void hash_entries(const HashVectorAxis* axes, const GridLevel& level, 
 // Computes the corners of a level. kAlong: weights of the derivative along the direction. kSlopes: weights of the
 // derivatives with respect to each scaled coordinate.
 template <bool kAlong, bool kSlopes>
-VN_INLINE void hash_corners(const HashEncoding& in, const GridLevel& level, const HashPlaces& places, int64_t rows,
-                            HashCorners& to) {
+VN_INLINE void hash_corners(const GridLevel& level, const HashPlaces& places, int64_t rows, HashCorners& to) {
   for (int64_t i = 0; i < rows; i += kLanes) {
     HashVectorAxis axes[3];
     for (int axis = 0; axis < 3; ++axis) {
-      axes[axis] = hash_vector_axis(load(places.place[axis] + i), load(places.along[axis] + i), level, in.smooth);
+      axes[axis] = hash_vector_axis(load(places.place[axis] + i), load(places.along[axis] + i), level);
     }
     hash_entries(axes, level, to, i);
     const HashVectorAxis &a = axes[0], &b = axes[1], &c = axes[2];
@@ -127,9 +118,9 @@ VN_INLINE void hash_corners(const HashEncoding& in, const GridLevel& level, cons
       }
       F32 by_x = a.slope[x] * at, by_y = a.at[x] * (b.slope[y] * c.at[z]), by_z = a.at[x] * (b.at[y] * c.slope[z]);
       if (kAlong) {
-        by_x = a.bend[x] * at + a.slope[x] * along;
-        by_y = a.along[x] * (b.slope[y] * c.at[z]) + a.at[x] * (b.bend[y] * c.at[z] + b.slope[y] * c.along[z]);
-        by_z = a.along[x] * (b.at[y] * c.slope[z]) + a.at[x] * (b.along[y] * c.slope[z] + b.at[y] * c.bend[z]);
+        by_x = a.slope[x] * along;
+        by_y = a.along[x] * (b.slope[y] * c.at[z]) + a.at[x] * (b.slope[y] * c.along[z]);
+        by_z = a.along[x] * (b.at[y] * c.slope[z]) + a.at[x] * (b.along[y] * c.slope[z]);
       }
       store(to.weight[0][corner] + i, by_x);
       store(to.weight[1][corner] + i, by_y);

@@ -4,16 +4,14 @@ import contextlib
 import itertools
 import json
 import math
-import time
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 import turns
 from helpers import read_json, refuses
-from paper import balance, figures, nested, runs, slices
+from paper import balance, figures, runs, slices
 from paper import main as paper
 from paper.experiments import EXPERIMENTS
 from paper.report import ABOUT
@@ -32,9 +30,7 @@ TINY |= {"evaluations": 2, "eval_views": 1, "final_views": 1, "turn": 0.1, "cell
 def steady_clock(monkeypatch):
     """Sets a clock on which a step always takes ten milliseconds, so that splits and ends are deterministic."""
     ticks = itertools.count()
-    clock = SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks), time=time.time)
-    monkeypatch.setattr(nested, "time", clock)
-    monkeypatch.setitem(turns.CLOCKS, "wall", clock.perf_counter)
+    monkeypatch.setitem(turns.CLOCKS, "wall", lambda: 0.0101 * next(ticks))
 
 
 @pytest.fixture
@@ -223,17 +219,6 @@ def test_matched_parameters(settings):
         options = {} if config.parameters is None else {"width": solve_width(config, config.parameters)}
         counts[name] = count_parameters(config, **options)
     assert all(0.9 * counts["12 cells"] < count <= counts["12 cells"] for count in counts.values())
-
-
-def test_a_nested_picture(settings):
-    small = replace(settings, budget=0.2, downscale=4 * settings.downscale)  # the picture has four times the resolution
-    paper.repeat(small, ("nested-2d",))
-    rows = read_json(settings.out / "nested-2d.json")["results"]
-    cells = {row["variant"]: row["cells"] for row in rows}
-    assert cells[nested.ONE] == cells[nested.MATCHED] == 1 and cells[nested.NESTED] >= 4
-    levels = rows[-1]["levels"]
-    assert [level["cells"] for level in levels[:2]] == [1, 4] and len(levels) == 4
-    assert (settings.out / "nested-2d.png").is_file() and (settings.out / "nested-2d-pictures.png").is_file()
 
 
 def test_a_slice_through_a_known_density():

@@ -42,7 +42,7 @@ void members(voronerf::ProgramOutput& o) { read(o.width, o.ray, o.memory); }
 void members(voronerf::ProgramLookup& l) { read(l.input, l.parameter, l.grid, l.memory); }
 void members(voronerf::ProgramScatter& s) { read(s.input, s.parameter, s.grid, s.memory, s.sum); }
 void members(voronerf::GridLevel& l) { read(l.scale, l.shift, l.side, l.entries, l.offset, l.hashed); }
-void members(voronerf::HashGrid& g) { read(g.levels, g.low, g.high, g.features, g.smooth); }
+void members(voronerf::HashGrid& g) { read(g.levels, g.low, g.high, g.features); }
 void members(voronerf::ProgramTable& t) {
   read(t.packs, t.steps, t.operands, t.sums, t.inputs, t.outputs, t.memories, t.lookups, t.scatters, t.grids);
   read(t.sum_tensors, t.parameters, t.tile, t.columns, t.packed, t.partial, t.scratch, t.scratch_width, t.layout);

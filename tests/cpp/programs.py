@@ -31,8 +31,8 @@ POSITIVE = ("log", "power")
 def grid(draw: random.Random) -> HashGrid:
     """Draws a grid of up to five levels, whose first levels are dense."""
     given = {"levels": draw.randint(1, 5), "features": draw.choice((1, 2, 4, 8)), "base": draw.randint(2, 5)}
-    words = {"interpolation": draw.choice(("linear", "smoothstep")), "convention": draw.choice(CONVENTIONS)}
-    return HashGrid(log2_entries=10, finest=18, box=((-1, -1, -1), (0.5, 1, 2)), **given, **words)
+    box = (-1, -1, -1), (0.5, 1, 2)
+    return HashGrid(log2_entries=10, finest=18, box=box, convention=draw.choice(CONVENTIONS), **given)
 
 
 def layer_table(draw: random.Random) -> Program:

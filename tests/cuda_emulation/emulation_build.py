@@ -99,7 +99,6 @@ def _for_python(path):
     files += [
         bindings / name
         for name in (
-            "adam_call.cpp",
             "bind.cpp",
             "program_call.cpp",
             "signature.cpp",

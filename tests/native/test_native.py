@@ -239,25 +239,6 @@ assert len(loaded) == 1 or (not loaded and not _native.describe()["openmp"]), lo
     run_python(code, OMP_NUM_THREADS="2", VORONERF_ISA="portable")
 
 
-def test_a_trace_says_what_threads_would_share() -> None:
-    """On two threads a parallel region takes at least half of its serial time; a serial region gains nothing."""
-    compiled, before, points = _native.compiled, torch.get_num_threads(), torch.rand(1 << 18, 3)
-    torch.set_num_threads(1)
-    try:
-        compiled.trace(True)
-        nearest_centre(points, points[:64], backend="native")
-        nearest_centre(points[:1], points[:64], backend="native")  # one serial run
-    finally:
-        torch.set_num_threads(before)
-        (name, seconds, regions, inside, on), (_, _, _, inside_one, on_one) = compiled.trace(False)
-    assert name == "nearest_centre" and regions == 1 and 0 < inside <= seconds
-    # On a busy machine a single run may take longer than the average share of a thread.
-    assert inside / 2 - 1e-9 <= on[0] <= 0.6 * inside and on[0] > on[1] >= on[2] >= on[3] > 0
-    assert on_one == [pytest.approx(inside_one, abs=3e-6)] * 4  # the clock counts microseconds
-    nearest_centre(points, points[:64], backend="native")
-    assert compiled.trace(False) == []
-
-
 def test_an_unknown_instruction_set_is_an_error_whatever_the_backend() -> None:
     code = """
 import torch

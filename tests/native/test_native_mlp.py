@@ -55,7 +55,7 @@ NETWORKS = {
     "nerf 18": nerf(18, 2),
     "integrated": MLP(nerf(33, 2).layers, nerf(33, 2).outputs, 16, 2, "integrated"),
     "hashed 32": hashed(nerf(32, 2), 4, levels=8, features=2, finest=64),
-    "hashed 17": hashed(nerf(17, 2), 3, levels=3, features=1, finest=9, interpolation="smoothstep"),
+    "hashed 17": hashed(nerf(17, 2), 3, levels=3, features=1, finest=9),
     "hashed 256": hashed(nerf(256, 2), 2, levels=5, features=8, finest=30, box=((-1, -1, -1), (0, 1, 2))),
     "sigmoid": chain(20, 2, activation="sigmoid"),
     "sine": chain(20, 2, activation="sine"),

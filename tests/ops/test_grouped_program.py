@@ -17,7 +17,6 @@ from programs import derivatives as of_every_order
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from voronerf import HashGrid
 from voronerf.ops import grouped_program, hash_encode
 from voronerf.ops._core import native
 from voronerf.ops._core.encodings import ENCODINGS
@@ -375,31 +374,29 @@ ENCODED = {
     "constant": ("spherical", 3, 1),
     "hash": ("hash", 3, 0),
     "hash of each cell": ("hash", 3, 0),
-    "linear hash": ("hash", 3, 0),
 }
 
 
-def of_encoding(kind: str, ray: bool = False) -> tuple[Program, HashGrid]:
-    """Returns a program with the outputs sin(W e(x)) for each row and e(x) * other summed by ray, and its grid."""
+def of_encoding(kind: str, ray: bool = False) -> Program:
+    """Returns a program with the outputs sin(W e(x)) for each row and e(x) * other summed by ray."""
     name, raw, size = ENCODED[kind]
-    grid = replace(GRID, interpolation="linear") if kind == "linear hash" else GRID
     b = Builder()
     x = b.input(raw, ray=ray)
-    table = b.parameter(*grid.table_shape) if name == "hash" else 0
-    e = b.encode(name, x, b.grid(grid.text) if name == "hash" else size, table)
+    table = b.parameter(*GRID.table_shape) if name == "hash" else 0
+    e = b.encode(name, x, b.grid(GRID.text) if name == "hash" else size, table)
     other = b.input(e.width, ray=not ray)
     h = b.apply("sine", b.linear(e, b.parameter(2, e.width), 2), 1.0)
-    return b.program([h, b.binary("mul", e, other)], by_ray=[1]), grid
+    return b.program([h, b.binary("mul", e, other)], by_ray=[1])
 
 
-def formula(kind: str, grid: HashGrid, x: Tensor, table: Tensor | None, cells: Tensor) -> Tensor:
+def formula(kind: str, x: Tensor, table: Tensor | None, cells: Tensor) -> Tensor:
     """Computes the encoding without programs."""
     name, _, size = ENCODED[kind]
     if name in ENCODINGS:
         return ENCODINGS[name].formula(x, size)
     assert table is not None
     own = len(table) > 1
-    return hash_encode(x, table if own else table[0], grid, cells=cells if own else None, backend="reference")
+    return hash_encode(x, table if own else table[0], GRID, cells=cells if own else None, backend="reference")
 
 
 def encoding_arguments(program: Program, kind: str, sizes: list[int], rays: int) -> list[Tensor]:
@@ -422,7 +419,7 @@ def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None
     """Values and three orders of gradients are correct: with autograd of the reference, and with gradient programs."""
     if ray and kind.endswith(("hash", "cell")):
         pytest.skip("the positions of a grid are samples")
-    program, grid = of_encoding(kind, ray)
+    program = of_encoding(kind, ray)
     sizes, rays = [4, 0, 5], 6
     tensors = encoding_arguments(program, kind, sizes, rays)
     offsets = offsets_of(sizes) + 2  # two rows before the cells, three after them
@@ -438,7 +435,7 @@ def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None
         place = torch.arange(n) if order is None else torch.empty(n).long().index_copy(0, order.long(), torch.arange(n))
         cells = cells_of(offsets, x)[place]
         inside = ((place >= offsets[0]) & (place < offsets[-1]))[:, None]
-        e = formula(kind, grid, x, table, cells)
+        e = formula(kind, x, table, cells)
         h = (parameters[-1][cells.long()] @ e[:, :, None])[:, :, 0].sin()
         product = torch.where(inside, e * other, 0)
         return [torch.where(inside, h, 0), e.new_zeros(rays, e.shape[1]).index_add(0, ray_index, product)]
@@ -459,7 +456,7 @@ def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None
 @pytest.mark.parametrize("kind", [*ENCODINGS, "hash", "hash of each cell"])
 def test_gradient_programs_of_encodings_by_differences(kind: str) -> None:
     """Gradient programs pass gradcheck and gradgradcheck, which use finite differences."""
-    program, _ = of_encoding(kind)
+    program = of_encoding(kind)
     tensors = [tensor.requires_grad_() for tensor in encoding_arguments(program, kind, [2, 1], 3)]
     ray_index = torch.arange(8).int() % 3
 

@@ -20,8 +20,8 @@ GRIDS = {
     "hashed": HashGrid(levels=3, features=2, log2_entries=10, base=20, finest=300),
     "both": HashGrid(levels=8, features=2, log2_entries=12, base=4, finest=128, box=BOX),
     "one level": HashGrid(levels=1, features=1, log2_entries=10, base=7, finest=7),
-    "one feature": HashGrid(levels=5, features=1, log2_entries=11, base=2, finest=100, interpolation="smoothstep"),
-    "four features": HashGrid(levels=4, features=4, log2_entries=10, finest=64, interpolation="smoothstep", box=BOX),
+    "one feature": HashGrid(levels=5, features=1, log2_entries=11, base=2, finest=100),
+    "four features": HashGrid(levels=4, features=4, log2_entries=10, finest=64, box=BOX),
     "eight features": HashGrid(levels=3, features=8, log2_entries=10, base=8, finest=64),
     "many levels": HashGrid(levels=24, features=2, log2_entries=10, base=16, finest=2**19),
     "asked for ahead": HashGrid(levels=2, features=2, log2_entries=17, base=60, finest=200),
@@ -191,7 +191,6 @@ def test_errors():
         ({"base": 64, "finest": 32}, "HashGrid: base and finest must be 1 <= base <= finest <= 2^20, got 64 and 32"),
         ({"finest": math.nan}, "HashGrid: base and finest must be 1 <= base <= finest <= 2^20, got 16 and nan"),
         ({"box": ((0, 0, 0), (1, 0, 1))}, "HashGrid: box must be two corners, ... got ((0, 0, 0), (1, 0, 1))"),
-        ({"interpolation": "cubic"}, "HashGrid: interpolation must be one of linear, smoothstep, got 'cubic'"),
         ({"convention": "ngp"}, "HashGrid: convention must be one of tiny-cuda-nn, ... nerfstudio, got 'ngp'"),
     ],
 )
@@ -238,7 +237,7 @@ def test_every_instruction_set(isa, poisoned, name, dtype, several):
 
 def test_third_derivatives(backend):
     need("hash_encode", backend, torch.device("cpu"), torch.float32)
-    grid = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=20, interpolation="smoothstep", box=BOX)
+    grid = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=20, box=BOX)
     x, table, v = points(20, grid), features(grid), torch.randn(20, 3)
 
     def third(encode, dtype):

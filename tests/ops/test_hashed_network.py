@@ -13,7 +13,7 @@ from voronerf.ops.grouped_program.reference import cells_of
 
 GRIDS = {
     "plain": HashGrid(levels=4, features=2, log2_entries=10, base=4, finest=64),
-    "odd": HashGrid(levels=3, features=1, log2_entries=12, base=3, finest=9, interpolation="smoothstep"),
+    "odd": HashGrid(levels=3, features=1, log2_entries=12, base=3, finest=9),
     "wide": HashGrid(levels=5, features=8, log2_entries=10, base=8, finest=100, box=((-1, -1, -1), (2, 2, 2))),
 }
 grids = pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())

@@ -123,7 +123,7 @@ def test_errors(layers, outputs, octaves, message):
     assert str(caught.value) == message
 
 
-GRID = HashGrid(levels=3, features=2, log2_entries=10, base=3, finest=12, interpolation="smoothstep")
+GRID = HashGrid(levels=3, features=2, log2_entries=10, base=3, finest=12)
 HASHED = MLP(TABLES["tangled"].layers, (3, 1), None, 1, "hash", GRID)
 PROGRAMS = {
     **TABLES,

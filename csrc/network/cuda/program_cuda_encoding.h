@@ -53,8 +53,7 @@ __device__ __forceinline__ HashAxes hash_axes(const HashEncoding& grid, const Gr
   HashAxes result;
 #pragma unroll
   for (int axis = 0; axis < 3; ++axis) {
-    result.axes[axis] =
-        hash_axis(hash_place(point(axis), grid.low[axis], grid.inverse[axis]).place, level, grid.smooth);
+    result.axes[axis] = hash_axis(hash_place(point(axis), grid.low[axis], grid.inverse[axis]).place, level);
   }
   return result;
 }

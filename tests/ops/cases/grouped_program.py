@@ -40,7 +40,7 @@ def smooth(width: int = 9) -> Program:
     return b.program([b.apply("tanh", b.linear(h, b.parameter(2, 3), 2))])
 
 
-GRID = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=12, interpolation="smoothstep")
+GRID = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=12)
 
 
 def encoded(width: int = 9) -> Program:

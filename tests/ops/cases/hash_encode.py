@@ -17,7 +17,6 @@ def hash_grid(draw: Draw) -> HashGrid:
         log2_entries=draw.number("log2_entries", 10, 10, 12),
         base=base,
         finest=base + draw.number("finest", 37, 1, 50),
-        interpolation=draw.among("interpolation", "smoothstep", "linear"),
     )
 
 

@@ -28,7 +28,6 @@ EXTRAS = {
     "export": Extra("voronerf export: points, meshes, cells", ("trimesh", "skimage", "scipy")),
     "viewer": Extra("voronerf view and train --view, in the browser", ("viser",)),
     "colmap": Extra("voronerf process: cameras of a video or of pictures", ("pycolmap",)),
-    "nerfstudio": Extra("ns-train voronerf, in nerfstudio", ("nerfstudio",)),
     "warp": Extra("kernels in NVIDIA Warp (--backend warp)", ("warp",)),
     "tensorboard": Extra("train --tensorboard", ("tensorboard",)),
     "dev": Extra("checks of the source code", ("ruff", "mypy")),

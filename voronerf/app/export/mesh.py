@@ -49,7 +49,7 @@ REACH = 8
 SMOOTH, CUT = 1.0, 0.3
 #: The distance by which the surface of an object on a plain background is moved towards the cameras, as a fraction of
 #: the longest side of the scene's box: rendered depths lie a little inside the object, and smoothing makes it smaller.
-#: The value was chosen on the built-in scene and Lego (docs/export.md). For scenes without a box, the shift makes
+#: The value was chosen on the built-in scene and Lego. For scenes without a box, the shift makes
 #: meshes worse.
 BEFORE = 0.003
 #: Nodes along the side of a block, and number of blocks that are filled at once.

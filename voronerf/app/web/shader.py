@@ -206,8 +206,8 @@ def _linear(program: Program, step: Step, name: str, layout: Layout, steps: dict
 
 def _hash_grid(grids: list[HashGrid], number: int, x: str, out: str, wide: int) -> list[str]:
     grid = grids[number]
-    if len(grids) > 1 or grid.interpolation != "linear":
-        raise CannotDraw("its networks have a hash grid with smooth steps, or several grids")
+    if len(grids) > 1:
+        raise CannotDraw("its networks have several hash grids")
     lines = [f"let inside = clamp(({x} - GRID_LOW) * GRID_INVERSE, vec3f(), vec3f(1));  // hash grid"]
     levels = [_level(level, half) for level in grid.rows for half in range(-(-grid.features // 4))]
     per = max(1, 4 // grid.features)  # levels in a vec4f

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import torch
 
 CONVENTIONS = ("tiny-cuda-nn", "torch-ngp", "nerfstudio")
-INTERPOLATIONS = ("linear", "smoothstep")
 UNIT_CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
 
@@ -50,7 +49,6 @@ class HashGrid:
         finest: the resolution of the finest level, at least ``base``.
         box: the smallest and the largest corner of the space, three numbers each. A point outside the box has the
             features of the nearest point inside.
-        interpolation: "linear", or "smoothstep", whose first derivative is continuous.
         convention: the library whose table layout is used. "tiny-cuda-nn" (and instant-ngp): corners are shifted by
             half a cell, and a level of resolution N has N corners along an axis. "torch-ngp" (its gridencoder, with
             ``align_corners=False``): the same shift with N + 1 corners. "nerfstudio" (``HashEncoding`` in PyTorch, and
@@ -58,7 +56,7 @@ class HashGrid:
         text: the grid as JSON; :meth:`parse` reads it.
 
     Raises:
-        ValueError: a number is out of range, the box has no volume, or a name is unknown.
+        ValueError: a number is out of range, the box has no volume, or the convention is unknown.
 
     Examples:
         >>> from voronerf import HashGrid
@@ -75,7 +73,6 @@ class HashGrid:
     base: float = 16
     finest: float = 256
     box: tuple[tuple[float, float, float], tuple[float, float, float]] = UNIT_CUBE
-    interpolation: str = "linear"
     convention: str = "tiny-cuda-nn"
     text: str = dataclasses.field(init=False, repr=False, compare=False)
 
@@ -100,10 +97,10 @@ class HashGrid:
         if not valid:
             raise ValueError(f"HashGrid: box must be two corners, the second larger on each axis, got {self.box!r:.60}")
         object.__setattr__(self, "box", (low, high))
-        for name, words in (("interpolation", INTERPOLATIONS), ("convention", CONVENTIONS)):
-            value = getattr(self, name)
-            if not isinstance(value, str) or value not in words:
-                raise ValueError(f"HashGrid: {name} must be one of {', '.join(words)}, got {value!r:.60}")
+        if not isinstance(self.convention, str) or self.convention not in CONVENTIONS:
+            raise ValueError(
+                f"HashGrid: convention must be one of {', '.join(CONVENTIONS)}, got {self.convention!r:.60}"
+            )
         settings = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self) if entry.init}
         # Not a cached property, because torch.compile cannot trace its lock.
         object.__setattr__(self, "text", json.dumps(settings))

@@ -83,26 +83,12 @@ def adam(
         >>> (table[0] != 0).tolist()
         [False, True, False]
     """
-    arguments = rules, parameters, gradients, means, squares, guard, loss
-    if _makes_step(parameters, backend) and backends.compiled().adam_step(Rule, Guard, *arguments):
-        return
-    _check_all(*arguments)
+    _check_all(rules, parameters, gradients, means, squares, guard, loss)
     if not rules:
         return
     loss = None if loss is None else loss.detach()
     run = backends.resolve(_OP, backend=backend, device=parameters[0].device, dtype=torch.float32)
     run(rules, parameters, [gradient.contiguous() for gradient in gradients], means, squares, guard, loss)
-
-
-def _makes_step(parameters: Any, backend: str) -> bool:
-    """Returns whether the compiled module makes the whole step and also checks the arguments.
-
-    It does so for the native backend outside ``torch.compile``. ``parameters`` is not yet checked.
-    """
-    first = parameters[0] if isinstance(parameters, (list, tuple)) and parameters else None
-    if not isinstance(first, Tensor) or torch.compiler.is_dynamo_compiling():
-        return False
-    return backends.chosen(_OP, first.device, torch.float32, backend=backend) == "native"
 
 
 def average(

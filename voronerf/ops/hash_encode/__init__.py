@@ -21,10 +21,10 @@ def hash_encode(
     """Returns the features of points, interpolated on every level of a hash grid.
 
     Müller et al. 2022, section 3: on each level, the eight corners of the point's voxel select eight entries of the
-    table, by their row-major index or by a hash, and the features are interpolated. Positions and table have gradients
-    of every order. With linear interpolation, the gradient of the positions is discontinuous at voxel faces. Sums have
-    at least float32 precision. Results do not depend on the number of threads; on CUDA the gradient of the table is
-    summed in no fixed order.
+    table, by their row-major index or by a hash, and the features are interpolated linearly. Positions and table have
+    gradients of every order. The gradient of the positions is discontinuous at voxel faces. Sums have at least float32
+    precision. Results do not depend on the number of threads; on CUDA the gradient of the table is summed in no fixed
+    order.
 
     Args:
         positions: [n, 3] floating point, n < 2**31, in the units of ``grid.box``. A coordinate outside of the box is

@@ -68,7 +68,6 @@ def compiled_grid(text: str) -> native.compiled.HashGrid:
         low=grid.box[0],
         high=grid.box[1],
         features=grid.features,
-        smooth=grid.interpolation == "smoothstep",
     )
 
 

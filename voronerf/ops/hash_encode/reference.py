@@ -34,8 +34,6 @@ def _level(places: Tensor, rows: Tensor, start: Tensor | int, level: GridLevel, 
     where = places * level.scale + level.shift
     corner = where.detach().floor()
     inside = where - corner
-    if grid.interpolation == "smoothstep":
-        inside = inside * inside * (3 - 2 * inside)
     corner = corner.nan_to_num(0).long()
     total = places.new_zeros(len(places), grid.features)
     for step in itertools.product((0, 1), repeat=3):

@@ -95,7 +95,7 @@ def know_torch(module: Any) -> None:
 
 know_torch(compiled)
 
-signature, Rules, alike, adam_step = compiled.signature, compiled.Rules, compiled.alike, compiled.adam_step
+signature, Rules, alike = compiled.signature, compiled.Rules, compiled.alike
 """The functions that check arguments and make calls (csrc/bindings/signature.h); kept when tests replace `compiled`."""
 
 ISAS = compiled.Isa
