@@ -2,7 +2,7 @@
 
 import torch
 
-from voronerf.ops import Guard, Rule, adam
+from voronerf.ops import Guard, UpdateRule, adam
 
 
 def assert_adam(count, *, backend, device="cpu", scale=None, spoilt=None, limit=1e18, rate=0.01):
@@ -28,7 +28,7 @@ def assert_adam(count, *, backend, device="cpu", scale=None, spoilt=None, limit=
         if isinstance(spoilt, int) and step == 1:
             gradients[spoilt][-1] = 2 * limit
         scaled = [gradient.to(device) * (1 if scale is None else scale) for gradient in gradients]
-        rules = [Rule(at, rate, betas, epsilon, dense) for at, dense in zip(steps, dense_flags)]
+        rules = [UpdateRule(at, rate, betas, epsilon, dense) for at, dense in zip(steps, dense_flags)]
         adam(rules, tensors[0], scaled, *tensors[1:], guard=guard, loss=loss, backend=backend)
         left_out = step == 1 and spoilt is not None
         assert bool(guard.skip) == left_out and float(guard.in_a_row) == left_out

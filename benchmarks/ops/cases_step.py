@@ -216,7 +216,7 @@ def adam_work(entries: int, touched: float, device: torch.device) -> Work:
 
     def ours(backend: str) -> Contender:
         state = [table.clone(), torch.zeros_like(table), torch.zeros_like(table)]
-        rule = ops.Rule(torch.zeros((), device=device), 1e-2, dense=False)
+        rule = ops.UpdateRule(torch.zeros((), device=device), 1e-2, dense=False)
 
         def run(call: int) -> Results:
             lists = ([tensor] for tensor in (state[0], gradient, *state[1:]))

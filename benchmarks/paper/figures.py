@@ -27,7 +27,7 @@ GRID = 200  # times at which curves of several seeds are averaged
 DPI = 100
 
 
-class Rows:
+class Results:
     """The results by scene and variant, with one value per seed.
 
     Attributes:
@@ -98,7 +98,7 @@ def curves(path: Path, rows: Sequence[Row]) -> Path:
 
     Bands are the range over the seeds, dotted lines the splits.
     """
-    table = Rows(rows)
+    table = Results(rows)
     figure, axes = panes(len(table.scenes))
     for pane, scene in zip(axes, table.scenes):
         for number, variant in enumerate(table.variants):
@@ -114,7 +114,7 @@ def curves(path: Path, rows: Sequence[Row]) -> Path:
 
 def bars(path: Path, rows: Sequence[Row]) -> Path:
     """Plots the final PSNR of every variant, one pane per scene: the mean and each seed."""
-    table = Rows(rows)
+    table = Results(rows)
     figure, axes = panes(len(table.scenes), 7.0, 0.9 + 0.3 * len(table.variants))
     for pane, scene in zip(axes, table.scenes):
         names = [name for name in table.variants if table.values(name, scene)][::-1]
@@ -132,7 +132,7 @@ def bars(path: Path, rows: Sequence[Row]) -> Path:
 
 def counts(path: Path, rows: Sequence[Row]) -> Path:
     """Plots the final PSNR over the number of cells, with equal widths and with equal parameters."""
-    table = Rows(rows)
+    table = Results(rows)
     figure, axes = panes(len(table.scenes))
     for pane, scene in zip(axes, table.scenes):
         for matched in (False, True):

@@ -59,13 +59,13 @@ class Recording {
  public:
   // Calls of this thread between `begin` and `end` are added to the recording, which owns itself in between.
   static void begin(const py::object& self) {
-    if (recorded() != nullptr) throw std::logic_error("another recording is active");
-    recorded() = py::cast<Recording*>(self);
+    if (recording() != nullptr) throw std::logic_error("another recording is active");
+    recording() = py::cast<Recording*>(self);
     self.inc_ref();
   }
   static void end(const py::object& self) {
-    if (recorded() != py::cast<Recording*>(self)) return;
-    recorded() = nullptr;
+    if (recording() != py::cast<Recording*>(self)) return;
+    recording() = nullptr;
     self.dec_ref();
   }
 
@@ -202,14 +202,14 @@ bool load(Loaded& loaded, const py::args& arguments) {
 py::object call_any(const Function& function, const py::args& arguments) {
   for (const Bound& bound : function.overloads) {
     if (bound.function == nullptr || bound.given.size() != arguments.size()) continue;
-    if (recorded() == nullptr || bound.machine == nullptr) {
+    if (recording() == nullptr || bound.machine == nullptr) {
       Loaded loaded{&function, &bound, {}, {}};
       if (load(loaded, arguments)) return run(loaded);
     } else {
       auto loaded = std::unique_ptr<Loaded>(new Loaded{&function, &bound, {}, {}});
       if (!load(*loaded, arguments)) continue;
       py::object result = run(*loaded);
-      if (recorded() != nullptr) recorded()->add(std::move(loaded));
+      if (recording() != nullptr) recording()->add(std::move(loaded));
       return result;
     }
   }
@@ -271,7 +271,7 @@ constexpr const char* kStub =
     "    def replay(self, threads: int, times: int, first: int, last: int, drawn: int, places: Sequence[int],\n"
     "               bytes: int) -> int: ...\n"
     "\n"
-    "class Rules:\n"
+    "class TensorRules:\n"
     "    def __init__(self, rows: Sequence[Any], names: Sequence[str]) -> None: ...\n"
     "    def __call__(self, tensors: list[Tensor]) -> tuple[int, ...] | None: ...\n"
     "\n"
@@ -284,8 +284,8 @@ constexpr const char* kStub =
     "def signature(op: str, rows: Sequence[Any], positional: int, more: dict[str, Any]) -> Any: ...\n"
     "def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool: ...\n"
     "def way_of(arguments: tuple[Any, ...]) -> int: ...\n"
-    "def know_calls(objects: dict[str, Any]) -> None: ...\n"
-    "def know_torch(dtypes: dict[str, torch.dtype], classes: tuple[type, ...], exchange: Any) -> None: ...\n";
+    "def register_queries(objects: dict[str, Any]) -> None: ...\n"
+    "def register_torch(dtypes: dict[str, torch.dtype], classes: tuple[type, ...], exchange: Any) -> None: ...\n";
 
 // The stub of the module for type checkers (voronerf/ops/_core/_C.pyi). Declaring a struct or an enumeration also adds
 // its class or its names to the module.
@@ -358,7 +358,7 @@ class Declarations {
 
 }  // namespace
 
-void Module::add(const char* name, AnyFunction function, Call call, std::vector<const Type*> parameters,
+void Module::add(const char* name, AnyFunction function, Caller call, std::vector<const Type*> parameters,
                  const Type* result, const Type* machine) {
   std::vector<const Type*> arguments = parameters;
   if (machine != nullptr) {
@@ -407,9 +407,9 @@ void bind_all(PyObject* python) {
       .def_property_readonly("obstacle", &Recording::obstacle);
   bind_signatures(bound);
   bind_program_calls(bound);
-  // know_torch takes Python objects of torch, with which this module is not linked: the dtypes by name, the classes of
-  // plain tensors, and the capsule of torch's DLPack exchange API (tensor_view.h) or None.
-  bound.def("know_torch", [](const py::dict& names, const py::tuple& classes, const py::object& exchange) {
+  // register_torch takes Python objects of torch, with which this module is not linked: the dtypes by name, the classes
+  // of plain tensors, and the capsule of torch's DLPack exchange API (tensor_view.h) or None.
+  bound.def("register_torch", [](const py::dict& names, const py::tuple& classes, const py::object& exchange) {
     for (const auto& entry : names) {
       dtypes()[py::cast<std::string>(entry.first)] = py::reinterpret_borrow<py::object>(entry.second).release().ptr();
     }

@@ -66,7 +66,7 @@ class Module {
 
   // A type-erased function, and its caller: call(function, addresses of the parameters, address of the result).
   using AnyFunction = void (*)();
-  using Call = void (*)(AnyFunction, void* const*, void*);
+  using Caller = void (*)(AnyFunction, void* const*, void*);
 
  private:
   template <typename R, typename... A>
@@ -79,7 +79,7 @@ class Module {
     }
     add(name, reinterpret_cast<AnyFunction>(function), &call<R, A...>, {&type_of<A>()...}, result, machine);
   }
-  void add(const char* name, AnyFunction function, Call call, std::vector<const Type*> parameters, const Type* result,
+  void add(const char* name, AnyFunction function, Caller call, std::vector<const Type*> parameters, const Type* result,
            const Type* machine);
 
   template <typename R, typename... A>

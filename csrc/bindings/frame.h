@@ -20,7 +20,7 @@ constexpr size_t kMostBytes = 2048;  // limit for all parameters of a call
 
 struct Bound {
   Module::AnyFunction function;
-  Module::Call call;
+  Module::Caller call;
   std::vector<const Type*> given;       // parameters in Python
   std::vector<const Type*> parameters;  // parameters of the C++ function
   const Type *result, *machine;         // null: none
@@ -43,7 +43,7 @@ inline std::map<std::string, PyObject*>& dtypes() {
 }
 
 class Recording;
-inline Recording*& recorded() {  // the active recording of the calling thread, or null
+inline Recording*& recording() {  // the active recording of the calling thread, or null
   static thread_local Recording* recording = nullptr;
   return recording;
 }
@@ -97,7 +97,7 @@ class Frame {
         const int64_t rows = PyLong_AsLongLong(object);
         if (rows == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
         *static_cast<RowCount*>(place) = rows;
-        if (recorded() != nullptr && rows != 0) count(object, *static_cast<RowCount*>(place));
+        if (recording() != nullptr && rows != 0) count(object, *static_cast<RowCount*>(place));
         return true;
       }
       case Type::Kind::floating: {
@@ -154,7 +154,7 @@ class Frame {
     if (!view.is_contiguous() || is_negative(object)) return load_by_methods(type, object, address);
     keep(object);
     address = view.address();
-    if (recorded() != nullptr && add_tensor(*recorded(), object)) has_rows_ = true;
+    if (recording() != nullptr && add_tensor(*recording(), object)) has_rows_ = true;
     return true;
   }
   // Holds a reference to the object during the call.
@@ -170,7 +170,7 @@ class Frame {
   void count(PyObject* object, RowCount& rows) {
     if (PyLong_CheckExact(object)) {
       const std::string value = std::to_string(rows.value);
-      return refuse(*recorded(), "a row count is a plain int that a replay cannot read again: " + value);
+      return refuse(*recording(), "a row count is a plain int that a replay cannot read again: " + value);
     }
     const auto number = [object](const char* name) { return py::cast<int64_t>(py::handle(object).attr(name)); };
     const auto* memory = reinterpret_cast<const int64_t*>(py::cast<std::uintptr_t>(py::handle(object).attr("address")));
@@ -219,7 +219,7 @@ class Frame {
     Py_DECREF(number);
     if (pointer == nullptr && holds_entries(kept_.back())) return false;  // freed, as by storage.resize_
     address = pointer == nullptr ? TensorView::nothing() : pointer;
-    if (recorded() != nullptr && add_tensor(*recorded(), kept_.back())) has_rows_ = true;
+    if (recording() != nullptr && add_tensor(*recording(), kept_.back())) has_rows_ = true;
     return true;
   }
 

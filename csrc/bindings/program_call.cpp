@@ -49,12 +49,12 @@ class ProgramCall {
   // grids) that an earlier call kept. `gradients` is the index of the first input that is a gradient, or -1. `caller`
   // is the name of the op for error messages. Returns the outputs, the sums over rows and, if `keep`, the look-ups.
   // Returns None if Python has to make the call: during a recording, for unsupported tensors and, if `asked`, while
-  // torch has to see the call (Questions::is_watched).
+  // torch has to see the call (Questions::has_listeners).
   py::object call(const py::tuple& rows, bool keep, int64_t gradients, const char* caller, bool asked) const {
-    if (recorded() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
+    if (recording() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
       return py::none();
     }
-    if (asked && questions.is_watched()) return py::none();
+    if (asked && questions.has_listeners()) return py::none();
     Loaded loaded{function_, bound_, {}, {}};
     Frame& frame = loaded.frame;
     loaded.values.place(type_of<Program>()) = PyCapsule_GetPointer(program_.ptr(), "Program");

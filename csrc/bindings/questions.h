@@ -31,7 +31,7 @@ struct Questions {
   bool grad() const { return is_true(PyObject_CallNoArgs(grad_enabled)); }
   // Returns whether a mode, transform, tracer or profiler of torch must see the call, or forward-mode differentiation
   // is active.
-  bool is_watched() const {
+  bool has_listeners() const {
     for (PyObject* listener : listeners) {
       PyObject* const answer = PyObject_CallNoArgs(listener);
       const bool listens = answer == nullptr || PyObject_IsTrue(answer) != 0;

@@ -4,9 +4,9 @@
 
 namespace voronerf {
 
-VN_STRUCT(SparseDepth, depths, deltas, weights, offsets, distances, nearby, factor, s, r, m);
-VN_STRUCT(SmoothDepth, depths, weights, offsets, far, factor, edge, triples, r, m);
-VN_STRUCT(Surface, depths, deltas, weights, offsets, near, far, distortion, orientation, hidden, r, m);
+VN_STRUCT(SparseDepthInputs, depths, deltas, weights, offsets, distances, nearby, factor, s, r, m);
+VN_STRUCT(SmoothDepthInputs, depths, weights, offsets, far, factor, edge, triples, r, m);
+VN_STRUCT(SurfaceInputs, depths, deltas, weights, offsets, near, far, distortion, orientation, hidden, r, m);
 
 VN_BINDINGS(module) {
   module.cpu("sparse_depth_loss", VN_CPU(sparse_depth_loss_cpu));

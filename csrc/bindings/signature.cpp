@@ -18,7 +18,7 @@ constexpr int kMostArguments = 32;
 // Returns how to call a custom op with these arguments. 0: without torch's dispatcher and without gradients. 1: without
 // the dispatcher, but with gradients. 2: undecided; Python decides.
 int way_of(PyObject* arguments, bool top = true) {
-  if (top && questions.is_watched()) return 2;
+  if (top && questions.has_listeners()) return 2;
   bool learns = false;
   for (Py_ssize_t i = 0; i < PySequence_Fast_GET_SIZE(arguments); ++i) {
     PyObject* const argument = PySequence_Fast_GET_ITEM(arguments, i);
@@ -57,7 +57,7 @@ struct Argument {
 };
 
 // The state of a call while its arguments are checked.
-struct Call {
+struct CheckedCall {
   PyObject* values[kMostArguments] = {};
   TensorView views[kMostArguments];
   Common common;
@@ -68,14 +68,14 @@ struct Call {
 // A plan to call a compiled function with the arguments of an op: the source of each of its parameters.
 class Plan {
  public:
-  struct Source {
+  struct Binding {
     enum class Kind { argument, rays, letter, result, memory, constant, function, structure };
     Kind kind = Kind::constant;
     int place = 0;
     int64_t bytes = 0;
     std::vector<Letters::Size> sizes;
     py::object object;
-    std::vector<Source> members;
+    std::vector<Binding> members;
   };
   struct Size {
     Letters::Size size;
@@ -90,7 +90,7 @@ class Plan {
   // Reads (name of the function, sources, results, class of the results or None, function that is called if the result
   // is False).
   Plan(const py::tuple& parts, Letters& letters) : function_(&functions().at(py::cast<std::string>(parts[0]))) {
-    for (const auto& source : parts[1]) sources_.push_back(source_of(source, letters));
+    for (const auto& source : parts[1]) bindings_.push_back(binding_of(source, letters));
     for (const auto& row : parts[2]) {
       const auto result = py::cast<py::tuple>(row);
       results_.push_back({py::cast<int>(result[0]), py::cast<int>(result[2]), result[1], sizes_of(result[3], letters),
@@ -101,7 +101,7 @@ class Plan {
   }
 
   // Runs the function and returns its results; null if no overload takes these arguments.
-  py::object run(Call& call, const py::object& inputs, size_t count) const {
+  py::object run(CheckedCall& call, const py::object& inputs, size_t count) const {
     std::vector<py::object> results;
     results.reserve(results_.size());
     std::vector<TensorView> views(results_.size());
@@ -111,14 +111,14 @@ class Plan {
     }
     for (const Bound& bound : function_->overloads) {
       if (bound.function == nullptr || bound.machine != &type_of<Cpu>()) continue;
-      if (bound.given.size() != sources_.size() + 1) continue;
+      if (bound.given.size() != bindings_.size() + 1) continue;
       Loaded loaded{function_, &bound, {}, {}};
       std::vector<std::unique_ptr<char[]>> memories;
       const Loading loading{call, results, views, loaded.frame, memories, inputs, count};
       bool fits = true;
-      for (size_t i = 0; fits && i < sources_.size(); ++i) {
+      for (size_t i = 0; fits && i < bindings_.size(); ++i) {
         void*& place = loaded.values.place(*bound.given[i]);
-        fits = loading.load(sources_[i], *bound.given[i], place);
+        fits = loading.load(bindings_[i], *bound.given[i], place);
       }
       if (!fits) continue;
       *static_cast<Cpu*>(loaded.values.place(type_of<Cpu>())) = questions.cpu();
@@ -140,7 +140,7 @@ class Plan {
     return py::reinterpret_steal<py::object>(
         PyTuple_Type.tp_new(reinterpret_cast<PyTypeObject*>(kind.ptr()), arguments.ptr(), nullptr));
   }
-  static const py::object& given(Call& call, const py::object& inputs, size_t count) {
+  static const py::object& given(CheckedCall& call, const py::object& inputs, size_t count) {
     if (!call.given) {
       py::tuple values(count);
       for (size_t i = 0; i < count; ++i) values[i] = py::reinterpret_borrow<py::object>(call.values[i]);
@@ -161,33 +161,33 @@ class Plan {
     }
     return results;
   }
-  static Source source_of(const py::handle& description, Letters& letters) {
+  static Binding binding_of(const py::handle& description, Letters& letters) {
     const auto parts = py::cast<py::tuple>(description);
     const auto kind = py::cast<std::string>(parts[0]);
-    Source source;
+    Binding source;
     if (kind == "argument" || kind == "result" || kind == "rays") {
-      source.kind = kind == "result" ? Source::Kind::result
-                    : kind == "rays" ? Source::Kind::rays
-                                     : Source::Kind::argument;
+      source.kind = kind == "result" ? Binding::Kind::result
+                    : kind == "rays" ? Binding::Kind::rays
+                                     : Binding::Kind::argument;
       source.place = py::cast<int>(parts[1]);
     } else if (kind == "letter") {
-      source.kind = Source::Kind::letter;
+      source.kind = Binding::Kind::letter;
       source.sizes = letters.sizes(py::make_tuple(parts[1]));
     } else if (kind == "memory") {
-      source.kind = Source::Kind::memory;
+      source.kind = Binding::Kind::memory;
       source.bytes = py::cast<int64_t>(parts[1]);
       source.sizes = letters.sizes(parts[2]);
     } else if (kind == "structure") {
-      source.kind = Source::Kind::structure;
-      for (const auto& member : parts[1]) source.members.push_back(source_of(member, letters));
+      source.kind = Binding::Kind::structure;
+      for (const auto& member : parts[1]) source.members.push_back(binding_of(member, letters));
     } else {
-      source.kind = kind == "function" ? Source::Kind::function : Source::Kind::constant;
+      source.kind = kind == "function" ? Binding::Kind::function : Binding::Kind::constant;
       source.object = parts[1];
     }
     return source;
   }
 
-  py::object memory(const Result& result, Call& call, const py::object& inputs, size_t count) const {
+  py::object memory(const Result& result, CheckedCall& call, const py::object& inputs, size_t count) const {
     const bool second = result.condition >= 0 && call.values[result.condition] == Py_None;
     std::vector<int64_t> shape;
     shape.reserve(4);
@@ -202,7 +202,7 @@ class Plan {
 
   // Loads the parameters of the function from their sources.
   struct Loading {
-    Call& call;
+    CheckedCall& call;
     const std::vector<py::object>& results;
     const std::vector<TensorView>& views;
     Frame& frame;
@@ -210,18 +210,18 @@ class Plan {
     const py::object& inputs;
     size_t count;
 
-    bool load(const Source& source, const Type& type, void*& place) const {
+    bool load(const Binding& source, const Type& type, void*& place) const {
       switch (source.kind) {
-        case Source::Kind::argument: {
+        case Binding::Kind::argument: {
           PyObject* const value = call.values[source.place];
           if (type.kind != Type::Kind::tensor || value == Py_None) return frame.load(type, value, place);
           return frame.load_view(type, value, call.views[source.place], *static_cast<void**>(place));
         }
-        case Source::Kind::rays:  // whether the argument has a row per ray
+        case Binding::Kind::rays:  // whether the argument has a row per ray
           if (type.kind != Type::Kind::boolean) return false;
           *static_cast<bool*>(place) = call.views[source.place].dimensions > 1;
           return true;
-        case Source::Kind::letter: {
+        case Binding::Kind::letter: {
           const int64_t size = call.common.size(source.sizes[0]);
           if (type.kind == Type::Kind::rows) {
             *static_cast<RowCount*>(place) = size;
@@ -232,12 +232,12 @@ class Plan {
           }
           return true;
         }
-        case Source::Kind::result: {
+        case Binding::Kind::result: {
           const TensorView& view = views[static_cast<size_t>(source.place)];
           *static_cast<void**>(place) = view.address();
           return type.dtypes == 0 || (view.dtype() & type.dtypes) != 0;
         }
-        case Source::Kind::memory: {
+        case Binding::Kind::memory: {
           int64_t bytes = source.bytes;
           for (const auto& size : source.sizes) bytes *= call.common.size(size);
           memories.emplace_back(new char[static_cast<size_t>(bytes) + 64]);
@@ -245,9 +245,9 @@ class Plan {
           *static_cast<void**>(place) = reinterpret_cast<void*>((begin + 63) / 64 * 64);
           return true;
         }
-        case Source::Kind::constant:
+        case Binding::Kind::constant:
           return frame.load(type, source.object.ptr(), place);
-        case Source::Kind::function: {
+        case Binding::Kind::function: {
           const py::object value = source.object(Plan::given(call, inputs, count));
           frame.keep(value.ptr());
           return frame.load(type, value.ptr(), place);
@@ -266,7 +266,7 @@ class Plan {
   };
 
   const Function* function_;
-  std::vector<Source> sources_;
+  std::vector<Binding> bindings_;
   std::vector<Result> results_;
   py::object kind_, fault_;
 };
@@ -289,7 +289,7 @@ class Signature {
 
   // Returns the results of a call; NotImplemented if an argument breaks a rule, or if the rules cannot be checked here.
   py::object call(PyObject* args, PyObject* options) {
-    Call call;
+    CheckedCall call;
     const size_t count = arguments_.size() - 1;  // excludes the backend
     if (!bind(args, options, call) || !check(call)) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
     bool learns = false;
@@ -300,8 +300,8 @@ class Signature {
     if (!prepare_.is_none()) prepare(call);
     const Implementation* const chosen = choose(call);
     if (chosen == nullptr) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
-    if (chosen->plan && !learns && recorded() == nullptr && call.views[0].on_cpu() && questions.compiled_here() &&
-        (!chosen->narrow || call.common.first_float == kFloat32) && !questions.is_watched()) {
+    if (chosen->plan && !learns && recording() == nullptr && call.views[0].on_cpu() && questions.compiled_here() &&
+        (!chosen->narrow || call.common.first_float == kFloat32) && !questions.has_listeners()) {
       if (py::object result = chosen->plan->run(call, inputs_, count)) return result;
     }
     PyObject* const reference = PyObject_Vectorcall(chosen->run.ptr(), call.values, count, nullptr);
@@ -360,7 +360,7 @@ class Signature {
     return argument;
   }
 
-  bool bind(PyObject* args, PyObject* options, Call& call) const {
+  bool bind(PyObject* args, PyObject* options, CheckedCall& call) const {
     const auto positional_count = static_cast<size_t>(PyTuple_GET_SIZE(args));
     if (positional_count > static_cast<size_t>(positional_)) return false;
     for (size_t i = 0; i < positional_count; ++i) call.values[i] = PyTuple_GET_ITEM(args, static_cast<Py_ssize_t>(i));
@@ -381,7 +381,7 @@ class Signature {
     return true;
   }
 
-  bool check(Call& call) const {
+  bool check(CheckedCall& call) const {
     for (size_t i = 0; i < arguments_.size(); ++i) {
       const Argument& argument = arguments_[i];
       if (argument.optional && call.values[i] == Py_None) continue;
@@ -397,7 +397,7 @@ class Signature {
     }
     return true;
   }
-  bool check(const Argument& argument, PyObject*& value, TensorView& view, Call& call) const {
+  bool check(const Argument& argument, PyObject*& value, TensorView& view, CheckedCall& call) const {
     switch (argument.kind) {
       case Argument::Kind::tensor: {
         const bool second = argument.condition >= 0 && call.values[argument.condition] == Py_None;
@@ -443,7 +443,7 @@ class Signature {
   }
   // Detaches the value if the op is not differentiable with respect to this argument. Returns whether the value still
   // requires a gradient.
-  bool detach(size_t i, Call& call) const {
+  bool detach(size_t i, CheckedCall& call) const {
     if (!call.views[i].is_there() || (call.views[i].dtype() & kFloating) == 0) return false;
     if (!requires_gradient(call.values[i])) return false;
     call.common.learns = true;
@@ -454,14 +454,14 @@ class Signature {
     call.values[i] = call.own.back().ptr();
     return false;
   }
-  bool no_inference_of(const Call& call) const {
+  bool no_inference_of(const CheckedCall& call) const {
     if (!smooth_) return true;
     for (size_t i = 0; i + 1 < arguments_.size(); ++i) {
       if (call.views[i].is_there() && is_inference(call.values[i])) return false;
     }
     return true;
   }
-  void prepare(Call& call) const {
+  void prepare(CheckedCall& call) const {
     const size_t count = arguments_.size() - 1;
     py::object found = prepare_(Plan::given(call, inputs_, count));
     if (found.is(call.given)) return;
@@ -478,7 +478,7 @@ class Signature {
   }
   // Returns the implementation for the backend and the device and dtype of the first argument; null if the device or
   // dtype is unknown.
-  const Implementation* choose(const Call& call) {
+  const Implementation* choose(const CheckedCall& call) {
     static PyObject *const cpu = PyUnicode_InternFromString("cpu"), *const cuda = PyUnicode_InternFromString("cuda");
     const TensorView& first = call.views[0];
     const auto dtype = questions.dtypes.find(first.dtype());
@@ -536,9 +536,9 @@ PyObject* call_signature(PyObject* self, PyObject* const* given, Py_ssize_t) {
 
 void bind_signatures(py::module_& module) {
   questions.own = module.ptr();
-  py::class_<Rules>(module, "Rules", py::module_local())
+  py::class_<TensorRules>(module, "TensorRules", py::module_local())
       .def(py::init<const py::sequence&, const std::vector<std::string>&>())
-      .def("__call__", &Rules::check);
+      .def("__call__", &TensorRules::check);
   module.def("alike", &alike);
   module.def("way_of", [](const py::tuple& arguments) { return way_of(arguments.ptr()); });
   module.def("signature", [](const py::str& op, const py::sequence& rows, int positional, const py::dict& more) {
@@ -548,7 +548,7 @@ void bind_signatures(py::module_& module) {
                             [](void* object) { delete static_cast<Signature*>(object); });
     return py::reinterpret_steal<py::object>(PyCFunction_NewEx(&definition, owner.ptr(), nullptr));
   });
-  module.def("know_calls", [](const py::dict& objects) {
+  module.def("register_queries", [](const py::dict& objects) {
     const auto held = [&objects](const char* name) { return py::object(objects[name]).release().ptr(); };
     questions.grad_enabled = held("grad_enabled");
     questions.tangents = held("tangents");

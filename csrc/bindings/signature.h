@@ -6,7 +6,7 @@
 
 namespace voronerf {
 
-// Adds Rules, signature, alike, way_of and know_calls to the module.
+// Adds TensorRules, signature, alike, way_of and register_queries to the module.
 void bind_signatures(pybind11::module_& module);
 
 }  // namespace voronerf

@@ -129,11 +129,11 @@ struct TensorRule {
 };
 
 // The rules for a list of tensors that are not separate arguments, such as the tensors of a network.
-class Rules {
+class TensorRules {
  public:
   // Reads the rows of checks.py. A tuple for TensorRule::of is the rule of a tensor; a tuple (letter, number) gives the
   // default of a letter that is still unbound. `names` are the letters whose values a check returns.
-  Rules(const py::sequence& rows, const std::vector<std::string>& names) {
+  TensorRules(const py::sequence& rows, const std::vector<std::string>& names) {
     for (const auto& row : rows) {
       const auto parts = py::cast<py::tuple>(row);
       if (parts.size() == 2) {

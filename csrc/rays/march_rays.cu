@@ -23,11 +23,11 @@ __device__ __forceinline__ uint32_t lanes_below(int lane) { return (1u << lane) 
 
 VN_HD float sample_of(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i, int64_t stratum,
                       float* point, float& length) {
-  const float at = march_by_rule(in.spacing, [&](auto rule) {
-    using Rule = decltype(rule);
-    const float first = march_edge<Rule>(ray, stratum), last = march_edge<Rule>(ray, stratum + 1);
+  const float at = march_by_spacing(in.spacing, [&](auto spacing) {
+    using Spacing = decltype(spacing);
+    const float first = march_edge<Spacing>(ray, stratum), last = march_edge<Spacing>(ray, stratum + 1);
     length = last - first;
-    return march_sample<Rule>(ray, stratum, march_inside(in, key, i, stratum), first, last);
+    return march_sample<Spacing>(ray, stratum, march_inside(in, key, i, stratum), first, last);
   });
   march_point(in, march_where(in), in.origins + 3 * i, in.directions + 3 * i, at, point);
   return at;

@@ -28,13 +28,13 @@ struct Space {
 };
 
 // Computes the cells of 32 strata from `first` on, -1 outside the box.
-template <MarchWhere W, typename Rule>
+template <MarchWhere W, typename Spacing>
 VN_INLINE void cells_of(const MarchInputs& in, const MarchRay& ray, const float* origin, const float* direction,
                         const float* scale, const float* uniforms, int64_t first, int32_t* cells) {
   float edges[kMarchWord + 1];
-  for (int64_t j = 0; j <= kMarchWord; ++j) edges[j] = march_edge<Rule>(ray, first + j);
+  for (int64_t j = 0; j <= kMarchWord; ++j) edges[j] = march_edge<Spacing>(ray, first + j);
   for (int64_t j = 0; j < kMarchWord; ++j) {
-    const float at = march_sample<Rule>(ray, first + j, uniforms[j], edges[j], edges[j + 1]);
+    const float at = march_sample<Spacing>(ray, first + j, uniforms[j], edges[j], edges[j + 1]);
     float point[3];
     march_point(in, W, origin, direction, at, point);
     cells[j] = march_cell(in, scale, point);
@@ -43,7 +43,7 @@ VN_INLINE void cells_of(const MarchInputs& in, const MarchRay& ray, const float*
 
 VN_INLINE int bits_of(uint32_t word) { return __builtin_popcount(word); }
 
-template <MarchWhere W, typename Rule>
+template <MarchWhere W, typename Spacing>
 void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
   float scale[3];
@@ -66,7 +66,7 @@ void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin
         for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = 0.5f;
         if (in.uniforms != nullptr) __builtin_memcpy(uniforms, in.uniforms + i * in.s + first, sizeof(float) * size);
       }
-      cells_of<W, Rule>(in, ray, in.origins + 3 * i, in.directions + 3 * i, scale, uniforms, first, cells);
+      cells_of<W, Spacing>(in, ray, in.origins + 3 * i, in.directions + 3 * i, scale, uniforms, first, cells);
       uint32_t word = 0;
       for (int64_t j = 0; j < kMarchWord; ++j) {
         // No branch, since it would be unpredictable.
@@ -86,10 +86,10 @@ void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin
 
 // Returns whether strata are wide compared with the rounding of their depths. Then middles lie between their edges, and
 // a depth determines its stratum.
-template <typename Rule>
+template <typename Spacing>
 VN_INLINE bool wide(const MarchRay& ray) {
   const float largest = __builtin_fmaxf(__builtin_fabsf(ray.near), __builtin_fabsf(ray.far));
-  return Rule::has_inverse(ray) && ray.far - ray.near >= 1e-5f * ray.count * largest;
+  return Spacing::has_inverse(ray) && ray.far - ray.near >= 1e-5f * ray.count * largest;
 }
 
 // Returns an upper bound on the cells that a ray crosses per unit of distance, valid for the next kMarchRoom cells.
@@ -149,7 +149,7 @@ struct Walk {
       share[kTogether];
 };
 
-template <typename Rule>
+template <typename Spacing>
 VN_INLINE void enter(const MarchInputs& in, float width, int64_t i, int64_t j, Walk& walk) {
   const MarchRay ray = march_ray(in, i);
   float away = 0.0f, square = 0.0f;
@@ -164,12 +164,12 @@ VN_INLINE void enter(const MarchInputs& in, float width, int64_t i, int64_t j, W
   // slack: the rounding error of a position, in cells. share: the number of strata per unit of `progress`
   // (march_rays_math.h).
   walk.slack[j] = 1e-3f + 1e-6f * (away + __builtin_fabsf(ray.far) * walk.length[j]) / width;
-  walk.share[j] = Rule::rate(ray) * ray.count;
+  walk.share[j] = Spacing::rate(ray) * ray.count;
 }
 
 // Marches the rays of [begin, end) whose count is kToWalk, through the middles of strata. From an empty cell a ray
 // leaps the distance within which no cell can be occupied. A lane whose ray has ended takes the next ray.
-template <MarchWhere W, typename Rule>
+template <MarchWhere W, typename Spacing>
 VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* scale, uint32_t* mask, int32_t* counts,
                     int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
@@ -191,10 +191,10 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
       if (walk.ray[j] >= 0) counts[walk.ray[j]] = walk.samples[j];
       while (next_ray < end && counts[next_ray] != kToWalk) ++next_ray;
       if (next_ray < end) {
-        enter<Rule>(in, width, next_ray++, j, walk);
+        enter<Spacing>(in, width, next_ray++, j, walk);
         continue;
       }
-      enter<Rule>(in, width, begin, j, walk);  // any ray: the lane's results are ignored
+      enter<Spacing>(in, width, begin, j, walk);  // any ray: the lane's results are ignored
       walk.ray[j] = -1, walk.stratum[j] = strata;
       active &= ~(1u << j);
     }
@@ -205,7 +205,7 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
       const float o[3] = {walk.from[0][j], walk.from[1][j], walk.from[2][j]};
       const float d[3] = {walk.along[0][j], walk.along[1][j], walk.along[2][j]};
       const MarchRay ray{walk.near[j], walk.far[j], any.count, any.share};
-      const float at = Rule::depth(ray, march_fraction(ray, static_cast<float>(walk.stratum[j]) + 0.5f));
+      const float at = Spacing::depth(ray, march_fraction(ray, static_cast<float>(walk.stratum[j]) + 0.5f));
       float point[3];
       march_point(in, W, o, d, at, point);
       cells[j] = march_cell(in, scale, point);
@@ -228,7 +228,7 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
     for (int64_t j = 0; j < kTogether; ++j) {
       const float cellwise = static_cast<float>(rooms[j] - 1) + free[j];
       const float to = depth[j] + (cellwise < 0.0f ? 0.0f : cellwise) / pace[j];
-      const float place = Rule::progress(walk.near[j], to) * walk.share[j] + before;
+      const float place = Spacing::progress(walk.near[j], to) * walk.share[j] + before;
       const float ahead = place < count ? place : count;
       const int32_t far = static_cast<int32_t>(place >= 0.0f ? ahead : 0.0f), one = walk.stratum[j] + 1;
       next[j] = far < one ? one : far;
@@ -249,7 +249,7 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
   }
 }
 
-template <MarchWhere W, typename Rule>
+template <MarchWhere W, typename Spacing>
 VN_INLINE void count_by_leaps(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts,
                               int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
@@ -257,18 +257,18 @@ VN_INLINE void count_by_leaps(const MarchInputs& in, const uint8_t* room, uint32
   march_scale(in, scale);
   for (int64_t i = begin; i < end; ++i) {
     const bool ended = in.start != nullptr && in.start[i] >= in.s;
-    if (ended || !wide<Rule>(march_ray(in, i))) {
-      count<W, Rule>(in, mask, counts, i, i + 1);
+    if (ended || !wide<Spacing>(march_ray(in, i))) {
+      count<W, Spacing>(in, mask, counts, i, i + 1);
       continue;
     }
     for (int64_t w = i * words; w < (i + 1) * words; ++w) mask[w] = 0;
     counts[i] = kToWalk;
   }
-  leap<W, Rule>(in, room, scale, mask, counts, begin, end);
+  leap<W, Spacing>(in, room, scale, mask, counts, begin, end);
 }
 
 // Writes the samples in `strata`, at most kUnit of one ray, to the rows from `row` on.
-template <MarchWhere W, typename Rule>
+template <MarchWhere W, typename Spacing>
 __attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i,
                                          const int32_t* strata, int64_t size, int64_t row, int32_t* ray_index,
                                          float* depths, float* deltas, float* positions) {
@@ -281,8 +281,8 @@ __attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& 
     for (int64_t j = 0; in.uniforms != nullptr && j < size; ++j) inside[j] = in.uniforms[i * in.s + strata[j]];
   }
   for (int64_t j = 0; j < kUnit; ++j) {
-    const float first = march_edge<Rule>(ray, strata[j]), last = march_edge<Rule>(ray, strata[j] + 1);
-    at[j] = march_sample<Rule>(ray, strata[j], inside[j], first, last);
+    const float first = march_edge<Spacing>(ray, strata[j]), last = march_edge<Spacing>(ray, strata[j] + 1);
+    at[j] = march_sample<Spacing>(ray, strata[j], inside[j], first, last);
     length[j] = last - first;
     float point[3];
     march_point(in, W, origin, direction, at[j], point);
@@ -296,7 +296,7 @@ __attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& 
   }
 }
 
-template <MarchWhere W, typename Rule>
+template <MarchWhere W, typename Spacing>
 VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
                     float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
@@ -317,7 +317,7 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
           break;
         }
         if (waiting == kUnit) {
-          fill_unit<W, Rule>(in, ray, key, i, strata, kUnit, row, ray_index, depths, deltas, positions);
+          fill_unit<W, Spacing>(in, ray, key, i, strata, kUnit, row, ray_index, depths, deltas, positions);
           row += kUnit;
           waiting = 0;
         }
@@ -326,7 +326,7 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
       }
     }
     if (waiting > 0) {
-      fill_unit<W, Rule>(in, ray, key, i, strata, waiting, row, ray_index, depths, deltas, positions);
+      fill_unit<W, Spacing>(in, ray, key, i, strata, waiting, row, ray_index, depths, deltas, positions);
     }
     stop[i] = static_cast<int32_t>(next);
   }
@@ -335,11 +335,11 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
 // Calls `run` with the types of the grid's space and of the spacing.
 template <typename Run>
 VN_INLINE void specialised(const MarchInputs& in, const Run& run) {
-  march_by_rule(in.spacing, [&](auto rule) {
+  march_by_spacing(in.spacing, [&](auto spacing) {
     const MarchWhere where = march_where(in);
-    if (where == MarchWhere::kSphere) return run(Space<MarchWhere::kSphere>(), rule);
-    if (where == MarchWhere::kPerspective) return run(Space<MarchWhere::kPerspective>(), rule);
-    return run(Space<MarchWhere::kWorld>(), rule);
+    if (where == MarchWhere::kSphere) return run(Space<MarchWhere::kSphere>(), spacing);
+    if (where == MarchWhere::kPerspective) return run(Space<MarchWhere::kPerspective>(), spacing);
+    return run(Space<MarchWhere::kWorld>(), spacing);
   });
 }
 
@@ -347,19 +347,19 @@ VN_INLINE void specialised(const MarchInputs& in, const Run& run) {
 
 void march_count(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts, int64_t begin,
                  int64_t end) {
-  specialised(in, [&](auto space, auto rule) {
+  specialised(in, [&](auto space, auto spacing) {
     if (room != nullptr) {
-      count_by_leaps<space.kWhere, decltype(rule)>(in, room, mask, counts, begin, end);
+      count_by_leaps<space.kWhere, decltype(spacing)>(in, room, mask, counts, begin, end);
     } else {
-      count<space.kWhere, decltype(rule)>(in, mask, counts, begin, end);
+      count<space.kWhere, decltype(spacing)>(in, mask, counts, begin, end);
     }
   });
 }
 
 void march_fill(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index, float* depths,
                 float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
-  specialised(in, [&](auto space, auto rule) {
-    fill<space.kWhere, decltype(rule)>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
+  specialised(in, [&](auto space, auto spacing) {
+    fill<space.kWhere, decltype(spacing)>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
   });
 }
 

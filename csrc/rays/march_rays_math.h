@@ -61,19 +61,19 @@ struct MarchDisparity {
 
 // Calls `run` with the struct of the spacing.
 template <typename Run>
-VN_HD auto march_by_rule(MarchSpacing spacing, const Run& run) {
+VN_HD auto march_by_spacing(MarchSpacing spacing, const Run& run) {
   return spacing == MarchSpacing::disparity ? run(MarchDisparity()) : run(MarchLinear());
 }
 
-template <typename Rule>
+template <typename Spacing>
 VN_HD float march_edge(const MarchRay& ray, int64_t i) {
   const float number = static_cast<float>(i);
-  return number < ray.count ? Rule::depth(ray, march_fraction(ray, number)) : ray.far;
+  return number < ray.count ? Spacing::depth(ray, march_fraction(ray, number)) : ray.far;
 }
 
-template <typename Rule>
+template <typename Spacing>
 VN_HD float march_sample(const MarchRay& ray, int64_t i, float inside, float first, float last) {
-  const float at = Rule::depth(ray, march_fraction(ray, static_cast<float>(i) + inside));
+  const float at = Spacing::depth(ray, march_fraction(ray, static_cast<float>(i) + inside));
   const float above = at < first ? first : at;
   return above > last ? last : above;
 }

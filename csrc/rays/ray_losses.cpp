@@ -24,7 +24,7 @@ void add_losses(int64_t count, int64_t run, float share, float* of_rays, float* 
   *loss += share * static_cast<float>(sum);
 }
 
-float sparse_depth_of(const SparseDepth& in, int64_t ray, float share, float* of_weights) {
+float sparse_depth_of(const SparseDepthInputs& in, int64_t ray, float share, float* of_weights) {
   const auto near_point = [&](int64_t i) {
     return std::fabs(in.depths[i] - in.distances[ray]) <= in.nearby * in.distances[ray] + in.deltas[i];
   };
@@ -37,7 +37,7 @@ float sparse_depth_of(const SparseDepth& in, int64_t ray, float share, float* of
   return -std::log(total);
 }
 
-float disparity_of(const SmoothDepth& in, int64_t ray) {
+float disparity_of(const SmoothDepthInputs& in, int64_t ray) {
   double left = 1.0, sum = 0.0;
   for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) {
     left -= static_cast<double>(in.weights[i]);
@@ -48,21 +48,21 @@ float disparity_of(const SmoothDepth& in, int64_t ray) {
 
 // Adds the gradient with respect to the weights of a ray's samples. to_disparity: the gradient with respect to the
 // ray's disparity.
-void bend(const SmoothDepth& in, int64_t ray, float to_disparity, float* of_weights) {
+void bend(const SmoothDepthInputs& in, int64_t ray, float to_disparity, float* of_weights) {
   for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) {
     of_weights[i] += to_disparity * (1.0f / in.depths[i] - 1.0f / in.far[ray]);
   }
 }
 
 // Returns the decrease of the opacity from a sample to the next, 0 unless the next sample lies directly behind it.
-float fall(const Surface& in, int64_t i, float opacity, float next) {
+float fall(const SurfaceInputs& in, int64_t i, float opacity, float next) {
   const bool beside = in.depths[i + 1] - in.depths[i] < in.deltas[i] + in.deltas[i + 1];
   return beside ? std::max(opacity - next, 0.0f) : 0.0f;
 }
 
 // The position of a sample (`place`) is its disparity, which decreases along the ray. Samples are ignored if the
 // transmittance in front of them (`light`) is at most `hidden`.
-float surface_of(const Surface& in, int64_t ray, float share, float* of_weights, float* of_density) {
+float surface_of(const SurfaceInputs& in, int64_t ray, float share, float* of_weights, float* of_density) {
   const int64_t begin = in.offsets[ray], last = in.offsets[ray + 1];
   int64_t end = begin;
   double after = 0.0, moment_after = 0.0;
@@ -93,7 +93,7 @@ float surface_of(const Surface& in, int64_t ray, float share, float* of_weights,
 
 }  // namespace
 
-void sparse_depth_loss_cpu(const SparseDepth& in, float* loss, float* of_weights, float* of_rays, int threads) {
+void sparse_depth_loss_cpu(const SparseDepthInputs& in, float* loss, float* of_weights, float* of_rays, int threads) {
   check_ray_offsets("sparse_depth_loss", in.offsets, in.r, in.m);
   if (in.s == 0) return;
   const float share = in.factor / static_cast<float>(in.s);
@@ -101,7 +101,7 @@ void sparse_depth_loss_cpu(const SparseDepth& in, float* loss, float* of_weights
              [&](int64_t ray) { return sparse_depth_of(in, ray, share, of_weights); });
 }
 
-void smooth_depth_loss_cpu(const SmoothDepth& in, float* loss, float* of_weights, float* of_rays, int threads) {
+void smooth_depth_loss_cpu(const SmoothDepthInputs& in, float* loss, float* of_weights, float* of_rays, int threads) {
   check_ray_offsets("smooth_depth_loss", in.offsets, in.r, in.m);
   const int64_t triples = in.triples, first = in.r - 3 * triples;
   if (triples == 0) return;
@@ -118,7 +118,7 @@ void smooth_depth_loss_cpu(const SmoothDepth& in, float* loss, float* of_weights
   });
 }
 
-void surface_loss_cpu(const Surface& in, float* loss, float* of_weights, float* of_density, float* of_rays,
+void surface_loss_cpu(const SurfaceInputs& in, float* loss, float* of_weights, float* of_density, float* of_rays,
                       int threads) {
   check_ray_offsets("surface_loss", in.offsets, in.r, in.m);
   if (in.r == 0) return;

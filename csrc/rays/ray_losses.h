@@ -9,7 +9,7 @@
 
 namespace voronerf {
 
-struct SparseDepth {
+struct SparseDepthInputs {
   const float *depths, *deltas, *weights;  // [m]
   const int32_t* offsets;                  // [r+1]
   const float* distances;                  // [s], distance of each of the first rays' points, NaN for none
@@ -17,7 +17,7 @@ struct SparseDepth {
   RowCount s, r, m;
 };
 
-struct SmoothDepth {
+struct SmoothDepthInputs {
   const float *depths, *weights;  // [m]
   const int32_t* offsets;         // [r+1]
   const float* far;               // [r]
@@ -26,7 +26,7 @@ struct SmoothDepth {
   RowCount triples, r, m;
 };
 
-struct Surface {
+struct SurfaceInputs {
   const float *depths, *deltas, *weights;  // [m]
   const int32_t* offsets;                  // [r+1]
   const float *near, *far;                 // [r]
@@ -37,9 +37,9 @@ struct Surface {
 
 // These functions add to loss [1], of_weights [m] and of_density [m]. of_rays: [s] or [r], workspace. They throw
 // std::invalid_argument if offsets decrease or exceed m, and then add nothing.
-void sparse_depth_loss_cpu(const SparseDepth& in, float* loss, float* of_weights, float* of_rays, int threads);
-void smooth_depth_loss_cpu(const SmoothDepth& in, float* loss, float* of_weights, float* of_rays, int threads);
-void surface_loss_cpu(const Surface& in, float* loss, float* of_weights, float* of_density, float* of_rays,
+void sparse_depth_loss_cpu(const SparseDepthInputs& in, float* loss, float* of_weights, float* of_rays, int threads);
+void smooth_depth_loss_cpu(const SmoothDepthInputs& in, float* loss, float* of_weights, float* of_rays, int threads);
+void surface_loss_cpu(const SurfaceInputs& in, float* loss, float* of_weights, float* of_density, float* of_rays,
                       int threads);
 
 }  // namespace voronerf

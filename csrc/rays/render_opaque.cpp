@@ -41,13 +41,13 @@ void fill_samples(Isa isa, const MarchInputs& in, const uint32_t* mask, const in
 void add_wave(Isa isa, const SeenWave& in, int64_t r) { VN_FOR_ISA(isa, see_wave(in, r)) }
 
 // The arguments of one call, which its threads read.
-struct Call {
+struct RenderCall {
   const ProgramInputs& network;
   const ProgramRows& rows;
   const MarchInputs& march;
   const uint8_t* room;
   const SeeCells& cells;
-  const SeeRule& rule;
+  const SeeOptions& options;
   const SeeOutputs& out;
   int64_t directions;  // q, the columns of the directions
   Isa isa;
@@ -56,12 +56,12 @@ struct Call {
 
 class Pool {
  public:
-  Pool(const Call& call, float* workspace)
+  Pool(const RenderCall& call, float* workspace)
       : call_(call),
         network_(call.network),
         own_{workspace},
-        size_(
-            std::clamp<int64_t>(std::min(kSamples / call.rule.wave, call.march.r / (kShare * call.threads)), 64, 8192)),
+        size_(std::clamp<int64_t>(std::min(kSamples / call.options.wave, call.march.r / (kShare * call.threads)), 64,
+                                  8192)),
         number_(size_),
         start_(size_),
         stop_(size_),
@@ -74,7 +74,7 @@ class Pool {
         front_(size_),
         mask_(size_ * march_words(call.march.s)),
         offsets_(size_ + 1),
-        samples_(size_ * call.rule.wave),
+        samples_(size_ * call.options.wave),
         descent_(call.cells.child == nullptr ? 0 : locate_cell_workspace(call.cells.m, 1)),
         cell_offsets_(call.network.k + 1) {}
 
@@ -127,7 +127,7 @@ class Pool {
     march.near = near_.data(), march.far = far_.data();
     march.start = start_.data();
     march.r = count_;
-    march.max_samples = call_.rule.wave;
+    march.max_samples = call_.options.wave;
     count_strata(call_.isa, march, call_.room, mask_.data(), offsets_.data() + 1);
     offsets_[0] = 0;
     for (int64_t i = 0; i < count_; ++i) offsets_[i + 1] += offsets_[i];
@@ -149,7 +149,7 @@ class Pool {
     add_wave(
         call_.isa,
         {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(),
-         call_.rule.density_scale, call_.rule.activated, front_.data(),
+         call_.options.density_scale, call_.options.activated, front_.data(),
          out.heaviest == nullptr ? nullptr : most_.data(), out.colour, out.opacity, out.depth, out.light, out.heaviest},
         count_);
     return true;
@@ -182,7 +182,7 @@ class Pool {
   void drop() {
     int64_t kept = 0;
     for (int64_t i = 0; i < count_; ++i) {
-      if (stop_[i] >= call_.march.s || !(call_.out.light[number_[i]] > call_.rule.opaque)) {
+      if (stop_[i] >= call_.march.s || !(call_.out.light[number_[i]] > call_.options.opaque)) {
         finish(number_[i], far_[i]);
         continue;
       }
@@ -200,19 +200,19 @@ class Pool {
   // Turns the sums of a ray into its outputs. The colour of an opaque ray is divided by its opacity.
   void finish(int64_t ray, float far) const {
     const SeeOutputs& out = call_.out;
-    const SeeRule& rule = call_.rule;
+    const SeeOptions& options = call_.options;
     float *const colour = out.colour + 3 * ray, &opacity = out.opacity[ray];
     out.depth[ray] = opacity > 0.0f ? out.depth[ray] / opacity : far;
-    if (out.light[ray] <= rule.opaque) {
+    if (out.light[ray] <= options.opaque) {
       for (int i = 0; i < 3; ++i) colour[i] /= opacity;
       opacity = 1.0f;
     }
-    if (rule.background == nullptr) return;
-    const float* const background = rule.background + (rule.background_per_ray ? 3 * ray : 0);
+    if (options.background == nullptr) return;
+    const float* const background = options.background + (options.background_per_ray ? 3 * ray : 0);
     for (int i = 0; i < 3; ++i) colour[i] += (1.0f - opacity) * background[i];
   }
 
-  const Call& call_;
+  const RenderCall& call_;
   ProgramInputs network_;
   ProgramResults results_{nullptr, {TableType::float32}, nullptr};
   ProgramRows::WorkerMemory own_;
@@ -230,17 +230,17 @@ class Pool {
 }  // namespace
 
 bool render_opaque_cpu(const Program& program, const ProgramInputs& network, const MarchInputs& march,
-                       const SeeCells& cells, const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads) {
+                       const SeeCells& cells, const SeeOptions& options, const SeeOutputs& out, Isa isa, int threads) {
   if (march.r == 0) return true;
   const std::unique_ptr<uint8_t[]> rooms = march_rooms(march, threads);
   const ProgramRows rows(program, network, isa);
   const std::vector<ProgramInput>& inputs = program.table.inputs;
   const Workspace workspace(rows.workspace() * std::max(threads, 1));
-  const Call call{network, rows,
-                  march,   rooms.get(),
-                  cells,   rule,
-                  out,     inputs.size() > 1 ? inputs[1].width : 0,
-                  isa,     std::max(threads, 1)};
+  const RenderCall call{network, rows,
+                        march,   rooms.get(),
+                        cells,   options,
+                        out,     inputs.size() > 1 ? inputs[1].width : 0,
+                        isa,     std::max(threads, 1)};
   const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div<int64_t>(march.r, kRun)));
   Items items(march.r, kRun, team);
   std::vector<std::unique_ptr<Pool>> pools;  // allocated here, because code on the team's threads must not throw

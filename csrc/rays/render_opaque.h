@@ -20,7 +20,7 @@ struct SeeCells {
   int depth;
 };
 
-struct SeeRule {
+struct SeeOptions {
   float density_scale;
   bool activated;           // the networks' outputs are colour and density themselves
   float opaque;             // a ray ends after a wave that leaves at most this light
@@ -39,6 +39,6 @@ struct SeeOutputs {
 // whose values in `network` are not read, and optionally directions [r,q], one per ray. Returns false if a position is
 // not at a leaf after `depth` levels.
 bool render_opaque_cpu(const Program& program, const ProgramInputs& network, const MarchInputs& march,
-                       const SeeCells& cells, const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads);
+                       const SeeCells& cells, const SeeOptions& options, const SeeOutputs& out, Isa isa, int threads);
 
 }  // namespace voronerf

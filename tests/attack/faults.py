@@ -882,8 +882,8 @@ FAULTS = (
     _python(
         "Steps of a parameter in parts are counted for each of them",
         "nerf/adam.py",
-        "Rule(step.clone() if number else step, *rule)",
-        "Rule(step, *rule)",
+        "UpdateRule(step.clone() if number else step, *rule)",
+        "UpdateRule(step, *rule)",
         "tests/nerf/test_optimizer.py",
     ),
     Fault(

@@ -17,7 +17,7 @@ from torch.utils import _python_dispatch
 from voronerf.nerf import TrainingStep
 from voronerf.ops import nearest_centre
 from voronerf.ops._core.active import active
-from voronerf.ops._core.custom_op import is_watched
+from voronerf.ops._core.custom_op import has_listeners
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # the tests' helpers
 
@@ -63,7 +63,7 @@ def interrupted_step(rng: random.Random, folder: Path, inputs: Path) -> str:
     before = sys.getrefcount(points)
     nearest_centre(points, torch.rand(4, 3))
     flags = [name for name, value in vars(_python_dispatch).items() if name.startswith("_is_in_") and value is True]
-    if is_watched() or active.recording is not None or active.vary is not None or flags:
+    if has_listeners() or active.recording is not None or active.vary is not None or flags:
         raise Failed(f"a recording is left on: {said} {flags}")
     if sys.getrefcount(points) != before:
         raise Failed(f"the compiled module keeps its calls: {said}")

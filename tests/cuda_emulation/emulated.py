@@ -23,7 +23,7 @@ from voronerf.ops.grouped_program import native as _programs
 def module() -> ModuleType:
     """Returns the emulated module; builds it if necessary."""
     loaded = load(build())
-    _native.know_torch(loaded)
+    _native.register_torch(loaded)
     return loaded
 
 

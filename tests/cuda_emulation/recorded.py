@@ -91,7 +91,7 @@ def call_case(op: str, pins: dict[str, Any], n: int) -> None:
         torch.autograd.grad(sum(x.square().sum() for x in smooth), leaves, allow_unused=True)
 
 
-def recorded() -> list[tuple[int, str, list[Any]]]:
+def record_calls() -> list[tuple[int, str, list[Any]]]:
     """Returns each case's bytes of shared memory, kind of hostile arguments (`Case.hostile`), and calls."""
     records = []
 

@@ -75,7 +75,7 @@ def same(found, expected):
 
 def main(path, calls, kind="usual"):
     module = load(path)
-    module.know_torch(DTYPES, (), None)
+    module.register_torch(DTYPES, (), None)
     with open(calls, "rb") as file:
         every = pickle.load(file)
     for shared, hostile, recorded_calls in every * (3 if kind == "hostile" else 1):

@@ -55,7 +55,7 @@ def outcome(program: Program, tensors: list[Tensor], offsets: Tensor, products: 
             return grouped_program(
                 leaves[:count], leaves[count:], offsets, program=program, backend="reference", **given
             )
-        rows = plans.Rows(leaves[:count], leaves[count:], offsets, given.get("order"), given.get("ray_index"))
+        rows = plans.RunTensors(leaves[:count], leaves[count:], offsets, given.get("order"), given.get("ray_index"))
         name = "float32" if products == "tf32" else products
         return plans.run_program(rows, plans.RunOptions(program.text, products=name))
 
@@ -178,7 +178,7 @@ def test_what_must_not_stay_in_registers(make: Callable[[], Program], products: 
     right = grouped_program(exact[:count], exact[count:], offsets, program=program, backend="reference")
     assert any(part.any() for part in right) == (make is not learning_nothing)
     for shared_bytes in TILES:
-        rows = plans.Rows(tensors[:count], tensors[count:], offsets, None, None)
+        rows = plans.RunTensors(tensors[:count], tensors[count:], offsets, None, None)
         with emulated(shared_bytes=shared_bytes):
             found = plans.run(rows, plans.RunOptions(program.text, products=products))
             close(found, right, 2 * ALLOWED[products])  # rounding switches a few units
@@ -211,7 +211,7 @@ def test_rows_of_no_cell_keep_nothing() -> None:
     e = b.encode("hash", b.input(3), b.grid(GRID.text), b.parameter(*GRID.table_shape))
     program = b.program([e])
     x, table = torch.rand(200, 3), torch.randn(2, *GRID.table_shape)
-    rows = plans.Rows([x], [table], torch.tensor([30, 90, 150], dtype=torch.int32), None, None)
+    rows = plans.RunTensors([x], [table], torch.tensor([30, 90, 150], dtype=torch.int32), None, None)
     with emulated():
         out, kept = plans.run(rows, plans.RunOptions(program.text, keep=True))
     assert not (kept[:30].any() or kept[150:].any()) and torch.equal(kept[30:150, : e.width], out[30:150])
@@ -243,7 +243,7 @@ def test_what_was_looked_up_is_not_looked_up_again() -> None:
     program = b.program([b.linear(e, b.parameter(5, e.width), 5)])
     own = gradient(program, (False,), (False, True), (True,), ())
     x, table, weight = tensors_of(program, [70])
-    rows = plans.Rows([x], [table, weight], offsets_of([70]), None, None)
+    rows = plans.RunTensors([x], [table, weight], offsets_of([70]), None, None)
     with emulated():
         out, kept = plans.run(rows, plans.RunOptions(program.text, keep=True))
         assert kept.shape == (70, 16)
@@ -258,7 +258,7 @@ def test_types_in_memory(dtype: torch.dtype) -> None:
     """Checks that results equal float32 results for the same arguments, rounded to the type."""
     program = every_step()
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
-    inputs = plans.Rows(rows, [p.float() for p in parameters], offsets, None, None)
+    inputs = plans.RunTensors(rows, [p.float() for p in parameters], offsets, None, None)
     with emulated():
         found = plans.run_program(inputs, plans.RunOptions(program.text))
         exact = plans.run_program(inputs._replace(inputs=[x.float() for x in rows]), plans.RunOptions(program.text))
@@ -339,7 +339,7 @@ def test_numbers_that_are_none_stay_in_their_rows() -> None:
     tensors[0][5, 1], tensors[0][9, 0] = torch.nan, torch.inf
     for products in ALLOWED:
         with emulated(), torch.no_grad():
-            rows = plans.Rows(tensors[:1], tensors[1:], offsets_of([70]), None, None)
+            rows = plans.RunTensors(tensors[:1], tensors[1:], offsets_of([70]), None, None)
             options = plans.RunOptions(program.text, products=products.replace("tf32", "float32"))
             _, out = plans.run_program(rows, options)
         assert (~out.isfinite()).any(1).nonzero().flatten().tolist() in ([5, 9], [5]), products
@@ -353,7 +353,7 @@ def test_float16_cuts_values_off_and_leaves_gradients() -> None:
     x = torch.tensor([[1.0], [1e6]])
     given = [x, torch.ones(1, 16, 1), torch.ones(1, 3, 16) / 64]
     leaves = [leaf.requires_grad_() for leaf in given]
-    rows = plans.Rows(leaves[:1], leaves[1:], offsets_of([2]), None, None)
+    rows = plans.RunTensors(leaves[:1], leaves[1:], offsets_of([2]), None, None)
     with emulated():
         (out,) = plans.run_program(rows, plans.RunOptions(program.text, products="float16"))
         assert out[:, 0].tolist() == [0.25, LARGEST / 4]

@@ -10,7 +10,7 @@ import pytest
 from bugs import verdict
 from emulated import module
 from emulation_build import build
-from recorded import recorded
+from recorded import record_calls
 
 from voronerf.ops._core import backends
 
@@ -69,7 +69,7 @@ def test_finds(bug, sanitizer, expected):
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory):
     path = tmp_path_factory.mktemp("recorded") / "calls"
-    path.write_bytes(pickle.dumps(recorded()))
+    path.write_bytes(pickle.dumps(record_calls()))
     return str(path)
 
 

@@ -141,7 +141,7 @@ def test_the_grid_has_all_that_the_grids_of_the_runs_have(opened, tmp_path) -> N
     joined = joined_run(opened, tmp_path / "joined", frames=frames)
     grid = joined.renderer.occupancy
     for run, frame in zip(opened, frames, strict=True):
-        run_grid = edits.Source.of(run.path).grid
+        run_grid = edits.RunContents.of(run.path).grid
         full = run_grid.occupied.view(-1).nonzero()[:, 0]
         points = run_grid.points(full, torch.rand(len(full), 3))
         assert grid.occupied.view(-1)[grid.voxels(frame.points(points)).long()].all()

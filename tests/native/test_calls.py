@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import _disable_current_modes
 from torch.utils._pytree import tree_leaves
 
 from voronerf import ops
-from voronerf.ops import Rule, adam, cell_sort, composite, grouped_program, nearest_centre
+from voronerf.ops import UpdateRule, adam, cell_sort, composite, grouped_program, nearest_centre
 from voronerf.ops._core import backends
 from voronerf.ops._core.active import active
 from voronerf.ops._core.custom_op import Op
@@ -56,9 +56,9 @@ def results(name, arguments):
 @contextlib.contextmanager
 def without_the_exchange():
     """Simulates a torch version before 2.10, which has no tensor exchange API."""
-    native.compiled.know_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
+    native.compiled.register_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
     yield
-    native.know_torch(native.compiled)
+    native.register_torch(native.compiled)
 
 
 @pytest.mark.parametrize("learns", [False, True])
@@ -102,7 +102,7 @@ def test_what_learns_is_seen_by_torch():
 
 def test_calls_keep_nothing():
     points, centres, grid = torch.rand(8, 3), torch.rand(4, 3), [torch.rand(3)]
-    rule, other = Rule(torch.zeros(()), 0.1), [torch.zeros(3)]
+    rule, other = UpdateRule(torch.zeros(()), 0.1), [torch.zeros(3)]
     held = points, centres, rule, *grid, *other, torch.int32, "native", None
 
     def calls():
@@ -137,7 +137,7 @@ def test_freed_memory_is_refused():
     gone = torch.tensor(0.0)
     gone.untyped_storage().resize_(0)
     ones = [torch.ones(3)], [torch.ones(3)], [torch.zeros(3)], [torch.zeros(3)]
-    for rule in (Rule(gone, 0.1), Rule(torch.zeros(()), gone)):
+    for rule in (UpdateRule(gone, 0.1), UpdateRule(torch.zeros(()), gone)):
         with pytest.raises(TypeError, match=r"AdamRule: (step|rate_at) is no"):
             adam([rule], *ones)
     b = Builder()

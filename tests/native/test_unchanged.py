@@ -72,11 +72,11 @@ CHANGED = {
 def exchange(there):
     """Makes the guard use torch's tensor exchange API, or only Python's methods."""
     if not there:
-        native.compiled.know_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
+        native.compiled.register_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
     try:
         yield
     finally:
-        native.know_torch(native.compiled)
+        native.register_torch(native.compiled)
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["exchange", "methods"])

@@ -9,7 +9,7 @@ import torch
 from adam_steps import assert_adam
 from op_cases import refused, strided
 
-from voronerf.ops import Guard, Rule, adam
+from voronerf.ops import Guard, UpdateRule, adam
 from voronerf.ops._core import native
 
 pytestmark = pytest.mark.op("adam")
@@ -32,7 +32,7 @@ def test_leaves_out_a_step_wherever_a_gradient_is_not_finite(device, backend):
     sizes, judged = [3, 90, 530_001, 0, 4097], [True, False, True, True, True]
     tensors = [[torch.ones(n, device=device) for n in sizes] for _ in range(4)]
     gradients, guard = tensors[1], Guard.on(device)
-    rules = [Rule(torch.zeros((), device=device), 0.1, dense=every) for every in judged]
+    rules = [UpdateRule(torch.zeros((), device=device), 0.1, dense=every) for every in judged]
     places = [(0, 2), (2, 0), (2, 4095), (2, 4096), (2, 127 * 4096), (2, 530_000), (4, 0), (4, 4096)]
     for number, (which, place) in enumerate(places):
         gradients[which][place] = torch.nan
@@ -53,7 +53,7 @@ def test_a_table_may_have_any_gradient(device, backend):
     guard, step = Guard.on(device), torch.zeros((), device=device)
     guard.begin(3)
     arguments = [[tensor] for tensor in table]
-    adam([Rule(step, 0.1, dense=False)], *arguments, guard=guard, loss=step + 1, backend=backend)
+    adam([UpdateRule(step, 0.1, dense=False)], *arguments, guard=guard, loss=step + 1, backend=backend)
     assert float(step) == 1 and float(guard.skipped) == 3 and float(guard.skip) == 0
 
 
@@ -61,7 +61,7 @@ def test_what_was_found_before_leaves_out_a_step(device, backend):
     tensors = [[torch.ones(40, device=device)] for _ in range(4)]
     for found in (1.0, 0.0):
         guard, step = Guard(*torch.full((3,), found, device=device)), torch.zeros((), device=device)
-        adam([Rule(step, 0.1)], *tensors, guard=guard, backend=backend)
+        adam([UpdateRule(step, 0.1)], *tensors, guard=guard, backend=backend)
         assert float(step) == 1 - found and bool((tensors[0][0] == 1).all()) == (found == 1)
 
 
@@ -73,10 +73,10 @@ def test_refuses_what_would_be_read_out_of_bounds():
 
     def call(rules=None, **changed):
         arguments = {name: [torch.ones(())] for name in ("parameters", "gradients", "means", "squares")}
-        adam(rules or [Rule(torch.zeros(()), 0.1)], **{**arguments, **changed})
+        adam(rules or [UpdateRule(torch.zeros(()), 0.1)], **{**arguments, **changed})
 
     call()
-    rule = Rule(torch.zeros(()), 0.1)
+    rule = UpdateRule(torch.zeros(()), 0.1)
     wrong = {
         "adam: gradient must have shape [], got [2]": {"gradients": [torch.ones(2)]},
         "adam: mean must have shape [], got [1]": {"means": [torch.ones(1)]},
@@ -102,7 +102,7 @@ def test_refuses_what_would_be_read_out_of_bounds():
         "adam: step must be a dense tensor, got a sparse_coo one": {
             "rules": [rule._replace(step=torch.zeros(()).to_sparse())]
         },
-        "adam: rules[0] must be a Rule, got tuple": {"rules": [tuple(rule)]},
+        "adam: rules[0] must be a UpdateRule, got tuple": {"rules": [tuple(rule)]},
         "adam: guard must be a Guard, got Tensor": {"guard": torch.ones(())},
         "adam: learning_rate must be a number, got str": {"rules": [rule._replace(learning_rate="x")]},
         "adam: betas must be a number, got Tensor": {"rules": [rule._replace(betas=(0.9, torch.tensor(0.9)))]},
@@ -151,7 +151,7 @@ def loop(parameter, gradient, mean, square, step, rate, betas, epsilon):
 def test_a_table_equals_a_slow_loop(device, backend, shape, share):
     arguments = table(shape, share)
     actual = [t.to(device).clone() for t in arguments]
-    rule = Rule(torch.tensor(2.0, device=device), 0.01, (0.9, 0.99), 1e-10, dense=False)
+    rule = UpdateRule(torch.tensor(2.0, device=device), 0.01, (0.9, 0.99), 1e-10, dense=False)
     adam([rule], *([tensor] for tensor in (actual[0], strided(actual[1]), *actual[2:])), backend=backend)
     expected = loop(*arguments, 3, 0.01, (0.9, 0.99), 1e-10)
     untouched = arguments[1] == 0
@@ -166,7 +166,7 @@ def test_gradients_of_minus_zero_are_none_and_nan_spreads(device, backend):
     before = [t.clone() for t in tensors]
     tensors[1].fill_(-0.0)
     tensors[1][5] = torch.nan
-    rule = Rule(torch.zeros((), device=device), 0.1, dense=False)
+    rule = UpdateRule(torch.zeros((), device=device), 0.1, dense=False)
     adam([rule], *([tensor] for tensor in tensors), backend=backend)
     for now, then in zip((tensors[0], *tensors[2:]), (before[0], *before[2:]), strict=True):
         assert bool(now[5].isnan())
@@ -183,7 +183,7 @@ def test_native_bits_depend_neither_on_threads_nor_on_instructions():
                 torch.set_num_threads(count)
                 tensors = [t.clone() for t in arguments]
                 with native.using_isa(isa):
-                    rule = Rule(torch.tensor(6.0), 0.01, dense=False)
+                    rule = UpdateRule(torch.tensor(6.0), 0.01, dense=False)
                     adam([rule], *([tensor] for tensor in tensors), backend="native")
                 results.append(tensors)
     finally:
@@ -197,12 +197,16 @@ def test_native_bits_depend_neither_on_threads_nor_on_instructions():
     [
         (TypeError, "skip must be a tensor, got NoneType", {"guard": Guard(None, None, None)}),
         (ValueError, "skipped must have shape [], got [0]", {"guard": Guard(torch.ones(()), *[torch.ones(0)] * 2)}),
-        (TypeError, "dense must be True or False, got int", {"rules": [Rule(torch.ones(()), 0.1, dense=1)]}),
-        (ValueError, "learning_rate must have shape [], got [0]", {"rules": [Rule(torch.ones(()), torch.ones(0))]}),
-        (ValueError, "step must have shape [], got [0]", {"rules": [Rule(torch.ones(0), 0.1)]}),
+        (TypeError, "dense must be True or False, got int", {"rules": [UpdateRule(torch.ones(()), 0.1, dense=1)]}),
+        (
+            ValueError,
+            "learning_rate must have shape [], got [0]",
+            {"rules": [UpdateRule(torch.ones(()), torch.ones(0))]},
+        ),
+        (ValueError, "step must have shape [], got [0]", {"rules": [UpdateRule(torch.ones(0), 0.1)]}),
     ],
 )
 def test_forged_rules_and_guards_are_refused(error, message, change, backend):
-    arguments = {"rules": [Rule(torch.ones(()), 0.1)], "guard": Guard.on("cpu"), "loss": torch.ones(()), **change}
+    arguments = {"rules": [UpdateRule(torch.ones(()), 0.1)], "guard": Guard.on("cpu"), "loss": torch.ones(()), **change}
     with refused(error, f"adam: {message}"):
         adam(arguments.pop("rules"), *([torch.ones(3)] for _ in range(4)), **arguments, backend=backend)

@@ -766,5 +766,5 @@ def test_shapes_of_a_gpu_that_is_not_there(products):
         x, weight = torch.empty(9, 5, device="cuda"), torch.empty(2, 7, 5, device="cuda")
         offsets = torch.zeros(3, dtype=torch.int32, device="cuda")
         options = plans.RunOptions(program.text, products=products)
-        result = plans.run(plans.Rows([x], [weight], offsets, None, None), options)
+        result = plans.run(plans.RunTensors([x], [weight], offsets, None, None), options)
         assert [tuple(t.shape) for t in result] == [(9, 7)]

@@ -39,7 +39,7 @@ SMALLEST = 1e-4
 
 
 @dataclass(frozen=True)
-class Source:
+class RunContents:
     """The contents of a run to join, cut or place: settings, scene, parts and grid."""
 
     name: str
@@ -49,7 +49,7 @@ class Source:
     grid: OccupancyGrid | None
 
     @classmethod
-    def of(cls, run: Path | str) -> Source:
+    def of(cls, run: Path | str) -> RunContents:
         """Reads a source from a run directory; an ordinary run becomes one part whose only network is its field."""
         run = Path(run)
         name, record = run.name, run / "scene.json"
@@ -79,7 +79,7 @@ class Source:
         return cls(name, config, scene, Parts([Part(network, region=region)]), grid)
 
 
-def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Similarity] | None = None) -> Source:
+def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Similarity] | None = None) -> RunContents:
     """Joins several runs into a new run.
 
     Where runs overlap, a point is evaluated by the run that has the nearest cell centre.
@@ -104,12 +104,12 @@ def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Simila
     if len(runs) < 2 or (frames is not None and len(frames) != len(runs)):
         count = "none" if frames is None else f"{len(frames)}"
         raise ConfigError(f"join needs two runs or more, and a frame for each: got {len(runs)} runs, {count} frames")
-    sources = {str(run): Source.of(run) for run in runs}
+    sources = {str(run): RunContents.of(run) for run in runs}
     sources_of_runs = [sources[str(run)] for run in runs]
     return _write(join_sources(sources_of_runs, frames or [Similarity()] * len(runs)), Path(out))
 
 
-def cut(run: Path | str, keep: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Source:
+def cut(run: Path | str, keep: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> RunContents:
     """Writes a part of a run as a new run: the contents of a solid, or some cells.
 
     The new run has only the networks that it needs. Exception: if a solid is removed from a scene without a box, the
@@ -133,7 +133,7 @@ def cut(run: Path | str, keep: Solid | Sequence[int], out: Path | str, *, outsid
         >>> def ball_of(run, out):
         ...     return cut(run, Solid(ball=(0, 0, 0.4, 0.5)), out)
     """
-    source = Source.of(run)
+    source = RunContents.of(run)
     if isinstance(keep, Solid):
         return _write(cut_source(source, replace(keep, outside=keep.outside != outside)), Path(out))
     k = source.parts.num_cells
@@ -152,7 +152,7 @@ def place(
     *,
     degrees: Sequence[float] = (0, 0, 0),
     scale: float = 1.0,
-) -> Source:
+) -> RunContents:
     """Places an object into a scene, as a new run; the object's density is added to the scene's.
 
     Args:
@@ -175,7 +175,7 @@ def place(
         >>> def on_the_ground(garden, statue, out):
         ...     return place(garden, statue, (0.2, -0.1, 0), out, scale=0.5)
     """
-    source = Source.of(object_run)
+    source = RunContents.of(object_run)
     box = source.scene.box
     if box is None:
         raise ConfigError(
@@ -183,14 +183,14 @@ def place(
         )
     foot = torch.cat(((box[0] + box[1])[:2] / 2, box[0, 2:]))
     standing = Similarity.of(at, degrees, scale) @ Similarity(translation=-foot.double())
-    scene = source if Path(run) == Path(object_run) else Source.of(run)  # one source: its networks are stored once
+    scene = source if Path(run) == Path(object_run) else RunContents.of(run)  # one source: its networks are stored once
     return _write(join_sources([scene, source], [Similarity(), standing], on_top=True), Path(out))
 
 
 # Joining --------------------------------------------------------------------------------------------------------------
 
 
-def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_top: bool = False) -> Source:
+def join_sources(sources: Sequence[RunContents], frames: Sequence[Similarity], *, on_top: bool = False) -> RunContents:
     """Joins sources into one source.
 
     Where sources overlap, a point is evaluated by the source that has the nearest cell centre.
@@ -215,10 +215,10 @@ def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_
         parts += [part.changed(frame=frame @ part.frame, layer=part.layer + above) for part in source.parts]
     joined = Parts(parts, backend=first.parts.backend)
     scene = _join_scenes(sources, frames)
-    return Source(first.name, _settings(sources, frames, scene), scene, joined, _join_grids(sources, frames))
+    return RunContents(first.name, _settings(sources, frames, scene), scene, joined, _join_grids(sources, frames))
 
 
-def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
+def _settings(sources: Sequence[RunContents], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
     """Returns the settings of a joined run: the first source's, with stratified sampling and enough samples per ray.
 
     A ray is divided into strata with one sample each. In a scene with a box, the strata are as short as the shortest
@@ -240,7 +240,7 @@ def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Sc
     return replace(first, sampling="stratified", samples=(min(samples, 32_000),), out=None)
 
 
-def _join_scenes(sources: Sequence[Source], frames: Sequence[Similarity]) -> Scene:
+def _join_scenes(sources: Sequence[RunContents], frames: Sequence[Similarity]) -> Scene:
     """Joins the views and the boxes of all sources; a scene that occurs twice in the same place counts once."""
     first, box, views = sources[0].scene, sources[0].scene.box, []
     seen: set[tuple[str, str]] = set()
@@ -296,7 +296,7 @@ def moved_cameras(cameras: Cameras, frame: Similarity) -> Cameras:
     return replace(cameras, poses=poses)
 
 
-def _join_grids(sources: Sequence[Source], frames: Sequence[Similarity]) -> OccupancyGrid | None:
+def _join_grids(sources: Sequence[RunContents], frames: Sequence[Similarity]) -> OccupancyGrid | None:
     """Joins the occupancy grids; voxels have the size of the smallest source voxels if `MOST_VOXELS` allows it."""
     grids = [source.grid for source in sources]
     if any(source.scene.box is None for source in sources) or any(grid is None for grid in grids):
@@ -357,7 +357,7 @@ def _empty_grid(box: Tensor, shape: Sequence[int], threshold: float) -> Occupanc
 # Cutting --------------------------------------------------------------------------------------------------------------
 
 
-def cut_source(source: Source, keep: Solid | Tensor) -> Source:
+def cut_source(source: RunContents, keep: Solid | Tensor) -> RunContents:
     """Returns a part of a source as a new source: the contents of a solid, or some cells.
 
     The new source has only the networks that it needs. Exception: if a solid is removed from a scene without a box, the
@@ -419,7 +419,7 @@ def cut_source(source: Source, keep: Solid | Tensor) -> Source:
         share = float((grid.box[1] - grid.box[0]).norm() / (old_box[1] - old_box[0]).norm())
         config = replace(config, samples=(max(16, math.ceil((config.samples or (64,))[0] * share - 1e-6)),))
     config = _settings([replace(source, config=config, scene=scene)], [Similarity()], scene)
-    return Source(source.name, config, scene, parts, grid)
+    return RunContents(source.name, config, scene, parts, grid)
 
 
 def keep_cells(parts: Parts, keep: Tensor) -> Parts:
@@ -472,7 +472,7 @@ def _trimmed(grid: OccupancyGrid, parts: Parts, voxels: Tensor) -> OccupancyGrid
     return trimmed
 
 
-def _evaluated_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
+def _evaluated_grid(source: RunContents, parts: Parts, box: Tensor) -> OccupancyGrid:
     """Makes an occupancy grid of a box for a run without a grid: evaluates the field in every voxel."""
     threshold = -math.log1p(-OPACITY) * (source.config.samples or (64,))[0] / float((box[1] - box[0]).norm())
     return ask_everywhere(OccupancyGrid(box, PICTURE_RESOLUTION, threshold=threshold), parts.eval())
@@ -538,7 +538,7 @@ def _process_exists(number: int) -> bool:
     return True
 
 
-def _write(source: Source, out: Path) -> Source:
+def _write(source: RunContents, out: Path) -> RunContents:
     """Writes a run of parts into a new folder, atomically."""
     check_out(out)
     out.parent.mkdir(parents=True, exist_ok=True)

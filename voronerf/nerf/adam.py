@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from voronerf.nerf import schedule
 from voronerf.nerf.segment import replayed
 from voronerf.ops._core.rows import varying
-from voronerf.ops.adam import Guard, Rule, adam, average
+from voronerf.ops.adam import Guard, UpdateRule, adam, average
 from voronerf.router import VoronoiRouter
 from voronerf.router.optimizers import trained_parts
 
@@ -244,7 +244,7 @@ class Adam(torch.optim.Adam):
             state = self._state(parameter)
             step, members = state["step"], (parameter, gradient, state["exp_avg"], state["exp_avg_sq"])
             for number, part in enumerate(parts):
-                rules.append(Rule(step.clone() if number else step, *rule))  # a step counts once per parameter
+                rules.append(UpdateRule(step.clone() if number else step, *rule))  # a step counts once per parameter
                 tensors.append(members if part is ... else tuple(tensor[part] for tensor in members))
         if rules:
             adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)

@@ -153,7 +153,7 @@ class RayLoss:
         network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index)
         tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
         # A sample that almost no light reaches has a negligible gradient and is left out of the backward pass.
-        outputs = tape.raw, field.rule, HIDDEN
+        outputs = tape.raw, field.activation, HIDDEN
         rendered = self._render(*outputs, batch, samples)
         return {"outputs": outputs, "rendered": rendered, "learning": (self._learn_fused, tape, samples)}
 
@@ -180,7 +180,9 @@ class RayLoss:
             "learning": (self._learn_unfused, values, batch, samples, before),
         }
 
-    def _render(self, raw: Tensor, rule: dict[str, Any], hidden: float, batch: Batch, samples: Samples) -> RenderLoss:
+    def _render(
+        self, raw: Tensor, activation: dict[str, Any], hidden: float, batch: Batch, samples: Samples
+    ) -> RenderLoss:
         """Computes the loss of the colours and its gradient with respect to the raw outputs."""
         for name in ("target", "background"):
             if (colours := getattr(batch, name)) is not None and colours.requires_grad:
@@ -191,7 +193,7 @@ class RayLoss:
             samples.ray_offsets,
             batch.target,
             background=batch.background,
-            **rule,
+            **activation,
             robust=self.robust,
             hidden=hidden,
             triples=batch.unseen,
@@ -218,7 +220,7 @@ class RayLoss:
             samples.ray_offsets,
             background=batch.background,
             **{f"of_{name}": slope for name, slope in along.slopes._asdict().items()},
-            **along.rule,
+            **along.activation,
             hidden=along.hidden,
             backend=along.backend,
         )

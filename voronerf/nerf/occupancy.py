@@ -309,8 +309,8 @@ class OccupancyGrid:
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
-        rule: dict[str, Any] = {"decay": decay, "hidden": HIDDEN, "fixed": fixed, "backend": backend}
-        self._enter(positions, density.float(), deltas.float(), weights.float(), **rule)
+        options: dict[str, Any] = {"decay": decay, "hidden": HIDDEN, "fixed": fixed, "backend": backend}
+        self._enter(positions, density.float(), deltas.float(), weights.float(), **options)
 
     @torch.no_grad()
     def fill_holes(self, field: Field, *, generator: torch.Generator | None = None) -> None:
@@ -351,24 +351,24 @@ class OccupancyGrid:
         """Returns float32 [x, y, z], the number of occupied voxels in the 3 x 3 x 3 block around each voxel."""
         return torch.nn.functional.avg_pool3d(self.occupied[None].float(), 3, 1, 1, divisor_override=1)[0]
 
-    def _enter(self, *samples: Tensor, **rule: Any) -> None:
+    def _enter(self, *samples: Tensor, **options: Any) -> None:
         """Updates the grid from samples with densities per world unit; see `voronerf.ops.observe_occupancy`."""
-        rule |= {"threshold": self.threshold, "contraction": self._numbers}
-        observe_occupancy(self.density, self.occupied, self.box, *samples, **rule)
+        options |= {"threshold": self.threshold, "contraction": self._numbers}
+        observe_occupancy(self.density, self.occupied, self.box, *samples, **options)
 
     def voxels(self, points: Tensor) -> Tensor:
         """Returns int32 [n], the flat indices of the voxels of points [n, 3]; the nearest voxel for points outside."""
         return voxels_of(points, self.box, self.occupied.shape)
 
-    def march(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> March:
+    def march(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **options: Any) -> March:
         """Returns the samples of rays in occupied voxels; for the options see `voronerf.ops.march_rays`."""
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
-        return march_rays(*arguments, contraction=self._numbers, **rule)
+        return march_rays(*arguments, contraction=self._numbers, **options)
 
-    def render_colours(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RenderedRays:
+    def render_colours(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **options: Any) -> RenderedRays:
         """Renders rays by evaluating networks in occupied voxels; for the options see `voronerf.ops.render_opaque`."""
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
-        return render_opaque(*arguments, contraction=self._numbers, **rule)
+        return render_opaque(*arguments, contraction=self._numbers, **options)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns the tensors from which `from_state` makes the same grid, bit for bit."""

@@ -49,7 +49,7 @@ class Radiance(NamedTuple):
     networks: Networks
 
     @property
-    def rule(self) -> dict[str, Any]:
+    def activation(self) -> dict[str, Any]:
         """The options that tell `render_loss` how to read the outputs."""
         scale = self.networks.density_scale
         return {"activated": True} if scale is None else {"density_scale": scale}

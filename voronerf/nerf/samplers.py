@@ -73,7 +73,7 @@ RenderPass = Callable[[str, Samples], Rendered]
 
 @replayed
 class Sampler:
-    """A rule that chooses the sample points of rays; it may learn from the steps of a training.
+    """A method that chooses the sample points of rays; it may learn from the steps of a training.
 
     A subclass defines :meth:`sample`. A subclass with several passes also defines :meth:`draw` and
     :meth:`earlier_loss`. A subclass that learns defines :meth:`step_pre_backward` and :meth:`step_post_backward`. A
@@ -425,7 +425,7 @@ class Occupancy(Sampler):
         arguments = radiance.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32))
         if "cells" in arguments:  # each sample has its own cell
             return None
-        return {"network": {name: value for name, value in arguments.items() if name in NETWORK}, **radiance.rule}
+        return {"network": {name: value for name, value in arguments.items() if name in NETWORK}, **radiance.activation}
 
     def _leave_empty(self) -> None:
         if self.empty is not None:

@@ -37,7 +37,7 @@ from voronerf.ops import Guard
 from voronerf.ops._core import backends
 from voronerf.ops._core.active import active
 from voronerf.ops._core.capture import Capture
-from voronerf.ops._core.custom_op import is_watched
+from voronerf.ops._core.custom_op import has_listeners
 from voronerf.ops._core.recording import Recording
 from voronerf.ops._core.unchanged import Never, unchanged
 from voronerf.router.layout import tensors_of
@@ -409,7 +409,7 @@ class TrainingStep:
 
     def _is_unchanged(self) -> bool:
         """Returns whether all dependencies are unchanged, and no mode, transform or profiler of torch is active."""
-        return not is_watched() and self._dependencies_hold()
+        return not has_listeners() and self._dependencies_hold()
 
     def _on_gpu(self) -> bool:
         return self.batches.device.type == "cuda"
@@ -501,7 +501,7 @@ class TrainingStep:
 
     def _standing_obstacle(self) -> str | None:
         """Returns the reason why no step can be replayed, or None; other obstacles may appear in the recording."""
-        if is_watched():
+        if has_listeners():
             return "a mode, a transform or a profiler of torch is active"
         renderer, device = self.loss.renderer, self.batches.device
         place = getattr(self.batches, "place", device)

@@ -64,9 +64,10 @@ class LossAlongRays(NamedTuple):
         density: [m], the density at each sample per scene unit.
         error: [r], the squared error of the colour of each ray, summed over the channels.
         samples: The samples at which the networks were evaluated.
-        raw: [m, 4], the outputs of the networks: colour and density, before their activations or, with the rule
+        raw: [m, 4], the outputs of the networks: colour and density, before their activations or, with the option
             ``activated``, after them.
-        rule: The option that tells `voronerf.ops.render_loss` how to read ``raw``: ``density_scale`` or ``activated``.
+        activation: The option of `voronerf.ops.render_loss` that tells how to read ``raw``: ``density_scale`` or
+            ``activated``.
         hidden: A sample whose transmittance is at most this value is hidden, and gets no gradient.
         backend: The backend of the ops.
 
@@ -84,7 +85,7 @@ class LossAlongRays(NamedTuple):
     error: Tensor
     samples: Samples
     raw: Tensor
-    rule: dict[str, Any]
+    activation: dict[str, Any]
     hidden: float
     backend: str
 
@@ -253,7 +254,7 @@ class RayValues:
     @functools.cached_property
     def rgb(self) -> Tensor:
         """The colours of the samples [m, 3]."""
-        return self._leaf("rgb", activate(self._now(self._along.raw), **self._along.rule)[0])
+        return self._leaf("rgb", activate(self._now(self._along.raw), **self._along.activation)[0])
 
     @functools.cached_property
     def density(self) -> Tensor:

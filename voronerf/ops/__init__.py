@@ -14,7 +14,7 @@ from types import ModuleType
 
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import MLP, Layer
-from voronerf.ops.adam import Guard, Rule, adam, average
+from voronerf.ops.adam import Guard, UpdateRule, adam, average
 from voronerf.ops.balance_centres import balance_centres
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.composite import Composite, composite
@@ -56,8 +56,8 @@ __all__ = [
     "PixelRuns",
     "RenderLoss",
     "RenderedRays",
-    "Rule",
     "Tape",
+    "UpdateRule",
     "adam",
     "average",
     "balance_centres",

@@ -14,7 +14,7 @@ namespace {
 // depths, and C is [rows][kGranule], padded with 0. All sums use the same order, so a row's result does not depend on
 // its position. If `rows` is not a multiple of a block's rows, the last row is computed repeatedly.
 template <int O>
-void few_outputs(const Source* sources, int64_t count, const float* weights, int64_t depth, const float* bias,
+void few_outputs(const LeftPart* sources, int64_t count, const float* weights, int64_t depth, const float* bias,
                  bool relu, int64_t rows, float* c) {
   constexpr int kRows = kLanes / O;
   const F32 lowest = splat(relu ? 0.0f : -__builtin_huge_valf());  // NaN passes: it is not less
@@ -26,7 +26,7 @@ void few_outputs(const Source* sources, int64_t count, const float* weights, int
     for (int r = 0; r < kRows; ++r) row[r] = first + r < rows ? first + r : rows - 1;
     for (int i = 0; i < kLanes; ++i) sum[i] = splat(0.0f);
     const float* w = weights;
-    for (const Source* source = sources; source != sources + count; w += source->depth, ++source) {
+    for (const LeftPart* source = sources; source != sources + count; w += source->depth, ++source) {
       for (int64_t k = 0; k < source->depth; k += kLanes) {
         F32 b[O];
         for (int o = 0; o < O; ++o) b[o] = load(w + o * depth + k);

@@ -23,8 +23,8 @@ __attribute__((noinline)) void block(const Product& p, int64_t row, int64_t colu
   }
   const float* b = p.b + column;
   const int64_t b_stride = p.b_stride;
-  const Source* source = p.sources;
-  const Source* const end = source + p.count;
+  const LeftPart* source = p.sources;
+  const LeftPart* const end = source + p.count;
   // There is at least one source and none is empty, so do-while loops are possible: they keep the sums in registers.
   do {
     const int64_t stride = source->stride;

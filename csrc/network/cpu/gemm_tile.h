@@ -36,7 +36,7 @@ inline namespace tiles_of_pairs {
 constexpr int64_t kPanel = VN_ISA == 2 || VN_HALF == 2 ? 64 : 16;
 
 // One source of a concatenated A, with `depth` values of k in rows of `stride` floats.
-struct Source {
+struct LeftPart {
   const float* data;
   int64_t stride;
   int64_t depth;
@@ -45,7 +45,7 @@ struct Source {
 enum class Finish { none, relu, relu_slope };
 
 struct Product {
-  const Source* sources;
+  const LeftPart* sources;
   int64_t count;
   const float* b;  // [sum of depths][b_stride]
   int64_t b_stride;

@@ -120,7 +120,7 @@ template <int R, int C, Slope S, bool kFloats, Pairs P>
 __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& blocks) {
   constexpr bool kFinish = S != Slope::none || P != Pairs::none;
   alignas(64) float memory[kBlock * kBlock];
-  const Source& source = *p.sources;
+  const LeftPart& source = *p.sources;
   const int64_t a_next = kTileRows * source.stride, a_stride = source.stride * kFloat;
   const int64_t b_step = kStep * p.b_stride, b_stride = p.b_stride * kFloat;
   const int64_t start_next = kTileRows * p.start_stride, start_stride = p.start_stride * kFloat;

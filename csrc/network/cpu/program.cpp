@@ -76,7 +76,7 @@ void fetch(const float* from, int64_t floats, bool writes) {
 }
 
 // Prefetches each parameter of a cell once.
-void fetch_parameters(const ProgramCall& call, int64_t cell) {
+void fetch_parameters(const CpuProgram& call, int64_t cell) {
   if (call.code.packed > kMostFetched) return;
   uint64_t seen = 0;  // prefetched parameters: most are packed twice
   for (int32_t p = 0; p < call.code.pack_count; ++p) {
@@ -90,7 +90,7 @@ void fetch_parameters(const ProgramCall& call, int64_t cell) {
 }
 
 // Prefetches the sums of a cell, which will be written next.
-void fetch_sums(const ProgramCall& call, int64_t cell) {
+void fetch_sums(const CpuProgram& call, int64_t cell) {
   if (call.code.partial > kMostFetched) return;
   for (int32_t s = 0; s < call.code.sum_count; ++s) {
     const ProgramSum& sum = call.code.sums[s];
@@ -275,12 +275,12 @@ ProgramRows::ProgramRows(const Program& program, const ProgramInputs& in, Isa is
 
 int64_t ProgramRows::workspace() const { return aligned(aligned(table_.packed) + table_.columns * tile_ + kSlack); }
 
-ProgramCall ProgramRows::call(const ProgramInputs& in, const ProgramResults& results, bool* in_place) const {
+CpuProgram ProgramRows::call(const ProgramInputs& in, const ProgramResults& results, bool* in_place) const {
   for (size_t i = 0; i < table_.inputs.size(); ++i) {
     const bool plain = in.input_types[i] == TableType::float32 && !transposed_[i] && !rays_[i];
     in_place[i] = plain && in.order == nullptr;
   }
-  ProgramCall call{};
+  CpuProgram call{};
   call.code = code_of(table_);
   call.inputs = in.inputs;
   call.input_types = in.input_types.data();
@@ -304,7 +304,7 @@ ProgramCall ProgramRows::call(const ProgramInputs& in, const ProgramResults& res
   return call;
 }
 
-void ProgramRows::pack(const ProgramCall& call, int64_t cell, bool first, float* own) const {
+void ProgramRows::pack(const CpuProgram& call, int64_t cell, bool first, float* own) const {
   float* const tiles = own + aligned(table_.packed);
   if (in_tiles(table_)) {
     VN_FOR_TILES(isa_, program_tiles_pack(call, cell, first, own, tiles))
@@ -315,7 +315,7 @@ void ProgramRows::pack(const ProgramCall& call, int64_t cell, bool first, float*
   VN_FOR_ISA(isa_, program_pack(call, cell, first, own, tiles))
 }
 
-void ProgramRows::run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, float* own,
+void ProgramRows::run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end, float* own,
                       float* partial) const {
   float* const tiles = own + aligned(table_.packed);
   if (in_tiles(table_)) {
@@ -329,7 +329,7 @@ void ProgramRows::run(const ProgramCall& call, int64_t cell, int64_t begin, int6
   VN_FOR_ISA(isa_, program_run(call, cell, begin, end, own, tiles, partial))
 }
 
-void ProgramRows::reduce(const ProgramCall& call, int64_t cell, float* partials, int64_t count) const {
+void ProgramRows::reduce(const CpuProgram& call, int64_t cell, float* partials, int64_t count) const {
   VN_FOR_ISA(isa_, program_reduce(call, cell, partials, count))
 }
 
@@ -339,7 +339,7 @@ void ProgramRows::forward(const ProgramInputs& in, const ProgramResults& results
   bool in_place[kFew];
   float* memories[kFew] = {};
   bool filled[kFew] = {};
-  ProgramCall program_call = call(in, results, in_place);
+  CpuProgram program_call = call(in, results, in_place);
   program_call.memories = memories;
   program_call.filled = filled;
   for (int64_t cell = 0; cell < in.k; ++cell) {
@@ -366,7 +366,7 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& original, 
   const ProgramRows rows(program, in, isa);
   std::unique_ptr<bool[]> in_place(new bool[table.inputs.size()]), filled(new bool[table.memories.size()]());
   std::vector<float*> memories(table.memories.size(), nullptr);
-  ProgramCall call = rows.call(in, results, in_place.get());
+  CpuProgram call = rows.call(in, results, in_place.get());
   call.memories = memories.data();
   call.filled = filled.get();
   call.n = original.n;

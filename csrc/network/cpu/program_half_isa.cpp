@@ -12,11 +12,11 @@
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 
-void program_half_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free) {
+void program_half_pack(const CpuProgram& call, int64_t cell, bool first, float* packed, float* free) {
   pack_cell(call, cell, first, packed, free);
 }
 
-void program_half_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed,
+void program_half_run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end, const float* packed,
                       float* tiles, float* partial) {
   run_tiles(call, cell, begin, end, packed, tiles, partial);
 }

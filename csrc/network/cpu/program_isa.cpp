@@ -9,16 +9,16 @@
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 
-void program_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free) {
+void program_pack(const CpuProgram& call, int64_t cell, bool first, float* packed, float* free) {
   pack_cell(call, cell, first, packed, free);
 }
 
-void program_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed, float* tiles,
+void program_run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end, const float* packed, float* tiles,
                  float* partial) {
   run_tiles(call, cell, begin, end, packed, tiles, partial);
 }
 
-void program_reduce(const ProgramCall& call, int64_t cell, float* partials, int64_t count) {
+void program_reduce(const CpuProgram& call, int64_t cell, float* partials, int64_t count) {
   const ProgramCode& code = call.code;
   for (int64_t part = 1; part < count; ++part) {
     const float* next = partials + part * code.partial;

@@ -8,7 +8,7 @@
 namespace voronerf {
 
 // The data of a call that the tiles read.
-struct ProgramCall {
+struct CpuProgram {
   ProgramCode code;
   const void* const* inputs;
   const TableType* input_types;
@@ -33,26 +33,26 @@ struct ProgramCall {
 
 // Packs a cell's parameters. `first`: the cell is the thread's first one. `free`: the thread's slots, as scratch
 // memory.
-VN_DECLARE_FOR_ISA(void program_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free))
+VN_DECLARE_FOR_ISA(void program_pack(const CpuProgram& call, int64_t cell, bool first, float* packed, float* free))
 
 // Runs rows [begin, end) of the packed cell. `tiles` holds the slots, and the sums of the rows are written to
 // `partial`.
-VN_DECLARE_FOR_ISA(void program_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end,
+VN_DECLARE_FOR_ISA(void program_run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end,
                                     const float* packed, float* tiles, float* partial))
 
 // The same functions with products of bfloat16 pairs.
 #if VN_HAS_HALF
 namespace avx512 {
-void program_half_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free);
-void program_half_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed,
+void program_half_pack(const CpuProgram& call, int64_t cell, bool first, float* packed, float* free);
+void program_half_run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end, const float* packed,
                       float* tiles, float* partial);
 }  // namespace avx512
 #endif
 
 // The same functions with tile registers, which the portable path emulates.
-#define VN_DECLARE_TILES                                                                                         \
-  void program_tiles_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free);        \
-  void program_tiles_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed, \
+#define VN_DECLARE_TILES                                                                                        \
+  void program_tiles_pack(const CpuProgram& call, int64_t cell, bool first, float* packed, float* free);        \
+  void program_tiles_run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end, const float* packed, \
                          float* tiles, float* partial);
 VN_DECLARE_IN(portable, VN_DECLARE_TILES)
 #if VN_HAS_TILES
@@ -61,6 +61,6 @@ VN_DECLARE_IN(avx512, VN_DECLARE_TILES)
 #undef VN_DECLARE_TILES
 
 // Computes the sums of a cell from `count` partials, added in order. It overwrites the first partial.
-VN_DECLARE_FOR_ISA(void program_reduce(const ProgramCall& call, int64_t cell, float* partials, int64_t count))
+VN_DECLARE_FOR_ISA(void program_reduce(const CpuProgram& call, int64_t cell, float* partials, int64_t count))
 
 }  // namespace voronerf

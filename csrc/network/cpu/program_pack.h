@@ -148,7 +148,7 @@ struct Matrix {
 
 #endif
 
-[[maybe_unused]] void pack_cell(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free) {
+[[maybe_unused]] void pack_cell(const CpuProgram& call, int64_t cell, bool first, float* packed, float* free) {
   for (int32_t p = 0; p < call.code.pack_count; ++p) {
     const ProgramPack& pack = call.code.packs[p];
     float* const to = packed + pack.at;

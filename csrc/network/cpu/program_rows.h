@@ -32,10 +32,10 @@ class ProgramRows {
 
   // Returns the data of a call except its arrays of n rows (`memories`, `filled` and `looked_up`). The data points into
   // this object, `in` and `results`, which must outlive the data.
-  ProgramCall call(const ProgramInputs& in, const ProgramResults& results, bool* in_place) const;
-  void pack(const ProgramCall& call, int64_t cell, bool first, float* own) const;
-  void run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, float* own, float* partial) const;
-  void reduce(const ProgramCall& call, int64_t cell, float* partials, int64_t count) const;
+  CpuProgram call(const ProgramInputs& in, const ProgramResults& results, bool* in_place) const;
+  void pack(const CpuProgram& call, int64_t cell, bool first, float* own) const;
+  void run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end, float* own, float* partial) const;
+  void reduce(const CpuProgram& call, int64_t cell, float* partials, int64_t count) const;
   const std::vector<HashEncoding>& grids() const { return grids_; }
 
  private:

@@ -14,11 +14,11 @@ VN_INLINE int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
 
 // Columns of a value or vector, in rows of `stride` floats; stride 0: all rows are the same. `spread`: one column is
 // broadcast.
-struct Rows {
+struct Operand {
   const float* data;
   int64_t stride;
   bool spread;
-  VN_INLINE F32 vector(const Rows& rows, int64_t row, int64_t column) {
+  VN_INLINE F32 vector(const Operand& rows, int64_t row, int64_t column) {
     const float* from = rows.data + row * rows.stride;
     return rows.spread ? splat(*from) : load(from + column);
   }
@@ -84,7 +84,7 @@ VN_INLINE void clear_behind(float* pairs, int64_t width, int64_t rows, int64_t s
 }
 
 // Rounds rows to pairs, padded with 0. If `left` is not 0, the rounding remainders follow `left` floats later.
-VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to, int64_t stride, int64_t left = 0) {
+VN_INLINE void narrow_rows(const Operand& x, int64_t width, int64_t rows, float* to, int64_t stride, int64_t left = 0) {
   for (int64_t row = 0; row < rows; ++row, to += stride) {
     narrow_row(x.data + row * x.stride, width, to, left == 0 ? nullptr : to + left);
   }
@@ -92,7 +92,7 @@ VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to
 
 // Joins neighbouring rows to pairs [(rows + 1) / 2][columns]. An odd last row is paired with zeros. `columns` must be a
 // multiple of 16.
-VN_INLINE void interleave_columns(const Rows& x, int64_t columns, int64_t rows, float* to) {
+VN_INLINE void interleave_columns(const Operand& x, int64_t columns, int64_t rows, float* to) {
   for (int64_t row = 0; row < rows; row += 2, to += columns) {
     const float* from = x.data + row * x.stride;
     for (int64_t i = 0; i < columns; i += kLanes) {
@@ -122,18 +122,18 @@ VN_INLINE void copy_pairs(const uint16_t* from, int64_t width, float* to) {
 }
 
 // Clears the padding rows of pairs in a slot: the rows after the last row, up to a multiple of 32.
-VN_INLINE void clear_behind(const Rows& x, int64_t columns, int64_t rows) {
+VN_INLINE void clear_behind(const Operand& x, int64_t columns, int64_t rows) {
   float* const data = const_cast<float*>(x.data);
   for (int64_t row = rows; row % kTransposed != 0; ++row) {
     for (int64_t i = 0; i < pairs_of(columns); i += kLanes) store(data + row * x.stride + i, splat(0.0f));
   }
 }
 
-VN_INLINE Rows behind(const Rows& x, int64_t floats) { return {x.data + floats, x.stride, x.spread}; }
+VN_INLINE Operand behind(const Operand& x, int64_t floats) { return {x.data + floats, x.stride, x.spread}; }
 
 // Converts rows of pairs to pairs of neighbouring rows, transposed to [columns][stride]. `columns` must be a multiple
 // of 16.
-VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* to, int64_t stride) {
+VN_INLINE void turn_pairs(const Operand& x, int64_t columns, int64_t rows, float* to, int64_t stride) {
   clear_behind(x, columns, rows);
 #if VN_ISA == 2
   // Eight columns are transposed at a time. 128-bit lane l of vector i holds the columns of pair i + 4 l, so shuffles
@@ -180,7 +180,7 @@ VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* t
 }
 
 // Converts rows of pairs to pairs of neighbouring rows, [row pairs][columns]. `columns` must be a multiple of 16.
-VN_INLINE void zip_pairs(const Rows& x, int64_t columns, int64_t rows, float* to) {
+VN_INLINE void zip_pairs(const Operand& x, int64_t columns, int64_t rows, float* to) {
   clear_behind(x, columns, rows);
   for (int64_t row = 0; row < 2 * pairs_of(rows); row += 2, to += columns) {
     const float *even = x.data + row * x.stride, *odd = even + x.stride;
@@ -202,7 +202,7 @@ VN_INLINE void zip_pairs(const Rows& x, int64_t columns, int64_t rows, float* to
 }
 
 // Adds the sums over rows of pairs to `to` [columns], or overwrites it if `first`.
-VN_INLINE void add_pairs(const Rows& x, int64_t columns, int64_t rows, bool first, float* to) {
+VN_INLINE void add_pairs(const Operand& x, int64_t columns, int64_t rows, bool first, float* to) {
   for (int64_t column = 0; column < columns; column += 2 * kLanes) {
     const bool both = column + kLanes < columns;
     F32 even[] = {splat(0.0f), splat(0.0f)}, odd[] = {splat(0.0f), splat(0.0f)};  // even and odd columns, by row parity

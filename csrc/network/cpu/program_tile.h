@@ -18,7 +18,7 @@ namespace {
 
 // Computes to = body(x, y) elementwise, for all `stride` columns including the padding.
 template <typename Body>
-VN_INLINE void each(float* to, int64_t stride, int64_t rows, const Rows& x, const Rows& y, const Body& body) {
+VN_INLINE void each(float* to, int64_t stride, int64_t rows, const Operand& x, const Operand& y, const Body& body) {
   const bool flat = !x.spread && !y.spread && x.stride == stride && y.stride == stride;
   if (flat) {
     for (int64_t i = 0; i < rows * stride; i += kLanes) store(to + i, body(load(x.data + i), load(y.data + i)));
@@ -26,13 +26,13 @@ VN_INLINE void each(float* to, int64_t stride, int64_t rows, const Rows& x, cons
   }
   for (int64_t row = 0; row < rows; ++row) {
     for (int64_t c = 0; c < stride; c += kLanes) {
-      store(to + row * stride + c, body(Rows::vector(x, row, c), Rows::vector(y, row, c)));
+      store(to + row * stride + c, body(Operand::vector(x, row, c), Operand::vector(y, row, c)));
     }
   }
 }
 
 template <typename Function, int Order>
-void apply_order(float* to, int64_t stride, int64_t rows, const Rows& x, const Rows* times, float a, float b) {
+void apply_order(float* to, int64_t stride, int64_t rows, const Operand& x, const Operand* times, float a, float b) {
   if (times == nullptr) {
     each(to, stride, rows, x, x, [=](F32 v, F32) { return Function::template at<Order>(v, a, b); });
   } else {
@@ -44,7 +44,7 @@ void apply_order(float* to, int64_t stride, int64_t rows, const Rows& x, const R
 }
 
 template <typename Function>
-void apply_function(const ProgramStep& step, float* to, int64_t rows, const Rows& x, const Rows* times) {
+void apply_function(const ProgramStep& step, float* to, int64_t rows, const Operand& x, const Operand* times) {
   const int64_t stride = step.stride;
   switch (step.order) {
     case 0:
@@ -60,7 +60,7 @@ void apply_function(const ProgramStep& step, float* to, int64_t rows, const Rows
 
 // Runs a program on the rows of one tile.
 struct ProgramTile {
-  const ProgramCall& call;
+  const CpuProgram& call;
   const float* packed;
   float* tiles;
   float* partial;
@@ -73,7 +73,7 @@ struct ProgramTile {
     float* const kept = memory < 0 ? nullptr : call.memories[memory];
     return kept == nullptr ? slot(columns) : kept + begin * stride;
   }
-  Rows operand(const ProgramOperand& o) const {
+  Operand operand(const ProgramOperand& o) const {
     if (o.parameter) return {packed + pack(o.slot).at, 0, o.spread};
     if (o.input >= 0 && call.in_place[o.input]) {
       const int64_t width = call.input_widths[o.input];
@@ -99,7 +99,7 @@ struct ProgramTile {
   }
 
   // Returns the result of a step, or the step's input if the input is read in place.
-  Rows result_of(const ProgramStep& step, const float* to) const {
+  Operand result_of(const ProgramStep& step, const float* to) const {
     if (step.op != ProgramOp::input || !step.in_place || !call.in_place[step.number]) return {to, step.stride, false};
     return {static_cast<const float*>(call.inputs[step.number]) + begin * step.width, step.width, false};
   }
@@ -123,8 +123,8 @@ struct ProgramTile {
       case ProgramOp::linear:
         return linear(step, operands, to);
       case ProgramOp::function: {
-        const Rows x = operand(operands[0]), times = step.operand_count > 1 ? operand(operands[1]) : x;
-        const Rows* by = step.operand_count > 1 ? &times : nullptr;
+        const Operand x = operand(operands[0]), times = step.operand_count > 1 ? operand(operands[1]) : x;
+        const Operand* by = step.operand_count > 1 ? &times : nullptr;
         switch (step.function) {
 #define VN_CASE(NAME, ...)    \
   case ProgramFunction::NAME: \
@@ -135,7 +135,7 @@ struct ProgramTile {
         return;
       }
       case ProgramOp::binary: {
-        const Rows x = operand(operands[0]), y = operand(operands[1]);
+        const Operand x = operand(operands[0]), y = operand(operands[1]);
         const F32 zero = splat(0.0f);
         switch (step.binary) {
           case ProgramBinary::add:
@@ -235,7 +235,7 @@ struct ProgramTile {
   }
 
   void output(const ProgramStep& step, const ProgramOperand& from) const {
-    const Rows x = operand(from);
+    const Operand x = operand(from);
     if (x.data == static_cast<float*>(call.outputs[step.number]) + begin * step.width) return;  // in place
     const int64_t width = step.width, row_width = call.output_widths[step.number];
     float* const summed = step.memory < 0 ? nullptr : call.memories[step.memory];  // rows of a ray output
@@ -268,23 +268,23 @@ struct ProgramTile {
   void linear(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
     const bool slopes = step.finish == ProgramFinish::relu_slope;
     const int32_t count = step.sources;
-    const Rows add = step.operand_count > count + slopes ? operand(operands[count]) : Rows{kZeros, 0, false};
+    const Operand add = step.operand_count > count + slopes ? operand(operands[count]) : Operand{kZeros, 0, false};
     const float* slope = slopes ? operand(operands[step.operand_count - 1]).data : nullptr;
     const Finish finish = step.finish == ProgramFinish::none   ? Finish::none
                           : step.finish == ProgramFinish::relu ? Finish::relu
                                                                : Finish::relu_slope;
     const float* const weights = packed + pack(step.number).at;
     const int64_t depth = steps_of(step.depth), panels = call.parts ? 2 : 1;
-    Source sources[kMostSources];
+    LeftPart sources[kMostSources];
     for (int32_t i = 0; i < count; ++i) {
-      const Rows x = operand(operands[i]);
+      const Operand x = operand(operands[i]);
       sources[i] = {x.data, x.stride, steps_of(operands[i].width)};
     }
     float* const pairs = step.pairs < 0 ? nullptr : slot(step.pairs);
     const int64_t pairs_stride = stride_of(step.width), pairs_left = left_of(step.width);
     bool slope_in_pairs = false;
 #if VN_HALF
-    const Rows x = in_pairs(operands[0], scratch(0));
+    const Operand x = in_pairs(operands[0], scratch(0));
     sources[0].data = x.data;  // with pairs there is one source
     sources[0].stride = x.stride;
 #endif
@@ -343,7 +343,7 @@ struct ProgramTile {
 
 #if VN_HALF
   // Returns an operand of a product as pairs: stored pairs, or pairs computed in `free`.
-  Rows in_pairs(const ProgramOperand& of, float* free) const {
+  Operand in_pairs(const ProgramOperand& of, float* free) const {
     const int64_t stride = stride_of(of.width);
     if (of.pairs >= 0) return {slot(of.pairs), stride, false};
     narrow_rows(operand(of), of.width, rows, free, stride, left_of(of.width));
@@ -351,7 +351,7 @@ struct ProgramTile {
   }
 #endif
 
-  void total(const ProgramStep& step, const Rows& x, float* to) const {
+  void total(const ProgramStep& step, const Operand& x, float* to) const {
     const int64_t group = step.number;
     for (int64_t row = 0; row < rows; ++row, to += step.stride) {
       const float* from = x.data + row * x.stride;
@@ -378,7 +378,7 @@ struct ProgramTile {
       for (int64_t i = 0; i < rows * step.stride; i += kLanes) store(to + i, splat(0.0f));
     }
     for (int32_t i = 0; i < step.operand_count; ++i) {
-      const Rows x = operand(operands[i]);
+      const Operand x = operand(operands[i]);
       const int64_t width = operands[i].width;
       float* into = to + operands[i].place;
       const float* from = x.data;
@@ -397,7 +397,7 @@ struct ProgramTile {
   // Encodings ---------------------------------------------------------------------------------------------------------
 
   // Returns rows of `d` floats contiguously, copied if necessary.
-  const float* contiguous(const Rows& x, int64_t d) const {
+  const float* contiguous(const Operand& x, int64_t d) const {
     if (x.stride == d) return x.data;
     float* const to = scratch(0);
     for (int64_t row = 0; row < rows; ++row) copy_row(x.data + row * x.stride, d, to + row * d);
@@ -418,12 +418,12 @@ struct ProgramTile {
   // Looks up the encoding of x or, if step.order is 1, computes the gradient with respect to x. The operands are x or,
   // for the gradient, x, the gradient with respect to the encoding, and the encoding.
   void look_up(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
-    const Rows x = operand(operands[0]);
+    const Operand x = operand(operands[0]);
     if (step.order == 0) {
       if (step.memory >= 0 && call.filled[step.memory]) return;
       return hash_encode_rows(grid(step, contiguous(x, 3)), to, step.stride, 0, rows);
     }
-    const Rows g = operand(operands[1]);
+    const Operand g = operand(operands[1]);
     float* const points = scratch(1);
     for (int64_t row = 0; row < rows; ++row) copy_row(x.data + row * x.stride, 3, points + 3 * row);
     hash_encode_positions_backward(grid(step, points), g.data, g.stride, points, 0, rows);
@@ -432,16 +432,16 @@ struct ProgramTile {
 
   template <typename Formula>
   void encode_by(ByRow<Formula>, const ProgramStep& step, const ProgramOperand* operands, float* to) const {
-    const Rows x = operand(operands[0]);
+    const Operand x = operand(operands[0]);
     const int64_t raw = operands[0].width, size = step.depth;
     if (step.order == 0) return ByRow<Formula>::values(x.data, x.stride, raw, size, rows, to, step.stride);
-    const Rows g = operand(operands[1]);
+    const Operand g = operand(operands[1]);
     ByRow<Formula>::gradient(x.data, x.stride, raw, size, g.data, g.stride, rows, to, step.stride);
   }
 
   template <bool kBlurred>
   void encode_by(Octaves<kBlurred>, const ProgramStep& step, const ProgramOperand* operands, float* to) const {
-    const Rows x = operand(operands[0]);
+    const Operand x = operand(operands[0]);
     const Columns columns{kBlurred ? operands[0].width / 2 : operands[0].width, step.depth, !kBlurred};
     const float* const table = packed + pack(step.number).at;
     const int64_t stride = step.stride;
@@ -452,7 +452,7 @@ struct ProgramTile {
       if (kBlurred) blur(x.data + columns.d, x.stride, table, rows, to, stride);
       return;
     }
-    const Rows g = operand(operands[1]), value = operand(operands[2]);
+    const Operand g = operand(operands[1]), value = operand(operands[2]);
     const int64_t of_table = pack(step.number).width;
     for (int64_t row = 0; row < rows; ++row, to += stride) {
       const float *encoded = value.data + row * value.stride, *gradient = g.data + row * g.stride;
@@ -468,7 +468,7 @@ struct ProgramTile {
 #if VN_HALF == 2
     if (of.pairs >= 0) return add_pairs(in_pairs(of, nullptr), step.stride, rows, fill, to);
 #endif
-    const Rows g = operand(of);
+    const Operand g = operand(of);
     for (int64_t c = 0; c < step.stride; c += kLanes) {
       // Four independent sums hide the latency of additions.
       F32 sums[4] = {fill ? splat(0.0f) : load(to + c), splat(0.0f), splat(0.0f), splat(0.0f)};
@@ -488,18 +488,18 @@ struct ProgramTile {
     const ProgramOperand &of_a = operands[step.order ? 0 : 1], &of_b = operands[step.order ? 1 : 0];
 #if VN_HALF == 2
     const int64_t depth = pairs_of(rows);
-    const Source left{scratch(0), depth, depth}, right{scratch(1), padded(of_b.width), depth};
+    const LeftPart left{scratch(0), depth, depth}, right{scratch(1), padded(of_b.width), depth};
     const int64_t width = padded(of_a.width), a_left = call.parts ? width * depth : 0, b_left = depth * right.stride;
-    const Rows a = in_pairs(of_a, scratch(2));
+    const Operand a = in_pairs(of_a, scratch(2));
     turn_pairs(a, width, rows, scratch(0), depth);
     if (call.parts) turn_pairs(behind(a, left_of(of_a.width)), width, rows, scratch(0) + a_left, depth);
-    const Rows b = in_pairs(of_b, scratch(2));
+    const Operand b = in_pairs(of_b, scratch(2));
     zip_pairs(b, right.stride, rows, scratch(1));
     if (call.parts) zip_pairs(behind(b, left_of(of_b.width)), right.stride, rows, scratch(1) + b_left);
 #else
     constexpr int64_t a_left = 0, b_left = 0;
-    const Rows a = operand(of_a), b = operand(of_b);
-    Source left{a.data, a.stride, rows}, right{b.data, b.stride, rows};
+    const Operand a = operand(of_a), b = operand(of_b);
+    LeftPart left{a.data, a.stride, rows}, right{b.data, b.stride, rows};
 #if VN_HALF
     left = {scratch(0), padded(of_a.width), (rows + 1) / 2};
     right = {scratch(1), padded(of_b.width), (rows + 1) / 2};
@@ -535,7 +535,7 @@ struct ProgramTile {
   }
 };
 
-[[maybe_unused]] void run_tiles(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed,
+[[maybe_unused]] void run_tiles(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end, const float* packed,
                                 float* tiles, float* partial) {
   for (int64_t row = begin; row < end; row += call.tile) {
     ProgramTile{call, packed, tiles, partial, cell, row, smaller(call.tile, end - row), row == begin}.run();

@@ -14,11 +14,11 @@
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 
-void program_tiles_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free) {
+void program_tiles_pack(const CpuProgram& call, int64_t cell, bool first, float* packed, float* free) {
   pack_cell(call, cell, first, packed, free);
 }
 
-void program_tiles_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed,
+void program_tiles_run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end, const float* packed,
                        float* tiles, float* partial) {
   shape_for(kBlock);
   run_tiles(call, cell, begin, end, packed, tiles, partial);

@@ -56,7 +56,7 @@ __device__ __forceinline__ float derivative(int order, float x, float a, float b
 
 template <typename Tile>
 __device__ __noinline__ void function_step(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
-  const Rows x = tile.operand(operands[0]), times = tile.operand(operands[step.operand_count - 1]);
+  const Operand x = tile.operand(operands[0]), times = tile.operand(operands[step.operand_count - 1]);
   const float a = step.a, b = step.b;
   const int order = step.order;
   const bool alone = step.operand_count == 1;
@@ -93,7 +93,7 @@ __device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& s
   const auto to = tile.target(step);
   if (step.order == 1) {  // one operand writes each column
     for (int i = 0; i < step.operand_count; ++i) {
-      const Rows x = tile.operand(operands[i]);
+      const Operand x = tile.operand(operands[i]);
       const int place = operands[i].place;
       for_each_entry<Tile>(tile.rows(), operands[i].width,
                            [&](int row, int column) { to.put(row, place + column, x.at(row, column)); });
@@ -122,13 +122,13 @@ __device__ __noinline__ void plain_step(Tile tile, const ProgramStep& step) {
   const auto to = tile.target(step);
   switch (step.op) {
     case ProgramOp::binary: {
-      const Rows x = tile.operand(operands[0]), y = tile.operand(operands[1]);
+      const Operand x = tile.operand(operands[0]), y = tile.operand(operands[1]);
       return for_each_entry<Tile>(tile.rows(), step.width, [&](int row, int column) {
         to.put(row, column, binary(step.binary, x.at(row, column), y.at(row, column)));
       });
     }
     case ProgramOp::total: {
-      const Rows x = tile.operand(operands[0]);
+      const Operand x = tile.operand(operands[0]);
       return for_each_entry<Tile>(tile.rows(), step.width, [&](int row, int column) {
         float sum = 0.0f;
         for (int i = 0; i < step.number; ++i) sum += x.at(row, column * step.number + i);

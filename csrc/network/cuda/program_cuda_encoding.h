@@ -67,7 +67,7 @@ __device__ __forceinline__ const typename HashElement<kType>::Type* hash_table(c
 
 template <typename Tile>
 __device__ __noinline__ void look_up(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
-  const Rows x = tile.value(operands[0]);
+  const Operand x = tile.value(operands[0]);
   const auto to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
   const int rows = tile.rows();
@@ -127,7 +127,7 @@ __device__ __noinline__ void scatter_rows(Tile tile, const ProgramStep& step, co
 // Computes the gradient of the points of a look-up. Eight lanes share the levels of a row.
 template <typename Tile>
 __device__ __noinline__ void look_up_gradient(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
-  const Rows x = tile.value(operands[0]), g = tile.value(operands[1]);
+  const Operand x = tile.value(operands[0]), g = tile.value(operands[1]);
   const auto to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
   const int worker = Tile::worker(), part = worker % 8, rows = tile.rows();
@@ -172,14 +172,14 @@ template <typename Formula>
 struct ByRow {
   template <typename Tile>
   static __device__ __noinline__ void run(Tile tile, const ProgramStep& step, const ProgramOperand* operands) {
-    const Rows x = tile.value(operands[0]);
+    const Operand x = tile.value(operands[0]);
     const auto to = tile.target(step);
     const int row = Tile::worker(), raw = operands[0].width;
     if (row >= tile.rows()) return;
     const auto of = [&](int column) { return x.at(row, column); };
     const auto put = [&](int column, float value) { to.put(row, column, value); };
     if (step.order == 0) return Formula::values(of, raw, step.depth, put);
-    const Rows g = tile.value(operands[1]);
+    const Operand g = tile.value(operands[1]);
     Formula::gradient(of, raw, step.depth, [&](int column) { return g.at(row, column); }, put);
   }
 };
@@ -205,7 +205,7 @@ __device__ __noinline__ float2 exact_sine_and_cosine(float value, int octave) {
 // are the next `features` columns of x; otherwise the result begins with x itself. A thread computes a sine and its
 // cosine.
 template <bool kBlurred, typename Tile>
-__device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int features, const Rows& x,
+__device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int features, const Operand& x,
                                               const Target<Tile::kBfloat16>& to) {
   if (!kBlurred) {
     for_each_entry<Tile>(tile.rows(), features, [&](int row, int column) { to.put(row, column, x.at(row, column)); });
@@ -225,7 +225,7 @@ __device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int
 // row: every fourth by the hardware functions, and the next three by double-angle formulas, each of which doubles the
 // error.
 template <bool kBlurred, bool kFloats, typename Tile>
-__device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int features, const Rows& x,
+__device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int features, const Operand& x,
                                              const Target<Tile::kBfloat16>& to) {
   constexpr int kDoubled = 4;
   const int rows = tile.rows();
@@ -266,7 +266,7 @@ __device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int 
 }
 template <bool kBlurred, typename Tile>
 __device__ __noinline__ void octaves(Tile tile, const ProgramStep& step, const ProgramOperand* operands, int features) {
-  const Rows x = tile.value(operands[0]);
+  const Operand x = tile.value(operands[0]);
   const auto to = tile.target(step);
   if constexpr (Tile::kHalves) {
     if (to.has_halves && to.has_floats) return fast_octaves<kBlurred, true>(tile, step.depth, features, x, to);
@@ -280,7 +280,7 @@ __device__ __noinline__ void octaves(Tile tile, const ProgramStep& step, const P
 template <typename Tile>
 __device__ __noinline__ void octaves_gradient(Tile tile, const ProgramStep& step, const ProgramOperand* operands,
                                               int features, bool blurred) {
-  const Rows g = tile.value(operands[1]), encoded = tile.value(operands[2]);
+  const Operand g = tile.value(operands[1]), encoded = tile.value(operands[2]);
   const auto to = tile.target(step);
   const int octaves = step.depth;
   const int before = blurred ? 0 : features;

@@ -592,7 +592,7 @@ struct TensorSteps {
   template <int kTiles>
   static __device__ __forceinline__ void add(Sums<kTiles>& sums, const CudaStep& step, const Tile& tile, int first) {
     const int lane = lane_again(), rows = tile.rows();
-    const Rows added = tile.operand(tile.call.code.operands[step.added]);
+    const Operand added = tile.operand(tile.call.code.operands[step.added]);
     for_each_sum<kTiles>([&](int r, int t, int i) {
       const MapPlace at = place(r, t, i, lane);
       const bool inside = at.row < rows && first + at.column < step.width;
@@ -774,7 +774,7 @@ struct FloatSteps {
 #pragma unroll
       for (int r = 0; r < kRows; ++r) sums[r] = four;
     } else if (step.added >= 0) {
-      const Rows rows = tile.operand(tile.call.code.operands[step.added]);
+      const Operand rows = tile.operand(tile.call.code.operands[step.added]);
 #pragma unroll
       for (int r = 0; r < kRows; ++r) {
         const int at = row + kApart * r;

@@ -160,7 +160,7 @@ VN_HD constexpr int pair_words(int width) { return padded(width, 2 * kGranule) /
 VN_HD constexpr int pair_stride(int width) { return pair_words(width) + kProgramSkew; }
 
 // Columns of a value or of a cell's parameter vector.
-struct Rows {
+struct Operand {
   const float* data;
   int stride;
   bool spread;
@@ -257,10 +257,10 @@ struct ProgramTile {
   __device__ __forceinline__ Target<kBfloat16> target(const CudaStep& step) const {
     return target(step.slot, step.stride, step.pairs, step.width, step.slot >= 0);
   }
-  __device__ __forceinline__ Rows value(const ProgramOperand& o) const {
+  __device__ __forceinline__ Operand value(const ProgramOperand& o) const {
     return {slot(o.slot) + o.start, o.stride, o.spread};
   }
-  __device__ __forceinline__ Rows operand(const ProgramOperand& o) const {
+  __device__ __forceinline__ Operand operand(const ProgramOperand& o) const {
     if (o.parameter) return {parameter(call.code.packs[o.slot]), 0, o.spread};
     return value(o);
   }
@@ -353,7 +353,7 @@ __device__ __forceinline__ void output_step(const Tile& tile, const CudaStep& st
   const CudaProgram& call = tile.call;
   const int output = step.number, width = step.width, type = call.output_types[output], begin = tile.begin();
   const int64_t wide = call.output_widths[output];
-  const Rows x = tile.operand(call.code.operands[step.added]);
+  const Operand x = tile.operand(call.code.operands[step.added]);
   const auto put = [&](int64_t source, int row, int column) {
     store_number(call.outputs[output], type, source * wide + step.depth + column, x.at(row, column));
   };

@@ -29,7 +29,7 @@ from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.scenes import SceneError, builtin_scene, images, load_scene, photographs
 from voronerf.app.scenes.colmap import read_model
 from voronerf.app.scenes.photographs import find_frame
-from voronerf.app.scenes.scene import SparseDepth
+from voronerf.app.scenes.scene import KnownDepths
 from voronerf.app.train import Callback, ConfigError, TrainConfig, train
 from voronerf.app.train.build import (
     ROBUST,
@@ -140,7 +140,7 @@ def test_rays_from_elsewhere_end_the_sooner_the_more_points_there_are(tmp_path):
     def known(share):
         points = pixels[: int(share * len(pixels))].repeat(2)
         return replace(
-            scene, train=replace(scene.train, sparse_depth=SparseDepth(points, torch.full((len(points),), 1.0)))
+            scene, train=replace(scene.train, sparse_depth=KnownDepths(points, torch.full((len(points),), 1.0)))
         )
 
     few, many = known(0.51 * COVERED), known(1.01 * COVERED)

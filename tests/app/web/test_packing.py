@@ -19,7 +19,7 @@ from voronerf import NeRF, VoronoiRouter
 from voronerf.app.web import CannotDraw, export_web, pack, page_of
 from voronerf.app.web import packing as packing_file
 from voronerf.app.web.page import wide_enough
-from voronerf.app.web.shader import BLOCK, Layout, fours, networks_text
+from voronerf.app.web.shader import BLOCK, ParameterOffsets, fours, networks_text
 from voronerf.nerf import Stratified, orbit_cameras
 from voronerf.nerf.fields import MipNeRF
 from voronerf.nerf.radiance import radiance_of
@@ -56,7 +56,7 @@ def part(packed, name, dtype):
 @pytest.mark.parametrize("kind", KINDS)
 def test_parameters_are_read_back_as_the_shader_reads_them(runs, kind):
     run = runs(kind)
-    field, packed, layout = radiance_of(run.router, examples()), pack(run), Layout()
+    field, packed, layout = radiance_of(run.router, examples()), pack(run), ParameterOffsets()
     networks_text(field.networks, layout)
     values = part(packed, "parameters", "<f2").reshape(-1)[: run.diagram.num_cells * layout.size]
     values = values.reshape(run.diagram.num_cells, layout.size).astype(np.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from cases import Arguments, Case, Draw
-from voronerf.ops.adam import Guard, Rule
+from voronerf.ops.adam import Guard, UpdateRule
 
 
 def _make(draw: Draw, n: int) -> Arguments:
@@ -17,7 +17,7 @@ def _make(draw: Draw, n: int) -> Arguments:
         lists["squares"].append(draw.uniform(size, 2).contiguous())
     guard = draw.among("guard", Guard.on("cpu"), None)
     loss = None if guard is None else torch.tensor(draw.among("loss", 0.5, torch.nan))
-    rules = [Rule(torch.tensor(2.0), 0.01), Rule(torch.tensor(0.0), 0.02, dense=False)]
+    rules = [UpdateRule(torch.tensor(2.0), 0.01), UpdateRule(torch.tensor(0.0), 0.02, dense=False)]
     return {"rules": rules, **lists, "guard": guard, "loss": loss}
 
 

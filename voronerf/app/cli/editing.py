@@ -15,14 +15,14 @@ from voronerf.app.train.callbacks import counted
 from voronerf.app.train.config import ConfigError
 from voronerf.app.wording import as_typed
 from voronerf.editing import edits
-from voronerf.editing.edits import Source, check_out
+from voronerf.editing.edits import RunContents, check_out
 from voronerf.editing.geometry import Similarity, Solid
 
 #: The text that describes a transform in error messages.
 MOVE = "seven finite numbers tx ty tz rx ry rz s, the scale s 1e-9 to 1e9"
 
 
-def tell(out: Path, written: Source) -> int:
+def tell(out: Path, written: RunContents) -> int:
     """Prints the path, cells, parts and size of a written run."""
     counts = {"cell": written.parts.num_cells, "part": len(written.parts.parts)}
     cells, parts = (counted(count, name) for name, count in counts.items())

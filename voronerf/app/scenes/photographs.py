@@ -22,7 +22,7 @@ from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import OPAQUE, Decoded, Header, read_images, read_masks
 from voronerf.app.scenes.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Lens, have_rays
-from voronerf.app.scenes.scene import Scene, SparseDepth, Split
+from voronerf.app.scenes.scene import KnownDepths, Scene, Split
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
 from voronerf.nerf.cameras import Cameras, focus_point, shared_focus
 from voronerf.nerf.contraction import Contraction, Perspective
@@ -285,7 +285,7 @@ def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
     return [f"{start} {treatment}: {some_of(names)}"] if names else []
 
 
-def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:
+def find_depths(split: Split, views: Sequence[View], frame: Frame) -> KnownDepths | None:
     """Returns the pixels that show sparse points, and the points' distances; None if a split's views see no points.
 
     Pixels that are masked do not count.
@@ -304,7 +304,7 @@ def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDept
         distances.append((points - split.cameras.origins[index]).norm(dim=-1))
     if not sum(map(len, pixels)):
         return None
-    return SparseDepth(torch.cat(pixels), torch.cat(distances))
+    return KnownDepths(torch.cat(pixels), torch.cat(distances))
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from voronerf.nerf.volume import Space
 KINDS = ("object", "forward", "inside-out", "unbounded")
 
 
-class SparseDepth(NamedTuple):
+class KnownDepths(NamedTuple):
     """The pixels that show points of a sparse model, and these points' distances.
 
     Attributes:
@@ -60,7 +60,7 @@ class Split:
     names: tuple[str, ...]
     masks: Tensor | None = None
     on_disk: bool = False
-    sparse_depth: SparseDepth | None = None
+    sparse_depth: KnownDepths | None = None
 
     def __len__(self) -> int:
         return len(self.names)

@@ -13,7 +13,7 @@ from voronerf.app.train.build import make_routers, parameter_shapes
 from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, load_optimizer_tensors, optimizer_tensors
 from voronerf.app.train.config import TrainConfig, differences
 from voronerf.app.train.schema import check_types
-from voronerf.app.train.state import Stage, State
+from voronerf.app.train.state import State, TrainingStage
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.adam import parameter_groups
 from voronerf.nerf.samplers import SAMPLERS
@@ -126,7 +126,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
             values["stages"] = tuple(values["stages"])
         check_types(source, Stored, values)
         for number, stage in enumerate(values["stages"]):
-            check_types(f"{source}: stage {number}", Stage, stage)
+            check_types(f"{source}: stage {number}", TrainingStage, stage)
         stored = Stored(**values)
         times = [stored.seconds, stored.evaluation_seconds, stored.reserved_seconds]
         if not (stored.step >= 0 and all(0 <= each < math.inf for each in times) and stored.stages):

@@ -33,7 +33,7 @@ HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 @dataclass(frozen=True)
-class Stage:
+class TrainingStage:
     """A period of training on one diagram.
 
     ``balance_before`` and ``balance_after`` measure the imbalance before and after the centres of new cells are moved:
@@ -106,7 +106,7 @@ class State:
     rays_done: int = 0
     loss: float = math.nan
     skipped_in_a_row: int = 0
-    stages: list[Stage] = field(default_factory=lambda: [Stage(1, 0.0, 0, None, None, 0)])
+    stages: list[TrainingStage] = field(default_factory=lambda: [TrainingStage(1, 0.0, 0, None, None, 0)])
     stopped: bool = False
     training_step: TrainingStep = field(init=False)
 
@@ -223,12 +223,12 @@ class State:
             float(torch.tensor([getattr(balance, name) for balance in balances]).median()) if balances else None
             for name in ("imbalance_before", "imbalance_after")
         )
-        self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
+        self.stages.append(TrainingStage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
 
     def begin_again(self) -> None:
         """Adds a stage for a restart of the coarse stage, and resets the number of rays."""
         self.rays = int(self.config.rays or 0)
-        self.stages.append(Stage(1, self.seconds, self.step, None, None, 0))
+        self.stages.append(TrainingStage(1, self.seconds, self.step, None, None, 0))
 
     def count_steps(self, count: int, rays: int) -> None:
         """Counts ``count`` steps with ``rays`` rays each."""
@@ -242,7 +242,7 @@ class State:
     def restore(self, skipped: int, stages: Sequence[Mapping[str, Any]], **counters: float) -> None:
         """Restores the counters of a checkpoint, which are named like the attributes of a state."""
         self.guard.begin(skipped)
-        self.stages[:] = (Stage(**stage) for stage in stages)
+        self.stages[:] = (TrainingStage(**stage) for stage in stages)
         for name, value in counters.items():
             setattr(self, name, value)
 

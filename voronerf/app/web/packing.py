@@ -2,7 +2,7 @@
 
 The bytes have these parts in this order, each aligned to 16 bytes:
 
-    parameters  float16, cell after cell in the order of `Layout`: blocks of matrices, and biases
+    parameters  float16, cell after cell in the order of `ParameterOffsets`: blocks of matrices, and biases
     table       float16, of a hash grid: [e, f], or [k, e, f] if each cell has its own table
     occupied    a bit per voxel, 32 to a word, least significant bit first
     centres     float32 [m, 4]: x, y, z, and the bits of an int32: the index of the child diagram, or
@@ -26,7 +26,7 @@ from torch import Tensor
 
 from voronerf.app.evaluate.panels import palette
 from voronerf.app.run import Run
-from voronerf.app.web.shader import BLOCK, CannotDraw, Layout, fours, networks_text, shader_text
+from voronerf.app.web.shader import BLOCK, CannotDraw, ParameterOffsets, fours, networks_text, shader_text
 from voronerf.nerf.cameras import Cameras, shared_focus
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.radiance import Radiance, radiance_of
@@ -75,7 +75,7 @@ def pack(run: Run) -> Packed:
     radiance, sampler = _networks(run), run.renderer.sampler
     assert isinstance(sampler, Occupancy)
     grid, k, diagram = sampler.grid, run.diagram.num_cells, run.diagram
-    layout = Layout()
+    layout = ParameterOffsets()
     networks = networks_text(radiance.networks, layout)
     parameters, tables = radiance.cells.parameters, radiance.networks.program.tables
     if len(tables) > 1:
@@ -142,7 +142,7 @@ def _half(values: NDArray[np.float32]) -> NDArray[np.float16]:
 
 
 def _parameters(
-    parameters: list[Tensor], shapes: tuple[tuple[int, ...], ...], layout: Layout, k: int
+    parameters: list[Tensor], shapes: tuple[tuple[int, ...], ...], layout: ParameterOffsets, k: int
 ) -> NDArray[np.float16]:
     """Returns [k, size], the matrix blocks and biases of every cell."""
     rows = np.zeros((k, layout.size), "<f2")

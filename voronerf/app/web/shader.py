@@ -2,8 +2,8 @@
 
 A field is a program (`voronerf.ops._core.program`). Each value of the program becomes an array of vec4f, with four
 columns in each vec4f; padding lanes are finite, and their weights are 0. A matrix becomes blocks of four outputs and
-four inputs, since a product of a mat4x4f and a vec4f needs no sums across lanes. `Layout` has the offsets of a cell's
-blocks and biases; `voronerf.app.web.packing` writes them.
+four inputs, since a product of a mat4x4f and a vec4f needs no sums across lanes. `ParameterOffsets` has the offsets of
+a cell's blocks and biases; `voronerf.app.web.packing` writes them.
 
 o outputs and i inputs of a matrix, w columns.
 """
@@ -56,7 +56,7 @@ class CannotDraw(ConfigError):
 
 
 @dataclass
-class Layout:
+class ParameterOffsets:
     """The offsets of a cell's parameters, counted in float16 elements from the cell's first parameter.
 
     Attributes:
@@ -82,7 +82,7 @@ def fours(width: int) -> int:
     return -(-width // 4)
 
 
-def networks_text(networks: Networks, layout: Layout) -> str:
+def networks_text(networks: Networks, layout: ParameterOffsets) -> str:
     """Returns the WGSL function ``evaluate``, which computes colour and density at a position; fills ``layout``.
 
     Raises:
@@ -127,7 +127,7 @@ def _is_relu_of(after: Step, step: Step) -> bool:
 
 
 def _step(
-    program: Program, step: Step, name: str, layout: Layout, grids: list[HashGrid], steps: dict[int, Step]
+    program: Program, step: Step, name: str, layout: ParameterOffsets, grids: list[HashGrid], steps: dict[int, Step]
 ) -> list[str]:
     """Returns the WGSL lines of a step."""
     out, wide = f"v{step.out}", fours(step.width)
@@ -174,7 +174,7 @@ def _step(
     raise CannotDraw(f"its networks have a step {step.op} {name}".rstrip())
 
 
-def _linear(program: Program, step: Step, name: str, layout: Layout, steps: dict[int, Step]) -> list[str]:
+def _linear(program: Program, step: Step, name: str, layout: ParameterOffsets, steps: dict[int, Step]) -> list[str]:
     """Returns the WGSL lines of a linear step, block by block, with its bias."""
     matrix, start, transposed = map(int, step.numbers)
     if transposed or name not in ("", "relu"):

@@ -54,7 +54,7 @@ class Implementation:
 
 
 @dataclass(frozen=True)
-class Row:
+class Availability:
     """One line of the table of ops and backends, as `voronerf info` prints it.
 
     Attributes:
@@ -300,8 +300,8 @@ def torch_on_one_thread() -> Iterator[None]:
         _override.threads = previous
 
 
-def table() -> list[Row]:
-    """Returns the `Row` of every pair of op and backend."""
+def table() -> list[Availability]:
+    """Returns the `Availability` of every pair of op and backend."""
     rows = []
     for op in ops():
         for backend in BACKENDS:
@@ -312,7 +312,7 @@ def table() -> list[Row]:
                 dtypes = ("plain torch",)
             devices = tuple(device for device, reason in reasons.items() if reason is None)
             distinct = dict.fromkeys(reason for reason in reasons.values() if reason is not None)
-            rows.append(Row(op, backend, devices, dtypes, "; ".join(distinct)))
+            rows.append(Availability(op, backend, devices, dtypes, "; ".join(distinct)))
     return rows
 
 

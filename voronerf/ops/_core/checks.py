@@ -192,7 +192,7 @@ class Checked:
                     check_no_inference(self.op, **self.tensors)
 
 
-class Row(NamedTuple):
+class TensorRule(NamedTuple):
     """The rule of a tensor: the arguments of `Checked.tensor`.
 
     Attributes:
@@ -217,13 +217,13 @@ class Default(NamedTuple):
     number: int
 
 
-Rows = Sequence[Row | Default]
-Others = tuple[Sequence[Row], Sequence[Any]]
+TensorRules = Sequence[TensorRule | Default]
+Others = tuple[Sequence[TensorRule], Sequence[Any]]
 """Additional rows, and one tensor for each row."""
 
 
-def check_rows(
-    op: str, make: Callable[..., Rows], tensors: list[Any], *arguments: Any, smooth: bool = True
+def check_rules(
+    op: str, make: Callable[..., TensorRules], tensors: list[Any], *arguments: Any, smooth: bool = True
 ) -> dict[str, int]:
     """Checks each tensor against one row of a table; the number of rows depends on the network.
 
@@ -271,7 +271,7 @@ def check_rows(
 
 
 @functools.lru_cache(maxsize=4096)
-def _compiled(make: Callable[..., Rows], *arguments: Any) -> tuple[list[str], Callable[[list[Any]], Any]]:
+def _compiled(make: Callable[..., TensorRules], *arguments: Any) -> tuple[list[str], Callable[[list[Any]], Any]]:
     """Returns the letters of the rows, and a compiled function.
 
     The function returns the sizes of the letters for tensors, or None if a tensor breaks a rule.
@@ -288,7 +288,7 @@ def _compiled(make: Callable[..., Rows], *arguments: Any) -> tuple[list[str], Ca
             if isinstance(row, Default)
             else ([_short(dtype) for dtype in row.dtypes], "filled" if row.empty else "", row.shape, None)
         )
-    return letters, native.Rules([tuple(row) for row in rules], letters)
+    return letters, native.TensorRules([tuple(row) for row in rules], letters)
 
 
 def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool:
@@ -302,7 +302,7 @@ def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> 
     return native is not None and native.alike(lists, written, scalars)
 
 
-def _letters(rows: Rows) -> list[str]:
+def _letters(rows: TensorRules) -> list[str]:
     shapes = [[row.letter] if isinstance(row, Default) else row.shape for row in rows]
     entries = [entry for shape in shapes for entry in shape if isinstance(entry, str)]
     return [*dict.fromkeys(entry.removesuffix("+1").removeprefix("1|") for entry in entries)]

@@ -26,7 +26,7 @@ _PLAIN = (Tensor, torch.nn.Parameter)
 _is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
 
 
-def is_watched() -> bool:
+def has_listeners() -> bool:
     """Returns whether modes, transforms, tracers or profilers of torch observe calls."""
     for listens in LISTENERS:  # noqa: SIM110  # any() with a generator takes twice the time
         if listens():
@@ -198,7 +198,7 @@ class Op:
             return self._with_node(flat, arguments) if self.with_gradients is None else self.with_gradients(*arguments)
         if forward_ad._current_level >= 0:
             self._refuse_tangents(flat)
-        if active.recording is None and is_watched():
+        if active.recording is None and has_listeners():
             return self._transformed(flat) if torch._C._are_functorch_transforms_active() else self._op(*flat)
         tensors = [flat[place] for place in self.tensors if flat[place] is not None]
         for place in self._lists:

@@ -152,8 +152,8 @@ class Argument(NamedTuple):
         checked.tensor(self.name, tensor, dtypes, *(rule.otherwise if second_shape else rule.shape))
 
 
-class Source(NamedTuple):
-    """The origin of a parameter of a compiled function, or of a member of its structs.
+class Binding(NamedTuple):
+    """The binding of a parameter of a compiled function, or of a member of its structs.
 
     Attributes:
         get: a function that returns the parameter, given the arguments of an op and the memory for its results.
@@ -459,7 +459,7 @@ class Declaration:
 
         return decorate
 
-    def inputs(self, kind: Any, **others: Any) -> Source:
+    def inputs(self, kind: Any, **others: Any) -> Binding:
         """Returns the source of a compiled struct whose members are arguments.
 
         Args:
@@ -472,7 +472,7 @@ class Declaration:
         """
         return self._struct(kind, others, self.Inputs)
 
-    def outputs(self, kind: Any, **others: str) -> Source:
+    def outputs(self, kind: Any, **others: str) -> Binding:
         """Returns the source of a compiled struct whose members are the results' memory.
 
         Args:
@@ -481,7 +481,7 @@ class Declaration:
         """
         return self._struct(kind, others, self._Results)
 
-    def _struct(self, kind: Any, others: dict[str, Any], source: Any) -> Source:
+    def _struct(self, kind: Any, others: dict[str, Any], source: Any) -> Binding:
         values = [others.get(name, name) for name in kind._fields]
         names = [value for value in values if isinstance(value, str)]
         if unknown := [name for name in names if not hasattr(source, name)]:
@@ -498,35 +498,35 @@ class Declaration:
                 parts.insert(place, value(arguments) if callable(value) else value)
             return new(kind, parts)
 
-        return Source(get, ("structure", [self._source(value, of_results).plan for value in values]))
+        return Binding(get, ("structure", [self._binding(value, of_results).plan for value in values]))
 
-    def _source(self, value: Any, of_results: bool = False) -> Source:
+    def _binding(self, value: Any, of_results: bool = False) -> Binding:
         """Returns the source of a parameter or a member.
 
         ``value`` is of one of the kinds that `compiled_op` lists for its parameters. With ``of_results``, a name that
         is both an argument and a result means the result.
         """
-        if isinstance(value, Source):
+        if isinstance(value, Binding):
             return value
         if isinstance(value, Memory):
             shape, dtype = value.shape, value.dtype
             make = lambda args, _: new_empty(args[0], *[getattr(args, n) for n in shape], dtype=dtype)  # noqa: E731
-            return Source(make, ("memory", dtype.itemsize, shape))
+            return Binding(make, ("memory", dtype.itemsize, shape))
         if not isinstance(value, str):
             if callable(value):
-                return Source(lambda args, _: value(args), ("function", value))
-            return Source(lambda args, _: value, ("constant", value))
+                return Binding(lambda args, _: value(args), ("function", value))
+            return Binding(lambda args, _: value, ("constant", value))
         if value in self.results and (of_results or value not in self._places):
             place = [*self.results].index(value)
             alone = len(self.results) == 1
-            return Source(lambda _, results: results if alone else results[place], ("result", place))
+            return Binding(lambda _, results: results if alone else results[place], ("result", place))
         get = operator.attrgetter(value)
         plan: tuple[Any, ...] = ("letter", value) if value in self._letters() else ("function", get)
         if value in self._places:
             plan = "argument", self._places[value]
         elif value.endswith("_per_ray"):
             plan = "rays", self._places[value.removesuffix("_per_ray")]
-        return Source(lambda args, _: get(args), plan)
+        return Binding(lambda args, _: get(args), plan)
 
     def _result_rows(self) -> list[tuple[Any, ...]]:
         """Returns the description of the results for the compiled module."""
@@ -561,7 +561,7 @@ class Declaration:
             name: the name of the custom op; by default the op's name.
             function: the name of the compiled function.
             parameters: the parameters of the function except the machine. Each is the name of an argument, a result or
-                a letter, a `Source` (`inputs`, `outputs`), a `Memory`, a function of the arguments, or a constant.
+                a letter, a `Binding` (`inputs`, `outputs`), a `Memory`, a function of the arguments, or a constant.
             on_cuda: a function (arguments, results, machine) that fills the results on a GPU; None if the compiled
                 function has the same parameters on a GPU.
             fault: a function that raises the error; it is called with the arguments if the compiled function returns

@@ -22,7 +22,7 @@ from voronerf.ops._core.checks import (
     check_tensor,
     check_writable,
 )
-from voronerf.ops.adam.reference import Guard, Rule
+from voronerf.ops.adam.reference import Guard, UpdateRule
 
 _OP = backends.declare("adam", native=Implementation(EVERYWHERE, (torch.float32,)), warp=PLAIN)
 _AVERAGE = backends.declare(
@@ -34,7 +34,7 @@ _AVERAGE = backends.declare(
 
 
 def adam(
-    rules: Sequence[Rule],
+    rules: Sequence[UpdateRule],
     parameters: Sequence[Tensor],
     gradients: Sequence[Tensor],
     means: Sequence[Tensor],
@@ -73,13 +73,14 @@ def adam(
 
     Examples:
         >>> import torch
-        >>> from voronerf.ops import Rule, adam
+        >>> from voronerf.ops import UpdateRule, adam
         >>> steps, weight, mean, square = torch.zeros(()), torch.zeros(2), torch.zeros(2), torch.zeros(2)
-        >>> adam([Rule(steps, 0.25)], [weight], [torch.tensor([0.5, -2.0])], [mean], [square])
+        >>> adam([UpdateRule(steps, 0.25)], [weight], [torch.tensor([0.5, -2.0])], [mean], [square])
         >>> weight, steps
         (tensor([-0.2500,  0.2500]), tensor(1.))
         >>> table = [torch.zeros(3)]  # only one entry gets a gradient
-        >>> adam([Rule(steps, 0.25, dense=False)], table, [torch.tensor([0.0, 1, 0])], [torch.ones(3)], [torch.ones(3)])
+        >>> gradients, rules = [torch.tensor([0.0, 1, 0])], [UpdateRule(steps, 0.25, dense=False)]
+        >>> adam(rules, table, gradients, [torch.ones(3)], [torch.ones(3)])
         >>> (table[0] != 0).tolist()
         [False, True, False]
     """
@@ -128,7 +129,7 @@ def average(
 
 
 def _check_all(
-    rules: Sequence[Rule],
+    rules: Sequence[UpdateRule],
     parameters: Sequence[Tensor],
     gradients: Sequence[Tensor],
     means: Sequence[Tensor],
@@ -141,7 +142,7 @@ def _check_all(
         return
     checked: Any = None
     for index, rule in enumerate(rules):
-        check_kind(_OP, f"rules[{index}]", rule, Rule)
+        check_kind(_OP, f"rules[{index}]", rule, UpdateRule)
         if checked is None or any(part is not previous for part, previous in zip(rule[1:], checked[1:])):
             _check_rule(rule, parameters[0])  # equal rules in a row are checked once
         checked = rule
@@ -211,7 +212,7 @@ def _check_scalar(op: str, name: str, tensor: Any, parameter: Tensor) -> None:
     check_same_device(op, **{"parameters[0]": parameter, name: tensor})
 
 
-def _check_rule(rule: Rule, parameter: Tensor) -> None:
+def _check_rule(rule: UpdateRule, parameter: Tensor) -> None:
     if isinstance(rule.learning_rate, Tensor):
         _check_scalar(_OP, "learning_rate", rule.learning_rate, parameter)
     else:

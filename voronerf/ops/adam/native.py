@@ -9,11 +9,11 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops.adam import reference
-from voronerf.ops.adam.reference import Guard, Rule
+from voronerf.ops.adam.reference import Guard, UpdateRule
 
 
 def adam(
-    rules: Sequence[Rule],
+    rules: Sequence[UpdateRule],
     parameters: Sequence[Tensor],
     gradients: Sequence[Tensor],
     means: Sequence[Tensor],

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 
-class Rule(NamedTuple):
+class UpdateRule(NamedTuple):
     """The Adam settings of a parameter.
 
     Attributes:
@@ -21,8 +21,8 @@ class Rule(NamedTuple):
 
     Examples:
         >>> import torch
-        >>> from voronerf.ops import Rule
-        >>> Rule(torch.tensor(0.0), learning_rate=0.02, dense=False).betas
+        >>> from voronerf.ops import UpdateRule
+        >>> UpdateRule(torch.tensor(0.0), learning_rate=0.02, dense=False).betas
         (0.9, 0.999)
     """
 
@@ -87,7 +87,7 @@ class Guard(NamedTuple):
 
 @torch.no_grad()
 def adam(
-    rules: Sequence[Rule],
+    rules: Sequence[UpdateRule],
     parameters: Sequence[Tensor],
     gradients: Sequence[Tensor],
     means: Sequence[Tensor],

@@ -8,31 +8,31 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
-from voronerf.ops._core.checks import INDEX, Row, check_integer, check_rows
+from voronerf.ops._core.checks import INDEX, TensorRule, check_integer, check_rules
 from voronerf.ops._core.declare import declare
 from voronerf.ops.draw_pixels.reference import KnownPixels, PixelRuns
 
-_SEED = Row("seed", INDEX, (1,))
+_SEED = TensorRule("seed", INDEX, (1,))
 
 
-def _of_known() -> list[Row]:
-    return [_SEED, Row("pixels", (torch.int64,), ("p",)), Row("distances", (torch.float32,), ("p",))]
+def _of_known() -> list[TensorRule]:
+    return [_SEED, TensorRule("pixels", (torch.int64,), ("p",)), TensorRule("distances", (torch.float32,), ("p",))]
 
 
-def _of_runs() -> list[Row]:
-    of_pixels = [Row(name, (torch.int64,), ("n",)) for name in ("ends", "shift")]
-    return [_SEED, *of_pixels, Row("first", INDEX, ("p",))]
+def _of_runs() -> list[TensorRule]:
+    of_pixels = [TensorRule(name, (torch.int64,), ("n",)) for name in ("ends", "shift")]
+    return [_SEED, *of_pixels, TensorRule("first", INDEX, ("p",))]
 
 
 def _prepare(arguments: Any) -> Any:
     runs, below, known = arguments.runs, arguments.below, arguments.known_pixels
     if known is not None:
-        sizes = check_rows("draw_pixels", _of_known, [arguments.seed, known.pixels, known.distances], smooth=False)
+        sizes = check_rules("draw_pixels", _of_known, [arguments.seed, known.pixels, known.distances], smooth=False)
         if not sizes["p"]:
             raise ValueError("draw_pixels: known_pixels must hold at least one pixel, got none")
         check_integer("draw_pixels", "draws", known.draws, 0, arguments.count)
     if runs is not None:
-        sizes = check_rows("draw_pixels", _of_runs, [arguments.seed, runs.ends, runs.shift, runs.first], smooth=False)
+        sizes = check_rules("draw_pixels", _of_runs, [arguments.seed, runs.ends, runs.shift, runs.first], smooth=False)
         if not (sizes["n"] and sizes["p"]):
             raise ValueError("draw_pixels: runs must hold at least one run, got none")
         check_integer("draw_pixels", "bits", runs.bits, 0, 48)

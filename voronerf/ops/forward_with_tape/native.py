@@ -17,7 +17,7 @@ from voronerf.ops._core import native
 from voronerf.ops._core.derivatives import run_backward, with_gradients
 from voronerf.ops.forward_with_tape.reference import Graph, Tape
 from voronerf.ops.grouped_program.arguments import ProgramArguments
-from voronerf.ops.grouped_program.native import Network, Rows, RunOptions, run, run_gradient
+from voronerf.ops.grouped_program.native import Network, RunOptions, RunTensors, run, run_gradient
 from voronerf.ops.routed_program import frozen_rows
 from voronerf.ops.routed_program.native import find, normalise_routing, routed_program
 from voronerf.ops.routed_program.reference import count_cells, mask_rows
@@ -51,7 +51,7 @@ class _NativeTape(Tape):
     """The tape that keeps the tensors of the forward pass for the native backward pass."""
 
     raw: Tensor
-    rows: Rows
+    rows: RunTensors
     options: RunOptions
     leaves: Sequence[Tensor]  # inputs and parameters of the caller
     count: Tensor | None

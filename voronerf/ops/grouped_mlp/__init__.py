@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from voronerf.ops._core import backends
-from voronerf.ops._core.checks import INDEX, Row
+from voronerf.ops._core.checks import INDEX, TensorRule
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.grouped_mlp.checks import Layered
 
 _OP = backends.declare("grouped_mlp", runs="grouped_program")
-_OFFSETS = Row("offsets", INDEX, ("k+1",), empty="must have at least two entries")
+_OFFSETS = TensorRule("offsets", INDEX, ("k+1",), empty="must have at least two entries")
 
 
 def grouped_mlp(

@@ -13,8 +13,8 @@ from voronerf.ops._core.checks import (
     FLOATING,
     INDEX,
     Others,
-    Row,
-    check_rows,
+    TensorRule,
+    check_rules,
     check_shape,
     check_tensor,
 )
@@ -75,7 +75,7 @@ class Layered(NamedTuple):
         parameters = [*weights, *[bias for bias in biases if bias is not None]]
         tensors = [positions, *behind[1], *read, *parameters, *last[1]]
         settings = layers, p, q, form, biased, weights[0].dtype, tuple(behind[0]), tuple(last[0])
-        sizes = check_rows(op, _rows, tensors, *settings)
+        sizes = check_rules(op, _rows, tensors, *settings)
         if direction_index is not None and not sizes["r"] and sizes["n"]:
             assert directions is not None
             raise ValueError(f"{op}: directions must hold a row for the direction_index, got {list(directions.shape)}")
@@ -119,28 +119,28 @@ def _rows(
     form: tuple[bool, int, bool],
     biased: tuple[bool, ...],
     dtype: torch.dtype,
-    behind: Sequence[Row],
-    last: Sequence[Row],
-) -> list[Row]:
+    behind: Sequence[TensorRule],
+    last: Sequence[TensorRule],
+) -> list[TensorRule]:
     """Returns the rules for the tensors of a network: positions, ``behind``, further inputs, parameters and ``last``.
 
     ``form`` is (whether directions have an index, the number of dimensions of the features or 0, whether there are
     directions).
     """
     indexed, dimensions, directed = form
-    rows = [Row("positions", FLOATING, ("n", "p")), *behind]
+    rows = [TensorRule("positions", FLOATING, ("n", "p")), *behind]
     if directed:
-        rows.append(Row("directions", FLOATING, ("r" if indexed else "n", "q")))
+        rows.append(TensorRule("directions", FLOATING, ("r" if indexed else "n", "q")))
     if indexed:
-        rows.append(Row("direction_index", INDEX, ("n",)))
+        rows.append(TensorRule("direction_index", INDEX, ("n",)))
     if dimensions:
         assert layers.grid is not None
         shape = layers.grid.table_shape
-        rows.append(Row("features", FLOATING, ("k", *shape) if dimensions == 3 else shape))
+        rows.append(TensorRule("features", FLOATING, ("k", *shape) if dimensions == 3 else shape))
     for i, shape in enumerate(layers.weight_shapes(p, q)):
         empty = "" if i else "must hold at least one cell"
-        rows.append(Row(f"weights[{i}]", (dtype,) if i else FLOATING, ("k", *shape), empty=empty))
+        rows.append(TensorRule(f"weights[{i}]", (dtype,) if i else FLOATING, ("k", *shape), empty=empty))
     for i, layer in enumerate(layers.layers):
         if biased[i]:
-            rows.append(Row(f"biases[{i}]", (dtype,), ("k", layer.width), like="weights[0]"))
+            rows.append(TensorRule(f"biases[{i}]", (dtype,), ("k", layer.width), like="weights[0]"))
     return [*rows, *last]

@@ -10,7 +10,16 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, INDEX, Default, Others, Row, Rows, check_rows, check_tensor
+from voronerf.ops._core.checks import (
+    FLOATING,
+    INDEX,
+    Default,
+    Others,
+    TensorRule,
+    TensorRules,
+    check_rules,
+    check_tensor,
+)
 from voronerf.ops._core.program import Program
 from voronerf.ops.grouped_program.arguments import ProgramArguments
 
@@ -120,7 +129,7 @@ def check_program(
     if layers:
         check_tensor(op, "parameters", layers[0])
     dtype = layers[0].dtype if layers else None
-    sizes = check_rows(op, _rows, tensors, program, dtype, tuple(first[0]), tuple(last[0]))
+    sizes = check_rules(op, _rows, tensors, program, dtype, tuple(first[0]), tuple(last[0]))
     if ray_index is not None and not sizes["r"] and sizes["n"]:
         at = next(i for i in range(len(inputs)) if _among(i, program.rays))
         shape = list(inputs[at].shape)
@@ -128,23 +137,25 @@ def check_program(
     return sizes
 
 
-_OFFSETS = Row("offsets", INDEX, ("k+1",), empty="must have at least two entries")
-_ORDER = Row("order", INDEX, ("n",))
+_OFFSETS = TensorRule("offsets", INDEX, ("k+1",), empty="must have at least two entries")
+_ORDER = TensorRule("order", INDEX, ("n",))
 
 
-def _rows(program: Program, dtype: torch.dtype | None, first: Sequence[Row], last: Sequence[Row]) -> Rows:
+def _rows(
+    program: Program, dtype: torch.dtype | None, first: Sequence[TensorRule], last: Sequence[TensorRule]
+) -> TensorRules:
     """Returns the rules for the tensors of a program: ``first``, inputs, parameters, the ray index and ``last``.
 
     ``dtype`` is the dtype of all parameters except tables, or None without such parameters.
     """
-    rows: list[Row | Default] = [*first]
+    rows: list[TensorRule | Default] = [*first]
     for i, width in enumerate(program.inputs):
-        rows.append(Row(f"inputs[{i}]", FLOATING, ("r" if _among(i, program.rays) else "n", width)))
+        rows.append(TensorRule(f"inputs[{i}]", FLOATING, ("r" if _among(i, program.rays) else "n", width)))
     for i, shape in enumerate(program.parameters):
         dtypes = FLOATING if dtype not in FLOATING or _among(i, program.tables) else (dtype,)
-        rows.append(Row(f"parameters[{i}]", dtypes, ("1|k", *shape)))
+        rows.append(TensorRule(f"parameters[{i}]", dtypes, ("1|k", *shape)))
     if program.rays:
-        rows.append(Row("ray_index", INDEX, ("n",)))
+        rows.append(TensorRule("ray_index", INDEX, ("n",)))
     return [*rows, Default("k", 1), *last]
 
 

@@ -38,7 +38,7 @@ _ROWS = (24, 96)  # the fewest and the most rows of a tile; both are whole block
 _WHOLE = 48  # the fewest rows of a tile if encodings write whole vectors of rows
 _TILE = 32  # rows of a block of products in tile registers
 _GRANULE = 16  # widths are padded to multiples of this number of floats
-_FEW = 4  # layers of at most this width use the kernel for few outputs (few_outputs_tile.h)
+_NARROW = 4  # layers of at most this width use the kernel for few outputs (few_outputs_tile.h)
 _NONE = -1
 
 
@@ -434,10 +434,10 @@ class _Lowering:
         count, relu_slope = _sources(step), step.name == "relu_slope"
         sources, added = step.operands[:count], step.operands[count : len(step.operands) - relu_slope]
         depth, unit = sum(c.width for c in sources), 2 * _GRANULE if self.half else _GRANULE
-        few = step.width <= _FEW and not relu_slope and all(c.width % unit == 0 for c in sources) and not self.tiles
+        few = step.width <= _NARROW and not relu_slope and all(c.width % unit == 0 for c in sources) and not self.tiles
         few = few and not self.cuda
         few = few and all(c.of == PARAMETER for c in added)
-        order = 0 if not few else 1 if step.width == 1 else _FEW
+        order = 0 if not few else 1 if step.width == 1 else _NARROW
         kind, width = ("transposed", step.width) if transposed else ("matrix", depth)
         kind = f"few{'_transposed' * transposed}" if few else kind
         deep = self.pairs_of(depth) if self.tiles else -(-depth // 2) if self.half else depth

@@ -26,7 +26,7 @@ from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
 from voronerf.ops.grouped_program.reference import evaluate
 
 
-class Rows(NamedTuple):
+class RunTensors(NamedTuple):
     """The tensors of a program.
 
     Attributes:
@@ -54,7 +54,7 @@ class RunOptions(NamedTuple):
         text: the text of the program.
         caller: the name of the op for error messages.
         products: the type of the operands of products: "float32", "bfloat16" or, on CUDA, "float16".
-        keep: whether the features looked up in hash grids are additional results, see `Rows`.
+        keep: whether the features looked up in hash grids are additional results, see `RunTensors`.
         gradients: the index of the first input that is a gradient, or -1. Rows whose gradients are all 0 add nothing to
             any sum, so they may be dropped.
     """
@@ -101,9 +101,9 @@ class Network(NamedTuple):
         ]
         return Network(rows, cast_parameters, index, RunOptions(text, caller, PRODUCTS.get(dtype, "float32")), dtype)
 
-    def rows(self, offsets: Tensor, order: Tensor | None = None) -> Rows:
+    def rows(self, offsets: Tensor, order: Tensor | None = None) -> RunTensors:
         """Returns the tensors of the program, with the offsets [k + 1] of the cells and the order of the rows."""
-        return Rows(self.inputs, self.parameters, offsets, order, self.ray_index)
+        return RunTensors(self.inputs, self.parameters, offsets, order, self.ray_index)
 
     def run(self, offsets: Tensor, order: Tensor | None = None) -> list[Tensor]:
         """Returns the results: outputs [n, w] and sums."""
@@ -120,7 +120,7 @@ def grouped_program(arguments: ProgramArguments, offsets: Tensor, order: Tensor 
     return Network.of(arguments).run(offsets, order)
 
 
-def run_program(rows: Rows, options: RunOptions) -> list[Tensor]:
+def run_program(rows: RunTensors, options: RunOptions) -> list[Tensor]:
     """Returns the outputs and sums of a program, with gradients of every order."""
     if torch.is_grad_enabled() and _tables(options.text):
         options = options._replace(keep=any(t.requires_grad for t in (*rows.inputs, *rows.parameters)))
@@ -160,11 +160,11 @@ def _tables(text: str) -> tuple[int, ...]:
 class _Call(NamedTuple):
     """The arguments of the custom op: the tensors of a program, and its options."""
 
-    rows: Rows
+    rows: RunTensors
     options: RunOptions
 
 
-def _sizes(program: Program, rows: Rows) -> tuple[int, int]:
+def _sizes(program: Program, rows: RunTensors) -> tuple[int, int]:
     """Returns the numbers of rows and rays."""
     n = rows_of(rows.inputs[0] if rows.ray_index is None else rows.ray_index)
     return n, rows_of(rows.inputs[program.rays[0]]) if program.rays else 0
@@ -194,7 +194,7 @@ def run(arguments: _Call) -> list[Tensor]:
     return _run(*arguments)
 
 
-def _run(rows: Rows, options: RunOptions) -> list[Tensor]:
+def _run(rows: RunTensors, options: RunOptions) -> list[Tensor]:
     """Returns the results of a program: outputs, sums and kept features."""
     program = Program.parse(options.text)
     if not compiled_runs(program.text):
@@ -210,7 +210,7 @@ def _run(rows: Rows, options: RunOptions) -> list[Tensor]:
     return _run_by_structs(program, lowered, _Call(rows, options)) if direct is None else direct
 
 
-def _run_without_gradients(rows: Rows, options: RunOptions) -> list[Tensor] | None:
+def _run_without_gradients(rows: RunTensors, options: RunOptions) -> list[Tensor] | None:
     """Returns the results of a CPU call without gradients that nothing in torch observes, or None to use the op."""
     text = options.text
     if native.on_cuda(rows.offsets) or not compiled_runs(text):
@@ -253,7 +253,7 @@ def _run_by_structs(program: Program, lowered: Lowered, arguments: _Call) -> lis
 def _run_on_cuda(
     program: Program,
     lowered: Lowered,
-    rows: Rows,
+    rows: RunTensors,
     options: RunOptions,
     arguments: native.compiled.ProgramInputs,
     outputs: list[Tensor],
@@ -295,7 +295,7 @@ def _code(text: str, layout: str, device: torch.device) -> Tensor:
 
 def program_inputs(
     lowered: Lowered,
-    rows: Rows,
+    rows: RunTensors,
     n: int,
     r: int,
     *,
@@ -384,7 +384,7 @@ def _multiplies_halves(products: str, device: torch.device) -> bool:
     return native.compiled.multiplies_halves(products, machine)
 
 
-def _setup(ctx: Any, inputs: tuple[Rows, RunOptions], output: Sequence[Tensor]) -> None:
+def _setup(ctx: Any, inputs: tuple[RunTensors, RunOptions], output: Sequence[Tensor]) -> None:
     rows, ctx.options = inputs
     ctx.count, ctx.parameters, ctx.results = len(rows.inputs), len(rows.parameters), _results(ctx.options.text)
     ctx.set_materialize_grads(False)
@@ -398,7 +398,7 @@ def _setup(ctx: Any, inputs: tuple[Rows, RunOptions], output: Sequence[Tensor]) 
 def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
     gradients, none = _saved_gradients(ctx, arriving), cast(Any, (None,) * len(RunOptions._fields))
     row_gradients: Any = (gradients[: ctx.count], gradients[ctx.count :], *none[:3], [None] * ctx.kept)
-    return Rows._make(row_gradients), RunOptions(*none)
+    return RunTensors._make(row_gradients), RunOptions(*none)
 
 
 def _saved_gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> list[Tensor | None]:
@@ -409,12 +409,12 @@ def _saved_gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> list[Tensor
     if not any(g is not None for g in arriving) or not any(wanted):
         return [None] * count
     offsets, order, ray_index, *kept = saved[count:]
-    rows = Rows(saved[: ctx.count], saved[ctx.count : count], offsets, order, ray_index, kept)
+    rows = RunTensors(saved[: ctx.count], saved[ctx.count : count], offsets, order, ray_index, kept)
     return run_gradient(rows, ctx.options, arriving, wanted)
 
 
 def run_gradient(
-    rows: Rows, options: RunOptions, arriving: Sequence[Tensor | None], wanted: Sequence[bool]
+    rows: RunTensors, options: RunOptions, arriving: Sequence[Tensor | None], wanted: Sequence[bool]
 ) -> list[Tensor | None]:
     """Returns the gradients of the inputs, then of the parameters.
 
@@ -434,7 +434,7 @@ def run_gradient(
         return gradients
     inputs = [*rows.inputs, *[g for g in arriving[:split] if g is not None]]
     parameters = [*rows.parameters, *[g for g in arriving[split:] if g is not None]]
-    call = Rows(inputs, parameters, rows.offsets, rows.order, rows.ray_index, rows.kept if derived.keeps else ())
+    call = RunTensors(inputs, parameters, rows.offsets, rows.order, rows.ray_index, rows.kept if derived.keeps else ())
     # `run_program` keeps the looked-up features again, for a pass that is differentiated further.
     values = run_program(call, derived.options) if torch.is_grad_enabled() else run(call, derived.options)
     for place, total in zip(derived.places, values, strict=True):
@@ -502,7 +502,7 @@ class _Node(torch.autograd.Function):
 _apply_node = super(torch.autograd.Function, _Node).apply
 
 
-def _run_with_gradients(rows: Rows, options: RunOptions) -> list[Tensor]:
+def _run_with_gradients(rows: RunTensors, options: RunOptions) -> list[Tensor]:
     """Returns the results of a call with gradients that nothing else in torch observes."""
     inputs, parameters, offsets, order, ray_index, _ = rows
     return list(_apply_node(_Call(rows, options), *inputs, *parameters, offsets, order, ray_index))

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, INDEX, Row, check_rows
+from voronerf.ops._core.checks import FLOATING, INDEX, TensorRule, check_rules
 from voronerf.ops._core.grids import HashGrid
 
 _OP = backends.declare(
@@ -53,14 +53,14 @@ def hash_encode(
     """
     if not isinstance(grid, HashGrid):
         raise TypeError(f"{_OP}: grid must be a HashGrid, got {type(grid).__name__}")
-    check_rows(_OP, _rows, [positions, table] if cells is None else [positions, table, cells], grid, cells is not None)
+    check_rules(_OP, _rows, [positions, table] if cells is None else [positions, table, cells], grid, cells is not None)
     dtype = torch.promote_types(positions.dtype, table.dtype)
     run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=dtype)
     encoded: Tensor = run(positions, table, grid, cells)
     return encoded
 
 
-def _rows(grid: HashGrid, several: bool) -> list[Row]:
+def _rows(grid: HashGrid, several: bool) -> list[TensorRule]:
     shape: tuple[int | str, ...] = ("k", *grid.table_shape) if several else grid.table_shape
-    rows = [Row("positions", FLOATING, ("n", 3)), Row("table", FLOATING, shape)]
-    return [*rows, Row("cells", INDEX, ("n",))] if several else rows
+    rows = [TensorRule("positions", FLOATING, ("n", 3)), TensorRule("table", FLOATING, shape)]
+    return [*rows, TensorRule("cells", INDEX, ("n",))] if several else rows

@@ -17,6 +17,6 @@ def _compiled(op: str, struct: type, slopes: tuple[str, ...], rays: str, **const
 
 
 _structs = native.compiled
-sparse_depth_loss = _compiled("sparse_depth_loss", _structs.SparseDepth, ("of_weights",), "s", nearby=NEARBY)
-smooth_depth_loss = _compiled("smooth_depth_loss", _structs.SmoothDepth, ("of_weights",), "r", edge=EDGE)
-surface_loss = _compiled("surface_loss", _structs.Surface, ("of_weights", "of_density"), "r")
+sparse_depth_loss = _compiled("sparse_depth_loss", _structs.SparseDepthInputs, ("of_weights",), "s", nearby=NEARBY)
+smooth_depth_loss = _compiled("smooth_depth_loss", _structs.SmoothDepthInputs, ("of_weights",), "r", edge=EDGE)
+surface_loss = _compiled("surface_loss", _structs.SurfaceInputs, ("of_weights", "of_density"), "r")

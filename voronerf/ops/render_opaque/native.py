@@ -27,7 +27,7 @@ _OP = declared("render_opaque")
 _rays = _OP.inputs(
     native.compiled.MarchInputs, **{**INPUTS, "uniforms": None, "seed": None, "start": None, "max_samples": "samples"}
 )
-_rule = _OP.inputs(native.compiled.SeeRule)
+_options = _OP.inputs(native.compiled.SeeOptions)
 _outputs = _OP.outputs(native.compiled.SeeOutputs)
 
 
@@ -68,7 +68,7 @@ def render_opaque(*flat: Any) -> RenderedRays:
             m=0 if centres is None else len(centres),
             depth=depth,
         ),
-        _rule(arguments),
+        _options(arguments),
         outputs if arguments.heaviest else outputs._replace(heaviest=None),
         native.cpu(),
     )

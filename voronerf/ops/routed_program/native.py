@@ -16,12 +16,12 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.checks import check_same_device, to_common_dtype
-from voronerf.ops._core.custom_op import custom_op, is_watched
+from voronerf.ops._core.custom_op import custom_op, has_listeners
 from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.cell_sort.native import sort
 from voronerf.ops.grouped_program.arguments import ProgramArguments
-from voronerf.ops.grouped_program.native import Network, Rows, RunOptions, run_program
+from voronerf.ops.grouped_program.native import Network, RunOptions, RunTensors, run_program
 from voronerf.ops.locate_cell.native import find as find_leaves
 from voronerf.ops.nearest_centre import nearest_centre
 from voronerf.ops.nearest_centre.native import find as find_nearest
@@ -88,7 +88,7 @@ def run_checked(
                 centre_index=routing.centre_index if centres is routing.centres else None,
             )
         cells, order, offsets = find(first, normalise_routing(routing, k), k, options.caller)
-    outputs = run_program(Rows(inputs, parameters, offsets, order, None), options)
+    outputs = run_program(RunTensors(inputs, parameters, offsets, order, None), options)
     if frozen is not None:
         rows = frozen_rows(frozen, cells)
         outputs = [stop_gradients(out, rows) for out in outputs]
@@ -122,7 +122,7 @@ def find(positions: Tensor, routing: Routing, k: int, caller: str) -> Route:
 
 def _is_observed(positions: Tensor) -> bool:
     """Returns whether torch must observe the lookup of the cells, or the samples are on a GPU."""
-    return not positions.is_cpu or torch.compiler.is_compiling() or is_watched()
+    return not positions.is_cpu or torch.compiler.is_compiling() or has_listeners()
 
 
 def _in_two_calls(coords: Tensor, centres: Tensor, index: Tensor | None, k: int) -> Route:

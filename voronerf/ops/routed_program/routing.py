@@ -10,19 +10,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.checks import FLOATING, INDEX, Others, Row, check_integer, to_common_dtype
+from voronerf.ops._core.checks import FLOATING, INDEX, Others, TensorRule, check_integer, to_common_dtype
 
 _ROWS = {
-    "cells": Row("cells", INDEX, ("n",)),
-    "centres": Row("centres", FLOATING, ("k", 3)),
-    "child_offsets": Row("child_offsets", INDEX, ("g+1",)),
-    "child": Row("child", INDEX, ("m",)),
-    "frozen": Row("frozen", (torch.bool,), ("k",)),
-    "rows": Row("rows", INDEX, (1,)),
-    "coords": Row("coords", FLOATING, ("n", 3)),
-    "centre_index": Row("centre_index", INDEX, ("w",)),
+    "cells": TensorRule("cells", INDEX, ("n",)),
+    "centres": TensorRule("centres", FLOATING, ("k", 3)),
+    "child_offsets": TensorRule("child_offsets", INDEX, ("g+1",)),
+    "child": TensorRule("child", INDEX, ("m",)),
+    "frozen": TensorRule("frozen", (torch.bool,), ("k",)),
+    "rows": TensorRule("rows", INDEX, (1,)),
+    "coords": TensorRule("coords", FLOATING, ("n", 3)),
+    "centre_index": TensorRule("centre_index", INDEX, ("w",)),
 }
-_ROWS_OF_A_TREE = {**_ROWS, "centres": Row("centres", FLOATING, ("m", 3))}
+_ROWS_OF_A_TREE = {**_ROWS, "centres": TensorRule("centres", FLOATING, ("m", 3))}
 
 
 class Routing(NamedTuple):
@@ -59,7 +59,7 @@ class Routing(NamedTuple):
             check_integer(op, "depth", self.depth, 1)
             if self.child is None and self.depth != 1:
                 raise ValueError(f"{op}: depth must be 1 for a flat diagram, got {self.depth}")
-        rows: dict[str, Row] = _ROWS if self.child is None else _ROWS_OF_A_TREE
+        rows: dict[str, TensorRule] = _ROWS if self.child is None else _ROWS_OF_A_TREE
         names = [name for name in rows if getattr(self, name) is not None]
         return [rows[name] for name in names], [getattr(self, name) for name in names]
 

@@ -20,7 +20,7 @@ SHARE = 8  # average number of rays in a square of the grid
 CLIP = 1e-4  # distance of the near clipping plane from the camera
 SLACK = 5e-4  # tolerance for float32 rounding, relative to the distance
 
-Rows = NDArray[np.int64]
+Indices = NDArray[np.int64]
 Numbers = NDArray[np.float64]
 MISS = np.uint64(np.float32(np.inf).view(np.uint32)) << np.uint64(32)
 
@@ -52,8 +52,8 @@ class Caster:
         self._shadows = shadows.min(1).T - 2 * SLACK, shadows.max(1).T + 2 * SLACK  # [2, m] each
 
     def first(
-        self, origins: Array, directions: Array, solid: Rows, near: Array, start: Rows, end: Rows
-    ) -> tuple[Array, Rows]:
+        self, origins: Array, directions: Array, solid: Indices, near: Array, start: Indices, end: Indices
+    ) -> tuple[Array, Indices]:
         """Returns the first solid on each ray; at equal distances, the solid with the lowest number.
 
         Args:
@@ -86,7 +86,9 @@ class Caster:
             self._test(origins, directions, ray, number, keys)
         return depth, (keys & np.uint64(2**32 - 1)).astype(np.int64)
 
-    def _test(self, origins: Array, directions: Array, rays: Rows, numbers: Rows, keys: NDArray[np.uint64]) -> None:
+    def _test(
+        self, origins: Array, directions: Array, rays: Indices, numbers: Indices, keys: NDArray[np.uint64]
+    ) -> None:
         """Intersects pairs of a ray and a solid, and lowers `keys` [r] in place for nearer hits.
 
         Args:
@@ -115,7 +117,7 @@ class Caster:
 
     def seen(
         self, poses: Numbers, scale: Numbers, size: tuple[int, int], origins: Array, directions: Array
-    ) -> tuple[Array, Rows]:
+    ) -> tuple[Array, Indices]:
         """Returns the first solid on each camera ray of v pictures, in row-major order.
 
         Args:
@@ -180,7 +182,7 @@ class Caster:
         return lit
 
 
-def _rows(heights: Rows) -> tuple[Rows, Rows]:
+def _rows(heights: Indices) -> tuple[Indices, Indices]:
     """Enumerates the rows of rectangles: returns (number of the rectangle, row within it), one entry per row."""
     rectangle = np.repeat(np.arange(len(heights)), heights)
     return rectangle, np.arange(len(rectangle)) - np.repeat(np.cumsum(heights) - heights, heights)

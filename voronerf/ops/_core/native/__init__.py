@@ -87,15 +87,15 @@ DTYPES = {
 """The dtypes, by name in the compiled module."""
 
 
-def know_torch(module: Any) -> None:
+def register_torch(module: Any) -> None:
     """Passes a compiled module the torch objects that it needs."""
     exchange = getattr(Tensor, "__dlpack_c_exchange_api__", None)  # exists from torch 2.10 on
-    module.know_torch(DTYPES, (Tensor, torch.nn.Parameter), exchange)
+    module.register_torch(DTYPES, (Tensor, torch.nn.Parameter), exchange)
 
 
-know_torch(compiled)
+register_torch(compiled)
 
-signature, Rules, alike = compiled.signature, compiled.Rules, compiled.alike
+signature, TensorRules, alike = compiled.signature, compiled.TensorRules, compiled.alike
 """The functions that check arguments and make calls (csrc/bindings/signature.h); kept when tests replace `compiled`."""
 
 ISAS = compiled.Isa
@@ -188,7 +188,7 @@ def refuse_where_deterministic(op: str, tensor: Tensor) -> None:
     warnings.warn(message, stacklevel=2)
 
 
-compiled.know_calls(
+compiled.register_queries(
     {
         "grad_enabled": torch.is_grad_enabled,
         "tangents": vars(forward_ad),
