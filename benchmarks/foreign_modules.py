@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(counts(results))
     if options.json:
         head = metadata(
-            benchmark="modules of public repositories in VoronoiRouter(fuse=True, way='fused')",
+            benchmark="modules of public repositories in VoronoiRouter(fuse=True)",
             samples=N,
             sizes=[SIZES.start, SIZES.stop - 1],
             cells=K,

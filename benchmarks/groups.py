@@ -80,7 +80,7 @@ class Siren(nn.Module):
 def ways(k: int) -> dict[str, tuple[Parameters, Run]]:
     """Returns {method: (parameters, function [k, rows, 2] -> [k, rows, 3])}; all methods have the same k networks."""
     modules = [Siren() for _ in range(k)]
-    router = VoronoiRouter.from_modules(modules, fuse=True, way="fused")
+    router = VoronoiRouter.from_modules(modules, fuse=True)
     labels = torch.arange(k)[:, None]
 
     stacked = {name: nn.Parameter(value.detach()) for name, value in stack_module_state(modules)[0].items()}
@@ -178,7 +178,7 @@ def network() -> nn.Module:
 
 def step_times(options: Options) -> dict[str, float]:
     """Measures forward and backward of `KEYS` networks with a batch, and the step of each optimiser."""
-    router = VoronoiRouter(network(), KEYS, fuse=True, way="fused")
+    router = VoronoiRouter(network(), KEYS, fuse=True)
     batches = [(torch.randn(BATCH, 8), torch.randint(KEYS, (BATCH,))) for _ in range(4)]
 
     def differentiate(number: int) -> None:
@@ -215,7 +215,7 @@ def learn(name: str, rate: float, seed: int) -> tuple[float, float]:
     labels = torch.arange(KEYS // 10)
     silent, others = labels[labels % 10 == 0], labels[labels % 10 > 0]
     directions = torch.randn(len(labels), 8)
-    router = VoronoiRouter(network(), len(labels), fuse=True, way="fused")
+    router = VoronoiRouter(network(), len(labels), fuse=True)
     optimizer = OPTIMIZERS[name](list(router.parameters()), rate)
 
     def error(allowed: Tensor, rows: int = BATCH) -> Tensor:

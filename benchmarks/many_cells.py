@@ -34,7 +34,7 @@ def measure(scene: Scene, cells: int, options: argparse.Namespace) -> dict[str, 
     torch.manual_seed(0)
     kind, generator, space = FIELDS[options.field], torch.Generator().manual_seed(0), scene.space()
     field = kind.build(json.loads(options.options))
-    router = VoronoiRouter(field, torch.zeros(1, 3), coords="first3", way="fused", **kind.router_options)
+    router = VoronoiRouter(field, torch.zeros(1, 3), coords="first3", **kind.router_options)
     grid = OccupancyGrid.for_training(scene.box, options.samples, contraction=space.contraction)
     sampler = Occupancy(grid, options.samples, space=space)
     renderer = Renderer({"field": router}, sampler).train()

@@ -22,7 +22,7 @@ def fit(router: VoronoiRouter, optimizer: torch.optim.Optimizer, target, steps: 
 def main() -> None:
     torch.manual_seed(0)
     field = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 3))
-    router = VoronoiRouter(field, torch.rand(8, 3) * 2 - 1, coords="first3", fuse=True, way="fused")
+    router = VoronoiRouter(field, torch.rand(8, 3) * 2 - 1, coords="first3", fuse=True)
     optimizer = torch.optim.Adam(router.parameters(), lr=3e-3)
     fit(router, optimizer, colour, 100)
 

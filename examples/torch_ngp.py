@@ -117,7 +117,7 @@ def main() -> None:
 
     # After: one network per cell.
     centres = torch.rand(16, 3) * 2 - 1
-    options = {"methods": ["density"], "share": ["encoder.*"], "fuse": True, "way": "fused"}
+    options = {"methods": ["density"], "share": ["encoder.*"], "fuse": True}
     model = VoronoiRouter(model, centres, coords="first3", **options)
     routed_sigma, routed_rgb = model(x, d)
     routed_density = model.density(x)

@@ -19,7 +19,7 @@ space, views, generator = scene.space(), scene.train, torch.Generator().manual_s
 cube, pixel, contracted = scene.cube(space), scene.pixel(space), space.contraction is not None
 samples = usual_samples((cube[1][0] - cube[0][0]) / pixel, contracted=contracted, seconds=seconds)
 field = HashGridField(**HashGridField.scene_options(pixel, cube, contracted, seconds))
-router = VoronoiRouter(field, torch.zeros(1, 3), coords="first3", way="fused", share=["features"])  # coarse: one cell
+router = VoronoiRouter(field, torch.zeros(1, 3), coords="first3", share=["features"])  # coarse: one cell
 sampler = Occupancy(OccupancyGrid.for_training(scene.box, samples, contraction=space.contraction), samples, space=space)
 renderer = Renderer({"field": router}, sampler).train()
 loss = RayLoss(renderer, terms=[SparseDepth(0.003)])

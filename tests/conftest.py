@@ -47,7 +47,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "op(name): run on the backends that implement this op")
-    config.addinivalue_line("markers", "measures: this test's router times its execution paths")
     unknown = _required(config) - set(PARTS)
     if unknown:
         raise pytest.UsageError(f"--require takes {','.join(PARTS)}, got {','.join(sorted(unknown))}")

@@ -127,7 +127,7 @@ def test_classes_and_hooks_are_the_same_during_a_trace(monkeypatch: pytest.Monke
     thread = threading.Thread(target=beside)
     monkeypatch.setattr(Field, "host", staticmethod(look))
     profile, x = sys.getprofile(), torch.rand(60, 3)
-    router = VoronoiRouter(Field(), torch.rand(4, 3), coords="first3", fuse=True, way="fused")
+    router = VoronoiRouter(Field(), torch.rand(4, 3), coords="first3", fuse=True)
     thread.start()
     router(x)
     thread.join(20)

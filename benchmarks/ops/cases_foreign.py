@@ -1,9 +1,8 @@
 """Cases of VoronoiRouter around fields of other codebases (``foreign_fields.py``). n samples, k cells.
 
-A row's main time is the default router's, without ``fuse``. Its alternatives are the router with ``fuse=True``, which
-chooses the fastest evaluation path; the router with ``way="fused"``; the loop over boolean masks with a module per
-cell; and one module for all samples. Results and gradients are compared with the loop over masks. The loop also uses
-the library's cell lookup.
+A row's main time is that of the router with ``fuse=True``. Its alternatives are the router with ``way="grouped"``, the
+loop over boolean masks with a module per cell, and one module for all samples. Results and gradients are compared with
+the loop over masks. The loop also uses the library's cell lookup.
 """
 
 from __future__ import annotations
@@ -284,10 +283,9 @@ def foreign_work(field: Field, n: int, k: int, direction: str, device: torch.dev
         raise NotApplicable("measured on the CPU")
     batch = Batch(field, n, k, direction)
     return Work(
-        ours=lambda backend: batch.routed(backend=backend),
+        ours=lambda backend: batch.routed(fuse=True, backend=backend),
         alternatives={
-            "fuse=True": lambda: batch.routed(fuse=True),
-            "fused": lambda: batch.routed(fuse=True, way="fused"),
+            "grouped": lambda: batch.routed(way="grouped"),
             "masks": batch.masks,
             "masks behind one encoding": lambda: batch.masks(encoded=True),
             "one module": batch.single,

@@ -29,17 +29,11 @@ N, K, SEED = 300, 4, 1
 SIZES = range(1, 70)
 """The batch sizes at which values are compared: the number of samples, or of rays."""
 WAYS: dict[str, dict[str, Any]] = {
-    "fused": {"fuse": True, "way": "fused"},
+    "fused": {"fuse": True},
     "grouped": {"way": "grouped"},
-    "as it comes": {},
 }
 """The options of the routers that are compared at all of :data:`SIZES`."""
-TIMED: dict[str, dict[str, Any]] = {
-    "fuse=True": {"fuse": True},
-    "grouped": {"way": "grouped"},
-    "cell by cell": {"way": "loop"},
-    "as it comes": {},
-}
+TIMED: dict[str, dict[str, Any]] = {**WAYS, "cell by cell": {"way": "loop"}}
 """The options of the routers that are timed."""
 TIMED_SIZES, TIME_LIMIT = (1024, 8192), 0.05
 """The numbers of samples of timed steps, and the seconds for each way at each number."""
@@ -308,7 +302,7 @@ def _sizes(case: Case, options: Mapping[str, Any]) -> tuple[str, list[int], dict
 
 def _compared(case: Case) -> tuple[dict[str, Any], dict[str, float]]:
     row, modules, router = case.row, case.modules, case.router(**WAYS["fused"])
-    for _ in range(2):  # the first call selects the evaluation path of the next call
+    for _ in range(2):  # the second call may be cached
         routed = case.routed(router)
     looped = case.looped
     if [value.shape for value in routed] != [value.shape for value in looped]:
@@ -352,7 +346,7 @@ def _speed(case: Case) -> dict[str, float]:
             losses = [value.square().mean() for value in forward() if value.requires_grad]
             torch.stack(losses).sum().backward()
 
-        for _ in range(3):  # the router selects the way
+        for _ in range(3):  # the first calls make a plan and a cached call
             run(0)
         return run
 

@@ -36,7 +36,7 @@ def interrupted_step(rng: random.Random, folder: Path, inputs: Path) -> str:
     """Interrupts a step once, and compares the following steps with eager steps of a copy."""
     options: dict[str, Any] = {"cells": rng.choice((1, 3)), "photograph": rng.random() < 0.3}
     if rng.random() < 0.3:
-        options |= {"field": Scaled, "fuse": True, "way": "fused"}
+        options |= {"field": Scaled, "fuse": True}
     training, (phase, (steps, change)) = Training(**options), rng.choice([*PHASES.items()])
     hooks, step = rng.sample([*HOOKS], rng.choice((0, 0, 1))), training.step
     for name in hooks:

@@ -29,7 +29,7 @@ def changed_steps(rng: random.Random, folder: Path, inputs: Path) -> str:
     """Compares two trainings with the same random changes between their steps: one recorded, one eager."""
     options = {"cells": rng.choice((1, 1, 3)), "photograph": rng.random() < 0.3}
     if rng.random() < 0.3:
-        options |= {"field": Scaled, "fuse": True, "way": "fused"}
+        options |= {"field": Scaled, "fuse": True}
     trainings = [Training(**options) for _ in range(2)]
     trainings[1].run_as_it_is()
     hooks = rng.sample([*HOOKS], rng.choice((0, 0, 1, 2)))

@@ -126,7 +126,7 @@ def test_foreign_contenders_compute_what_masks_do(name):
 def test_fused_foreign_fields_compute_what_masks_do(name):
     """Compares values and the gradients of every parameter; some values are derivatives of the field."""
     work = cases_foreign.foreign_work(cases_foreign.FIELDS[name], 300, 4, "forward+backward", CPU)
-    fused = work.alternatives["fused"]()
+    fused = work.ours("auto")
     assert work.error(fused.adapt(fused.run(0))) < 1e-3
 
 

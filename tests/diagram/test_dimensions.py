@@ -131,7 +131,7 @@ def test_what_does_not_fit_is_refused(generator: torch.Generator) -> None:
 
 
 @pytest.mark.parametrize("d", DIMENSIONS)
-@pytest.mark.parametrize("options", [{"way": "loop"}, {"way": "grouped"}, {"fuse": True, "way": "fused"}])
+@pytest.mark.parametrize("options", [{"way": "loop"}, {"way": "grouped"}, {"fuse": True}])
 def test_a_router_of_so_many_coordinates(d: int, options: dict[str, object], generator: torch.Generator) -> None:
     net = nn.Sequential(nn.Linear(d, 16), nn.ReLU(), nn.Linear(16, 3))
     points = torch.rand(30, 20, d, generator=generator)

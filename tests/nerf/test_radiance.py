@@ -90,7 +90,7 @@ RAW = ("softplus", "hash", "table")
 def make(name, k=4, **options):
     torch.manual_seed(0)
     module, own = FIELDS[name]
-    router = VoronoiRouter(module(), torch.rand(k, 3) - 0.5, coords="first3", way="fused", **own, **options)
+    router = VoronoiRouter(module(), torch.rand(k, 3) - 0.5, coords="first3", **own, **options)
     for p in router.parameters():
         if p.dim() > 1:
             p.data += 0.1 * torch.randn(p.shape)
@@ -340,7 +340,7 @@ def test_what_keeps_a_field_from_the_fast_step():
             colour, density = super().forward(positions, directions)
             return colour, density + F.embedding(positions[:, 0].long().abs() % 2, self.colour.weight[:, :1])[:, 0]
 
-    centres, arguments = torch.rand(3, 3), {"coords": "first3", "way": "fused"}
+    centres, arguments = torch.rand(3, 3), {"coords": "first3"}
     assert why(lambda *arguments: make("table")[1](*arguments)) == "the field is a function, not a VoronoiRouter"
     router, field = make("relu")
     assert why(field, first=False) == "Foreign.forward is traced at its first call"

@@ -377,7 +377,7 @@ def test_a_second_optimizer_learns(field):
     """`explain` names a parameter that only another optimizer has; the steps of that optimizer move the parameter."""
     moved = []
     for as_it_is in (False, True):
-        training = Training(field=Scaled, fuse=True, way="fused") if field else Training()
+        training = Training(field=Scaled, fuse=True) if field else Training()
         module = training.router.module
         name, parameter = ("layer.bias", module.layer.bias) if field else ("density.bias", module.density.bias)
         group = training.optimizer.param_groups[0]
@@ -460,7 +460,7 @@ def test_a_fused_field_is_replayed():
     """Replays use changed attributes of the field."""
     results = []
     for as_it_is in (False, True):
-        training = Training(cells=2, field=Scaled, fuse=True, way="fused")
+        training = Training(cells=2, field=Scaled, fuse=True)
         steps = training.train(6, as_it_is=as_it_is)
         replayed = "replayed" in training.step.explain()
         assert replayed != as_it_is, training.step.explain()

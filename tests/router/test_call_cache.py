@@ -38,7 +38,7 @@ class Named(nn.Module):
 def routed(module: nn.Module, d: int = 3, **options: Any) -> VoronoiRouter:
     generator = torch.Generator().manual_seed(3)
     centres = options.pop("diagram", None) or torch.rand(6, d, generator=generator)
-    router = VoronoiRouter(module, centres, **{"coords": f"first{d}", "fuse": True, "way": "fused", **options})
+    router = VoronoiRouter(module, centres, **{"coords": f"first{d}", "fuse": True, **options})
     return perturb(router, generator)
 
 
@@ -160,7 +160,7 @@ LEADS = [(1,), (2,), (7,), (300,), (1, 5), (6, 1), (1, 40), (9, 40)]
 def test_few_samples_are_as_well_known_as_many(
     leads: list[tuple[int, ...]], fuse: bool, monkeypatch: pytest.MonkeyPatch, calls: list[str]
 ) -> None:
-    router, probes, probe = routed(Named(), fuse=fuse, way="fastest"), list[Any](), dispatch.Probe
+    router, probes, probe = routed(Named(), fuse=fuse), list[Any](), dispatch.Probe
     monkeypatch.setattr(dispatch, "Probe", lambda *made_of: probes.append(made_of) or probe(*made_of))
     for turn in range(3):
         del calls[:], probes[:]
@@ -200,7 +200,7 @@ class Given(nn.Module):
 @pytest.mark.parametrize("method", ["forward", "chosen"])
 @pytest.mark.parametrize("fuse", [True, False])
 def test_a_row_beside_one_sample_may_be_what_all_share(fuse: bool, method: str, sizes: tuple[int, ...]) -> None:
-    router, t = routed(Given(), fuse=fuse, way="fastest", methods=["chosen"]), rows(1, seed=1)
+    router, t = routed(Given(), fuse=fuse, methods=["chosen"]), rows(1, seed=1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for n in sizes:
@@ -211,7 +211,7 @@ def test_a_row_beside_one_sample_may_be_what_all_share(fuse: bool, method: str, 
 
 
 def test_a_row_beside_one_ray_is_of_that_ray_or_of_all_samples() -> None:
-    router = routed(Given(), way="fastest")
+    router = routed(Given())
     for r, s, rays in [(1, 6, 1), (1, 1, 1), (5, 9, 5), (1, 9, 1), (5, 9, 1), (5, 1, 5), (5, 1, 1), (1, 9, 1)]:
         x, t = rows(r * s), rows(rays, seed=1)
         codes = t.expand(r, 3).repeat_interleave(s, 0)
@@ -230,7 +230,7 @@ class Mean(nn.Linear):
 @pytest.mark.filterwarnings("ignore:VoronoiRouter")
 @pytest.mark.parametrize("fuse", [True, False])
 def test_of_few_samples_a_module_that_mixes_them_runs_cell_by_cell(fuse: bool) -> None:
-    router = routed(Mean(3, 2), fuse=fuse, way="fastest")
+    router = routed(Mean(3, 2), fuse=fuse)
     for x in (torch.zeros(1, 3), rows(7), rows(2)):
         torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0])
     with pytest.raises(TypeError, match="it mixes samples"):

@@ -1,9 +1,7 @@
-"""The choice of a call's evaluation path: it is based on measurements, is reported, and has no side effects."""
+"""The way of a call: the first possible one, which `explain` reports; a first call has no side effects."""
 
 from __future__ import annotations
 
-import copy
-import types
 from typing import Any
 
 import pytest
@@ -11,10 +9,8 @@ import torch
 from convention_harness import uniform
 from router_fields import masked_loop
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from voronerf import VoronoiRouter
-from voronerf.router import dispatch
 
 CENTRES = torch.rand(6, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
 
@@ -23,86 +19,25 @@ def network() -> nn.Module:
     return nn.Sequential(nn.Linear(3, 16), nn.ReLU(), nn.Linear(16, 4))
 
 
-@pytest.mark.parametrize("fastest", ["fused", "grouped", "cell by cell"])
-def test_the_fastest_is_taken_and_said(monkeypatch: pytest.MonkeyPatch, fastest: str) -> None:
-    calls = []
-    monkeypatch.setattr(dispatch, "_LOOKS", 1)
-
-    def measured(ways: Any, call: Any, grouping: Any) -> list[float]:
-        calls.append([way.name for way in ways])
-        return [0.001 if way.name == fastest else 0.004 for way in ways]
-
-    monkeypatch.setattr(dispatch, "measure", measured)
-    router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=True), uniform((200,))
-    for _ in range(3):
-        torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
-    others = [f"{name} 4 ms" for name in ("fused", "grouped", "cell by cell") if name != fastest]
-    assert router.explain() == f"forward: {fastest}: 1 ms for 200 samples, {', '.join(others)}"
-    assert calls == [["fused", "grouped", "cell by cell"]]
-    router(uniform((2000,)))  # measured again: over four times as many samples
-    router(uniform((2,)))
-    with torch.no_grad():
-        router(x)
-    assert len(calls) == 3
-
-
-@pytest.mark.parametrize(
-    ("fused", "taken"),
-    [
-        ([17.6, 0.8], "fused"),  # one noisy measurement
-        ([17.6, 17.6, 0.8], "fused"),
-        ([2.9], "fused"),  # slower, but not by much
-        ([17.6, 17.6, 17.6], "grouped"),
-    ],
-)
-def test_a_fused_way_is_left_if_it_is_clearly_slower_again_and_again(
-    fused: list[float], taken: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now, looks = [0.0], list[float]()
-
-    def measured(ways: Any, call: Any, grouping: Any) -> list[float]:
-        looks.append(now[0])
-        return [fused[len(looks) - 1], 2.4, 9.0]
-
-    monkeypatch.setattr(dispatch, "measure", measured)
-    monkeypatch.setattr(dispatch, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
-    router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=True), uniform((200,))
-    for _ in range(6):
-        for _ in range(3):
-            router(x)
-        y = checkpoint(router, x, use_reentrant=False)
-        now[0] += 1.1
-        assert len(torch.autograd.grad(y.sum(), list(router.parameters()))) == 4, "the same way again"
-    assert len(looks) == len(fused) and looks == sorted(set(looks)), "one at a time"
-    assert router.explain().split("\n")[-1].startswith(f"forward: {taken}: "), router.explain()
-    assert "measured again" not in router.explain().split("\n")[-1]
-
-
-def test_what_is_about_as_fast_and_more_promising_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatch, "measure", lambda ways, call, grouping: [1.01, 1.0])
-    router = VoronoiRouter(network(), CENTRES, coords="first3")
-    router(uniform((200,)))
-    assert router.explain().startswith("forward: grouped: ")
-
-
 @pytest.mark.parametrize(
     ("way", "fuse", "taken"),
     [
+        (None, True, "fused"),
+        (None, False, "grouped"),
         ("fused", True, "fused"),
-        ("fused", False, "grouped"),
         ("grouped", True, "grouped"),
         ("loop", True, "cell by cell"),
     ],
 )
-def test_a_way_by_name_is_not_measured(monkeypatch: pytest.MonkeyPatch, way: Any, fuse: bool, taken: str) -> None:
-    monkeypatch.setattr(dispatch, "measure", None)
-    router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=fuse, way=way), uniform((200,))
+def test_the_first_possible_way_is_taken(way: Any, fuse: bool, taken: str) -> None:
+    options: Any = {} if way is None else {"way": way}
+    router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=fuse, **options), uniform((200,))
     torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
     assert router.explain() == f"forward: {taken}"
 
 
 def test_a_way_that_is_none() -> None:
-    with pytest.raises(ValueError, match="way must be 'fastest', 'fused', 'grouped' or 'loop', got 'quick'"):
+    with pytest.raises(ValueError, match="way must be 'fused', 'grouped' or 'loop', got 'quick'"):
         VoronoiRouter(network(), CENTRES, coords="first3", way="quick")  # type: ignore[arg-type]
 
 
@@ -119,21 +54,17 @@ class Counts(nn.Module):
         return self.net(x) + 0 * torch.rand_like(x[:, :1])
 
 
-@pytest.mark.measures
 @pytest.mark.parametrize("requires_grad", [False, True])
-def test_measuring_leaves_no_trace(requires_grad: bool) -> None:
+def test_a_first_call_leaves_no_trace(requires_grad: bool) -> None:
     router, x = VoronoiRouter(Counts(), CENTRES, coords="first3"), uniform((200,)).requires_grad_(requires_grad)
-    fixed = copy.deepcopy(router)
-    fixed.way = "grouped"
-    torch.manual_seed(3)
-    result = router(x)
-    after = torch.get_rng_state()
-    text = router.explain()
-    assert " ms for 200 samples, " in text and "grouped" in text and "cell by cell" in text
-    torch.manual_seed(3)
-    torch.testing.assert_close(result, fixed(x))
-    if text.startswith("forward: grouped"):
-        assert torch.equal(after, torch.get_rng_state()) and router.module.seen == fixed.module.seen == 1
+    for count in (1, 2):
+        torch.manual_seed(3)
+        result, after = router(x), torch.get_rng_state()
+        torch.manual_seed(3)
+        torch.rand(200, 1)
+        assert torch.equal(after, torch.get_rng_state()) and router.module.seen == count
+        torch.testing.assert_close(result, masked_loop(router, router.diagram.locate(x), [x])[0][0])
+    assert router.explain() == "forward: grouped"
     assert all(parameter.grad is None for parameter in router.parameters()) and x.grad is None
 
 

@@ -19,7 +19,7 @@ from voronerf.nerf.radiance import radiance_of
 
 K = 5
 WAYS: dict[str, dict[str, Any]] = {
-    "fused": {"fuse": True, "way": "fused"},
+    "fused": {"fuse": True},
     "grouped": {"way": "grouped"},
     "loop": {"way": "loop"},
 }

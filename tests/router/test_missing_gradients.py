@@ -104,7 +104,7 @@ def test_shared_parameters_methods_and_labels(options: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", ["an encoder under no_grad", "two heads", "a detached head"])
 def test_a_compiled_call(name: str) -> None:
     """A compiled router leaves the same gradients None as a compiled module."""
-    router = VoronoiRouter(Network(name), torch.rand(K, 3), coords="first3", fuse=True, way="fused")
+    router = VoronoiRouter(Network(name), torch.rand(K, 3), coords="first3", fuse=True)
     router(uniform((50,)).requires_grad_())
     results = []
     for module, network in ((router, router.module), (cell := router.cell(0), cell)):
@@ -117,7 +117,7 @@ def test_an_optimizer_leaves_a_frozen_encoder_as_it_is() -> None:
     """AdamW decays every parameter with a gradient, even if the gradient is zero."""
     for name in ("an encoder under no_grad", "a detached encoder"):
         torch.manual_seed(0)
-        router = VoronoiRouter(Network(name), torch.rand(K, 3), coords="first3", fuse=True, way="fused")
+        router = VoronoiRouter(Network(name), torch.rand(K, 3), coords="first3", fuse=True)
         parameters = dict(router.module.named_parameters())
         first = {name: p.detach().clone() for name, p in parameters.items()}
         optimizer = torch.optim.AdamW(router.parameters(), lr=0.1, weight_decay=0.1)

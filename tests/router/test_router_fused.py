@@ -89,7 +89,7 @@ def both(make: Callable[[], nn.Module], x: Tensor, *args: Any, **options: Any) -
     """Returns (router result, result of a loop over masks, router); each cell is a separate module."""
     modules = [randomised(make()) for _ in range(K)]
     centres = torch.rand(K, 3, generator=torch.Generator().manual_seed(3)) * 2 - 1
-    options = {"coords": "first3", "fuse": True, "way": "fused", **options}
+    options = {"coords": "first3", "fuse": True, **options}
     router = VoronoiRouter.from_modules(modules, centres, **options)
     cells = router.assign(x)
     expected = torch.empty(0)
@@ -196,7 +196,7 @@ def test_parts_of_what_is_split(forward: Callable[[Any, Tensor], Any], between: 
     """Values, their structure and gradients equal the loop's, for all splits and uses of the parts."""
     torch.manual_seed(0)
     centres = torch.rand(K, 3) * 2 - 1
-    router = VoronoiRouter(Parts(forward), centres, coords="first3", fuse=True, way="fused")
+    router = VoronoiRouter(Parts(forward), centres, coords="first3", fuse=True)
     perturb(router, torch.Generator().manual_seed(1))
     x = uniform((90,)).requires_grad_()
     result = router(x)
@@ -583,9 +583,7 @@ class FastAttention(nn.Module):
 @pytest.mark.parametrize("tokens", [1, 3, 16])
 def test_attention_over_the_tokens_of_a_sample(tokens: int) -> None:
     torch.manual_seed(0)
-    router = perturb(
-        VoronoiRouter(FastAttention(), uniform((4,)), coords="first3", fuse=True, way="fused"), torch.Generator()
-    )
+    router = perturb(VoronoiRouter(FastAttention(), uniform((4,)), coords="first3", fuse=True), torch.Generator())
     for n in (50, 1, 16):
         x = uniform((n,), 4 * tokens)
         (expected,), _ = masked_loop(router, router.assign(x[:, :3]), [x])

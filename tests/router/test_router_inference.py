@@ -29,7 +29,7 @@ def nested() -> VoronoiDiagram:
 ROUTERS: dict[str, Callable[[], VoronoiRouter]] = {
     "index": lambda: VoronoiRouter(NeRF(width=8, depth=2, view_directions=False), points(2048, 1)),
     "tree": lambda: VoronoiRouter(NeRF(width=8, depth=2, view_directions=False), nested()),
-    "fused": lambda: VoronoiRouter(Heads(), points(5, 1), coords="first3", methods=["density"], fuse=True, way="fused"),
+    "fused": lambda: VoronoiRouter(Heads(), points(5, 1), coords="first3", methods=["density"], fuse=True),
     "grouped": lambda: VoronoiRouter(Heads(), points(5, 1), coords="first3", methods=["density"], way="grouped"),
 }
 
@@ -154,7 +154,7 @@ def test_uses_after_inference_mode(name: str, change: str) -> None:
 @pytest.mark.parametrize("name", ["fused", "grouped"])
 def test_labels_of_methods_are_not_the_callers(name: str) -> None:
     """Labels that the caller overwrites after a call change the cells of a next method only if it gets them."""
-    options: Any = {"fuse": True, "way": "fused"} if name == "fused" else {"way": "grouped"}
+    options: Any = {"fuse": True} if name == "fused" else {"way": "grouped"}
     router, x = VoronoiRouter(Heads(), 3, methods=["density"], **options), points(60)
     with torch.no_grad():
         router.module.net[0].bias.add_(torch.arange(3.0)[:, None])

@@ -217,7 +217,7 @@ def test_explain_says_why_a_method_is_not_fused() -> None:
         def shade(self, x: Tensor) -> Tensor:
             return super().forward(x) + torch.rand_like(x[:, :1])
 
-    router = VoronoiRouter(Both(3, 2), centres(), coords="first3", methods=["shade"], fuse=True, way="fused")
+    router = VoronoiRouter(Both(3, 2), centres(), coords="first3", methods=["shade"], fuse=True)
     with pytest.warns(UserWarning, match=r"fuse=True needs a network that can be fused, but in Both.shade"):
         router.shade(uniform((40,)))
     for n in (5, 40, 5):
@@ -320,7 +320,7 @@ def test_widths_that_are_numbers_of_samples_of_a_trace(width):
     """All widths are multiples of 37, and 1147 is 31 * 37; a trace tries 37 samples first, and 31 samples second."""
     torch.manual_seed(0)
     field = nn.Sequential(nn.Linear(3, width), nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, 4))
-    router = VoronoiRouter(field, torch.rand(3, 3), coords="first3", fuse=True, way="fused")
+    router = VoronoiRouter(field, torch.rand(3, 3), coords="first3", fuse=True)
     x = torch.rand(50, 3)
     torch.testing.assert_close(router(x), field(x))
     assert router.explain() == "forward: fused"

@@ -130,7 +130,7 @@ def test_complex_layers_stay_complex_under_autocast(fuse: bool) -> None:
     generator = torch.Generator().manual_seed(3)
     centres = torch.rand(5, 3, generator=generator) * 2 - 1
     torch.manual_seed(0)
-    way = {"fuse": True, "way": "fused"} if fuse else {"way": "grouped"}
+    way = {"fuse": True} if fuse else {"way": "grouped"}
     router = perturb(VoronoiRouter(Gabor(), centres, coords="first3", **way), generator)
     x = uniform((300,)).requires_grad_()
     expected = router(x)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from voronerf import VoronoiRouter
 
 CENTRES = torch.rand(4, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
-WAYS: list[dict[str, Any]] = [{}, {"way": "loop"}, {"way": "grouped"}, {"fuse": True, "way": "fused"}]
+WAYS: list[dict[str, Any]] = [{}, {"way": "loop"}, {"fuse": True}]
 every_way = pytest.mark.parametrize("options", WAYS, ids=str)
 
 

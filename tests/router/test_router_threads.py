@@ -319,7 +319,7 @@ def interrupted(function: Callable[[], Any], at: int) -> bool:
 FIRST: dict[
     str, tuple[Callable[[], VoronoiRouter], Callable[[VoronoiRouter], Any], Callable[[VoronoiRouter], None]]
 ] = {
-    "fused": (lambda: scaled(fuse=True, way="fused"), lambda router: router(uniform((60,))), call_again),
+    "fused": (lambda: scaled(fuse=True), lambda router: router(uniform((60,))), call_again),
     "grouped": (lambda: scaled(way="grouped"), lambda router: router(uniform((60,))), call_again),
     "program": (radiance_field, lambda router: router.program(uniform((60,))), ask_again),
 }

@@ -20,10 +20,9 @@ from voronerf.router import VoronoiRouter
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
 
 WAYS: dict[str, dict[str, Any]] = {
-    "fused": {"fuse": True, "way": "fused"},
+    "fused": {"fuse": True},
     "grouped": {"way": "grouped"},
     "loop": {"way": "loop"},
-    "fastest": {"fuse": True},
     "reference": {"way": "grouped", "backend": "reference"},
 }
 
@@ -107,13 +106,14 @@ class Scaled(nn.Linear):
         return Scaling.apply(super().forward(x))
 
 
-@pytest.mark.parametrize("options", [{"fuse": True, "way": "fused"}, {"way": "grouped"}, {"way": "loop"}])
+@pytest.mark.parametrize("options", [{"fuse": True}, {"way": "grouped"}, {"way": "loop"}])
 def test_a_checkpoint_around_a_custom_function_that_saves_tensors(options: Any, generator: torch.Generator) -> None:
     router, x = router_of(Scaled(3, 2), generator, **options), torch.rand(60, 3, generator=generator)
     for _ in range(2):
         result = gradients(lambda x: checkpoint(router, x, use_reentrant=False), router, x)
         torch.testing.assert_close(result, gradients(router, router, x))
-    assert router.explain().startswith(f"forward: {'cell by cell' if options['way'] == 'loop' else options['way']}")
+    way = options.get("way", "fused")
+    assert router.explain().startswith(f"forward: {'cell by cell' if way == 'loop' else way}")
 
 
 def test_a_checkpoint_around_batches_of_which_some_cannot_be_grouped(generator: torch.Generator) -> None:
@@ -177,7 +177,6 @@ def _on_cpu(router: VoronoiRouter, x: Tensor) -> Tensor:
     return y
 
 
-@pytest.mark.measures
 @pytest.mark.parametrize("n", [4, 300])
 @pytest.mark.parametrize("context", CONTEXTS)
 @pytest.mark.parametrize("way", WAYS)

@@ -224,7 +224,7 @@ class MadeInside(nn.Module):
 @pytest.mark.parametrize("kept", [True, False])
 @pytest.mark.parametrize("fuse", [True, False])
 def test_layers_that_are_made_inside_of_forward(kept: bool, fuse: bool, generator: torch.Generator) -> None:
-    router = router_of(MadeInside(kept), generator, fuse=fuse, way="fastest")
+    router = router_of(MadeInside(kept), generator, fuse=fuse, way="fused")
     with pytest.raises(TypeError, match="MadeInside makes layers or draws numbers inside of its forward"):
         router(torch.rand(100, 3, generator=generator))
 
@@ -251,7 +251,7 @@ class Gaussian(nn.Linear):
 
 def test_refusals_name_a_written_buffer_and_a_distribution_that_checks(generator: torch.Generator) -> None:
     with pytest.raises(TypeError, match="RunningMean writes into its buffer 'mean'; write it outside of forward"):
-        router_of(RunningMean(), generator, way="fastest")(torch.rand(100, 3, generator=generator))
+        router_of(RunningMean(), generator, way="fused")(torch.rand(100, 3, generator=generator))
     with pytest.raises(ValueError, match="mixes or selects them; pass validate_args=False to the distribution"):
         router_of(Gaussian(3, 2), generator, fuse=True, way="fused")(torch.rand(100, 3, generator=generator))
 
@@ -274,7 +274,7 @@ class Forecast(nn.Module):
 @pytest.mark.filterwarnings("ignore:VoronoiRouter")
 @pytest.mark.parametrize("packed", [False, True])
 def test_recurrent_layers_with_dropout_and_packed_sequences(packed: bool, generator: torch.Generator) -> None:
-    router, x = router_of(Forecast(packed), generator, way="fastest"), torch.rand(50, 6, generator=generator)
+    router, x = router_of(Forecast(packed), generator, way="fused"), torch.rand(50, 6, generator=generator)
     assert not torch.equal(router(x), router(x)), "dropout"
     router.eval()
     expected = masked_loop(router, router.assign(x[:, :3].contiguous()), [x])[0][0]
@@ -372,7 +372,7 @@ def test_directions_are_told(generator: torch.Generator) -> None:
 
 def test_centres_in_other_units_are_told_once(generator: torch.Generator) -> None:
     x = torch.rand(2000, 3, generator=generator)
-    for options in ({}, {"way": "grouped"}, {"fuse": True, "way": "fused"}):
+    for options in ({}, {"fuse": True}):
         router = VoronoiRouter(net(), 100 * torch.rand(8, 3, generator=generator), coords="first3", **options)
         with warnings.catch_warnings():
             warnings.simplefilter("error")

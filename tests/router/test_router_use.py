@@ -221,7 +221,7 @@ class Fast(nn.Module):
 @pytest.mark.parametrize("make", [SkipNet, Sine, Fast, Heads])
 def test_fused_under_autocast_is_as_near_to_float64_as_the_loop(make: type[nn.Module], dtype: torch.dtype) -> None:
     generator = torch.Generator().manual_seed(5)
-    router = VoronoiRouter(make(), uniform(generator, 5, 3), coords="first3", fuse=True, way="fused")
+    router = VoronoiRouter(make(), uniform(generator, 5, 3), coords="first3", fuse=True)
     perturb(router, generator, 0.01 if make is Fast else 0.2)
     x = uniform(generator, 120, 15 if make is SkipNet else 3)
     router(x)  # the first call runs without autocast
@@ -248,7 +248,7 @@ def test_fused_under_autocast_is_as_near_to_float64_as_the_loop(make: type[nn.Mo
 
 def test_inference_mode(generator: torch.Generator) -> None:
     """A router constructed and called in inference mode, with inputs made there, can be trained afterwards."""
-    for options in ({"fuse": True, "way": "fused"}, {"way": "grouped"}, {"way": "loop"}):
+    for options in ({"fuse": True}, {"way": "grouped"}, {"way": "loop"}):
         with torch.inference_mode():
             router, x = router_of(Heads(), generator, **options), uniform(generator, 50, 3)
             before = router(x)
@@ -295,7 +295,7 @@ class Named(nn.Module):
         return Labelled.of(self.fc(x), ["u", "v"]) if self.use == "for results" else self.fc(x)
 
 
-WAYS: list[dict[str, Any]] = [{"fuse": True, "way": "fused"}, {"way": "grouped"}, {"way": "loop"}]
+WAYS: list[dict[str, Any]] = [{"fuse": True}, {"way": "grouped"}, {"way": "loop"}]
 
 
 @pytest.mark.parametrize("options", WAYS)

@@ -64,7 +64,7 @@ class Encoded(nn.Module):
 def test_gives_the_same(name, backend):
     torch.manual_seed(0)
     encode, encodings = ENCODINGS[name]
-    router = VoronoiRouter(Encoded(encode), torch.rand(3, 3), coords="first3", fuse=True, way="fused", backend=backend)
+    router = VoronoiRouter(Encoded(encode), torch.rand(3, 3), coords="first3", fuse=True, backend=backend)
     x, offsets = torch.rand(40, 3), torch.tensor([0, 40], dtype=torch.int32)
     known = router.program(x, trace=True)
     steps = [step for step in known.program.steps if step.op == "encode"]
@@ -86,7 +86,7 @@ def test_gives_the_same(name, backend):
 
 
 def test_nothing_is_copied_that_lies_in_order():
-    router = VoronoiRouter(Encoded(in_turns), torch.rand(3, 3), coords="first3", fuse=True, way="fused")
+    router = VoronoiRouter(Encoded(in_turns), torch.rand(3, 3), coords="first3", fuse=True)
     program = router.program(torch.rand(40, 3), trace=True).program
     assert [step.op for step in program.steps] == ["input", "encode", "linear", "function", "linear", "linear"]
 

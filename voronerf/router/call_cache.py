@@ -132,7 +132,7 @@ class CachedCall:
             drawn = router.assignment == "stochastic" and router.training
             if drawn or router.methods or not self._is_compilable:
                 return None
-        elif not self.plan.takes_first(n, k):
+        elif not self.plan.is_ready(n):
             return None
         for i in self._tensors:
             shape = (x := arguments[i]).shape

@@ -1,8 +1,8 @@
 """Runs routed calls in one of three ways: fused, grouped or cell by cell.
 
-The loop over cells defines the result. The first call of a kind makes a :class:`CallPlan` with the ways whose results
-agree with the loop (:mod:`voronerf.router.probe`). A call runs in the way that was fastest for the first batch of about
-the same size, or in the way that the user has chosen (``way=``).
+The loop over cells defines the result. The first call of a kind makes a :class:`CallPlan`: its way is the first one, in
+this order, that is possible and whose results agree with the loop (:mod:`voronerf.router.probe`). The option ``way`` of
+a router names the way to begin with.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import os
 import re
 import sys
 import threading
-import time
 import traceback
 import warnings
 from collections.abc import Collection, Mapping
@@ -27,12 +26,12 @@ from voronerf.ops._core.unchanged import Never, unchanged
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.call_cache import CachedCall
 from voronerf.router.cells import refuse_statistics
-from voronerf.router.double import Double, Forbidden
+from voronerf.router.double import Forbidden
 from voronerf.router.fused import Fused
-from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
+from voronerf.router.grouped import Grouped, Loop, Ungroupable
 from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
-from voronerf.router.layout import SHARED, Call, Results, map_tensors, map_tree, tensors_of
-from voronerf.router.plan import SLICE, CallPlan, measured_samples
+from voronerf.router.layout import SHARED, Call, Results, map_tree, tensors_of
+from voronerf.router.plan import CallPlan
 from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import CellProgram
 from voronerf.router.trace import Unfusable
@@ -42,12 +41,6 @@ from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, loo
 _OP = "VoronoiRouter"
 _PLANS = 256  # maximum number of kinds of calls with plans
 _TRACES = 8  # maximum number of traces for a kind of call; a module that changes more often runs grouped
-_TURNS, _SECONDS = 8, 0.08  # the maximum number of turns; time in seconds after which no turn begins
-_BEHIND = 1.5  # a loop that is slower than the fastest way by this factor is not timed again
-# The fused way is given up after _LOOKS slow timings, which are at least _APART seconds apart. A timing is slow if the
-# fused way takes more than _CLEAR times as long as the fastest way.
-_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3
-_EQUAL = 1.02  # times within this factor of the least count as equal; the plan's first such way is chosen
 _OF_DTYPES = re.compile("same dtype|expected scalar type|Input type")  # PyTorch's messages about dtypes
 _LIBRARY_FOLDERS = tuple(
     str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1))
@@ -74,7 +67,7 @@ class Dispatch:
     """The plans of a router's calls. A copy of a router starts without plans."""
 
     def __init__(self) -> None:
-        self._lock = threading.RLock()  # held while a plan is made or timed
+        self._lock = threading.RLock()  # held while a plan is made
         self.forget()
 
     def __reduce__(self) -> tuple[type[Dispatch], tuple[()]]:
@@ -122,7 +115,7 @@ class Dispatch:
             return f"{call.name} is traced at its {'next' if plans else 'first'} call"
         plan = plan or self._plan(call, cast(Grouping, grouping), options)
         if plan.fused is None:
-            return f"{call.name} runs {plan.ways[0].name}: {plan.ways[0].why}"
+            return f"{call.name} runs {plan.way.name}: {plan.way.why}"
         program = plan.fused.whole_program
         if isinstance(program, str):
             return f"{call.name} is not one program: {program}"
@@ -241,7 +234,7 @@ class Dispatch:
         if plan is not None and (few or not plan.may_group or plan.skip or recorded()):
             return plan
         if not layout.n:
-            return CallPlan([Loop("no samples yet")])
+            return CallPlan(loop := Loop("no samples yet"), loop)
         with self._lock, _own_randomness(grouping), aside(call) as copied:
             probe = Probe(copied, grouping)
             if plan is not None and not probe.is_groupable():
@@ -253,18 +246,18 @@ class Dispatch:
             try:
                 if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
                     check_rays(copied)
-                ways, may_group = probe.find_ways(
+                way, loop, may_group = probe.find_way(
                     options, (lambda *_: None) if few else self.warn_once, inputs, too_many
                 )
             except (TypeError, ValueError) as error:
                 if not few or isinstance(error, Forbidden):
                     raise
-                ways, may_group = [Loop()], False  # with one sample, a tensor [1, f] may also be shared
-            if few and isinstance(ways[0], Loop) and options.way != "loop":
-                ways[0].why = f"first calls of fewer than {FEWEST} samples"
+                way, may_group = (loop := Loop()), False  # with one sample, a tensor [1, f] may also be shared
+            if few and way is loop and options.way != "loop":
+                loop.why = f"first calls of fewer than {FEWEST} samples"
         if len(self.plans) >= _PLANS:
             self.plans, self.cached = {}, {}
-        new_plan = CallPlan(ways, options.way == "fastest", may_group, few, constants=constants, counts=probe.counts)
+        new_plan = CallPlan(way, loop, may_group, few, constants=constants, counts=probe.counts)
         if new_plan.fused is not None:
             new_plan.watch = Watch.of(call.module, new_plan.fused.reads, new_plan.fused.inputs)
         if probe.refused and new_plan.fused is not None:
@@ -273,8 +266,6 @@ class Dispatch:
         old_plans = set(map(id, self.plans.get(key, [])))
         cached = list(self.cached.items())  # another thread may add a call
         self.cached = {call_key: other for call_key, other in cached if id(other.plan) not in old_plans}
-        if plans and [way.name for way in plans[0].ways] == [way.name for way in ways]:
-            new_plan.choices, new_plan.lost_timings = plans[0].choices, plans[0].lost_timings
         self.plans[key] = (
             [new_plan] if new_plan.fused is None else [new_plan, *(other for other in plans if other is not plan)]
         )
@@ -315,46 +306,15 @@ class Dispatch:
         tried = [Inputs(sources, dtype, others) for dtype in NUMBERS] if new else []
         return [*tried, *present, Inputs()], ""
 
-    def _choose(self, plan: CallPlan, call: Call, grouping: Grouping) -> tuple[Way, str]:
-        """Returns the way in which a call runs, and the reason."""
-        n, k = call.layout.n, grouping.k
-        ways = [way for way in plan.ways if k > 1 or not isinstance(way, Grouped)]
-        if plan.skip:
-            plan.skip = max(plan.skip - (not recorded()), 0)  # another thread may have counted it
-            ways = ways[-1:]
-        if not plan.measured or len(ways) == 1 or n < FEWEST:
-            return ways[0], ways[0].why
-        size, n = plan.size(n, k), min(n, measured_samples(ways))
-        losses, retry_time, why = plan.lost_timings.get(size, (0, 0.0, ""))
-        if losses and size not in plan.choices and (recorded() or time.monotonic() < retry_time):
-            return ways[0], why
-        if size not in plan.choices:
-            try:
-                with self._lock, aside(call) as copied:
-                    times = measure(ways, copied, grouping)
-            except (Ungroupable, Unfusable):  # `_run` finds another way for this batch
-                return ways[0], ways[0].why
-            fused = isinstance(ways[0], Fused)  # the fused way is kept unless it is clearly slower each time
-            is_slower = fused and times[0] > _CLEAR * min(times)
-            losses += is_slower
-            first = next(i for i, seconds in enumerate(times) if seconds <= _EQUAL * min(times))
-            first = 0 if fused and not (is_slower and losses == _LOOKS) else first
-            texts = [f"{way.name} {1e3 * seconds:.3g} ms" for way, seconds in zip(ways, times, strict=True)]
-            others = ", ".join(texts[:first] + texts[first + 1 :])
-            why = f"{1e3 * times[first]:.3g} ms for {n} samples, {others}" if min(times) else ""
-            if is_slower and first == 0:
-                why = "; ".join(filter(None, (ways[0].why, f"{why}, to be measured again")))
-                plan.lost_timings[size] = losses, time.monotonic() + _APART, why
-                return ways[0], why
-            plan.choices[size] = first, why
-        first, why = plan.choices[size]
-        return ways[first], "; ".join(filter(None, (ways[first].why, why)))
-
     def _run(self, plan: CallPlan, call: Call, grouping: Grouping) -> Results:
         """Runs a call as planned, or cell by cell if its batch cannot be grouped."""
-        way, why = self._choose(plan, call, grouping)
-        latest, warns = self._latest_ways.setdefault(call.method, {}), len(plan.ways) == 1
-        if isinstance(way, (Fused, Grouped)):
+        way, loop = plan.way, plan.loop
+        latest, warns = self._latest_ways.setdefault(call.method, {}), way is loop
+        if plan.skip:
+            plan.skip = max(plan.skip - (not recorded()), 0)  # another thread may have counted it
+            way = loop
+        why = way.why
+        if isinstance(way, Fused) or (isinstance(way, Grouped) and grouping.k > 1):
             try:
                 results, plan.wait = self._run_once(way, call, grouping), 0
                 latest[way.name] = why
@@ -368,10 +328,10 @@ class Dispatch:
                 if not recorded():
                     plan.postpone()
                 reason = error if isinstance(error, (Ungroupable, Unfusable)) else f"its forward fails ({error})"
-                way, why, warns = plan.ways[-1], f"for some batches, since {reason}", True
+                why, warns = f"for some batches, since {reason}", True
         layout = call.layout
         try:
-            results = way.run(call, grouping)
+            results = loop.run(call, grouping)
         except Exception as error:
             shown = _misfit(error, call) or error
             if len(layout.lead) > 1 and not layout.flat and len(shown.args) == 1 and isinstance(shown.args[0], str):
@@ -380,11 +340,11 @@ class Dispatch:
             if shown is error:
                 raise
             raise shown from error
-        if grouping.k == 1 and isinstance(way, Loop):
+        if grouping.k == 1:
             latest["the module itself"] = "there is one cell"
             return results
-        latest[way.name] = why
-        if why and warns and grouping.k > 1 and layout.n >= FEWEST:
+        latest[loop.name] = why
+        if why and warns and layout.n >= FEWEST:
             self.warn_once(f"cells {call.method}", f"{call.name} runs cell by cell: {why}")
         return results
 
@@ -497,62 +457,3 @@ class _Constant(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[None, ...]:
         return (None,) * ctx.count
-
-
-def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
-    """Returns each way's time in seconds for a part of a batch: forward and, if gradients are on, backward.
-
-    The ways take turns, and the least time of each way counts. The loop over cells (`Loop`) is not timed again if it is
-    much slower than the fastest way. The ways run on a double of the module, so the module itself gets no writes and no
-    gradients. The state of random generators is restored.
-    """
-    most, times = measured_samples(ways), _least_times(ways, call, grouping, SLICE, 2)
-    return _least_times(ways, call, grouping, most, 1) if min(most, call.layout.n) > 2 * SLICE else times
-
-
-def _least_times(ways: list[Way], call: Call, grouping: Grouping, most: int, fewest: int) -> list[float]:
-    """Returns each way's least time in seconds over at least ``fewest`` turns.
-
-    A call on more than ``most`` samples is cut to about ``most``, unless the grouping itself selects samples.
-    """
-    k, device, selection = grouping.k, grouping.device, call.part(most) if grouping.rows is None else None
-    if selection is not None:
-        call, rows = selection
-        cells = None if grouping.cells is None else grouping.cells.index_select(0, rows)
-        grouping = Grouping(cells, len(rows), k, device, grouping.backend)
-    double, leaves = Double(call.module), list[Tensor]()
-
-    def leaf(value: Tensor) -> Tensor:
-        copied = value.detach().requires_grad_(value.requires_grad and torch.is_grad_enabled())
-        leaves.extend([copied] * copied.requires_grad)
-        return copied
-
-    double.fill({id(p): leaf(p) for _, _, p in owned_parameters(call.module)})
-    double.own_buffers()
-    args, kwargs = map_tensors((call.args, call.kwargs), leaf)
-    timed, cuda = replace(call, module=double.module, args=args, kwargs=kwargs), device.type == "cuda"
-
-    # A thread's processor time is more exact under load, but it omits the work of other threads.
-    clock = time.perf_counter if cuda or torch.get_num_threads() > 1 else time.thread_time
-
-    def seconds(way: Way) -> float:
-        if cuda:
-            torch.cuda.synchronize(device)
-        start = clock()
-        outputs = [t for t in way.run(timed, grouping.anew()).unsorted if t.requires_grad and t.is_floating_point()]
-        if outputs and leaves:
-            # The outputs are summed, because torch imports sympy if several outputs get a gradient each.
-            total = torch.stack([(t * torch.ones_like(t)).sum().float() for t in outputs]).sum()
-            torch.autograd.grad(total, leaves, allow_unused=True)
-        if cuda:
-            torch.cuda.synchronize(device)
-        return clock() - start
-
-    times, turns, began = [float("inf")] * len(ways), 0, clock()
-    with torch.random.fork_rng([device] if cuda else []):
-        while turns < fewest or (turns < _TURNS and clock() - began < _SECONDS):
-            for i, way in enumerate(ways):
-                if turns == 0 or not isinstance(way, Loop) or times[i] < _BEHIND * min(times):
-                    times[i] = min(times[i], seconds(way))
-            turns += 1
-    return times

@@ -168,11 +168,6 @@ class Double:
         for registry in registries if name in vars(part) else [part._buffers]:
             registry[name] = value
 
-    def own_buffers(self) -> None:
-        """Copies the buffers, so that the double no longer shares them."""
-        for part in self.module.modules():
-            part._buffers = {name: None if b is None else b.clone() for name, b in part._buffers.items()}
-
     def end(self) -> None:
         """Removes the parameters, so that the module's code fails if the backward pass runs it again."""
         for registry, _, _ in self._places:

@@ -153,7 +153,7 @@ def register(function: Any, rule: Rule) -> None:
         >>> class Field(torch.nn.Linear):
         ...     def forward(self, x):
         ...         return shift(x @ self.weight.T, self.bias)
-        >>> router = VoronoiRouter(Field(3, 2), torch.randn(4, 3), coords="first3", way="grouped")
+        >>> router = VoronoiRouter(Field(3, 2), torch.randn(4, 3), coords="first3")
         >>> router(torch.randn(64, 3)).shape
         torch.Size([64, 2])
         >>> print(router.explain())

@@ -56,10 +56,6 @@ class Grouping:
         else:
             self._order, self.offsets = ops.cell_sort(cells, k, backend=backend)
 
-    def anew(self) -> Grouping:
-        """Returns a new grouping of the same entries, without cached results."""
-        return Grouping(self.cells, self.n, self.k, self.device, self.backend, self.rows)
-
     @functools.cached_property
     @torch.inference_mode(False)
     def source(self) -> Tensor | None:

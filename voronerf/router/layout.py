@@ -309,30 +309,6 @@ class Call:
         same = args is self.args and kwargs is self.kwargs
         return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)
 
-    def part(self, most: int) -> tuple[Call, Tensor] | None:
-        """Returns a call on about ``most`` of the samples, and the numbers of these samples, int64 [m].
-
-        Returns None if the call has at most ``most`` samples.
-
-        The samples are evenly spaced along the longest leading dimension, so that many rays stay complete.
-        """
-        lead = self.layout.lead
-        if self.layout.n <= most:
-            return None
-        dim = max(range(len(lead)), key=lead.__getitem__)
-        count = max(lead[dim] * most // self.layout.n, 1)
-        first = next(t for t in tensors_of((self.args, self.kwargs)))
-        index = torch.arange(count, device=first.device) * lead[dim] // count
-
-        def select(tensor: Tensor, kind: str) -> Tensor:
-            whole = kind == RAY and dim == len(lead) - 1
-            return tensor if whole or tensor.shape[dim] == 1 else tensor.index_select(dim, index.to(tensor.device))
-
-        args, kwargs = self.changed(select)
-        small = dataclasses.replace(self.layout, lead=(*lead[:dim], count, *lead[dim + 1 :]))
-        rows = torch.arange(self.layout.n, device=index.device).reshape(lead).index_select(dim, index)
-        return dataclasses.replace(self, layout=small, args=args, kwargs=kwargs), rows.flatten()
-
     def shared(self) -> list[Tensor]:
         """Lists the tensors that are the same for all samples; call :meth:`changed` first, which finds them."""
         tensors: list[Tensor] = []

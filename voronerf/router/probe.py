@@ -1,4 +1,4 @@
-"""Finds the ways whose results agree with the loop over cells.
+"""Finds a way whose results agree with the loop over cells.
 
 Each way runs once on a few samples of the first batch, in a copy of the module whose cells have different parameters.
 Results and gradients are compared.
@@ -54,7 +54,7 @@ class Options:
     """The options of a router that decide which ways are tried."""
 
     fuse: bool  # user promises that ``forward`` is a pure function
-    way: str  # "fastest"; or "fused", "grouped" or "loop" without timing
+    way: str  # the first way to try: "fused", "grouped" or "loop"
     many_methods: bool  # whether several methods are routed; if so, a method that cannot be fused is no error
     names: tuple[str, ...]  # names of the parameters that the module was wrapped with
 
@@ -110,10 +110,10 @@ class Probe:
                 part = parts[source[0]]
                 (part._buffers if source[1] in part._buffers else vars(part))[source[1]] = value
 
-    def find_ways(
+    def find_way(
         self, options: Options, warn_once: Callable[[str, str], None], inputs: Sequence[Inputs], too_many: str = ""
-    ) -> tuple[list[Way], bool]:
-        """Returns the ways that agree with the loop, the loop last, and whether another batch may run grouped.
+    ) -> tuple[Way, Loop, bool]:
+        """Returns the first way that agrees with the loop, the loop, and whether another batch may run grouped.
 
         The module is fused with the first of ``inputs`` that succeeds. It is not fused if its constants have changed
         too often; ``too_many`` is then the explanation, otherwise it is empty.
@@ -124,7 +124,7 @@ class Probe:
         """
         call = self._call
         steps: Callable[[], list[Step]] = self.steps
-        with contextlib.suppress(Exception):  # the ways name the reason
+        with contextlib.suppress(Exception):  # the way names the reason
             steps = functools.partial(steps_of, self.note_changes(warn_once).runs, _COUNTS)
         for loop in (Loop(), Loop(again=True)):
             try:
@@ -135,13 +135,13 @@ class Probe:
             except Exception as error:  # perhaps because code runs again in the backward pass
                 why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
         else:
-            return [Loop(why)], False
-        ways, may_group, unfused = list[Way](), False, too_many
+            return (loop := Loop(why)), loop, False
+        may_group, unfused = False, too_many
         if unfused:
             warn_once(f"changes {call.method}", f"{call.name} is {unfused}")
-        elif options.fuse and options.way in ("fastest", "fused"):
+        elif options.fuse and options.way == "fused":
             try:
-                ways.append(self._fused(loop, expected, inputs))
+                return self._fused(loop, expected, inputs), loop, False
             except Exception as error:
                 self._check_rows(loop)
                 why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
@@ -150,25 +150,21 @@ class Probe:
                     raise ValueError(f"{_OP}: {message}") from error
                 unfused = f"not fused, since {why}"
                 warn_once(f"fuse {call.method}", message)
-        if options.way in ("fastest", "grouped") or (options.way == "fused" and not ways):
+        if options.way != "loop":
             try:
                 grouped = Grouped([steps()], quiet=True)
                 if self._agrees(grouped, loop, expected):
                     piece = min(max(_PIECE * _SAMPLES // grouped.widest, 1 << 10), 1 << 16)
-                    ways.append(Grouped(grouped.records, piece, why=unfused))
-                else:
-                    loop.why = "its forward on the samples of all cells gives other results than the loop over cells"
+                    return Grouped(grouped.records, piece, why=unfused), loop, False
+                loop.why = "its forward on the samples of all cells gives other results than the loop over cells"
             except BackendUnavailable:
                 raise
             except Ungroupable as error:
                 loop.why, may_group = str(error), error.of_batch
             except Exception as error:
                 loop.why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
-        if not ways:
-            self._check_rows(loop)
-        elif loop.again:
-            ways = ways[:1]  # no timing, since some checkpoints refuse torch.autograd.grad
-        return [*ways, loop], may_group and not ways
+        self._check_rows(loop)
+        return loop, loop, may_group
 
     def steps(self) -> list[Step]:
         """Returns the steps of the module; see :class:`Recording`."""

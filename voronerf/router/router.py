@@ -79,9 +79,9 @@ class VoronoiRouter(nn.Module):
     split. The parameters of all copies are stacked, ``[k, ...]``, under the module's own names with the prefix
     ``module.``: an optimiser sees as many tensors as for one module. Buffers are shared by all cells.
 
-    The reference is a loop over the cells, which runs each copy on its samples. A call uses the fastest of the
-    following ways, whose results are compared with the reference once for each kind of call. :meth:`explain` reports
-    the way, the reason and the measured times:
+    The reference is a loop over the cells, which runs each copy on its samples. A call uses the first possible one of
+    the following ways, whose results are compared with the reference once for each kind of call. :meth:`explain`
+    reports the way, and the reason why an earlier one is impossible:
 
     - fused: one operation for the whole network. This needs a field with a method ``program``
       (:func:`voronerf.router.layered_program`), or ``fuse=True``.
@@ -129,10 +129,8 @@ class VoronoiRouter(nn.Module):
             is traced and runs as one operation; if this is impossible, an error names the line. Changed numbers,
             attributes and buffers take effect, except writes by ``buffer.data`` or in inference mode to buffers above 1
             MiB or on a GPU; write these by ``buffer.copy_(...)``.
-        way: "fastest" times the ways on a part of the first batch of each kind of call and each size (within a factor
-            of four). It keeps the fused way unless another one is clearly faster in three measurements, at least a
-            second apart. "fused", "grouped" and "loop" choose a way without timing; if this way is impossible, the next
-            way in this order runs.
+        way: The first way to try: "fused" (which needs ``fuse=True``), "grouped" or "loop". If it is impossible, the
+            next way in this order runs. With few cells, "loop" may be faster than "grouped".
         layout: The shape in which the module gets samples ``[rays, samples, f]``: "rays" for ``[n, 1, f]``, with
             per-ray arguments as ``[n, f]``; "flat" for ``[n, f]``, for modules that squeeze or flatten.
         assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell at random by the
@@ -149,7 +147,7 @@ class VoronoiRouter(nn.Module):
         >>> import torch
         >>> from voronerf import VoronoiRouter
         >>> field = torch.nn.Sequential(torch.nn.Linear(3, 64), torch.nn.ReLU(), torch.nn.Linear(64, 4))
-        >>> router = VoronoiRouter(field, torch.rand(16, 3), coords="first3", fuse=True, way="fused")
+        >>> router = VoronoiRouter(field, torch.rand(16, 3), coords="first3", fuse=True)
         >>> points = torch.rand(1000, 3)
         >>> router(points).shape
         torch.Size([1000, 4])
@@ -176,7 +174,7 @@ class VoronoiRouter(nn.Module):
         methods: Sequence[str] = (),
         share: Sequence[str] = (),
         fuse: bool = False,
-        way: Literal["fastest", "fused", "grouped", "loop"] = "fastest",
+        way: Literal["fused", "grouped", "loop"] = "fused",
         layout: Literal["rays", "flat"] = "rays",
         assignment: Assignment = "nearest",
         temperature: float = 0.05,
@@ -362,7 +360,7 @@ class VoronoiRouter(nn.Module):
         Examples:
             >>> import torch
             >>> from voronerf import VoronoiRouter
-            >>> router = VoronoiRouter(torch.nn.Linear(3, 2), torch.rand(4, 3), coords="first3", way="grouped")
+            >>> router = VoronoiRouter(torch.nn.Linear(3, 2), torch.rand(4, 3), coords="first3")
             >>> optimizer = torch.optim.AdamW(router.parameters())
             >>> router.freeze([0, 1, 2], optimizer=optimizer)
             >>> before = router.module.weight.detach().clone()
@@ -943,7 +941,7 @@ def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> 
         "assignment": (options["assignment"] in ("nearest", "stochastic"), "'nearest' or 'stochastic'"),
         "temperature": (options["temperature"] > 0, "positive"),
         "layout": (options["layout"] in ("rays", "flat"), "'rays' or 'flat'"),
-        "way": (options["way"] in ("fastest", "fused", "grouped", "loop"), "'fastest', 'fused', 'grouped' or 'loop'"),
+        "way": (options["way"] in ("fused", "grouped", "loop"), "'fused', 'grouped' or 'loop'"),
         "backend": (options["backend"] in ("auto", *BACKENDS), f"auto, {', '.join(BACKENDS)}"),
         "coords": (
             coords in (None, "first1", "first2", "first3", "first4") or isinstance(coords, slice) or callable(coords),

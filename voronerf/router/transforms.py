@@ -71,7 +71,7 @@ def unwrapped(tensor: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def aside(call: Call) -> Iterator[Call]:
-    """Yields a copy of a call for a probe or a timing, hidden from transforms and saved-tensor hooks.
+    """Yields a copy of a call for a probe, hidden from transforms and saved-tensor hooks.
 
     ``torch.utils.checkpoint`` counts the tensors that a call saves, and compares the number with the recomputation.
     """

@@ -178,7 +178,6 @@ def make_routers(config: TrainConfig, device: torch.device | str | None = None) 
             assignment=config.assignment,
             temperature=TEMPERATURE,
             backend=config.backend,
-            way="fused",  # results must not depend on timings: a run is resumed bit for bit
             **kind.router_options,
         ).to(config.device if device is None else device)
         for name, network in networks.items()

@@ -167,9 +167,7 @@ class State:
         return native and all(map(self._is_one_program, self.routers.values()))
 
     def _is_one_program(self, router: VoronoiRouter) -> bool:
-        """Returns whether a router always runs as one fused program, rather than in a way chosen by measured times."""
-        if router.fuse and router.way != "fused":  # timings may select another implementation
-            return False
+        """Returns whether a router runs as one fused program."""
         return not isinstance(router.program(*_samples(6 if self.renderer.cones else 3), trace=True), str)
 
     def learning_rate(self) -> float:
