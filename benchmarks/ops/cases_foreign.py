@@ -1,8 +1,8 @@
 """Cases of VoronoiRouter around fields of other codebases (``foreign_fields.py``). n samples, k cells.
 
-A row's main time is that of the router with ``fuse=True``. Its alternatives are the router with ``way="grouped"``, the
-loop over boolean masks with a module per cell, and one module for all samples. Results and gradients are compared with
-the loop over masks. The loop also uses the library's cell lookup.
+The main contender of a row is the router with ``fuse=True``. Its alternatives are the router with ``way="grouped"``,
+the loop over boolean masks with a module per cell, and one module for all samples. Results and gradients are compared
+with the loop over masks. The loop also uses the library's cell lookup.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ class Field:
 
 
 FIELDS = {
-    "nerf-pytorch w64": Field(fields.NeRF, encoded),
-    "nerf-pytorch w256": Field(functools.partial(fields.NeRF, 256), encoded, most=MIDDLE, most_cells=16),
+    "nerf-pytorch w64": Field(fields.nerf, encoded),
+    "nerf-pytorch w256": Field(functools.partial(fields.nerf, 256), encoded, most=MIDDLE, most_cells=16),
     "appearance": Field(fields.AppearanceNeRF, encoded_and_image),
     "nerfacc": Field(fields.VanillaField, with_directions),
     "siren": Field(fields.Siren),

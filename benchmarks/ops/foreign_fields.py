@@ -5,12 +5,18 @@ No field knows of cells. n samples; R components of a plane; T entries of a tabl
 
 from __future__ import annotations
 
+import importlib.util
 import math
-from typing import cast
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
 def frequencies(x: Tensor, octaves: int) -> Tensor:
@@ -19,30 +25,28 @@ def frequencies(x: Tensor, octaves: int) -> Tensor:
     return torch.cat([x, *waves], -1)
 
 
-class NeRF(nn.Module):
-    """The network of nerf-pytorch: eight layers on encoded inputs, a skip connection after the fifth."""
+def example(name: str) -> ModuleType:
+    """Imports the script `name` from `examples/`, which has a stand-in for a codebase."""
+    full = f"examples_{name}"
+    if full not in sys.modules:
+        spec = importlib.util.spec_from_file_location(full, EXAMPLES / f"{name}.py")
+        assert spec is not None and spec.loader is not None
+        sys.modules[full] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[full])
+    return sys.modules[full]
 
-    def __init__(self, width: int = 64, points: int = 63, views: int = 27) -> None:
-        super().__init__()
-        self.points, self.views = points, views
-        self.pts_linears = nn.ModuleList(
-            [nn.Linear(points, width)] + [nn.Linear(width + (points if i == 4 else 0), width) for i in range(7)]
-        )
-        self.views_linears = nn.ModuleList([nn.Linear(views + width, width // 2)])
-        self.feature_linear, self.alpha_linear = nn.Linear(width, width), nn.Linear(width, 1)
-        self.rgb_linear = nn.Linear(width // 2, 3)
 
-    def forward(self, x: Tensor) -> Tensor:
-        points, views = torch.split(x, [self.points, self.views], dim=-1)
-        h = points
-        for i, layer in enumerate(self.pts_linears):
-            h = F.relu(layer(h))
-            if i == 4:
-                h = torch.cat([points, h], -1)
-        alpha, h = self.alpha_linear(h), torch.cat([self.feature_linear(h), views], -1)
-        for layer in self.views_linears:
-            h = F.relu(layer(h))
-        return torch.cat([self.rgb_linear(h), alpha], -1)
+def nerf(width: int = 64) -> nn.Module:
+    """Returns the network of nerf-pytorch: eight layers on encoded inputs, a skip connection after the fifth."""
+    module: nn.Module = example("nerf_pytorch").NeRF(W=width, input_ch=63, input_ch_views=27, use_viewdirs=True)
+    return module
+
+
+def skip_net(points: int = 9, views: int = 6) -> nn.Module:
+    """Returns a small network of nerf-pytorch."""
+    sizes = {"D": 4, "W": 12, "input_ch": points, "input_ch_views": views, "skips": [2]}
+    module: nn.Module = example("nerf_pytorch").NeRF(**sizes, use_viewdirs=True)
+    return module
 
 
 class AppearanceNeRF(nn.Module):
@@ -523,3 +527,70 @@ class Barf(nn.Module):
         for layer in self.layers:
             h = torch.relu(layer(h))
         return cast(Tensor, self.head(h))
+
+
+class LearnedSine(nn.Module):
+    """A small network with sines of scaled layers, a learned frequency and a residual block."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b, self.out = nn.Linear(3, 8), nn.Linear(8, 8), nn.Linear(8, 2, bias=False)
+        self.frequency = nn.Parameter(torch.tensor(3.0))
+        self.scale = nn.Parameter(torch.rand(8) + 0.5)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = torch.sin(self.frequency * self.a(x))
+        h = h + torch.sin(self.b(h)) * self.scale
+        return cast(Tensor, self.out(h))
+
+
+class Heads(nn.Module):
+    """A small field with flags, an optional argument, results of one dimension, and the methods that renderers call."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(3, 8), nn.SiLU(), nn.Linear(8, 5))
+        self.colour = nn.Sequential(nn.Linear(4 + 3, 6, bias=False), nn.ReLU(inplace=True), nn.Linear(6, 3))
+        self.register_buffer("bands", 2.0 ** torch.arange(2))
+
+    def forward(self, x: Tensor, d: Tensor | None = None, density_only: bool = False) -> Any:
+        result = self.density(x)
+        if density_only or d is None:
+            return result["sigma"]
+        return self.color(x, d, result["features"]), result["sigma"]
+
+    def density(self, x: Tensor) -> dict[str, Tensor]:
+        h = self.net(x)
+        return {"sigma": torch.exp(h[..., 0].clamp(max=4)), "features": h[..., 1:]}
+
+    def color(self, x: Tensor, d: Tensor, features: Tensor) -> Tensor:
+        return torch.sigmoid(self.colour(torch.cat([d, features], -1)))
+
+    def query_density(self, x: Tensor) -> Tensor:
+        return self.density(x)["sigma"][..., None]
+
+    def query_opacity(self, x: Tensor, step_size: float = 0.01) -> Tensor:
+        return self.query_density(x) * step_size
+
+    def get_density(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        sigma, features = torch.split(self.net(x), [1, 4], dim=-1)
+        return F.relu(sigma), features
+
+    def sdf(self, x: Tensor) -> Tensor:
+        return cast(Tensor, self.net(x)[:, :1])
+
+    def occupancy(self, x: Tensor) -> Tensor:
+        return torch.sigmoid(-10 * self.sdf(x))
+
+    def features(self, x: Tensor, *, scale: float = 2.0, normalise: bool = True) -> Tensor:
+        h = self.net(x)[..., 1:] * scale
+        return F.normalize(h, dim=-1) if normalise else h
+
+    def alpha(self, x: Tensor, distance: Tensor) -> Tensor:
+        return 1 - torch.exp(-self.query_density(x) * distance)
+
+    def warp(self, x: Tensor, t: Tensor) -> Tensor:
+        return x + t * torch.tanh(self.net(x)[..., :3])
+
+    def both(self, x: Tensor, d: Tensor) -> list[Tensor]:
+        return [self(x, d)[0], self(x, -d)[0]]

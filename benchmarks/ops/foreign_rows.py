@@ -1,11 +1,13 @@
 """Compares a module of other code in VoronoiRouter with a loop over masks of distinct modules.
 
-A new module needs only a :class:`Row`; :func:`compare` and :func:`speed` do the rest. n samples, k cells.
+A new module needs only a :class:`Row`; :func:`compare`, :func:`errors` and :func:`speed` do the rest. n samples, k
+cells.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import fnmatch
 import functools
 import itertools
@@ -13,7 +15,7 @@ import math
 import re
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,13 +23,15 @@ import numpy as np
 import torch
 from harness import Run, Stopwatch, measure
 from torch import Tensor, nn
-from torch.utils._pytree import tree_leaves, tree_map_only
 
 from voronerf import VoronoiRouter
 
+Loss = Callable[[list[Tensor], list[Tensor], list[Tensor]], Tensor]  # of results, inputs and parameters
 N, K, SEED = 300, 4, 1
-SIZES = range(1, 70)
-"""The batch sizes at which values are compared: the number of samples, or of rays."""
+LARGEST = 69
+SIZES = range(1, LARGEST + 1)
+"""The batch sizes at which values are compared: the number of samples, or of rays. Sizes of a module's tensors up to
+``LARGEST`` are compared, too."""
 WAYS: dict[str, dict[str, Any]] = {
     "fused": {"fuse": True},
     "grouped": {"way": "grouped"},
@@ -42,6 +46,37 @@ ROUNDED = 1e-4
 NO_PART = 1e-6
 """A tensor's error is divided by its size (its largest entry or its norm), or by this fraction of the largest tensor's
 size, whichever is larger: a smaller tensor is zero except for rounding."""
+
+
+def mapped(tree: Any, function: Callable[[Tensor], Any]) -> Any:
+    """Applies ``function`` to every tensor in tuples, lists, dicts and dataclasses, and returns the new tree."""
+    if isinstance(tree, Tensor):
+        return function(tree)
+    if isinstance(tree, dict):
+        return {key: mapped(value, function) for key, value in tree.items()}
+    if isinstance(tree, (tuple, list)):
+        parts = [mapped(value, function) for value in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
+    if dataclasses.is_dataclass(tree) and not isinstance(tree, type):
+        names = [each.name for each in dataclasses.fields(tree)]
+        return dataclasses.replace(tree, **{name: mapped(getattr(tree, name), function) for name in names})
+    return tree
+
+
+def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields (path, value) for each leaf of a tree; the path contains the types of the containers."""
+    kind, items = type(tree).__name__, None
+    if isinstance(tree, dict):
+        items = tree.items()
+    elif isinstance(tree, (tuple, list)):
+        items = enumerate(tree)
+    elif dataclasses.is_dataclass(tree) and not isinstance(tree, type):
+        items = [(each.name, getattr(tree, each.name)) for each in dataclasses.fields(tree)]
+    if items is None:
+        yield path, tree
+    else:
+        for key, value in items:
+            yield from leaves(value, f"{path}/{kind}[{key}]")
 
 
 def uniform(lead: tuple[int, ...], *shape: int) -> Tensor:
@@ -78,24 +113,27 @@ class Row:
         lead: The leading shape of the samples, (n,) or (rays, samples).
         options: Further options of the router.
         second: Whether the gradients of an eikonal loss, (|d y / d x| - 1)^2, are compared, too.
+        ways: The ways that tests of every run compare: "fused" with ``fuse=True``; "grouped" or "cell by cell", as the
+            module runs without ``fuse``. Long tests compare the other rows, too.
     """
 
     module: str
     make: Callable[..., nn.Module]
-    inputs: tuple[Any, ...]
+    inputs: tuple[Any, ...] = (3,)
     method: str = "forward"
     keywords: Mapping[str, Any] = field(default_factory=dict)
     coords: Callable[..., Tensor] | None = None
     lead: tuple[int, ...] = (N,)
     options: Mapping[str, Any] = field(default_factory=dict)
     second: bool = False
+    ways: tuple[str, ...] = ()
 
     def arguments(self, dtype: torch.dtype) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """Returns arguments and keyword arguments, whose float tensors require gradients."""
 
         def build(item: Any) -> Any:
             value = uniform(self.lead, item) if type(item) is int else item(self.lead) if callable(item) else item
-            return tree_map_only(Tensor, leaf, value)
+            return mapped(value, leaf)
 
         def leaf(value: Tensor) -> Tensor:
             return value.to(dtype).requires_grad_() if value.is_floating_point() else value
@@ -147,10 +185,10 @@ class Case:
         centres: The centres of the cells, [k, d].
     """
 
-    def __init__(self, row: Row, imported: tuple[Any, ...], dtype: torch.dtype = torch.float32) -> None:
+    def __init__(self, row: Row, imported: tuple[Any, ...] = (), dtype: torch.dtype = torch.float32) -> None:
         self.row, self.modules = row, row.modules(dtype, imported)
         self.args, self.kwargs = row.arguments(dtype)
-        self.tensors = [value for value in tree_leaves((self.args, self.kwargs)) if isinstance(value, Tensor)]
+        self.tensors = [value for _, value in leaves((self.args, self.kwargs)) if isinstance(value, Tensor)]
         self.coords: Any = row.coords or f"first{min(3, self.tensors[0].shape[-1])}"
         positions = row.coords(*self.args, **self.kwargs) if row.coords else self.tensors[0][..., :3]
         self.positions = positions.detach().flatten(0, len(row.lead) - 1)
@@ -166,31 +204,32 @@ class Case:
         options = {"coords": self.coords, "methods": methods, **options, **self.row.options}
         return VoronoiRouter.from_modules(self.modules, self.centres, **options)
 
-    def routed(self, router: VoronoiRouter, first: int | None = None) -> list[Tensor]:
-        """Returns a router's results for the first samples or rays; None for all."""
-        method = getattr(router, self.row.method)
+    def routed(self, router: nn.Module, first: int | None = None) -> dict[str, Any]:
+        """Returns the results of a router or a module, by path, for the first samples or rays; None for all."""
+        method = router if self.row.method == "forward" else getattr(router, self.row.method)
         if first is None:
-            return _tensors(method(*self.args, **self.kwargs))
+            return _results(method(*self.args, **self.kwargs))
 
         def short(value: Tensor) -> Tensor:
             part = value.detach()[:first] if value.shape[:1] == self.row.lead[:1] else value.detach()
             return part.requires_grad_(value.requires_grad and torch.is_grad_enabled())
 
-        args, kwargs = tree_map_only(Tensor, short, (self.args, self.kwargs))
-        return _tensors(method(*args, **kwargs))
+        args, kwargs = mapped((self.args, self.kwargs), short)
+        return _results(method(*args, **kwargs))
 
-    def loop(self) -> list[Tensor]:
-        """Returns the results of the loop over masks."""
+    def loop(self) -> dict[str, Any]:
+        """Returns the results of the loop over masks, by path."""
         return _loop(self.row, self.modules, self.cells(), self.args, self.kwargs)
 
     @property
-    def per_ray(self) -> list[int]:
-        """The numbers of the arguments with one row for each ray; shapes are ambiguous for as many rays as samples."""
-        lead, tensors = self.row.lead, [(i, arg) for i, arg in enumerate(self.args) if isinstance(arg, Tensor)]
-        return [i for i, arg in tensors if arg.shape[:1] == lead[:1] and arg.shape[: len(lead)] != lead]
+    def per_ray(self) -> list[int | str]:
+        """The arguments with one row for each ray; shapes are ambiguous for as many rays as samples."""
+        lead, named = self.row.lead, [*enumerate(self.args), *self.kwargs.items()]
+        tensors = [(name, value) for name, value in named if isinstance(value, Tensor)]
+        return [name for name, value in tensors if value.shape[:1] == lead[:1] and value.shape[: len(lead)] != lead]
 
     @functools.cached_property
-    def looped(self) -> list[Tensor]:
+    def looped(self) -> dict[str, Any]:
         """The results of the loop over masks, with gradients."""
         return self.loop()
 
@@ -217,13 +256,9 @@ def compare(row: Row, *imported: Any) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row already reports an unfused module
         try:
-            way, errors = _compared(case)
+            found |= errors(case, WAYS["fused"], imported)
         except Exception as error:
             found["how"] = f"refused: {_reason(error)}"
-        else:
-            if not max(errors.values()) <= ROUNDED and (exact := _in_double(_compared, case, imported)):
-                errors |= {f"{name}_float64": error for name, error in exact[1].items()}
-            found |= {**way, **errors}
         try:
             _ = case.looped
         except Exception:  # the module mixes samples, and masks fail, too
@@ -279,32 +314,46 @@ def _sizes(case: Case, options: Mapping[str, Any]) -> tuple[str, list[int], dict
     wrong: set[int] = set()
     raised: dict[int, str] = {}
     options = {"per_ray": case.per_ray or None, **options}
-    looped = [(value.detach(), float(value.abs().max()) or 1.0) for value in case.looped]
+    looped = [(value.detach(), float(value.abs().max()) or 1.0) for value in _tensors(case.looped)]
     tensors = [*case.modules[0].parameters(), *case.modules[0].buffers()]
-    first = {size for tensor in tensors for size in tensor.shape if size in SIZES}
+    first = {size for tensor in tensors for size in tensor.shape if 0 < size <= LARGEST}
+    sizes = sorted({*SIZES, *first})
     with torch.set_grad_enabled(case.differentiates):
         try:
             router = case.router(**options)
         except Exception as error:
             return f"refused: {_reason(error)}", [], {}
-        for size, called in [*((size, router) for size in SIZES), *((size, None) for size in sorted(first))]:
+        for size, called in [*((size, router) for size in sizes), *((size, None) for size in sorted(first))]:
             try:
-                routed = case.routed(called or case.router(**options), size)
+                routed = _tensors(case.routed(called or case.router(**options), size))
             except Exception as error:
                 raised.setdefault(size, _reason(error))
                 continue
             pairs = [(a.detach(), b[:size], largest) for a, (b, largest) in zip(routed, looped, strict=True)]
             if not all(a.shape == b.shape and float((a - b).abs().max()) <= ROUNDED * s for a, b, s in pairs):
                 wrong.add(size)
-        how = _way(router, case.row.method)["how"] if len(raised) < len(SIZES) else "refused"
+        how = _way(router, case.row.method)["how"] if len(raised) < len(sizes) else "refused"
     return how, sorted(wrong), dict(sorted(raised.items()))
 
 
-def _compared(case: Case) -> tuple[dict[str, Any], dict[str, float]]:
-    row, modules, router = case.row, case.modules, case.router(**WAYS["fused"])
+def errors(case: Case, options: Mapping[str, Any], imported: tuple[Any, ...] = (), **losses: Loss) -> dict[str, Any]:
+    """Returns how a case runs with these options, and its largest errors; in float64, too, if those are large.
+
+    ``losses`` are further losses whose gradients are compared.
+    """
+    way, found = _compared(case, options, losses)
+    if not max(found.values()) <= ROUNDED and (exact := _in_double(_compared, case, imported, options, losses)):
+        found |= {f"{name}_float64": error for name, error in exact[1].items()}
+    return {**way, **found}
+
+
+def _compared(
+    case: Case, options: Mapping[str, Any], losses: Mapping[str, Loss]
+) -> tuple[dict[str, Any], dict[str, float]]:
+    row, modules, router = case.row, case.modules, case.router(**options)
     for _ in range(2):  # the second call may be cached
-        routed = case.routed(router)
-    looped = case.looped
+        routed = _tensors(case.routed(router))
+    looped = _tensors(case.looped)
     if [value.shape for value in routed] != [value.shape for value in looped]:
         raise ValueError(f"shapes {[list(v.shape) for v in routed]} instead of {[list(v.shape) for v in looped]}")
 
@@ -313,15 +362,16 @@ def _compared(case: Case) -> tuple[dict[str, Any], dict[str, float]]:
     stacked = [dict(router.module.named_parameters())[name] for name in names]
     tables = [dict(module.named_parameters()) for module in modules]
     single = [[table[name] for table in tables[: 1 if name in shared else K]] for name in names]
-    losses = {"gradient_error": _weighted, **({"second_derivative_error": _eikonal} if row.second else {})}
-    errors = {"value_error": _error(routed, looped, lambda x: x.abs().max())}
+    losses = {"gradient_error": _weighted, **({"second_derivative_error": _eikonal} if row.second else {}), **losses}
+    found = {"value_error": _error(routed, looped, lambda x: x.abs().max())}
     for name, loss in losses.items():
-        got = _gradients(loss(routed, inputs), [*stacked, *inputs])
-        right = iter(_gradients(loss(looped, inputs), [*[p for cells in single for p in cells], *inputs]))
+        got = _gradients(loss(routed, inputs, stacked), [*stacked, *inputs])
+        separate = [p for cells in single for p in cells]
+        right = iter(_gradients(loss(looped, inputs, separate), [*separate, *inputs]))
         parts = [[next(right) for _ in cells] for cells in single]
         expected = [torch.stack(part) if len(part) > 1 else part[0] for part in parts]
-        errors[name] = _error(got, [*expected, *right], torch.linalg.vector_norm)
-    return _way(router, row.method), errors
+        found[name] = _error(got, [*expected, *right], torch.linalg.vector_norm)
+    return _way(router, row.method), found
 
 
 def speed(row: Row, *imported: Any) -> dict[str, dict[str, float]]:
@@ -335,15 +385,15 @@ def speed(row: Row, *imported: Any) -> dict[str, dict[str, float]]:
 
 
 def _speed(case: Case) -> dict[str, float]:
-    case.args, case.kwargs = tree_map_only(Tensor, Tensor.detach, (case.args, case.kwargs))
+    case.args, case.kwargs = mapped((case.args, case.kwargs), Tensor.detach)
 
-    def step(forward: Callable[[], list[Tensor]], *modules: nn.Module) -> Run:
+    def step(forward: Callable[[], dict[str, Any]], *modules: nn.Module) -> Run:
         parameters = [parameter for module in modules for parameter in module.parameters()]
 
         def run(_: int) -> None:
             for parameter in parameters:
                 parameter.grad = None
-            losses = [value.square().mean() for value in forward() if value.requires_grad]
+            losses = [value.square().mean() for value in _tensors(forward()) if value.requires_grad]
             torch.stack(losses).sum().backward()
 
         for _ in range(3):  # the first calls make a plan and a cached call
@@ -363,35 +413,50 @@ def _speed(case: Case) -> dict[str, float]:
     return {"masks_ms": round(masks, 3), **{name: round(masks / t.median_ms, 2) for name, t in timings.items()}}
 
 
-def _loop(row: Row, modules: list[nn.Module], cells: Tensor, args: Any, kwargs: Any) -> list[Tensor]:
-    """Runs the loop over masks: each module on the samples of its cell."""
+def _loop(row: Row, modules: list[nn.Module], cells: Tensor, args: Any, kwargs: Any) -> dict[str, Any]:
+    """Runs the loop over masks: each module on the samples of its cell; returns the results by path."""
     order, parts = [], []
     for cell, module in enumerate(modules):
         rows = (cells == cell).nonzero()[:, 0]
         if len(rows):
-            part = tree_map_only(Tensor, lambda value, rows=rows: row.part(value, rows), (args, kwargs))
+            part = mapped((args, kwargs), lambda value, rows=rows: row.part(value, rows))
             order.append(rows)
-            parts.append(_tensors(getattr(module, row.method)(*part[0], **part[1])))
+            parts.append(_results(getattr(module, row.method)(*part[0], **part[1])))
     back, d = torch.cat(order).argsort(), len(row.lead)
-    return [torch.cat(part)[back].reshape(*row.lead, *part[0].shape[d:]) for part in zip(*parts, strict=True)]
+    tensors = {key: [part[key] for part in parts] for key, value in parts[0].items() if isinstance(value, Tensor)}
+    joined = {key: torch.cat(pieces)[back].reshape(*row.lead, *pieces[0].shape[d:]) for key, pieces in tensors.items()}
+    return parts[0] | joined
 
 
-def _tensors(results: Any) -> list[Tensor]:
-    """Returns the tensors of results; complex tensors as pairs of numbers."""
-    tensors = [value for value in tree_leaves(results) if isinstance(value, Tensor)]
-    return [torch.view_as_real(value) if value.is_complex() else value for value in tensors]
+def _results(results: Any) -> dict[str, Any]:
+    """Returns the leaves of results by path; complex tensors as pairs of numbers."""
+    return {
+        path: torch.view_as_real(value) if isinstance(value, Tensor) and value.is_complex() else value
+        for path, value in leaves(results)
+    }
 
 
-def _weighted(results: list[Tensor], _: list[Tensor]) -> Tensor:
+def _tensors(results: dict[str, Any]) -> list[Tensor]:
+    return [value for value in results.values() if isinstance(value, Tensor)]
+
+
+def _weighted(results: list[Tensor], *_: list[Tensor]) -> Tensor:
     """Returns a loss in which each number of the results has a different weight."""
     torch.manual_seed(SEED)
     terms = [(value * torch.randn(value.shape).to(value)).sum() for value in results]
     return torch.stack([term for term in terms if term.requires_grad]).sum()
 
 
-def _eikonal(results: list[Tensor], inputs: list[Tensor]) -> Tensor:
+def _eikonal(results: list[Tensor], inputs: list[Tensor], _: list[Tensor]) -> Tensor:
     (slope,) = torch.autograd.grad(results[0][..., 0].sum(), inputs[:1], create_graph=True)
     return (slope.norm(dim=-1) - 1).square().mean()
+
+
+def curved(results: list[Tensor], inputs: list[Tensor], parameters: list[Tensor], by_parameters: bool = True) -> Tensor:
+    """Returns the sum of the squares of the gradients of the weighted results."""
+    options: dict[str, Any] = {"create_graph": True, "allow_unused": True, "materialize_grads": True}
+    slopes = torch.autograd.grad(_weighted(results), [*inputs, *parameters * by_parameters], **options)
+    return torch.stack([slope.square().sum() for slope in slopes]).sum()
 
 
 def _gradients(loss: Tensor, of: list[Tensor]) -> list[Tensor]:

@@ -533,14 +533,6 @@ FAULTS = (
         "tests/nerf/test_optimizer.py",
     ),
     _python(
-        "Samples of frozen cells are grouped within a transform",
-        "router/dispatch.py",
-        "with outside():  # a torch",
-        "with torch.no_grad():  # a torch",
-        "tests/router/test_router_transforms.py",
-        "tests/router/test_router_freeze.py",
-    ),
-    _python(
         "What few samples have shown is not looked at again with more of them",
         "router/plan.py",
         "return not self.skip and (not self.small or n < FEWEST)",

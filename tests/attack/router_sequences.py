@@ -27,8 +27,9 @@ from torch.utils.checkpoint import checkpoint
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
 from voronerf.router import dispatch
 
-sys.path.append(str(Path(__file__).parents[1] / "router"))
-from router_fields import Heads, Sine, SkipNet, tensors
+sys.path += [str(Path(__file__).parents[1] / "router"), str(Path(__file__).parents[2] / "benchmarks")]
+from ops.foreign_fields import Heads, LearnedSine, skip_net
+from router_loop import tensors
 
 WAYS = ("fused", "grouped", "loop")
 #: The numbers of samples in a call, to choose from.
@@ -193,8 +194,8 @@ def weights_of_functions() -> nn.Module:
 
 KINDS = {
     "layers": Kind(layers, share="0.*"),
-    "skips": Kind(SkipNet, (15,)),
-    "sines": Kind(Sine, share="frequency"),
+    "skips": Kind(skip_net, (15,)),
+    "sines": Kind(LearnedSine, share="frequency"),
     "heads": Kind(Heads, (3, 3), methods=("density",)),
     "density": Kind(Heads),
     "changing": Kind(Changing),

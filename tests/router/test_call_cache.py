@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 import torch
-from router_fields import Heads, Sine, masked_loop, perturb, tensors
+from ops.foreign_fields import Heads, LearnedSine
+from router_loop import masked_loop, perturb, tensors
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
@@ -98,7 +99,7 @@ KINDS: dict[str, tuple[Callable[[], VoronoiRouter], Call]] = {
     "by name": (lambda: routed(Named()), lambda r: r(rows(40), d=rows(40, seed=1))),
     "flags": (lambda: routed(Heads()), lambda r: r(rows(40), rows(40, seed=1), density_only=True)),
     "one dimension": (lambda: routed(Heads()), lambda r: r(rows(40), None)),
-    "a number all cells share": (lambda: routed(Sine(), share=["frequency"]), lambda r: r(rows(40))),
+    "a number all cells share": (lambda: routed(LearnedSine(), share=["frequency"]), lambda r: r(rows(40))),
     "weights of functions": (
         lambda: routed(nn.utils.parametrizations.weight_norm(nn.Linear(3, 4))),
         lambda r: r(rows(40)),

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from convention_listed import RAYS, uniform
-from router_fields import Heads
+from ops.foreign_fields import Heads
+from router_loop import uniform
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiRouter
@@ -79,7 +79,7 @@ def test_modules_that_mix_samples_are_refused(number: int, centres: Tensor) -> N
     step, parts = [*MIXING, *ALONG_RAYS][number]
     module = Mixes(step, **{name: make() for name, make in parts.items()})
     with pytest.raises((ValueError, TypeError), match=r"(?s)VoronoiRouter.*sample"):
-        VoronoiRouter(module, centres, coords="first3")(uniform((40,) if number < len(MIXING) else RAYS))
+        VoronoiRouter(module, centres, coords="first3")(uniform((40,) if number < len(MIXING) else (9, 7)))
 
 
 class Field(nn.Module):

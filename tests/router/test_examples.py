@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from convention_harness import EXAMPLES
+from ops.foreign_fields import EXAMPLES
 
 ELSEWHERE = ("nerf_pytorch_style", "poisson", "train")  # these scripts have tests of their own
 SCRIPTS = sorted(path for path in EXAMPLES.glob("*.py") if path.stem not in ELSEWHERE)

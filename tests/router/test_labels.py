@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 import torch
-from router_fields import Heads, Sine, masked_loop, perturb, tensors
+from ops.foreign_fields import Heads, LearnedSine
+from router_loop import masked_loop, perturb, tensors
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
@@ -47,7 +48,7 @@ def gradients(results: list[Tensor], wanted: list[Tensor]) -> list[Tensor]:
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
 def test_every_way_equals_the_loop_with_gradients(way: str, dtype: torch.dtype, generator: torch.Generator) -> None:
-    router = routed(Sine(), way)
+    router = routed(LearnedSine(), way)
     for n in (40, 23, 1):  # a first call, a call with a cached program, a single sample
         x, cells = torch.rand(n, 3, generator=generator, requires_grad=True), drawn(generator, n, dtype=dtype)
         expected, modules = masked_loop(router, cells, [x])
@@ -64,7 +65,7 @@ def test_every_way_equals_the_loop_with_gradients(way: str, dtype: torch.dtype, 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_labels_have_the_leading_shape_of_samples(way: str, generator: torch.Generator) -> None:
-    router, x, cells = routed(Sine(), way), torch.rand(8, 6, 3, generator=generator), drawn(generator, 8, 6)
+    router, x, cells = routed(LearnedSine(), way), torch.rand(8, 6, 3, generator=generator), drawn(generator, 8, 6)
     flat = router(x.flatten(0, 1), cells=cells.flatten())
     torch.testing.assert_close(router(x, cells=cells), flat.reshape(8, 6, 2))
     members = torch.arange(K).expand(8, K)  # an ensemble: every network gets each row
@@ -98,7 +99,7 @@ def test_fields_methods_autocast_and_double_precision(fuse: bool, generator: tor
     torch.testing.assert_close([colour, sigma], masked_loop(heads, cells, [x, d])[0])
     torch.testing.assert_close(heads.density(x, cells=cells)["sigma"], sigma)
     torch.testing.assert_close(heads.density(x, cells=0 * cells)["sigma"], heads.cell(0).density(x)["sigma"])
-    router = routed(Sine(), "fused" if fuse else "grouped")
+    router = routed(LearnedSine(), "fused" if fuse else "grouped")
     with torch.autocast("cpu", torch.bfloat16):
         half = router(x, cells=cells)
     assert half.dtype == torch.bfloat16
@@ -109,7 +110,7 @@ def test_fields_methods_autocast_and_double_precision(fuse: bool, generator: tor
 
 def test_a_diagram_gives_way_to_labels(generator: torch.Generator) -> None:
     for way in WAYS:
-        router = routed(Sine(), way, torch.rand(K, 3, generator=generator), coords="first3")
+        router = routed(LearnedSine(), way, torch.rand(K, 3, generator=generator), coords="first3")
         x, cells = torch.rand(30, 3, generator=generator), drawn(generator, 30)
         torch.testing.assert_close(router(x, cells=cells), masked_loop(router, cells, [x])[0][0])
         torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
@@ -183,7 +184,7 @@ def test_a_vector_for_each_label(way: str, generator: torch.Generator) -> None:
 
 @pytest.mark.parametrize("way", WAYS)
 def test_frozen_networks_learn_nothing(way: str, generator: torch.Generator) -> None:
-    router, x, cells = routed(Sine(), way), torch.rand(40, 3, generator=generator), drawn(generator, 40)
+    router, x, cells = routed(LearnedSine(), way), torch.rand(40, 3, generator=generator), drawn(generator, 40)
     before, values = gradients([router(x, cells=cells)], list(router.parameters())), router(x, cells=cells)
     router.freeze([1, 2])
     torch.testing.assert_close(router(x, cells=cells), values)
@@ -194,7 +195,7 @@ def test_frozen_networks_learn_nothing(way: str, generator: torch.Generator) -> 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_labels_are_checked(way: str) -> None:
-    router, x = routed(Sine(), way), torch.rand(20, 3)
+    router, x = routed(LearnedSine(), way), torch.rand(20, 3)
     router(x, cells=torch.zeros(20, dtype=torch.int64))
     few, rule = torch.zeros(20, dtype=torch.int64), "cells must have the leading shape of the samples, such as [n]"
     for cells, kind, message in (
@@ -250,10 +251,10 @@ def test_what_needs_centres_is_refused() -> None:
 
 
 def test_states_parts_copies_and_new_labels(tmp_path: Path, generator: torch.Generator) -> None:
-    router, x, cells = routed(Sine()), torch.rand(30, 3, generator=generator), drawn(generator, 30)
+    router, x, cells = routed(LearnedSine()), torch.rand(30, 3, generator=generator), drawn(generator, 30)
     values = router(x, cells=cells)
     torch.save(router.state_dict(), tmp_path / "state.pt")
-    other = VoronoiRouter(Sine(), 2, fuse=True)
+    other = VoronoiRouter(LearnedSine(), 2, fuse=True)
     other.load_state_dict(torch.load(tmp_path / "state.pt"))
     for same in (other, copy.deepcopy(router), pickle.loads(pickle.dumps(router))):
         assert same.num_cells == K and torch.equal(same(x, cells=cells), values)
@@ -272,7 +273,7 @@ def test_states_parts_copies_and_new_labels(tmp_path: Path, generator: torch.Gen
 
 @pytest.mark.parametrize("whole", [False, True])
 def test_graphs_of_the_compiler(whole: bool, generator: torch.Generator) -> None:
-    router, x, cells = routed(Sine(), "fused" if whole else "grouped"), torch.rand(40, 3), drawn(generator, 40)
+    router, x, cells = routed(LearnedSine(), "fused" if whole else "grouped"), torch.rand(40, 3), drawn(generator, 40)
     expected = router(x, cells=cells)
     torch._dynamo.reset()  # forget the graphs of the other case
 
@@ -288,7 +289,7 @@ def test_graphs_of_the_compiler(whole: bool, generator: torch.Generator) -> None
 
 
 def test_gradients_by_torch_func(generator: torch.Generator) -> None:
-    router, x, cells = routed(Sine()), torch.rand(30, 3, generator=generator), drawn(generator, 30)
+    router, x, cells = routed(LearnedSine()), torch.rand(30, 3, generator=generator), drawn(generator, 30)
     parameters = dict(router.named_parameters())
 
     def loss(parameters: dict[str, Tensor], cells: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from convention_listed import uniform
+from router_loop import uniform
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter

@@ -8,7 +8,7 @@ import pickle
 import pytest
 import torch
 import torch.nn.functional as F
-from router_fields import masked_loop, perturb
+from router_loop import masked_loop, perturb
 from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 import torch.utils.checkpoint
-from convention_calls import Truncated
+from ops.foreign_kinds import TRUNCATED
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiRouter
@@ -187,9 +187,10 @@ def test_state_that_is_loaded_in_inference_mode() -> None:
 
 
 def test_networks_traced_in_two_threads_leave_custom_functions_as_they_were() -> None:
-    before, routers = torch.autograd.Function.apply, [VoronoiRouter(Truncated(), centres(), coords="first3", fuse=True)]
+    before = torch.autograd.Function.apply
+    routers = [VoronoiRouter(TRUNCATED.make(), centres(), coords="first3", fuse=True)]
     routers.append(copy.deepcopy(routers[0]))
-    x, results = torch.rand(60, 7), {}
+    x, results = torch.rand(60, 3), {}
     start = threading.Barrier(2)
 
     def call(i: int) -> None:

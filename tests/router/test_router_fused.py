@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from convention_harness import randomised
-from convention_listed import uniform
-from router_fields import masked_loop, perturb, tensors
+from router_loop import masked_loop, perturb, randomised, tensors, uniform
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from router_fields import Heads, masked_loop, tensors
+from ops.foreign_fields import Heads
+from router_loop import masked_loop, tensors
 from torch import Tensor
 
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter

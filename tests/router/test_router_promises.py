@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from convention_harness import randomised
-from convention_listed import LISTED, ngp, uniform
-from convention_rules import Encoded, Scales, seen
-from router_fields import SkipNet, masked_loop, perturb, tensors
+from ops.foreign_fields import skip_net
+from ops.foreign_kinds import ENCODED, PYTORCH, Scales, ngp, seen
+from ops.foreign_rows import Case, Row
+from router_loop import masked_loop, perturb, tensors, uniform
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
@@ -97,7 +97,7 @@ def test_what_does_not_fuse_is_refused_with_its_line(step: Any, says: str) -> No
 
 def test_fused_networks_follow_parameters(generator: torch.Generator) -> None:
     x = torch.rand(60, 15, generator=generator) * 2 - 1
-    router = perturb(VoronoiRouter(SkipNet(), centres(), coords="first3", fuse=True), generator)
+    router = perturb(VoronoiRouter(skip_net(), centres(), coords="first3", fuse=True), generator)
     before = router(x)
     perturb(router, generator)
     assert not torch.allclose(router(x), before)
@@ -126,10 +126,10 @@ def test_a_module_that_writes_into_its_argument_leaves_that_of_the_call_alone() 
 
 
 def test_shared_parameters_are_one_copy() -> None:
-    router = VoronoiRouter(Encoded(), centres(), coords="first3", share=["encoder.*", "table.weight"])
+    router = VoronoiRouter(ENCODED.make(), centres(), coords="first3", **ENCODED.options)
     first, cell = "encoder.0.weight", router.cell(1)
     assert router.module.get_parameter("head.bias").shape == (6, 2)
-    assert router.module.get_parameter(first).shape == cell.get_parameter(first).shape == (6, 3)
+    assert router.module.get_parameter(first).shape == cell.get_parameter(first).shape == (24, 3)
     assert cell.get_parameter(first) is not router.module.get_parameter(first)
     with torch.no_grad():
         cell.get_parameter(first).add_(1)
@@ -249,19 +249,19 @@ def test_a_rule_of_ones_own_may_be_wrong(generator: torch.Generator) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:VoronoiRouter")
-@pytest.mark.parametrize("case", LISTED[:2], ids=str)
-def test_resuming_after_a_split_in_the_order_of_nerf_pytorch(case: Any) -> None:
+@pytest.mark.parametrize("row", PYTORCH, ids=lambda row: row.module)
+def test_resuming_after_a_split_in_the_order_of_nerf_pytorch(row: Row) -> None:
     """A resumed run loads the optimiser's state and then the network's; here the saved run was split into 4 cells."""
-    module, (args, kwargs) = randomised(case.make()), case.arguments(case.lead)
-    points = case.positions(*args, **kwargs).reshape(-1, 3)
+    case = Case(row)
+    points, module = case.positions, case.modules[0]
 
     def made() -> tuple[VoronoiRouter, torch.optim.Optimizer]:
-        router = VoronoiRouter(module, torch.zeros(1, 3), **case.options)
+        router = VoronoiRouter(module, torch.zeros(1, 3), **{"coords": "first3", **row.options})
         return router, torch.optim.Adam(router.parameters(), lr=1e-2)
 
     def step(router: VoronoiRouter, optimizer: torch.optim.Optimizer) -> None:
         optimizer.zero_grad()
-        sum(t.square().mean() for t in tensors(case.call(router, args, kwargs))).backward()
+        sum(t.square().mean() for t in tensors(case.routed(router))).backward()
         optimizer.step()
 
     router, optimizer = made()

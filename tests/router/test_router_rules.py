@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from convention_harness import uniform
-from router_fields import masked_loop, perturb
+from router_loop import masked_loop, perturb, uniform
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter

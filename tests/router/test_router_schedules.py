@@ -9,9 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from convention_harness import randomised
-from convention_listed import uniform
-from router_fields import masked_loop, perturb
+from router_loop import masked_loop, perturb, randomised, uniform
 from torch import Tensor, nn
 from torch.nn.utils import parametrizations, parametrize, prune
 

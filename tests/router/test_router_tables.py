@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from convention_rules import Corners
-from router_fields import masked_loop, perturb
+from ops.foreign_kinds import CORNERS
+from router_loop import masked_loop, perturb
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
@@ -30,7 +30,7 @@ def _gradients(out: Tensor, parameters: list[Tensor], k: int, weights: Tensor) -
 
 
 def test_indices_outside_of_a_table_are_refused() -> None:
-    router = _router(Corners(), 3)
+    router = _router(CORNERS.make(), 3)
     x = torch.rand(40, 3)
     router(x)
     x[7, 0] = 2.4

@@ -19,8 +19,7 @@ from typing import Any
 
 import pytest
 import torch
-from convention_harness import uniform
-from router_fields import masked_loop
+from router_loop import masked_loop, uniform
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiRouter

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from router_fields import Heads, perturb
+from ops.foreign_fields import Heads
+from router_loop import perturb
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, vjp, vmap

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from router_fields import masked_loop
+from router_loop import masked_loop
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiDiagram

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 import torch
 import torch.distributed
-from convention_arguments import CodePerRay
-from router_fields import Heads, Sine, SkipNet, masked_loop, perturb
+from ops.foreign_fields import Heads, LearnedSine, skip_net
+from ops.foreign_kinds import CodePerRay
+from router_loop import masked_loop, perturb
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
@@ -38,9 +39,9 @@ def router_of(module: nn.Module, generator: torch.Generator, k: int = 5, **optio
 
 def test_where_positions_are(generator: torch.Generator) -> None:
     x = uniform(generator, 30, 15)
-    first = router_of(SkipNet(), generator)
+    first = router_of(skip_net(), generator)
     for coords, shift in (("first3", 0), (slice(3, 6), 3), (lambda x: x[:, 6:9], 6)):
-        router = VoronoiRouter(SkipNet(), first.diagram, coords=coords)
+        router = VoronoiRouter(skip_net(), first.diagram, coords=coords)
         router.load_state_dict(first.state_dict())
         cells = router.diagram.locate(x[:, shift : shift + 3])
         torch.testing.assert_close(router(x), masked_loop(router, cells, [x])[0][0])
@@ -96,7 +97,7 @@ OPTIMIZERS: dict[str, Callable[[Any], torch.optim.Optimizer]] = {
 def test_children_step_as_their_parent_would(generator: torch.Generator, name: str) -> None:
     """After a split that moves no sample to another cell, optimiser steps are the same as without the split."""
     x = uniform(generator, 200, 3)
-    router = router_of(Sine(), generator, k=2)
+    router = router_of(LearnedSine(), generator, k=2)
     router.module.b.requires_grad_(False)
     frozen = router.module.b.weight.detach().clone()
     trained = [p for p in router.parameters() if p.requires_grad]
@@ -131,7 +132,7 @@ def test_children_step_as_their_parent_would(generator: torch.Generator, name: s
 
 def test_other_optimisers_begin_anew_and_say_so(generator: torch.Generator) -> None:
     x = uniform(generator, 60, 3)
-    router = router_of(Sine(), generator, k=1)
+    router = router_of(LearnedSine(), generator, k=1)
     optimizer = torch.optim.LBFGS(router.parameters(), max_iter=2)
 
     def closure() -> Tensor:
@@ -149,7 +150,7 @@ def test_other_optimisers_begin_anew_and_say_so(generator: torch.Generator) -> N
 
 
 def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
-    router = router_of(Sine(), generator, k=1)
+    router = router_of(LearnedSine(), generator, k=1)
     x = uniform(generator, 90, 3)
     before = router(x)
     parents = router.subdivide(4, points=x, weights=torch.rand(90, generator=generator))
@@ -159,7 +160,7 @@ def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
     torch.testing.assert_close(router(x), before)
     with pytest.raises(ValueError, match="a number of children needs points, and no parents"):
         router.subdivide(4)
-    other = router_of(Sine(), generator, k=1)
+    other = router_of(LearnedSine(), generator, k=1)
     other.subdivide(4, points=x)  # all points have equal weight
     assert other.num_cells == 4
     with pytest.raises(TypeError, match="must be a VoronoiDiagram or a number of children, got float"):
@@ -175,10 +176,10 @@ def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("make", [SkipNet, Sine])
+@pytest.mark.parametrize("make", [skip_net, LearnedSine])
 def test_half_precision(generator: torch.Generator, dtype: torch.dtype, make: type[nn.Module]) -> None:
     router = router_of(make(), generator)
-    x = uniform(generator, 64, 15 if make is SkipNet else 3).to(dtype)
+    x = uniform(generator, 64, 15 if make is skip_net else 3).to(dtype)
     exact = router(x.float())
     router = router.to(dtype)
     assert router.diagram.centres.dtype == torch.float32
@@ -188,10 +189,10 @@ def test_half_precision(generator: torch.Generator, dtype: torch.dtype, make: ty
         torch.testing.assert_close(actual.float(), exact, rtol=0.1, atol=0.05)
 
 
-@pytest.mark.parametrize("make", [SkipNet, Sine])
+@pytest.mark.parametrize("make", [skip_net, LearnedSine])
 def test_autocast(generator: torch.Generator, make: type[nn.Module]) -> None:
     router = router_of(make(), generator)
-    x = uniform(generator, 64, 15 if make is SkipNet else 3)
+    x = uniform(generator, 64, 15 if make is skip_net else 3)
     exact = router(x)
     for _ in range(3):
         with torch.autocast("cpu", torch.bfloat16):
@@ -218,12 +219,12 @@ class Fast(nn.Module):
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("make", [SkipNet, Sine, Fast, Heads])
+@pytest.mark.parametrize("make", [skip_net, LearnedSine, Fast, Heads])
 def test_fused_under_autocast_is_as_near_to_float64_as_the_loop(make: type[nn.Module], dtype: torch.dtype) -> None:
     generator = torch.Generator().manual_seed(5)
     router = VoronoiRouter(make(), uniform(generator, 5, 3), coords="first3", fuse=True)
     perturb(router, generator, 0.01 if make is Fast else 0.2)
-    x = uniform(generator, 120, 15 if make is SkipNet else 3)
+    x = uniform(generator, 120, 15 if make is skip_net else 3)
     router(x)  # the first call runs without autocast
     cells = router.diagram.locate(x[:, :3])
     exact_router = copy.deepcopy(router).double()
@@ -300,7 +301,7 @@ WAYS: list[dict[str, Any]] = [{"fuse": True}, {"way": "grouped"}, {"way": "loop"
 
 @pytest.mark.parametrize("options", WAYS)
 def test_tensors_of_subclasses_are_taken_as_plain(generator: torch.Generator, options: dict[str, Any]) -> None:
-    router, x = router_of(SkipNet(), generator, **options), uniform(generator, 60, 15)
+    router, x = router_of(skip_net(), generator, **options), uniform(generator, 60, 15)
     leaf = x.clone().requires_grad_()
     expected = router(leaf)
     (slope,) = torch.autograd.grad(expected.sum(), leaf)
@@ -312,7 +313,7 @@ def test_tensors_of_subclasses_are_taken_as_plain(generator: torch.Generator, op
         torch.testing.assert_close(torch.autograd.grad(actual.sum(), labelled)[0].as_subclass(Tensor), slope)
     torch.testing.assert_close(router(x, coords=Labelled.of(x[:, :3], list("xyz"))), expected)
     torch.testing.assert_close(router(labelled.reshape(6, 10, 15)), expected.reshape(6, 10, 4))
-    assert router.explain().split(":")[1].split()[0] == options["way"].replace("loop", "cell")
+    assert router.explain().split(":")[1].split()[0] == options.get("way", "fused").replace("loop", "cell")
 
 
 def test_a_layer_table_takes_subclasses_of_tensors(generator: torch.Generator) -> None:
@@ -381,7 +382,7 @@ def test_compiled_parts_have_no_parameters(generator: torch.Generator) -> None:
 
 
 def test_compile_checkpoint_and_functional_call(generator: torch.Generator) -> None:
-    router = router_of(SkipNet(), generator)
+    router = router_of(skip_net(), generator)
     x = uniform(generator, 40, 15)
     expected, parameters = router(x), list(router.parameters())
     wanted = torch.autograd.grad(expected.square().sum(), parameters)
@@ -425,7 +426,7 @@ def test_reentrant_checkpoints_inside(generator: torch.Generator) -> None:
 
 
 def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
-    router = router_of(SkipNet(), generator)
+    router = router_of(skip_net(), generator)
     x = uniform(generator, 40, 15)
     router(x).square().sum().backward()
     wanted = [p.grad.clone() for p in router.parameters()]
@@ -447,7 +448,7 @@ def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
 
 def test_an_average_of_weights_is_split_with_its_router(generator: torch.Generator) -> None:
     """``AveragedModel`` holds a copy of the router with its own diagram; the recipe in the docs splits both."""
-    router, x = router_of(SkipNet(), generator), uniform(generator, 40, 15)
+    router, x = router_of(skip_net(), generator), uniform(generator, 40, 15)
     router(x)
     average = torch.optim.swa_utils.AveragedModel(router, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.5))
     average.update_parameters(router)

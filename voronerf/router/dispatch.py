@@ -35,7 +35,7 @@ from voronerf.router.plan import CallPlan
 from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import CellProgram
 from voronerf.router.trace import Unfusable
-from voronerf.router.transforms import aside, is_watched, outside, recorded
+from voronerf.router.transforms import aside, is_watched, recorded
 from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup
 
 _OP = "VoronoiRouter"
@@ -362,11 +362,10 @@ class Dispatch:
     def _run_apart(self, plan: CallPlan, call: Call, grouping: Grouping, frozen: Tensor) -> Results:
         """Runs a call without gradients for samples in frozen cells, bool [k], and with gradients for other samples."""
         k, device, backend, cells = grouping.k, grouping.device, grouping.backend, grouping.cells
-        with outside():  # a torch.func transform would wrap the masks
-            cells = torch.zeros(grouping.n, dtype=torch.int32, device=device) if cells is None else cells
-            is_frozen = frozen.index_select(0, cells)
-            rows = [mask.nonzero()[:, 0] for mask in (~is_frozen, is_frozen)]
-            parts = [Grouping(cells[index], len(index), k, device, backend, index) for index in rows]
+        cells = torch.zeros(grouping.n, dtype=torch.int32, device=device) if cells is None else cells
+        is_frozen = frozen.index_select(0, cells)
+        rows = [mask.nonzero()[:, 0] for mask in (~is_frozen, is_frozen)]
+        parts = [Grouping(cells[index], len(index), k, device, backend, index) for index in rows]
         outcomes = list[Results]()
         for part, has_gradients in zip(parts, (True, False), strict=True):
             if part.n:

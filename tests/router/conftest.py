@@ -1,0 +1,6 @@
+"""Makes the stand-ins of benchmarks/ops importable, which these tests share with the benchmarks."""
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))
