@@ -105,7 +105,7 @@ class Recording {
             drawn += bytes;
           }
           for (size_t i = first; i < last; ++i) {
-            if (!again(*calls_.at(i))) return;
+            if (!replay_call(*calls_.at(i))) return;
           }
         }
       } catch (...) {
@@ -134,7 +134,7 @@ class Recording {
   const std::string& obstacle() const { return obstacle_; }
 
  private:
-  static bool again(const Loaded& loaded) {
+  static bool replay_call(const Loaded& loaded) {
     for (const auto& [rows, memory, offset, capacity] : loaded.frame.counted()) {
       if (*memory > capacity) return false;
       *rows = *memory + offset;
@@ -143,7 +143,8 @@ class Recording {
     call(loaded, result);
     const Type* type = loaded.bound->result;
     if (type != nullptr && type->kind == Type::Kind::boolean && !result.boolean) {
-      throw std::invalid_argument(loaded.function->name + ": indices out of range");
+      throw std::invalid_argument(loaded.function->name +
+                                  ": arguments must be valid in a replay, got invalid indices or tables");
     }
     return true;
   }

@@ -399,13 +399,13 @@ FAULTS = (
     _step(
         "a call of many steps forgets averages and decay in between",
         "nerf/step.py",
-        "schedule.GROUP - at % schedule.GROUP, alike",
-        "alike",
+        "schedule.GROUP - at % schedule.GROUP, until_update",
+        "until_update",
     ),
     _step(
         "a call of many steps goes on after the grid has begun to learn",
         "nerf/step.py",
-        "at % schedule.GROUP, alike)",
+        "at % schedule.GROUP, until_update)",
         "at % schedule.GROUP)",
     ),
     _step(
@@ -471,7 +471,7 @@ FAULTS = (
     _step(
         "a replaced method that is removed again stays",
         "nerf/step.py",
-        "                guard.entries(vars(part), names)\n",
+        "                dependencies.entries(vars(part), names)\n",
         "                pass\n",
     ),
     _step(

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import backends, native
-from voronerf.ops._core.unchanged import Never, Values, unchanged
+from voronerf.ops._core.unchanged import Stale, Values, unchanged
 
 pytestmark = pytest.mark.native
 
@@ -103,7 +103,7 @@ def test_memory_that_a_tensor_has_left_is_not_given_to_another():
 
 
 def test_without_the_compiled_module_nothing_is_known():
-    guard = Never()
+    guard = Stale()
     notes(guard, Thing(), dict.fromkeys(("here", "place", "kind", "read"), torch.zeros(2)), {})
     assert not guard.holds()
 

@@ -39,7 +39,7 @@ from voronerf.ops._core.active import active
 from voronerf.ops._core.capture import Capture
 from voronerf.ops._core.custom_op import has_listeners
 from voronerf.ops._core.recording import Recording
-from voronerf.ops._core.unchanged import Never, unchanged
+from voronerf.ops._core.unchanged import Stale, unchanged
 from voronerf.router.layout import tensors_of
 
 _ATTRIBUTES = ("batches", "loss", "optimizer", "strategy", "guard", "generator", "autocast", "scaler")
@@ -179,7 +179,7 @@ class TrainingStep:
 
     def forget(self) -> None:
         """Drops all recordings, so the next step is recorded again; the rest of a running step runs eagerly."""
-        self._dependencies: Any = Never()
+        self._dependencies: Any = Stale()
         if not self._is_running:
             self._forget()
 
@@ -193,7 +193,7 @@ class TrainingStep:
         self._last = SegmentResult({})
         self._spent = dict[str, tuple[float, int]]()  # seconds and calls of each Python hook
         self._gradients = list[tuple[nn.Parameter, Tensor | None]]()  # a captured step writes to this memory
-        self._dependencies = Never()
+        self._dependencies = Stale()
         self._reads = list[tuple[Any, set[str]]]()  # objects, and the names of the attributes that segments read
         self._radiance: Radiance | None = None
         self._obstacle = ""
@@ -245,8 +245,8 @@ class TrainingStep:
             return self._run_steps(rays, steps)
         sampler, end = self.loss.renderer.sampler, at + steps
         while at < end:
-            alike = 1 if self._calls_hooks() else sampler.steps_per_update(at)
-            count = min(end - at, schedule.GROUP - at % schedule.GROUP, alike)
+            until_update = 1 if self._calls_hooks() else sampler.steps_per_update(at)
+            count = min(end - at, schedule.GROUP - at % schedule.GROUP, until_update)
             pre_backward = self._pre_backward(at)
             if sampler.evaluates_at(at) and not in_python(sampler, "step_pre_backward"):
                 self._run_or_replay_hook("before", pre_backward)
@@ -543,15 +543,15 @@ class TrainingStep:
         compiled = backends.compiled()
         if not isinstance(radiance, Radiance) or compiled is None:
             return
-        self._radiance, guard = radiance, unchanged()
+        self._radiance, dependencies = radiance, unchanged()
         field = cast(nn.Module, renderer.field)
-        guard.entries(vars(self), _ATTRIBUTES)
-        guard.entries(vars(radiance.router), ["assignment", "temperature", "backend", "coords"])
-        self._reads = note_attributes(guard, self._parts())
+        dependencies.entries(vars(self), _ATTRIBUTES)
+        dependencies.entries(vars(radiance.router), ["assignment", "temperature", "backend", "coords"])
+        self._reads = note_attributes(dependencies, self._parts())
         hooks = [(self.batches, ["draw", "fetch"]), (self.strategy, ["step_post_backward"])]
         for part, names in (*hooks, *((term, ["add"]) for term in self.loss.terms)):
             if hasattr(part, "__dict__"):  # replaced hooks run in Python
-                guard.entries(vars(part), names)
+                dependencies.entries(vars(part), names)
         dictionaries = list[dict[Any, Any]]()
         for module in field.modules():  # the field is the router or a module around it
             for name, members in vars(module).items():
@@ -559,23 +559,23 @@ class TrainingStep:
                     dictionaries.append(members)
         dictionaries += [*map(vars, radiance.router.module.modules()), optimizer.state, *optimizer.state.values()]
         for members in dictionaries:
-            guard.contents(members)
-        guard.contents(vars(optimizer), ["steps_done"])
+            dependencies.contents(members)
+        dependencies.contents(vars(optimizer), ["steps_done"])
         learning = list[nn.Parameter]()
         for group in optimizer.param_groups:
-            guard.contents(group, ["lr"])
+            dependencies.contents(group, ["lr"])
             for each in (group["params"], group["betas"]):
-                guard.contents(each)
+                dependencies.contents(each)
             learning += group["params"]
         if self._on_gpu():  # unlike a recording, a capture does not track its tensors
             owners = self.batches, renderer.sampler, self.strategy, self.guard, optimizer.state, self._gradients
             for tensor in (*tensors_of(owners), *field.parameters(), *field.buffers()):
-                guard.layout(tensor)
+                dependencies.layout(tensor)
         for parameter in dict.fromkeys((*field.parameters(), *learning)):
-            guard.attributes(parameter, ["requires_grad", *_HOOKS])
+            dependencies.attributes(parameter, ["requires_grad", *_HOOKS])
             for hooks in (getattr(parameter, name) for name in _HOOKS):
                 if hooks is not None:
-                    guard.contents(hooks)
+                    dependencies.contents(hooks)
         kind = self.batches.device.type  # for the autocast of the caller, not of the step
         for query in (
             backends.threads,
@@ -588,8 +588,8 @@ class TrainingStep:
             functools.partial(torch.get_autocast_dtype, kind),
             self._precision,
         ):
-            guard.answer(query)
-        self._dependencies = guard
+            dependencies.answer(query)
+        self._dependencies = dependencies
 
     def _parts(self) -> list[Any]:
         """Returns the objects with hooks that may be replayed."""

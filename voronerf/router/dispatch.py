@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.ops._core.backends import BackendUnavailable
-from voronerf.ops._core.unchanged import Never, unchanged
+from voronerf.ops._core.unchanged import Stale, unchanged
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.call_cache import CachedCall
 from voronerf.router.cells import refuse_statistics
@@ -35,7 +35,7 @@ from voronerf.router.plan import CallPlan
 from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import CellProgram
 from voronerf.router.trace import Unfusable
-from voronerf.router.transforms import aside, is_watched, recorded
+from voronerf.router.transforms import hooked, is_intercepted, untransformed
 from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup
 
 _OP = "VoronoiRouter"
@@ -78,7 +78,7 @@ class Dispatch:
         self.plans: dict[Any, list[CallPlan]] = {}  # by key: one plan for each trace, the latest first
         self._refused_inputs: dict[Any, tuple[set[Source], str]] = {}  # values that cannot be inputs, and why
         self.cached: dict[Any, CachedCall] = {}  # by `call_key`
-        self._checked = _Checked(0, [], [], Never())
+        self._checked = _Checked(0, [], [], Stale())
         self._subclasses: set[Any] = set()  # (method, tensor types) that work with plain tensors
         self._warned: set[str] = set()
         self._latest_ways: dict[str, dict[str, str]] = {}
@@ -145,7 +145,7 @@ class Dispatch:
         if (
             call.key is not None
             and not plan.counts
-            and not is_watched()
+            and not is_intercepted()
             and (cached := CachedCall.of(plan, call, grouping))
         ):
             if len(self.cached) >= _PLANS:
@@ -172,7 +172,7 @@ class Dispatch:
         entry, checked = self.cached.get(key), self._checked
         if entry is None or torch.compiler.is_compiling():
             return entry
-        if is_watched() or k != checked.k:
+        if is_intercepted() or k != checked.k:
             return None
         if not entry.unchanged.holds():
             if not checked.unchanged.holds() or entry.plan.watch.changed():
@@ -231,11 +231,11 @@ class Dispatch:
         constants, few = call.constants() if options.fuse else {}, layout.n < FEWEST
         plans = [plan for plan in self.plans.get(key, []) if few or not plan.small]
         plan = next((plan for plan in plans if not plan.changed(constants)), None)
-        if plan is not None and (few or not plan.may_group or plan.skip or recorded()):
+        if plan is not None and (few or not plan.may_group or plan.skip or hooked()):
             return plan
         if not layout.n:
             return CallPlan(loop := Loop("no samples yet"), loop)
-        with self._lock, _own_randomness(grouping), aside(call) as copied:
+        with self._lock, _own_randomness(grouping), untransformed(call) as copied:
             probe = Probe(copied, grouping)
             if plan is not None and not probe.is_groupable():
                 plan.postpone()
@@ -311,7 +311,7 @@ class Dispatch:
         way, loop = plan.way, plan.loop
         latest, warns = self._latest_ways.setdefault(call.method, {}), way is loop
         if plan.skip:
-            plan.skip = max(plan.skip - (not recorded()), 0)  # another thread may have counted it
+            plan.skip = max(plan.skip - (not hooked()), 0)  # another thread may have counted it
             way = loop
         why = way.why
         if isinstance(way, Fused) or (isinstance(way, Grouped) and grouping.k > 1):
@@ -325,7 +325,7 @@ class Dispatch:
                     raise
                 if isinstance(way, Fused) and not isinstance(error, Unfusable):
                     raise
-                if not recorded():
+                if not hooked():
                     plan.postpone()
                 reason = error if isinstance(error, (Ungroupable, Unfusable)) else f"its forward fails ({error})"
                 why, warns = f"for some batches, since {reason}", True
@@ -353,9 +353,9 @@ class Dispatch:
         try:
             return way.run(call, grouping)
         except Ungroupable as error:
-            if isinstance(way, Fused) or not error.is_new or recorded():
+            if isinstance(way, Fused) or not error.is_new or hooked():
                 raise
-        with self._lock, _own_randomness(grouping), aside(call) as copied:
+        with self._lock, _own_randomness(grouping), untransformed(call) as copied:
             way.records = [*way.records[1 - _TRACES :], Probe(copied, grouping).confirmed_steps()]
         return way.run(call, grouping)
 

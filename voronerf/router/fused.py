@@ -70,7 +70,7 @@ class ParameterEntries:
 
 
 @dataclass
-class Segment:
+class Subprogram:
     """A run of steps as one program, with its outputs and the sources of its inputs and parameters."""
 
     program: Program
@@ -283,12 +283,12 @@ class Fused:
         columns = self._lowering.operand(turned[0] & ((1 << 32) - 1))
         return columns if columns.index not in self._lowering.sources else self._lowering.builder.apply("copy", columns)
 
-    def _cut(self) -> dict[int, Segment]:
+    def _cut(self) -> dict[int, Subprogram]:
         """Returns the runs of steps, by number; the level of a step is the number of its run."""
         lowering, steps = self._lowering, self._lowering.builder.steps
         live = self._live
         level = {value: lowering.level(value) for value in live}
-        runs: dict[int, Segment] = {}
+        runs: dict[int, Subprogram] = {}
         for number in sorted({level[v] for v in live if v not in lowering.sources}):
             chosen = [steps[v] for v in sorted(live) if level[v] == number and v not in lowering.sources]
             later = {c.index for v in live if level[v] > number for c in steps[v].operands if c.of == VALUE}
@@ -416,7 +416,7 @@ class Fused:
             if number in self._runs:
                 self._compute_run(self._runs[number], values, grouping, order)
 
-    def _compute_run(self, run: Segment, values: dict[Any, Any], grouping: Grouping, order: Tensor | None) -> None:
+    def _compute_run(self, run: Subprogram, values: dict[Any, Any], grouping: Grouping, order: Tensor | None) -> None:
         n = values[self._n]
         rows = [_flat(values[source], n, source) for source in run.inputs]
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
@@ -439,16 +439,16 @@ class Fused:
             values[of] = tensor
 
 
-def _renumbered(steps: list[Step], results: list[Columns], lowering: Lowering, outputs: list[Any]) -> Segment:
-    """Makes a segment of some steps; the values and parameters of its program are numbered anew.
+def _renumbered(steps: list[Step], results: list[Columns], lowering: Lowering, outputs: list[Any]) -> Subprogram:
+    """Makes a subprogram of some steps; the values and parameters of its program are numbered anew.
 
     Args:
-        steps: The steps of the segment.
+        steps: The steps of the subprogram.
         results: The columns that the program outputs.
         lowering: The lowering to which the steps belong.
         outputs: The node or value of each output.
     """
-    b, run = Builder(), Segment(Program((), (), (), ()), outputs=outputs)
+    b, run = Builder(), Subprogram(Program((), (), (), ()), outputs=outputs)
     values: dict[int, int] = {}
     parameters: dict[int, int] = {}
 

@@ -35,8 +35,8 @@ _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (to
 _INPLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "div", "floordiv", "mod", "pow", "and", "or")}
 _MARK = "_voronerf_rows"
 
-Rule = Callable[..., Any]
-_RULES: dict[Any, Rule] = {}
+BatchingRule = Callable[..., Any]
+_RULES: dict[Any, BatchingRule] = {}
 
 
 def find(names: str, *places: Any) -> frozenset[Any]:
@@ -127,7 +127,7 @@ def without_randomness(func: Any, args: Any, kwargs: Any) -> Any:
     return func(*args, **kwargs).zero_()
 
 
-def register(function: Any, rule: Rule) -> None:
+def register(function: Any, rule: BatchingRule) -> None:
     """Registers a rule by which a function that takes parameters runs for all cells at once.
 
     Without a rule, a module that uses the function runs cell by cell.

@@ -402,36 +402,38 @@ def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
     return None
 
 
-def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: int = 3) -> Tensor:
-    """Returns the positions of a call's samples, [..., d]; ``rule`` is the ``coords`` rule or the positions."""
-    if rule is None:
+def find_positions(coords: Any, args: Sequence[Any], kwargs: dict[str, Any], d: int = 3) -> Tensor:
+    """Returns the positions of a call's samples, [..., d]; ``coords`` finds them or is the positions."""
+    if coords is None:
         raise ValueError(
             f"{_OP}: coords must name the positions among the module's arguments: pass "
             f"coords='first{d}', a slice of the features or a function of the arguments to the router, or "
             f"coords=positions [..., {d}] to this call"
         )
     source = None
-    if isinstance(rule, Tensor):
-        positions = as_plain(rule)
-    elif callable(rule):
-        positions = as_plain(rule(*args, **kwargs))
-    elif not isinstance(rule, (str, slice)):
-        raise TypeError(f"{_OP}: coords must be a tensor, got {type(rule).__name__}; {AS_TENSOR}")
+    if isinstance(coords, Tensor):
+        positions = as_plain(coords)
+    elif callable(coords):
+        positions = as_plain(coords(*args, **kwargs))
+    elif not isinstance(coords, (str, slice)):
+        raise TypeError(f"{_OP}: coords must be a tensor, got {type(coords).__name__}; {AS_TENSOR}")
     else:
         source = first_tensor(args, kwargs)
         if source is None:
             got = ", ".join(type(value).__name__ for value in (*args, *kwargs.values())) or "nothing"
             raise ValueError(
-                f"{_OP}: coords={rule!r} must find a tensor among the arguments, got {got}; {AS_TENSOR}, or as "
+                f"{_OP}: coords={coords!r} must find a tensor among the arguments, got {got}; {AS_TENSOR}, or as "
                 "coords a function of the arguments"
             )
-        whole = isinstance(rule, str) and source.shape[-1] == d == int(rule[5:])
-        positions = source if whole else source[..., : int(rule[5:])] if isinstance(rule, str) else source[..., rule]
+        whole = isinstance(coords, str) and source.shape[-1] == d == int(coords[5:])
+        positions = (
+            source if whole else source[..., : int(coords[5:])] if isinstance(coords, str) else source[..., coords]
+        )
     if isinstance(positions, Tensor) and positions.shape[-1:] == (d,) and positions.is_floating_point():
         return positions
-    what = "coords" if isinstance(rule, Tensor) else "the result of coords"
+    what = "coords" if isinstance(coords, Tensor) else "the result of coords"
     if source is not None:
-        what = f"coords={rule!r} of the first tensor, {list(source.shape)},"
+        what = f"coords={coords!r} of the first tensor, {list(source.shape)},"
     if not isinstance(positions, Tensor):
         raise TypeError(f"{_OP}: {what} must be a tensor, got {type(positions).__name__}")
     if positions.shape[-1:] != (d,):
@@ -443,22 +445,22 @@ _MANY = 4  # minimum number of cells for the warning that one cell has nearly al
 
 
 @torch.no_grad()
-def position_warning(rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor, centres: Tensor) -> str:
-    """Returns the reason why a rule's positions [n, d] may be another quantity, or an empty text.
+def position_warning(coords: Any, source: Tensor | None, positions: Tensor, counts: Tensor, centres: Tensor) -> str:
+    """Returns the reason why positions [n, d] may be another quantity, or an empty text.
 
     ``source`` is the call's first tensor; ``counts`` [k] is the number of samples in each cell.
     """
     flat, k, d = positions.detach().flatten(0, -2), len(counts), positions.shape[-1]
-    if isinstance(rule, str) and source is not None:
+    if isinstance(coords, str) and source is not None:
         x = source.detach().flatten(0, -2)[:256].float()
         circle = (x[:, :1].square() + x.square() - 1).abs().amax(0) < 1e-3
         if x.shape[1] > d and float(x[:, 0].std()) > 1e-3 and bool(circle.any()):
             return (
-                f"coords={rule!r} takes sines and cosines of an encoding for positions; let the encoding begin with "
+                f"coords={coords!r} takes sines and cosines of an encoding for positions; let the encoding begin with "
                 "the position, or pass coords=positions to each call"
             )
         if d == 3 and float((x[:, :3].norm(dim=1) - 1).abs().max()) < 1e-3:
-            return f"coords={rule!r} takes unit vectors, such as directions, for positions; pass coords=positions"
+            return f"coords={coords!r} takes unit vectors, such as directions, for positions; pass coords=positions"
     most = int(counts.max())
     if k < _MANY or most <= 0.9 * len(flat):
         return ""

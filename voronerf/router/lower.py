@@ -23,9 +23,10 @@ from voronerf.ops._core.program import PARAMETER, VALUE, Builder, Columns
 from voronerf.router.axes import Axis
 from voronerf.router.grouped import find
 from voronerf.router.layout import map_tensors, tensors_of
+from voronerf.router.waves import MOST_PARTS
 
 _LOW = (1 << 32) - 1
-_FEW, _PRODUCTS = 3, 16  # maximum number of separately read parts of a layer's input, and of layers of a function
+_PRODUCTS = 16  # maximum number of layers of a function
 _SMALL = 64  # maximum number of multiplications in a product of two matrices of samples
 
 _MOVERS = frozenset(
@@ -739,7 +740,7 @@ class _EntryMode(TorchDispatchMode):
                     raise NotAStep("a product that is added to a matrix")
                 add = self.lowering.vector(bias, bias.codes.reshape(-1).expand(width))
             parts = self.lowering.parts(numbers[0, i])
-            if len(parts) > _FEW:
+            if len(parts) > MOST_PARTS:
                 parts = [(self.b.move(flat.shape[1], parts), 0)]
             for x, at in parts:
                 add = self.b.linear(x, weight, width, at, add=add)

@@ -41,7 +41,7 @@ _OP = "VoronoiRouter"
 FEWEST = 8  # minimum number of samples in a probe; a smaller batch is extended by similar samples
 _SAMPLES, _CELLS = 41, 3  # numbers of samples and cells of a probe
 _COUNTS = (_SAMPLES, 37)  # numbers of samples by which sizes that count samples differ from other sizes
-_FEW = 8  # rows for the check whether a module needs a subclass of tensors
+_CHECKED = 8  # rows for the check whether a module needs a subclass of tensors
 _PIECE = 8 << 20  # bytes of the largest tensor in a piece of rows on a CPU; larger tensors outgrow the cache
 
 _OWN = frozenset(vars(nn.Module()))  # attributes that every module has
@@ -59,7 +59,7 @@ class Options:
     names: tuple[str, ...]  # names of the parameters that the module was wrapped with
 
 
-class Recording(NamedTuple):
+class ProbeRuns(NamedTuple):
     """Two runs of a module: their functions, the leaves of their results by name, and the double that ran."""
 
     runs: tuple[Recorder, Recorder]
@@ -167,8 +167,8 @@ class Probe:
         return loop, loop, may_group
 
     def steps(self) -> list[Step]:
-        """Returns the steps of the module; see :class:`Recording`."""
-        return steps_of(self.recorded().runs, _COUNTS)
+        """Returns the steps of the module; see :class:`ProbeRuns`."""
+        return steps_of(self.record().runs, _COUNTS)
 
     def confirmed_steps(self) -> list[Step]:
         """Returns the steps of the module, with which it runs grouped like the loop; raises :class:`Ungroupable`."""
@@ -177,7 +177,7 @@ class Probe:
             raise Ungroupable("its forward gives other results than the loop over cells", of_batch=True)
         return steps
 
-    def recorded(self, reads: set[tuple[int, str]] | None = None) -> Recording:
+    def record(self, reads: set[tuple[int, str]] | None = None) -> ProbeRuns:
         """Runs the first cell's module with two numbers of samples, and records the runs."""
         rows, runs, leaves = self._call.arranged(self._entries), (Recorder(), Recorder()), list[dict[str, Any]]()
         cell = {id(parameter): parameter[0] for parameter in cell_parameters(self._call.module)}
@@ -193,7 +193,7 @@ class Probe:
             for count, recorder in zip(_COUNTS, runs, strict=True):
                 leaves.append({})
                 map_tree(double.run(self._call, [tensor[:count] for tensor in rows], cell, recorder), note)
-        return Recording(runs, leaves, double)
+        return ProbeRuns(runs, leaves, double)
 
     def run_once(self, module: nn.Module) -> None:
         """Runs the first cell of a module for both numbers of samples, which fills caches in dicts and lists."""
@@ -210,13 +210,13 @@ class Probe:
             if isinstance(value, (list, dict, set)) and name not in _OWN
         }
 
-    def note_changes(self, warn_once: Callable[[str, str], None]) -> Recording:
+    def note_changes(self, warn_once: Callable[[str, str], None]) -> ProbeRuns:
         """Records the module, and notes what calls cannot keep: items of containers (CHANGES), numbers, and counts."""
 
         initial, call = self._containers(), self._source[0]
         if initial:
             self.run_once(self._call.module)
-        filled, recording = self._containers(), self.recorded()
+        filled, recording = self._containers(), self.record()
         trees = [[*parts_of(module).values()] for module in (self._call.module, call.module)]
         for (place, name), items in filled.items():
             if not all(_same_items(*pair) for pair in items):
@@ -231,7 +231,7 @@ class Probe:
         self._note_numbers(recording, warn_once)
         return recording
 
-    def _note_numbers(self, recording: Recording, warn_once: Callable[[str, str], None]) -> None:
+    def _note_numbers(self, recording: ProbeRuns, warn_once: Callable[[str, str], None]) -> None:
         """Finds the results that count samples; warns of other numbers, which a call cannot follow."""
         name, (ours, theirs), counts = self._call.name, recording.leaves, dict[str, int]()
         for key, number in ours.items():
@@ -247,7 +247,7 @@ class Probe:
         self.counts = counts
         if recording.double.assigned:
             parts = [*parts_of(self._call.module).values()]
-            for (place, key), line in self.recorded(set()).double.writes.items():
+            for (place, key), line in self.record(set()).double.writes.items():
                 if (place, key) in recording.double.assigned:
                     what = f"{type(parts[place]).__name__}.{key}{text_of_line(*line)}"
                     rule = "set it outside of forward, since assignments in forward are lost after the call"
@@ -448,7 +448,7 @@ def check_subclasses(call: Call, plain: Call) -> None:
     rows: list[Tensor] = []
 
     def first(tensor: Tensor, kind: str) -> Tensor:
-        rows.append(tensor[:_FEW])
+        rows.append(tensor[:_CHECKED])
         return tensor
 
     cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}

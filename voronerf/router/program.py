@@ -18,7 +18,7 @@ from voronerf.ops._core.checks import check_shape
 from voronerf.ops._core.layers import MLP
 from voronerf.ops._core.program import Builder, Program
 from voronerf.ops._core.tolerances import agree
-from voronerf.ops._core.unchanged import Never, unchanged
+from voronerf.ops._core.unchanged import Stale, unchanged
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.routed_program import routed_program
 from voronerf.router.axes import Axis
@@ -155,7 +155,7 @@ class FieldProgram:
     """
 
     def __init__(self) -> None:
-        self._looked = _Looked(None, "its program is unknown until the first call", None, Never())
+        self._looked = _Looked(None, "its program is unknown until the first call", None, Stale())
         self._activation: _Activation | None = None
 
     def __reduce__(self) -> tuple[type[FieldProgram], tuple[()]]:
@@ -215,7 +215,7 @@ class FieldProgram:
                 traced, parts = _steps_of(double.activate, layers.shapes[0][0]), [*parts_of(field).values()]
                 if not any(name in parts[place]._parameters for place, name in reads):
                     steps = traced
-            known = _Activation(key, steps, Watch.of(field, reads, Inputs()), Never())
+            known = _Activation(key, steps, Watch.of(field, reads, Inputs()), Stale())
         if not known.unchanged.holds():
             guard = unchanged()
             known.watch.note(guard)

@@ -32,7 +32,7 @@ _ELEMENTWISE = """
     __mod__ __pow__ __rpow__ __lt__ __le__ __gt__ __ge__ __eq__ __ne__
 """
 _INTEGERS = (torch.int32, torch.int64)
-_FEW = 1 << 12  # maximum number of values per cell for one joint look-up in planes
+_JOINT = 1 << 12  # maximum number of values per cell for one joint look-up in planes
 
 
 def rule(*functions: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -580,7 +580,7 @@ def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) ->
     if not 0 < dim < grid.dim() - 1 or m > 1:
         return NotImplemented
     is_bilinear = options["mode"] == "bilinear" and options["padding_mode"] in ("zeros", "border") and input.dim() == 4
-    is_small = grid[..., 0].numel() * input.shape[1] <= _FEW * run.grouping.k
+    is_small = grid[..., 0].numel() * input.shape[1] <= _JOINT * run.grouping.k
     if is_bilinear and is_small and input.origin[0].numel() < 1 << 31:
         cells = run.grouping.sorted_cells.reshape(-1, *[1] * (2 - dim)).expand(grid.shape[1:3])
         zeros, corners = options["padding_mode"] == "zeros", bool(options["align_corners"])

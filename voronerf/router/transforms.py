@@ -70,13 +70,13 @@ def unwrapped(tensor: Tensor) -> Tensor:
 
 
 @contextlib.contextmanager
-def aside(call: Call) -> Iterator[Call]:
+def untransformed(call: Call) -> Iterator[Call]:
     """Yields a copy of a call for a probe, hidden from transforms and saved-tensor hooks.
 
     ``torch.utils.checkpoint`` counts the tensors that a call saves, and compares the number with the recomputation.
     """
     if not transformed():
-        with torch.autograd.graph.saved_tensors_hooks(_identity, _identity) if recorded() else contextlib.nullcontext():
+        with torch.autograd.graph.saved_tensors_hooks(_identity, _identity) if hooked() else contextlib.nullcontext():
             yield call
         return
     with outside():
@@ -86,12 +86,12 @@ def aside(call: Call) -> Iterator[Call]:
         yield replace(call, module=double.module, args=args, kwargs=kwargs)
 
 
-def recorded() -> bool:
+def hooked() -> bool:
     """Returns whether saved-tensor hooks are active. The call may then run again, and must run in the same way."""
     return _hooks(False) is not None
 
 
-def is_watched() -> bool:
+def is_intercepted() -> bool:
     """Returns whether transforms, tracers or saved-tensor hooks see a call."""
     return _transforms() or _hooks(False) is not None or forward_ad._current_level >= 0 or torch._C._is_tracing()
 

@@ -18,7 +18,7 @@ from voronerf.ops._core.program import PARAMETER, VALUE, Columns, Program, Step,
 _Column = tuple[int, int]  # (value, column in it)
 _Waves = dict[_Column, dict[float, dict[int, list[_Column]]]]  # column: {factor: {0 for sine or 1 for cosine: copies}}
 _PHASES = {0.0: 0, round(math.pi / 2, 6): 1}
-_FEW = 3  # maximum number of parts of a layer's input that are read separately
+MOST_PARTS = 3  # maximum number of parts of a layer's input that are read separately
 _CLOSE = 3e-7  # maximum relative error of an octave
 
 
@@ -75,7 +75,7 @@ def with_encodings(program: Program, constants: Mapping[int, Sequence[float]]) -
 def _by_parts(step: Step, moves: Mapping[int, Step], new: int) -> list[Step]:
     """Splits a layer whose input is joined from a few parts into one layer for each part, whose results are added."""
     move = moves.get(step.operands[0].index) if step.op == "linear" and step.operands[0].of == VALUE else None
-    if move is None or step.numbers[2] or step.operands[0].width != move.width or len(move.operands) > _FEW:
+    if move is None or step.numbers[2] or step.operands[0].width != move.width or len(move.operands) > MOST_PARTS:
         return [step]
     if any(c.of != VALUE or c.spread for c in move.operands) or sum(c.width for c in move.operands) != move.width:
         return [step]

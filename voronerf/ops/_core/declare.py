@@ -570,7 +570,7 @@ class Declaration:
         """
         from voronerf.ops._core import native
 
-        sources, on_devices = [*map(self._source, parameters)], "cuda" in options.get("devices", ("cuda",))
+        sources, on_devices = [*map(self._binding, parameters)], "cuda" in options.get("devices", ("cuda",))
 
         def fill(arguments: Any, results: Any) -> None:
             machine = native.machine(arguments[0]) if on_devices else native.cpu()

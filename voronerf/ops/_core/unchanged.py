@@ -12,7 +12,7 @@ from voronerf.ops._core import backends
 _COPIED = 1 << 20  # maximum number of bytes of a tensor whose values are copied and compared
 
 
-class Never:
+class Stale:
     """A guard for use without the compiled module; `holds` is always False, so every call checks its dependencies."""
 
     def holds(self) -> bool:
@@ -28,7 +28,7 @@ class Never:
 def unchanged() -> Any:
     """Creates an empty guard; csrc/bindings/unchanged.h lists the properties that it can note."""
     module = backends.compiled()
-    return Never() if module is None else module.compiled.Unchanged()
+    return Stale() if module is None else module.compiled.Unchanged()
 
 
 class Values:
