@@ -102,6 +102,7 @@ def test_every_operation_has_rows_in_both_modes():
         assert len(set(keys)) == len(keys)
     both = {(case.op, case.direction) for case in throughput.chosen_cases(throughput.parse([]))}
     differentiable = {op for op, case in cases_any.CASES.items() if case.differentiable}
+    differentiable |= {"render_loss"}  # returns its gradient
     assert {op for op, direction in both if direction == "forward+backward"} == differentiable
 
 

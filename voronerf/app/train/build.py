@@ -120,7 +120,8 @@ def build(
     )
     photographs = scene.background is None
     terms: list[Term] = [SparseDepth(config.sparse_depth)] if config.sparse_depth else []
-    terms.append(SmoothDepth(SMOOTH_DEPTH))
+    if unseen:
+        terms.append(SmoothDepth(SMOOTH_DEPTH))
     if photographs and isinstance(contraction, Contraction):  # would lower the scores of forward-facing scenes
         terms.append(Surface(distortion=DISTORTION, orientation=ORIENTATION))
     return State(
