@@ -85,6 +85,13 @@ class Items {
   const int64_t run_;
 };
 
+// Calls body(item) for the items of a run. A function of its own: inlined into parallel_for, the body's loops would
+// share registers with the distribution of the items, and cell_sort would take 1.5 times as long.
+template <typename Body>
+__attribute__((noinline)) void run_items(const Body& body, int64_t begin, int64_t end) {
+  for (int64_t item = begin; item < end; ++item) body(item);
+}
+
 // Calls body(item) for every item, on at most `threads` threads and at most one per run. An exception of the body, such
 // as std::bad_alloc, ends the loop and is rethrown to the caller.
 template <typename Body>
@@ -96,7 +103,7 @@ void parallel_for(int64_t count, int64_t run, int threads, const Body& body) {
   parallel(static_cast<int>(std::min<int64_t>(threads, runs)), [&](int thread) {
     try {
       for (int64_t begin, end; !failed.load(std::memory_order_relaxed) && items.take(thread, begin, end);) {
-        for (int64_t item = begin; item < end; ++item) body(item);
+        run_items(body, begin, end);
       }
     } catch (...) {
       if (!failed.exchange(true)) failure = std::current_exception();
