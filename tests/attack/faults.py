@@ -433,7 +433,7 @@ FAULTS = (
         "yield argument.value",
     ),
     _step(
-        "what a term reads may have another name",
+        "what a hook returns may have another name",
         "nerf/segment.py",
         "[*held] if isinstance(held, dict) else len(entries)",
         "len(entries)",

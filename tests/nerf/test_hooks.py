@@ -22,7 +22,8 @@ from voronerf.nerf import (
     SplitStrategy,
     replayed,
 )
-from voronerf.nerf.segment import in_python
+from voronerf.nerf.segment import Segment, in_python
+from voronerf.ops import nearest_centre
 
 pytestmark = pytest.mark.native
 
@@ -260,6 +261,21 @@ def late(training, seen, batch):
     if training.done < 6:
         return torch.zeros(())
     return seen.weights.square().mean() if training.done < 12 else 0.01 * seen.density.mean()
+
+
+def test_a_segment_whose_argument_has_other_names_is_recorded_again():
+    """A hook may return its results under other names than in the recorded step."""
+    segment, centres = Segment(), torch.tensor([[0.0, 0, 0], [1, 1, 1]])
+
+    def find(given):
+        return nearest_centre(given["near"] if "near" in given else 1 - given["far"], centres)
+
+    cells = [
+        (segment.replayed, made.now(made.value).tolist())
+        for name in ("near", "near", "far", "far")
+        for made in [segment(find, {name: torch.ones(2, 3)})]
+    ]
+    assert cells == [(False, [1, 1]), (True, [1, 1]), (False, [0, 0]), (True, [0, 0])]
 
 
 def test_a_class_that_says_so_is_replayed():
