@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Builds the extension with AddressSanitizer in a separate folder, and runs random valid and invalid calls of the
-# operations with this build: sanitize_calls.sh [calls of each kind].
+# Builds the extension with AddressSanitizer beside the installed one, and runs random valid and invalid calls of the
+# operations with this build: sanitize_calls.sh [calls of each kind]. The next build compiles all files again, since both
+# builds keep their objects in build/.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 build=$(mktemp -d)
