@@ -45,7 +45,7 @@ from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops.grouped_linear.activation import activate
 from voronerf.ops.grouped_linear.reference import check_offsets
-from voronerf.ops.grouped_program.reference import cells_of
+from voronerf.ops.network.reference import cells_of
 
 ROWS, WIDTH, THREADS = 64, 16, 128
 """The numbers of rows per tile, features per column and threads per block. Wider columns would hold more padding,

@@ -26,8 +26,8 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
 @pytest.mark.parametrize("op", backends.ops())
 def test_reference_is_there_for_every_op(op: str) -> None:
     function = resolve(op, backend="reference", device=CPU, dtype=torch.float64)
-    shared = {"grouped_mlp": "grouped_program", "routed_mlp": "routed_program"}
-    assert function.__name__ == shared.get(op, op)
+    networks = "grouped_mlp", "grouped_program", "routed_mlp", "routed_program"
+    assert function.__name__ == ("network" if op in networks else op)
 
 
 def test_unknown_names_list_the_choices() -> None:
@@ -252,7 +252,7 @@ def test_auto_takes_warp_on_cuda_where_native_is_missing(monkeypatch: pytest.Mon
         kind = torch.int32 if op == "cell_sort" else torch.float32
         assert choose(op, "auto", "cuda", None, kind) == "warp"
         assert choose(op, "auto", "cpu", None, kind) == "native"
-    for op in ("routed_mlp", "adam", "composite"):  # the reference, which calls Warp ops
+    for op in ("adam", "composite"):  # the reference
         assert choose(op, "auto", "cuda", None, torch.float32) == "reference"
         assert choose(op, "warp", "cuda", None, torch.float32) == "warp"
 
@@ -272,8 +272,8 @@ def test_what_auto_takes_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.warp
 def test_what_warp_has_no_kernel_of_runs_as_plain_torch_with_its_operations_on_warp() -> None:
-    run = backends.resolve_composed("routed_mlp", backend="warp", device=CPU, dtype=torch.float32)
-    assert run.func.__module__ == "voronerf.ops.routed_program.reference" and run.keywords == {"backend": "warp"}
+    run = backends.resolve_composed("render_opaque", backend="warp", device=CPU, dtype=torch.float32)
+    assert run.func.__module__ == "voronerf.ops.render_opaque.reference" and run.keywords == {"backend": "warp"}
     assert resolve("adam", backend="warp", device=CPU, dtype=torch.float32).__module__ == "voronerf.ops.adam.reference"
     assert "warp" not in backends.implemented("adam")
 

@@ -279,7 +279,7 @@ constexpr const char* kStub =
     "class ProgramCall:\n"
     "    def __init__(self, program: Program, widths: Sequence[Any], sums: Sequence[Any], kept: Sequence[int],\n"
     "                 tables: Sequence[int], sizes: Sequence[int], rays: int, large: int, on_large: Any) -> None: ...\n"
-    "    def __call__(self, rows: tuple[Any, ...], keep: bool, gradients: int, caller: str,\n"
+    "    def __call__(self, tensors: tuple[Any, ...], keep: bool, gradients: int, caller: str, ray_name: str,\n"
     "                 asked: bool) -> list[Tensor] | None: ...\n"
     "\n"
     "def signature(op: str, rows: Sequence[Any], positional: int, more: dict[str, Any]) -> Any: ...\n"

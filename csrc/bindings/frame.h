@@ -128,16 +128,14 @@ class Frame {
       case Type::Kind::tensors:
         *static_cast<void***>(place) = nullptr;
         if (object == Py_None) return true;
-        arrays_.emplace_back();
-        return load_sequence(*type.of, object, [&](size_t count) {
-          arrays_.back().resize(count + 1);
-          *static_cast<void***>(place) = arrays_.back().data();
-          return arrays_.back().data();
-        });
+        return load_sequence(*type.of, object,
+                             [&](size_t count) { return *static_cast<void***>(place) = array(count); });
       case Type::Kind::sequence:
         return load_sequence(*type.of, object, [&](size_t count) { return type.resize(place, count); });
       case Type::Kind::structure:
         return load_structure(type, object, static_cast<char*>(place));
+      case Type::Kind::custom:
+        return type.load(this, object, place);
       case Type::Kind::opaque:
         if (!PyCapsule_IsValid(object, type.exact.c_str())) return false;
         place = PyCapsule_GetPointer(object, type.exact.c_str());
@@ -157,6 +155,8 @@ class Frame {
     if (recording() != nullptr && add_tensor(*recording(), object)) has_rows_ = true;
     return true;
   }
+  // Returns an array of addresses that lives as long as the call.
+  void** array(size_t count) { return arrays_.emplace_back(count + 1).data(); }
   // Holds a reference to the object during the call.
   void keep(PyObject* object) {
     Py_INCREF(object);

@@ -7,7 +7,8 @@
 //   T* const*     a sequence of such tensors, or None
 //   std::vector   a sequence
 //   enumeration   the name of a value (VN_NAMES)
-//   struct        a named tuple with its members (VN_STRUCT); the module makes its class
+//   struct        a named tuple with its members (VN_STRUCT); the module makes its class. VN_LOADER: an object that
+//                 the struct's own function loads
 //   numbers       int, float and bool
 //   RowCount      an int, which a recording reads again at each replay (frame.h, bind.cpp)
 #pragma once
@@ -48,6 +49,7 @@ struct Type {
     tensors,
     sequence,
     structure,
+    custom,
     opaque
   };
   Kind kind = Kind::none;
@@ -63,6 +65,7 @@ struct Type {
   void (*construct)(void*) = nullptr;
   void (*destroy)(void*) = nullptr;          // for an opaque object: deletes it
   void* (*resize)(void*, size_t) = nullptr;  // for a std::vector: returns its data
+  bool (*load)(void* frame, _object*, void*) = nullptr;  // for a type with a loader of its own
   mutable _object* known_dtype = nullptr;
   mutable _typeobject* known_class = nullptr;  // cached class of a struct's last argument
 };
@@ -103,6 +106,16 @@ std::vector<Member> members_of(const void* object, const char* names, const M&..
   return result;
 }
 
+// Declares a struct that a function of its own loads from a Python object (frame.h).
+template <typename T>
+struct Loader;
+#define VN_LOADER(T)                                               \
+  template <>                                                      \
+  struct Loader<T> {                                               \
+    static constexpr const char* vn_type = #T;                     \
+    static bool load(void* frame, _object* object, void* place);   \
+  }
+
 // Declares a class whose objects Python gets from the module and only passes back.
 template <typename T>
 struct Opaque;
@@ -116,6 +129,11 @@ template <typename T, typename = void>
 struct IsStruct : std::false_type {};
 template <typename T>
 struct IsStruct<T, std::enable_if_t<sizeof(Fields<T>) != 0>> : std::true_type {};
+
+template <typename T, typename = void>
+struct HasLoader : std::false_type {};
+template <typename T>
+struct HasLoader<T, std::enable_if_t<sizeof(Loader<T>) != 0>> : std::true_type {};
 
 template <typename T>
 struct ElementOf {
@@ -205,6 +223,12 @@ Type describe() {
   } else if constexpr (IsStruct<T>::value) {
     Type type = named_type(Kind::structure, sizeof(T), Fields<T>::vn_type, Fields<T>::vn_type);
     type.members = Fields<T>().vn_members();
+    type.construct = [](void* at) { new (at) T(); };
+    type.destroy = [](void* at) { static_cast<T*>(at)->~T(); };
+    return type;
+  } else if constexpr (HasLoader<T>::value) {
+    Type type = named_type(Kind::custom, sizeof(T), "tuple[Any, ...]", Loader<T>::vn_type);
+    type.load = &Loader<T>::load;
     type.construct = [](void* at) { new (at) T(); };
     type.destroy = [](void* at) { static_cast<T*>(at)->~T(); };
     return type;

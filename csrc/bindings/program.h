@@ -29,8 +29,7 @@ VN_STRUCT(ProgramLookup, input, parameter, grid, memory);
 VN_STRUCT(ProgramScatter, input, parameter, grid, memory, sum);
 VN_STRUCT(ProgramTable, packs, steps, operands, sums, inputs, outputs, memories, lookups, scatters, grids, sum_tensors,
           parameters, tile, columns, packed, partial, scratch, scratch_width, layout);
-VN_STRUCT(ProgramInputs, inputs, input_types, transposed, parameters, parameter_types, strides, offsets, order,
-          ray_index, n, r, k, kept, ready, gradients, caller, ray_name);
+VN_LOADER(ProgramInputs);  // program_call.cpp
 VN_STRUCT(ProgramResults, outputs, output_types, sums);
 VN_OPAQUE(Program);
 

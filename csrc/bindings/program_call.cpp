@@ -15,7 +15,31 @@ TableType table_type(unsigned dtype) {
   return dtype == kBfloat16 ? TableType::bfloat16 : dtype == kFloat16 ? TableType::float16 : TableType::float32;
 }
 
-// A program with the shapes and types of its results, which a call allocates.
+// The view of a tensor. If torch gives none (tensor_view.h), its shape, strides and dtype come from Python attributes.
+struct Look : TensorView {
+  bool is_viewed = false;
+  std::vector<int64_t> sizes;
+
+  bool look(PyObject* tensor) {
+    is_viewed = TensorView::look(tensor);
+    if (is_viewed) return true;
+    const py::handle object(tensor);
+    if (!py::hasattr(object, "stride") || !py::hasattr(object, "dtype")) return false;
+    sizes = py::cast<std::vector<int64_t>>(object.attr("shape"));
+    dimensions = static_cast<int32_t>(sizes.size());
+    const auto steps = py::cast<std::vector<int64_t>>(object.attr("stride")());
+    sizes.insert(sizes.end(), steps.begin(), steps.end());
+    shape = sizes.data();
+    strides = shape + dimensions;
+    const py::object dtype = object.attr("dtype");
+    const auto is = [&dtype](const char* name) { return dtype.ptr() == dtypes().at(name); };
+    code = is("bfloat16") ? 4 : is("float16") || is("float32") ? 2 : UINT8_MAX;
+    bits = is("float32") ? 32 : 16;
+    return true;
+  }
+};
+
+// A program with the facts that its calls need: the shapes and types of the results, and the sizes of parameters.
 class ProgramCall {
  public:
   // `widths` has, for each output, the number of columns and whether there is a row per ray. `sums` has, for each sum,
@@ -45,112 +69,132 @@ class ProgramCall {
     function_ = &function;
   }
 
-  // Runs the program on `rows`: inputs, parameters, offsets, order, ray_index and the look-ups (the features from hash
-  // grids) that an earlier call kept. `gradients` is the index of the first input that is a gradient, or -1. `caller`
-  // is the name of the op for error messages. Returns the outputs, the sums over rows and, if `keep`, the look-ups.
-  // Returns None if Python has to make the call: during a recording, for unsupported tensors and, if `asked`, while
-  // torch has to see the call (Questions::has_listeners).
-  py::object call(const py::tuple& rows, bool keep, int64_t gradients, const char* caller, bool asked) const {
+  // Runs the program on `tensors`: inputs, parameters, offsets, order, ray_index and the look-ups (the features from
+  // hash grids) that an earlier call kept. `gradients` is the index of the first input that is a gradient, or -1.
+  // `caller` and `ray_name` are the names of the op and of its argument for errors. Returns the outputs, the sums over
+  // rows and, if `keep`, the look-ups. Returns None if Python has to make the call: during a recording, for unsupported
+  // tensors and, if `asked`, while torch has to see the call (Questions::has_listeners).
+  py::object call(const py::tuple& tensors, bool keep, int64_t gradients, const char* caller, const char* ray_name,
+                  bool asked) const {
     if (recording() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
       return py::none();
     }
     if (asked && questions.has_listeners()) return py::none();
+    TensorView offsets;
+    if (!offsets.look(PyTuple_GET_ITEM(tensors.ptr(), 2)) || !offsets.on_cpu()) return py::none();
     Loaded loaded{function_, bound_, {}, {}};
     Frame& frame = loaded.frame;
     loaded.values.place(type_of<Program>()) = PyCapsule_GetPointer(program_.ptr(), "Program");
     auto& in = *static_cast<ProgramInputs*>(loaded.values.place(type_of<ProgramInputs>()));
     auto& out = *static_cast<ProgramResults*>(loaded.values.place(type_of<ProgramResults>()));
     *static_cast<Cpu*>(loaded.values.place(type_of<Cpu>())) = questions.cpu();
+    if (!load(frame, tensors.ptr(), 0, in, true)) return py::none();
+    const py::object kept = fast(PyTuple_GET_ITEM(tensors.ptr(), 5));
+    in.gradients = keep && !kept_.empty() ? -1 : gradients;  // look-ups are kept for all rows
+    in.caller = caller;
+    in.ray_name = ray_name;
 
-    const py::object inputs = fast(rows[0]), parameters = fast(rows[1]), kept_lookups = fast(rows[5]);
+    py::list results;
+    const TableType type = in.input_types[0];
+    void** const addresses = frame.array(widths_.size() + sums_.size());
+    void** next = addresses;
+    for (const auto& [width, by_ray] : widths_) {
+      if (by_ray && type != TableType::float32) return py::none();  // per-ray outputs are float32
+      out.output_types.push_back(type);
+      *next++ = memory(results, type, {by_ray ? in.r : in.n, width});
+    }
+    for (const auto& [table, shape] : sums_) {
+      const bool shared = table >= 0 && in.strides[static_cast<size_t>(table)] == 0;
+      std::vector<int64_t> sizes = {shared ? 1 : in.k};
+      sizes.insert(sizes.end(), shape.begin(), shape.end());
+      *next++ = memory(results, TableType::float32, sizes);
+    }
+    in.ready = !keep || kept_.empty();
+    void** const looked_up = frame.array(kept_.size());
+    if (keep) {
+      for (size_t i = 0; i < kept_.size(); ++i) looked_up[i] = memory(results, TableType::float32, {in.n, kept_[i]});
+    } else {
+      for (size_t i = 0; i < size(kept); ++i) {
+        TensorView view;
+        if (i >= kept_.size() || !view.look(at(kept, i))) return py::none();
+        if (!frame.load_view(any(), at(kept, i), view, looked_up[i])) return py::none();
+      }
+    }
+    if (!kept_.empty() && (keep || size(kept) != 0)) in.kept = reinterpret_cast<float* const*>(looked_up);
+    out.outputs = addresses;
+    out.sums = reinterpret_cast<float* const*>(addresses + widths_.size());
+    run(loaded);
+    return std::move(results);
+  }
+
+  // Loads inputs, parameters, offsets, order and ray_index from the entries of a tuple, from `first` on. Returns false
+  // for unsupported tensors and, if `viewed`, for tensors of which torch gives no view.
+  bool load(Frame& frame, PyObject* tuple, Py_ssize_t first, ProgramInputs& in, bool viewed) const {
+    const py::object inputs = fast(PyTuple_GET_ITEM(tuple, first)),
+                     parameters = fast(PyTuple_GET_ITEM(tuple, first + 1));
+    PyObject *const offsets = PyTuple_GET_ITEM(tuple, first + 2), *const ray_index = PyTuple_GET_ITEM(tuple, first + 4);
     const size_t count = size(inputs), parameter_count = size(parameters);
-    if (parameter_count != sizes_.size() || count == 0) return py::none();
-    std::vector<TensorView> views(count), parameter_views(parameter_count);
+    if (parameter_count != sizes_.size() || count == 0) return false;
+    std::vector<Look> views(count);
     for (size_t i = 0; i < count; ++i) {
-      if (!views[i].look(at(inputs, i)) || views[i].dimensions != 2) return py::none();
+      if (!views[i].look(at(inputs, i)) || views[i].dimensions != 2 || (viewed && !views[i].is_viewed)) return false;
     }
-    for (size_t i = 0; i < parameter_count; ++i) {
-      if (!parameter_views[i].look(at(parameters, i)) || parameter_views[i].dimensions < 1) return py::none();
-    }
-    TensorView offsets, ray_view;
-    PyObject* const ray_index = PyTuple_GET_ITEM(rows.ptr(), 4);
-    if (!offsets.look(PyTuple_GET_ITEM(rows.ptr(), 2)) || !offsets.on_cpu()) return py::none();
-    if (ray_index != Py_None && !ray_view.look(ray_index)) return py::none();
-    in.n = ray_index == Py_None ? views[0].shape[0] : ray_view.shape[0];
+    Look cells, index;
+    if (!cells.look(offsets) || (ray_index != Py_None && !index.look(ray_index))) return false;
+    in.n = ray_index == Py_None ? views[0].shape[0] : index.shape[0];
     in.r = rays_ < 0 ? 0 : views[static_cast<size_t>(rays_)].shape[0];
-    in.k = offsets.shape[0] - 1;
+    in.k = cells.shape[0] - 1;
 
     // The number of rows of a per-sample input. It is -1 if there are as many rays as samples, because the shape of an
     // input then does not tell whether its rows are samples or rays.
     const int64_t samples = ray_index != Py_None && in.n == in.r ? -1 : int64_t{in.n};
     const unsigned dtype = views[0].dtype();
-    if (dtype != kFloat32 && dtype != kBfloat16) return py::none();
-    std::vector<void*> pointers(count + parameter_count + kept_.size());
+    if (dtype != kFloat32 && dtype != kBfloat16) return false;
+    void **const pointers = frame.array(count), **const of_parameters = frame.array(parameter_count);
     for (size_t i = 0; i < count; ++i) {
-      if (views[i].dtype() != dtype) return py::none();
+      if (views[i].dtype() != dtype) return false;
       const bool transposed = is_transposed(views[i], samples) && !is_negative(at(inputs, i));
       in.input_types.push_back(table_type(dtype));
       in.transposed.push_back(static_cast<int32_t>(transposed));
       if (transposed) {
-        frame.keep(at(inputs, i));
-        pointers[i] = views[i].address();
-      } else if (!frame.load_view(any(), at(inputs, i), views[i], pointers[i])) {
-        return py::none();
+        const py::object turned = py::handle(at(inputs, i)).attr("t")();
+        if (!load_any(frame, turned.ptr(), pointers[i])) return false;
+      } else if (!load_any(frame, at(inputs, i), views[i], pointers[i])) {
+        return false;
       }
     }
     for (size_t i = 0; i < parameter_count; ++i) {
-      const TensorView& view = parameter_views[i];
+      Look view;
+      if (!view.look(at(parameters, i)) || view.dimensions < 1 || (viewed && !view.is_viewed)) return false;
       const bool table = std::find(tables_.begin(), tables_.end(), i) != tables_.end();
-      if (!table && view.dtype() != kFloat32) return py::none();
+      if (!table && view.dtype() != kFloat32) return false;
       in.parameter_types.push_back(table_type(view.dtype()));
       in.strides.push_back(view.shape[0] > 1 ? sizes_[i] : 0);
-      if (!frame.load_view(any(), at(parameters, i), view, pointers[count + i])) return py::none();
+      if (!load_any(frame, at(parameters, i), view, of_parameters[i])) return false;
     }
-    in.inputs = pointers.data();
-    in.parameters = pointers.data() + count;
-    if (!load(frame, rows, 2, in.offsets) || !load(frame, rows, 3, in.order) || !load(frame, rows, 4, in.ray_index)) {
-      return py::none();
-    }
-    in.gradients = keep && !kept_.empty() ? -1 : gradients;  // look-ups are kept for all rows
-    in.caller = caller;
-    in.ray_name = std::strstr(caller, "_mlp") != nullptr ? "direction_index" : "ray_index";
+    in.inputs = pointers;
+    in.parameters = of_parameters;
+    return member(frame, tuple, first + 2, in.offsets) && member(frame, tuple, first + 3, in.order) &&
+           member(frame, tuple, first + 4, in.ray_index);
+  }
 
-    py::list results;
-    std::vector<void*> addresses;
-    for (const auto& [width, by_ray] : widths_) {
-      if (by_ray && dtype != kFloat32) return py::none();  // per-ray outputs are float32
-      out.output_types.push_back(table_type(dtype));
-      addresses.push_back(memory(results, dtype, {by_ray ? in.r : in.n, width}));
-    }
-    for (const auto& [table, shape] : sums_) {
-      std::vector<int64_t> sizes = {table < 0 ? in.k : parameter_views[static_cast<size_t>(table)].shape[0]};
-      sizes.insert(sizes.end(), shape.begin(), shape.end());
-      addresses.push_back(memory(results, kFloat32, sizes));
-    }
-    in.kept = nullptr;
-    in.ready = true;
-    void** const looked_up = pointers.data() + count + parameter_count;
-    if (keep) {
-      for (size_t i = 0; i < kept_.size(); ++i) looked_up[i] = memory(results, kFloat32, {in.n, kept_[i]});
-      in.ready = kept_.empty();
-    } else {
-      for (size_t i = 0; i < size(kept_lookups); ++i) {
-        TensorView view;
-        if (i >= kept_.size() || !view.look(at(kept_lookups, i))) return py::none();
-        if (!frame.load_view(any(), at(kept_lookups, i), view, looked_up[i])) return py::none();
-      }
-    }
-    if (!kept_.empty() && (keep || size(kept_lookups) != 0)) in.kept = reinterpret_cast<float* const*>(looked_up);
-    out.outputs = addresses.data();
-    out.sums = reinterpret_cast<float* const*>(addresses.data() + widths_.size());
-    run(loaded);
-    return std::move(results);
+  template <typename T>
+  static bool member(Frame& frame, PyObject* tuple, Py_ssize_t place, T& value) {
+    void* target = &value;
+    return frame.load(type_of<T>(), PyTuple_GET_ITEM(tuple, place), target);
   }
 
  private:
   static const Type& any() { return type_of<const void*>(); }
-  static py::object fast(const py::handle& sequence) {
-    return py::reinterpret_steal<py::object>(PySequence_Fast(sequence.ptr(), "a program takes lists"));
+  static bool load_any(Frame& frame, PyObject* tensor, void*& address) {
+    void* target = &address;
+    return frame.load(any(), tensor, target);
+  }
+  static bool load_any(Frame& frame, PyObject* tensor, const Look& view, void*& address) {
+    return view.is_viewed ? frame.load_view(any(), tensor, view, address) : load_any(frame, tensor, address);
+  }
+  static py::object fast(PyObject* sequence) {
+    return py::reinterpret_steal<py::object>(PySequence_Fast(sequence, "a program takes lists"));
   }
   static size_t size(const py::object& items) { return static_cast<size_t>(PySequence_Fast_GET_SIZE(items.ptr())); }
   static PyObject* at(const py::object& items, size_t i) {
@@ -163,14 +207,10 @@ class ProgramCall {
       return false;
     return view.strides[0] == 1 && (view.shape[1] == 1 || view.strides[1] == view.shape[0]);
   }
-  template <typename T>
-  static bool load(Frame& frame, const py::tuple& rows, Py_ssize_t place, const T*& address) {
-    void* target = &address;
-    return frame.load(type_of<const T*>(), PyTuple_GET_ITEM(rows.ptr(), place), target);
-  }
-  void* memory(py::list& results, unsigned dtype, const std::vector<int64_t>& shape) const {
-    const auto tensor = questions.new_memory(shape, questions.dtypes.at(dtype));
-    int64_t bytes = dtype == kBfloat16 ? 2 : 4;
+  void* memory(py::list& results, TableType type, const std::vector<int64_t>& shape) const {
+    const bool narrow = type == TableType::bfloat16;
+    const auto tensor = questions.new_memory(shape, questions.dtypes.at(narrow ? kBfloat16 : kFloat32));
+    int64_t bytes = narrow ? 2 : 4;
     for (const int64_t length : shape) bytes *= length;
     if (bytes >= large_) on_large_(tensor);
     results.append(tensor);
@@ -193,6 +233,18 @@ class ProgramCall {
 };
 
 }  // namespace
+
+// Loads a tuple (ProgramCall, inputs, parameters, offsets, order, ray_index, kept, ready, gradients, caller, ray_name,
+// n, r), with the members of ProgramInputs.
+bool Loader<ProgramInputs>::load(void* frame_of_call, PyObject* tuple, void* place) {
+  if (!has_entries(tuple, 13) || !py::isinstance<ProgramCall>(PyTuple_GET_ITEM(tuple, 0))) return false;
+  auto& frame = *static_cast<Frame*>(frame_of_call);
+  auto& in = *static_cast<ProgramInputs*>(place);
+  const auto member = [&](Py_ssize_t i, auto& value) { return ProgramCall::member(frame, tuple, i, value); };
+  return py::cast<const ProgramCall&>(py::handle(PyTuple_GET_ITEM(tuple, 0))).load(frame, tuple, 1, in, false) &&
+         member(6, in.kept) && member(7, in.ready) && member(8, in.gradients) && member(9, in.caller) &&
+         member(10, in.ray_name) && member(11, in.n) && member(12, in.r);
+}
 
 void bind_program_calls(py::module_& module) {
   py::class_<ProgramCall>(module, "ProgramCall", py::module_local())

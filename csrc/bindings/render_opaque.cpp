@@ -7,7 +7,7 @@
 namespace voronerf {
 
 VN_STRUCT(SeeCells, centres, child_offsets, child, centre_index, m, depth);
-VN_STRUCT(SeeOptions, density_scale, activated, opaque, wave, background, background_per_ray);
+VN_STRUCT(SeeOptions, opaque, wave, background, background_per_ray);
 VN_STRUCT(SeeOutputs, colour, opacity, depth, light, heaviest);
 
 VN_BINDINGS(module) { module.cpu("render_opaque", VN_CPU(render_opaque_cpu)); }

@@ -149,8 +149,8 @@ class Pool {
     add_wave(
         call_.isa,
         {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(),
-         call_.options.density_scale, call_.options.activated, front_.data(),
-         out.heaviest == nullptr ? nullptr : most_.data(), out.colour, out.opacity, out.depth, out.light, out.heaviest},
+         front_.data(), out.heaviest == nullptr ? nullptr : most_.data(), out.colour, out.opacity, out.depth, out.light,
+         out.heaviest},
         count_);
     return true;
   }

@@ -21,8 +21,6 @@ struct SeeCells {
 };
 
 struct SeeOptions {
-  float density_scale;
-  bool activated;           // the networks' outputs are colour and density themselves
   float opaque;             // a ray ends after a wave that leaves at most this light
   int64_t wave;             // samples of a ray in a wave, which is evaluated at once
   const float* background;  // [r,3], or [3], or null for black
@@ -35,7 +33,7 @@ struct SeeOutputs {
   float* heaviest;                 // [r], depth of the heaviest sample, far without samples; or null
 };
 
-// The march must have no uniforms, seed or start. The program has one output with 4 columns. Its inputs are positions,
+// The march must have no uniforms, seed or start. The program has one output with 4 columns, colour and density. Its inputs are positions,
 // whose values in `network` are not read, and optionally directions [r,q], one per ray. Returns false if a position is
 // not at a leaf after `depth` levels.
 bool render_opaque_cpu(const Program& program, const ProgramInputs& network, const MarchInputs& march,

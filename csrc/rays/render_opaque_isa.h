@@ -9,11 +9,11 @@ namespace voronerf {
 
 // The samples of a wave, and the numbers [r] of their rays in the image.
 struct SeenWave {
-  const float* raw;                 // [m,4]
+  const float* raw;                 // [m,4], colour and density
   const float *depths, *deltas;     // [m]
   const int32_t *offsets, *number;  // [r+1], [r]
-  float density_scale;
-  bool activated;
+  static constexpr bool activated = true;  // as render_tile.h reads `raw`
+  static constexpr float density_scale = 1.0f;
   double* front;                   // [r], the optical depth so far
   float* most;                     // [r], the largest weight so far, or null
   float* colour;                   // of the image's rays, as in render_opaque.h

@@ -19,7 +19,7 @@ from voronerf.ops._core import native
 from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import ACTIVATIONS
 from voronerf.ops._core.program import FUNCTIONS, HASH, PARAMETER, Builder, Columns, Program, gradient
-from voronerf.ops.grouped_program import lowering
+from voronerf.ops.network import lowering
 
 compiled = native.compiled
 WIDTHS = (1, 3, 4, 5, 15, 16, 17, 33, 48, 63, 64, 65, 90, 129, 130)
@@ -159,7 +159,7 @@ def random_program(draw: random.Random, number: int) -> tuple[Program, int]:
                 tuple(shown),
                 tuple(True for _ in program.sums),
             )
-            first = len(program.inputs)  # as in run_gradient of grouped_program/native.py
+            first = len(program.inputs)  # as in Tape.backward of network/native.py
             first = first if not own.outputs and not program.sums and max(own.rays, default=-1) < first else -1
             program = own
         if (program.outputs or program.sums) and lowering.compiled_runs(program.text):

@@ -16,7 +16,7 @@ from unittest import mock
 from emulation_build import build, load
 
 from voronerf.ops._core import native as _native
-from voronerf.ops.grouped_program import native as _programs
+from voronerf.ops.network import native as _programs
 
 
 @functools.cache

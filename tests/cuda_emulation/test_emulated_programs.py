@@ -16,7 +16,7 @@ from torch import Tensor
 from voronerf import HashGrid
 from voronerf.ops import grouped_program
 from voronerf.ops._core.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
-from voronerf.ops.grouped_program import native as plans
+from voronerf.ops.network import native as plans
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "ops"))
 from cases.grouped_program import GRID, encoded, every_step, smooth
@@ -55,9 +55,9 @@ def outcome(program: Program, tensors: list[Tensor], offsets: Tensor, products: 
             return grouped_program(
                 leaves[:count], leaves[count:], offsets, program=program, backend="reference", **given
             )
-        rows = plans.RunTensors(leaves[:count], leaves[count:], offsets, given.get("order"), given.get("ray_index"))
         name = "float32" if products == "tf32" else products
-        return plans.run_program(rows, plans.RunOptions(program.text, products=name))
+        rows = offsets, given.get("order"), given.get("ray_index"), ()
+        return plans.Run(leaves[:count], leaves[count:], *rows, program.text, products=name).results()
 
     before, generator = torch.backends.cuda.matmul.fp32_precision, torch.Generator().manual_seed(5)
     leaves = [(tensor if products else tensor.double()).clone().requires_grad_() for tensor in tensors]
@@ -178,9 +178,9 @@ def test_what_must_not_stay_in_registers(make: Callable[[], Program], products: 
     right = grouped_program(exact[:count], exact[count:], offsets, program=program, backend="reference")
     assert any(part.any() for part in right) == (make is not learning_nothing)
     for shared_bytes in TILES:
-        rows = plans.RunTensors(tensors[:count], tensors[count:], offsets, None, None)
+        call = plans.Run(tensors[:count], tensors[count:], offsets, None, None, (), program.text, products=products)
         with emulated(shared_bytes=shared_bytes):
-            found = plans.run(rows, plans.RunOptions(program.text, products=products))
+            found = plans.run(*call)
             close(found, right, 2 * ALLOWED[products])  # rounding switches a few units
 
 
@@ -211,9 +211,9 @@ def test_rows_of_no_cell_keep_nothing() -> None:
     e = b.encode("hash", b.input(3), b.grid(GRID.text), b.parameter(*GRID.table_shape))
     program = b.program([e])
     x, table = torch.rand(200, 3), torch.randn(2, *GRID.table_shape)
-    rows = plans.RunTensors([x], [table], torch.tensor([30, 90, 150], dtype=torch.int32), None, None)
+    offsets = torch.tensor([30, 90, 150], dtype=torch.int32)
     with emulated():
-        out, kept = plans.run(rows, plans.RunOptions(program.text, keep=True))
+        out, kept = plans.run(*plans.Run([x], [table], offsets, None, None, (), program.text, keep=True))
     assert not (kept[:30].any() or kept[150:].any()) and torch.equal(kept[30:150, : e.width], out[30:150])
 
 
@@ -243,13 +243,13 @@ def test_what_was_looked_up_is_not_looked_up_again() -> None:
     program = b.program([b.linear(e, b.parameter(5, e.width), 5)])
     own = gradient(program, (False,), (False, True), (True,), ())
     x, table, weight = tensors_of(program, [70])
-    rows = plans.RunTensors([x], [table, weight], offsets_of([70]), None, None)
+    first = plans.Run([x], [table, weight], offsets_of([70]), None, None, (), program.text, keep=True)
     with emulated():
-        out, kept = plans.run(rows, plans.RunOptions(program.text, keep=True))
+        out, kept = plans.run(*first)
         assert kept.shape == (70, 16)
         for parameter in (table, torch.full_like(table, torch.nan)):
-            call = rows._replace(inputs=[x, torch.ones_like(out)], parameters=[parameter, weight], kept=[kept])
-            (found,) = plans.run(call, plans.RunOptions(own.text))
+            call = first._replace(inputs=[x, torch.ones_like(out)], parameters=[parameter, weight], kept=[kept])
+            (found,) = plans.run(*call._replace(text=own.text, keep=False))
             torch.testing.assert_close(found[0], kept[:, : e.width].sum(0).expand(5, -1), rtol=1e-5, atol=1e-5)
 
 
@@ -258,10 +258,10 @@ def test_types_in_memory(dtype: torch.dtype) -> None:
     """Checks that results equal float32 results for the same arguments, rounded to the type."""
     program = every_step()
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
-    inputs = plans.RunTensors(rows, [p.float() for p in parameters], offsets, None, None)
+    call = plans.Run(rows, [p.float() for p in parameters], offsets, None, None, (), program.text)
     with emulated():
-        found = plans.run_program(inputs, plans.RunOptions(program.text))
-        exact = plans.run_program(inputs._replace(inputs=[x.float() for x in rows]), plans.RunOptions(program.text))
+        found = call.results()
+        exact = call._replace(inputs=[x.float() for x in rows]).results()
     assert all(torch.equal(ours, right.to(dtype)) for ours, right in zip(found, exact, strict=True))
 
 
@@ -339,9 +339,8 @@ def test_numbers_that_are_none_stay_in_their_rows() -> None:
     tensors[0][5, 1], tensors[0][9, 0] = torch.nan, torch.inf
     for products in ALLOWED:
         with emulated(), torch.no_grad():
-            rows = plans.RunTensors(tensors[:1], tensors[1:], offsets_of([70]), None, None)
-            options = plans.RunOptions(program.text, products=products.replace("tf32", "float32"))
-            _, out = plans.run_program(rows, options)
+            rows, of = (offsets_of([70]), None, None, ()), products.replace("tf32", "float32")
+            _, out = plans.Run(tensors[:1], tensors[1:], *rows, program.text, products=of).results()
         assert (~out.isfinite()).any(1).nonzero().flatten().tolist() in ([5, 9], [5]), products
 
 
@@ -353,9 +352,9 @@ def test_float16_cuts_values_off_and_leaves_gradients() -> None:
     x = torch.tensor([[1.0], [1e6]])
     given = [x, torch.ones(1, 16, 1), torch.ones(1, 3, 16) / 64]
     leaves = [leaf.requires_grad_() for leaf in given]
-    rows = plans.RunTensors(leaves[:1], leaves[1:], offsets_of([2]), None, None)
+    rows = offsets_of([2]), None, None, ()
     with emulated():
-        (out,) = plans.run_program(rows, plans.RunOptions(program.text, products="float16"))
+        (out,) = plans.Run(leaves[:1], leaves[1:], *rows, program.text, products="float16").results()
         assert out[:, 0].tolist() == [0.25, LARGEST / 4]
         for size, finite in ((1.0, True), (1e6, False)):
             found = torch.autograd.grad(out, leaves, torch.full_like(out, size), retain_graph=True)

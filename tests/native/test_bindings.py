@@ -17,7 +17,7 @@ from voronerf.ops._core.program import BINARY, FUNCTIONS, HASH, Builder, Functio
 
 pytestmark = pytest.mark.native
 native = pytest.importorskip("voronerf.ops._core.native")
-lowering = pytest.importorskip("voronerf.ops.grouped_program.lowering")
+lowering = pytest.importorskip("voronerf.ops.network.lowering")
 
 
 def test_the_interface_is_the_checksum_of_what_the_build_bound() -> None:

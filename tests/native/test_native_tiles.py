@@ -14,7 +14,7 @@ from voronerf.ops import frequency_encode, grouped_mlp
 from voronerf.ops._core.layers import MLP, Layer
 
 native = pytest.importorskip("voronerf.ops._core.native")
-programs = pytest.importorskip("voronerf.ops.grouped_program.native")
+programs = pytest.importorskip("voronerf.ops.network.native")
 
 PRECISIONS = {"highest": 2e-6, "high": 1e-4, "medium": 0.05}
 """Values of ``torch.set_float32_matmul_precision``, and the largest allowed errors against float64."""

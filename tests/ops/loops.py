@@ -9,8 +9,8 @@ from torch.nn.functional import linear, softplus
 
 from voronerf.ops._core.encodings import ENCODINGS, wide
 from voronerf.ops._core.layers import DIRECTIONS, POSITIONS
-from voronerf.ops.grouped_program.reference import cells_of
 from voronerf.ops.hash_encode.reference import hash_encode
+from voronerf.ops.network.reference import cells_of
 
 ACTIVATIONS = {
     "none": lambda z: z,

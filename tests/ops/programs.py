@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from voronerf.ops._core.program import Program, gradient
-from voronerf.ops.grouped_program import reference
+from voronerf.ops.network import reference
 
 
 class ByPrograms(torch.autograd.Function):
@@ -17,11 +17,10 @@ class ByPrograms(torch.autograd.Function):
         ctx.text = text
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(offsets, order, ray_index, *tensors)
-        count = len(Program.parse(text).inputs)
+        program = Program.parse(text)
+        count = len(program.inputs)
         arguments = [tensor.detach() for tensor in tensors]
-        return tuple(
-            reference.evaluate(arguments[:count], arguments[count:], offsets, order, ray_index, text),
-        )
+        return tuple(reference.evaluate(arguments[:count], arguments[count:], offsets, order, ray_index, program))
 
     @staticmethod
     def backward(ctx, *arriving):

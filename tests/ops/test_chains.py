@@ -13,7 +13,7 @@ from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops._core.program import PARAMETER, Builder, Columns
 
 pytest.importorskip("warp")
-from voronerf.kernels.grouped_program import chain_of  # imports Warp
+from voronerf.kernels.network import chain_of  # imports Warp
 
 GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
 KINDS = {

@@ -39,8 +39,7 @@ RUNS = [
     for backend in backends.implemented(op)
     for device in ("cpu", "cuda")
 ]
-NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "routed_program", "adam", "average")
-NETWORKS += ("hash_encode",)
+NETWORKS = ("grouped_mlp", "grouped_program", "routed_mlp", "routed_program", "adam", "average", "hash_encode")
 """The ops that take tensors whose number or shapes depend on an argument that is no tensor, such as a program."""
 SINGLE = ("balance_centres", "cell_sort", "march_rays", "pixel_rays")
 """The ops without floating-point tensors, or with a single floating-point dtype."""
@@ -250,7 +249,7 @@ def test_every_output_is_written(request, name):
     assert len(guards) >= 8
 
 
-OF_NETWORKS = ("adam", "average", "forward_with_tape", "render_opaque")
+OF_NETWORKS = ("adam", "average", "render_opaque")
 """The ops that cannot be custom ops, since their arguments are lists of rules and networks."""
 
 
@@ -320,7 +319,7 @@ def test_refuses(op, message):
     case = CASES[op]
     name, arguments = case.call or op, case.make(Draw(), 6)
     getattr(ops, name)(**arguments)
-    kinds = "an integer|an MLP|True|a (number|tensor|list|function|HashGrid)"
+    kinds = "an integer|an MLP|True|Cells|a (number|tensor|list|function|HashGrid|Network)"
     of_types = re.search(f"dtype|must be ({kinds})", message)
     with refused(TypeError if of_types else ValueError, f"{name}: {message}"):
         getattr(ops, name)(**{**arguments, **case.refused[message]})

@@ -130,7 +130,7 @@ def test_second_derivatives_match_a_plain_loop(device, backend, activation):
 def test_gradients_that_nobody_asked_for_are_not_computed():
     class Watch(TorchDispatchMode):
         def __torch_dispatch__(self, function, types, arguments=(), options=None):
-            if function is torch.ops.voronerf.grouped_program_native.default:
+            if function is torch.ops.voronerf.network.default:
                 program = Program.parse(arguments[6])
                 wanted.append([step.op for step in program.steps if step.op in ("linear", "outer", "columns")])
             return function(*arguments, **(options or {}))

@@ -308,7 +308,7 @@ def test_errors():
     two = directions[:, :2]
     refuses("directions must have 3 features where they are spherical, got 2", directions=two, layers=harmonics)
     refuses("direction_index must come with directions, got no directions", directions=None, layers=TABLES["plain"])
-    refuses("directions must have shape [n, q] with n = 5, got [4, 3]", directions=directions[:4], direction_index=None)
+    refuses("directions must have shape [n, 3] with n = 5, got [4, 3]", directions=directions[:4], direction_index=None)
     refuses("directions must have dtype ..., got bool", directions=directions > 0)
     refuses("direction_index must have shape [n] with n = 5, got [4]", direction_index=case.direction_index[1:])
     refuses("direction_index must have dtype int32, got int64", direction_index=case.direction_index.long())

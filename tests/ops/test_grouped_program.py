@@ -22,8 +22,8 @@ from voronerf.ops._core import native
 from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.program import FUNCTIONS, PARAMETER, VALUE, Builder, Columns, Program, Step, gradient
 from voronerf.ops._core.tolerances import agree
-from voronerf.ops.grouped_program import native as plans
-from voronerf.ops.grouped_program.reference import cells_of
+from voronerf.ops.network import native as plans
+from voronerf.ops.network.reference import cells_of
 
 NUMBERS = {"softplus": (3.0, 20.0), "sine": (1.7, 0.3), "clamp": (-0.5, 0.6), "power": (1.5, 0.0), "affine": (2.0, 1.0)}
 SIZES = ([0], [1], [5, 0, 24], [96, 1], [97, 0, 3], [0, 95, 200, 23])
@@ -578,8 +578,8 @@ def test_high_derivatives_within_a_custom_op() -> None:
     assert sine is not None
     program = b.program([sine, b.encode("frequency", x, 1, along=[along, along])])
     rows = [torch.rand(5, 3), torch.rand(5, 3)]
-    how = (program.text, "grouped_program", "float32", False, -1)
-    result = torch.ops.voronerf.grouped_program_native(rows, [], offsets_of([5]), None, None, [], *how)
+    how = (program.text, "grouped_program", "ray_index", "float32", False, -1)
+    result = torch.ops.voronerf.network(rows, [], offsets_of([5]), None, None, [], *how)
     torch.testing.assert_close(result[0], rows[0].sin())
     second = -rows[1].square() * torch.stack([rows[0].sin(), rows[0].cos()])
     torch.testing.assert_close(result[1], torch.cat([torch.zeros(5, 3), *second], dim=1))
@@ -765,6 +765,5 @@ def test_shapes_of_a_gpu_that_is_not_there(products):
     with FakeTensorMode():
         x, weight = torch.empty(9, 5, device="cuda"), torch.empty(2, 7, 5, device="cuda")
         offsets = torch.zeros(3, dtype=torch.int32, device="cuda")
-        options = plans.RunOptions(program.text, products=products)
-        result = plans.run(plans.RunTensors([x], [weight], offsets, None, None), options)
+        result = plans.run(*plans.Run([x], [weight], offsets, None, None, (), program.text, products=products))
         assert [tuple(t.shape) for t in result] == [(9, 7)]

@@ -9,7 +9,7 @@ from op_cases import offsets_of, refused
 
 from voronerf import MLP, HashGrid, Layer
 from voronerf.ops import grouped_mlp, hash_encode, nearest_centre, routed_mlp
-from voronerf.ops.grouped_program.reference import cells_of
+from voronerf.ops.network.reference import cells_of
 
 GRIDS = {
     "plain": HashGrid(levels=4, features=2, log2_entries=10, base=4, finest=64),

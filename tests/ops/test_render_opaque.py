@@ -10,19 +10,21 @@ from helpers import on_any_number_of_threads
 from op_cases import refused
 
 from voronerf import MLP, Layer
-from voronerf.ops import render_opaque
+from voronerf.ops import Cells, Network, render_opaque
 
 pytestmark = pytest.mark.op("render_opaque")
 MOVED = ("origins", "directions", "near", "far")
 CHOICES = [
-    *itertools.product((0, 1, 33, 700), ("hashed", "as they are"), (1, 3), ("linear", "disparity"), (False, True))
+    *itertools.product(
+        (0, 1, 33, 700), ("hashed", "as they are"), (1, 3), ("linear", "disparity"), ("softplus", "relu")
+    )
 ]
 
 
 @pytest.mark.native
-@pytest.mark.parametrize(("n", "positions", "cells", "spacing", "activated"), CHOICES)
-def test_native_sees_what_the_reference_sees(n, positions, cells, spacing, activated):
-    pins = {"positions": positions, "cells": cells, "spacing": spacing, "activated": activated}
+@pytest.mark.parametrize(("n", "positions", "cells", "spacing", "density"), CHOICES)
+def test_native_sees_what_the_reference_sees(n, positions, cells, spacing, density):
+    pins = {"positions": positions, "cells": cells, "spacing": spacing, "density": density}
     arguments = CASE.make(Draw(n, **pins), n)
     actual, expected = (render_opaque(**arguments, backend=backend) for backend in ("native", "reference"))
     for name, part, other in zip(actual._fields, actual, expected, strict=True):
@@ -31,22 +33,14 @@ def test_native_sees_what_the_reference_sees(n, positions, cells, spacing, activ
 
 
 @pytest.mark.parametrize("backend", ["reference", pytest.param("native", marks=pytest.mark.native)])
-def test_activated_values_are_seen_as_they_are(backend):
-    """Activated values are rendered unchanged, even values that no activation returns."""
-    layers = {last: MLP((Layer(("positions",), 4, last),), outputs=(0,)) for last in ("none", "softplus")}
+def test_values_are_seen_as_they_are(backend):
+    """Colours and densities are rendered unchanged, even values that no activation returns."""
+    program = MLP((Layer(("positions",), 4),), outputs=(0,)).program(3, 0, None, (True,))
     origins, directions = torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]])
     ray = origins, directions, torch.zeros(1), torch.full((1,), 4.0)
     box, occupied = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.ones(2, 2, 2, dtype=torch.bool)
-    parameters = [torch.zeros(1, 4, 3), torch.tensor([[3.0, -2, 0.5, -0.25]])]
-
-    def see(last, **rule):
-        arguments = {"program": layers[last].program(3, 0, None, (True,)), "parameters": parameters}
-        return render_opaque(*ray, occupied, box, 64, arguments, opaque=0.0, backend=backend, **rule)
-
-    raw, soft = see("none", density_scale=1.0), see("softplus", activated=True)
-    for name in ("opacity", "depth", "light", "heaviest"):
-        torch.testing.assert_close(getattr(soft, name), getattr(raw, name), msg=name)
-    seen = see("none", activated=True)
+    network = Network(program, [torch.zeros(1, 4, 3), torch.tensor([[3.0, -2, 0.5, -0.25]])])
+    seen = render_opaque(*ray, occupied, box, 64, network, opaque=0.0, backend=backend)
     opacity = -torch.tensor([0.5]).expm1()  # the density is -0.25 over a length of 2
     torch.testing.assert_close(seen.opacity, opacity)
     torch.testing.assert_close(seen.colour, opacity * torch.tensor([[3.0, -2, 0.5]]))
@@ -58,10 +52,10 @@ def test_activated_values_are_seen_as_they_are(backend):
 def test_networks_of_other_dtypes_are_seen(dtype):
     """With a table of another dtype, or under autocast, separate operations run and give the same results."""
     arguments = CASE.make(Draw(1), 300)
-    network = dict(arguments["network"])
+    network = arguments["network"]
     if isinstance(dtype, torch.dtype):
-        *others, table = network["parameters"]
-        network["parameters"] = [*others, table.to(dtype)]
+        *others, table = network.parameters
+        network = Network(network.program, [*others, table.to(dtype)])
     with torch.autocast("cpu", torch.bfloat16, enabled=dtype == "autocast"):
         result = render_opaque(**{**arguments, "network": network}, backend="native")
     for part, other in zip(result[:4], render_opaque(**arguments, backend="reference")[:4], strict=True):
@@ -100,33 +94,28 @@ def test_leaps_over_empty_cells_find_the_same():
 def test_a_tree_of_diagrams_tells_the_cells():
     """Space is split in halves and one half again; each of the three networks has one colour."""
     program = MLP((Layer(("positions",), 4),), outputs=(0,)).program(3, 0, None, (True,))
-    colours = torch.tensor([[9.0, -9, -9, 9], [-9, 9, -9, 9], [-9, -9, 9, 9]])
-    network = {"program": program, "parameters": [torch.zeros(3, 4, 3), colours], "depth": 2}
-    network["centres"] = torch.tensor([[-0.5, 0, 0], [0.5, 0, 0], [0.5, -0.5, 0], [0.5, 0.5, 0]])
-    network["child_offsets"] = torch.tensor([0, 2, 4], dtype=torch.int32)
-    network["child"] = torch.tensor([-1, 1, -2, -3], dtype=torch.int32)
+    colours = torch.tensor([[1.0, 0, 0, 9], [0, 1, 0, 9], [0, 0, 1, 9]])
+    network = Network(program, [torch.zeros(3, 4, 3), colours])
+    centres = torch.tensor([[-0.5, 0, 0], [0.5, 0, 0], [0.5, -0.5, 0], [0.5, 0.5, 0]])
+    child_offsets, child = torch.tensor([0, 2, 4], dtype=torch.int32), torch.tensor([-1, 1, -2, -3], dtype=torch.int32)
+    cells = Cells(centres=centres, child_offsets=child_offsets, child=child, depth=2)
     origins = torch.tensor([[-0.5, -0.5, -2], [0.5, -0.5, -2], [0.5, 0.5, -2]])
     ray = origins, torch.tensor([[0.0, 0, 1]]).expand(3, 3), torch.zeros(3), torch.full((3,), 4.0)
     box, occupied = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.ones(2, 2, 2, dtype=torch.bool)
     for backend in ("auto", "reference"):
-        seen = render_opaque(*ray, occupied, box, 64, network, density_scale=1.0, backend=backend)
+        seen = render_opaque(*ray, occupied, box, 64, network, cells=cells, backend=backend)
         assert torch.equal(seen.colour.round(decimals=1), torch.eye(3)), backend
     with refused(ValueError, "render_opaque: depth must be the number of levels of the tree, got 1, which is too few"):
-        render_opaque(*ray, occupied, box, 64, {**network, "depth": 1}, density_scale=1.0, backend="native")
+        render_opaque(*ray, occupied, box, 64, network, cells=cells._replace(depth=1), backend="native")
 
 
-def test_what_is_of_the_samples_is_refused():
+def test_other_networks_are_refused():
     arguments = CASE.make(Draw(0), 3)
-    with refused(TypeError, "render_opaque: network must hold ... alone, got cells"):
-        render_opaque(**{**arguments, "network": {**arguments["network"], "cells": torch.zeros(3, dtype=torch.int32)}})
-    with refused(TypeError, "render_opaque: network must hold program, parameters, ... alone, got layers"):
-        render_opaque(**{**arguments, "network": {"program": 3, "parameters": [], "layers": None}})
-    with refused(TypeError, "render_opaque: program must be a Program, got int"):
-        render_opaque(**{**arguments, "network": {"program": 3, "parameters": []}})
-    layers = MLP((Layer(("positions",), 3),), outputs=(0,))
-    program = {"program": layers.program(3, 0, None, (False,)), "parameters": [torch.zeros(1, 3, 3)]}
-    with refused(ValueError, "render_opaque: program must have outputs of 4 numbers, colour and density, got 3"):
-        render_opaque(**{**arguments, "network": program})
-    wide = {**arguments["network"], "parameters": [p.double() for p in arguments["network"]["parameters"]]}
+    network = Network(
+        MLP((Layer(("positions",), 3),), outputs=(0,)).program(3, 0, None, (False,)), [torch.zeros(1, 3, 3)]
+    )
+    with refused(ValueError, "render_opaque: program must have one output of 4 numbers, colour and density, got [3]"):
+        render_opaque(**{**arguments, "network": network, "cells": None})
+    wide = Network(arguments["network"].program, [p.double() for p in arguments["network"].parameters])
     with refused(TypeError, "render_opaque: parameters must have dtype float32 or one of 16 bits, got float64"):
         render_opaque(**{**arguments, "network": wide})

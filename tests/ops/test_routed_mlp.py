@@ -281,12 +281,14 @@ def test_errors():
 @pytest.mark.native
 def test_errors_of_the_kernel():
     tree = Case.make("nerf", "tree")
-    refuses = refusals(functools.partial(tree.run, tree.leaves, backend="native"), "routed_mlp")
+    run = functools.partial(tree.run, tree.leaves, backend="native")
+    refuses = refusals(run, "locate_cell")
     refuses("child must name a diagram (below the number of diagrams) or a leaf (negative)", child=TREE["child"] + 9)
     refuses("depth must be the number of levels of the tree, got 1, which is too few", depth=1)
     # This leaf has no network.
-    refuses("cells must lie in 0 to 5, got values from ...", child=torch.where(TREE["child"] == -6, -7, TREE["child"]))
-    refuses(
+    leaf = torch.where(TREE["child"] == -6, -7, TREE["child"])
+    refusals(run, "cell_sort")("cells must lie in 0 to 5, got values from ...", child=leaf)
+    refusals(run, "routed_mlp")(
         "direction_index must be 0 to 4, got 5",
         direction_index=tree.options["direction_index"] + 1 + (tree.options["direction_index"] == 3).int(),
     )

@@ -10,7 +10,6 @@ from voronerf import NeRF, VoronoiRouter
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.fields import HashGridField
 from voronerf.nerf.radiance import radiance_of
-from voronerf.ops import forward_with_tape
 
 FROZEN, LEARNING = [1, 3], [0, 2]
 OPTIMIZERS = {
@@ -177,19 +176,21 @@ def gradients_of_table(router, points, count):
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])
-def test_forward_with_tape_leaves_frozen_cells_out(backend):
+def test_a_tape_leaves_frozen_cells_out(backend):
     router, points = make("table"), torch.rand(100, 3)
     router.freeze(FROZEN)
-    rays = torch.arange(100, dtype=torch.int32)
-    network = radiance_of(router).arguments(points, torch.ones(100, 3), rays)
-    tape = forward_with_tape(network, backend=backend)
-    tape.backward(tape.raw.square().sum(), 2 * tape.raw)
+    radiance, rays = radiance_of(router), torch.arange(100, dtype=torch.int32)
+    rows = radiance.rows(points, torch.ones(100, 3), rays)
+    (raw,), tape = radiance.network.fwd(**rows, backend=backend)
+    tape.learn(raw.square().sum(), [2 * raw])
     for p in router.parameters():
         assert not p.grad[FROZEN].any() and p.grad[LEARNING].any()
-    with pytest.raises(ValueError, match=r"frozen must have shape \[k\] with k = 4, got \[3\]"):
-        forward_with_tape({**network, "frozen": torch.zeros(3, dtype=torch.bool)})
-    with pytest.raises(TypeError, match="frozen must have dtype bool, got float32"):
-        forward_with_tape({**network, "frozen": torch.zeros(4)})
+    for frozen, error, message in (
+        (torch.zeros(3, dtype=torch.bool), ValueError, r"frozen must have shape \[k\] with k = 4, got \[3\]"),
+        (torch.zeros(4), TypeError, "frozen must have dtype bool, got float32"),
+    ):
+        with pytest.raises(error, match=message):
+            radiance.network.fwd(**{**rows, "cells": rows["cells"]._replace(frozen=frozen)})
 
 
 def test_averages_of_frozen_cells_stay():

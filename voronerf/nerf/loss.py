@@ -26,7 +26,7 @@ from voronerf.nerf.volume import (
 )
 from voronerf.ops._core import backends
 from voronerf.ops._core.derivatives import run_backward, with_gradients
-from voronerf.ops.forward_with_tape import Tape, forward_with_tape
+from voronerf.ops.network import OP, Tape
 from voronerf.ops.render_loss import RenderLoss, render_loss
 from voronerf.ops.rendered_gradient import rendered_gradient
 
@@ -150,10 +150,11 @@ class RayLoss:
     def _evaluate(self, field: Radiance, batch: Batch, samples: Samples) -> dict[str, Any]:
         """Evaluates the networks, and computes the loss of the colours and its gradient."""
         renderer = self.renderer
-        network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index)
-        tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
+        rows = field.rows(samples.inputs, batch.rays.directions, samples.ray_index)
+        rows["cells"] = rows["cells"]._replace(rows=samples.rows)
+        (raw,), tape = field.network(field.networks.raw).fwd(**rows, backend=renderer.backend)
         # A sample that almost no light reaches has a negligible gradient and is left out of the backward pass.
-        outputs = tape.raw, field.activation, HIDDEN
+        outputs = raw.float(), field.networks.activation, HIDDEN
         rendered = self._render(*outputs, batch, samples)
         return {"outputs": outputs, "rendered": rendered, "learning": (self._learn_fused, tape, samples)}
 
@@ -236,7 +237,7 @@ class RayLoss:
     def _learn_fused(self, tape: Tape, samples: Samples, rendered: RenderLoss, defer: bool) -> Tensor:
         if (full := self.renderer.sampler.space.full_gradient) is not None:
             rendered.gradient.mul_(gradient_factors(samples.depths, full)[:, None])
-        return tape.backward(rendered.loss, rendered.gradient, defer=defer)
+        return tape.learn(rendered.loss, [rendered.gradient], defer=defer)
 
     def _learn_unfused(
         self,
@@ -267,9 +268,9 @@ class RayLoss:
             routers = ((name, router_of(field)) for name, field in renderer.fields.items())
             return "\n".join([*lines, *(f"{name}: {router.explain()}" for name, router in routers if router)])
         place = renderer.device, torch.float32
-        chosen = backends.chosen("forward_with_tape", *place, backend=renderer.backend)
+        chosen = backends.chosen(OP, *place, backend=renderer.backend)
         lines.append(f"loss: networks, colours, loss and gradients in one operation, on the {chosen} backend")
         if chosen != "native":
-            reason = backends.why_not("forward_with_tape", "native", *place)
+            reason = backends.why_not(OP, "native", *place)
             lines.append(f"not faster: {reason or f'--backend {renderer.backend}'}")
         return "\n".join(lines)

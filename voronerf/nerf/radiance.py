@@ -12,7 +12,7 @@ from torch import Tensor
 
 from voronerf.nerf.field import DirectionPerSample, Field
 from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step, pruned
-from voronerf.ops.forward_with_tape import forward_with_tape
+from voronerf.ops.network import Network
 from voronerf.router import VoronoiRouter
 from voronerf.router.program import CellProgram
 
@@ -25,13 +25,15 @@ class Networks(NamedTuple):
     Attributes:
         program: The program from positions [n, 3], or Gaussians [n, 6], and, if used, directions [r, 3] of the rays, to
             one output [n, 4] of colour and density.
-        density_scale: The factor on the density's softplus, if the program ends before the sigmoid of the colour and
-            the softplus of the density; None if the program includes all activations.
-        density: The program from positions to the activated density [n, 1]; None if it uses directions.
+        raw: The same program without the sigmoid of the colour and the softplus of the density, which `render_loss`
+            computes faster; or ``program``, if it has other activations.
+        activation: The options that tell `render_loss` how to read the outputs of ``raw``.
+        density: The program from positions to the density [n, 1]; None if it uses directions.
     """
 
     program: Program
-    density_scale: float | None
+    raw: Program
+    activation: dict[str, Any]
     density: Program | None
 
 
@@ -48,25 +50,25 @@ class Radiance(NamedTuple):
     cells: CellProgram
     networks: Networks
 
-    @property
-    def activation(self) -> dict[str, Any]:
-        """The options that tell `render_loss` how to read the outputs."""
-        scale = self.networks.density_scale
-        return {"activated": True} if scale is None else {"density_scale": scale}
+    def network(self, program: Program) -> Network:
+        """Returns the networks of one of the programs of `Networks`."""
+        return Network(program, self.cells.parameters)
 
-    def arguments(self, inputs: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any]:
-        """Returns the arguments with which `forward_with_tape` evaluates the field at samples; see `Networks`."""
-        places, rays = self.router.places(inputs), self.networks.program.rays
-        tensors = {"inputs": [inputs, directions], "ray_index": ray_index} if rays else {"inputs": [inputs]}
-        return {"program": self.networks.program, "parameters": self.cells.parameters, **tensors, **places}
+    def rows(self, inputs: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any]:
+        """Returns the arguments with which a network evaluates samples, by name."""
+        cells = self.router.places(inputs)
+        if self.networks.program.rays:
+            return {"inputs": [inputs, directions], "cells": cells, "ray_index": ray_index}
+        return {"inputs": [inputs], "cells": cells}
 
     def density(self, points: Tensor) -> Tensor | None:
         """Returns the density [n] of points [n, 3] without evaluating colours; None if it depends on the direction."""
         router, program = self.router, self.networks.density
         if program is None:
             return None
-        network = {"program": program, "inputs": [points], "parameters": self.cells.parameters, **router.places(points)}
-        return forward_with_tape(network, backend=router.backend).raw[:, 0]
+        with torch.no_grad():
+            (density,), _ = self.network(program)([points], router.places(points), backend=router.backend)
+        return density[:, 0].float()
 
 
 def radiance_of(field: Field, samples: tuple[Tensor, Tensor] | None = None, *, inputs: int = 3) -> Radiance | str:
@@ -121,12 +123,15 @@ def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], 
     if (width := program.inputs[reads.index(0)]) != inputs:
         return f"the field takes {width} numbers per sample, got {inputs}"
     colour, density = program.outputs
-    raw = _before_activations(program.steps, colour, density)
-    outputs, scale = raw if raw is not None else ([colour, density], None)
+    outputs = [colour, density]
+    raw, activation = _before_activations(program.steps, *outputs) or (outputs, {"activated": True})
     direct = _without_moves(program)
     density_program = _field_program(direct, [direct.outputs[1]], reads, inputs)
     return Networks(
-        _field_program(program, outputs, reads, inputs), scale, None if density_program.rays else density_program
+        _field_program(program, outputs, reads, inputs),
+        _field_program(program, raw, reads, inputs),
+        activation,
+        None if density_program.rays else density_program,
     )
 
 
@@ -160,8 +165,10 @@ def _field_program(program: Program, outputs: Sequence[Columns], reads: tuple[in
     return b.program([b.side_by_side(values)])
 
 
-def _before_activations(steps: Sequence[Step], colour: Columns, density: Columns) -> tuple[list[Columns], float] | None:
-    """Returns the columns before sigmoid and softplus, and the softplus's factor; None for other activations."""
+def _before_activations(
+    steps: Sequence[Step], colour: Columns, density: Columns
+) -> tuple[list[Columns], dict[str, Any]] | None:
+    """Returns the columns before sigmoid and softplus, and the options of the loss; None for other activations."""
     steps_by_output = {step.out: step for step in steps}
 
     def before(columns: Columns, name: str) -> tuple[Columns, float, float] | None:
@@ -177,4 +184,4 @@ def _before_activations(steps: Sequence[Step], colour: Columns, density: Columns
     raw_density = before(density, "softplus")
     if raw_colour is None or raw_density is None or raw_density[1] != 1 or raw_density[2] < _THRESHOLD:
         return None
-    return [raw_colour[0], raw_density[0]], scale
+    return [raw_colour[0], raw_density[0]], {"density_scale": scale}

@@ -34,7 +34,6 @@ from voronerf.nerf.volume import RayColours, Rendered, RenderOutput, Samples, Sp
 from voronerf.ops._core.rows import fixed_count
 from voronerf.ops.composite import composite
 from voronerf.ops.formulas import Wave, walk
-from voronerf.ops.render_opaque import NETWORK
 from voronerf.ops.resample import resample
 
 #: The weight of the first pass in the loss if one network serves two passes (mip-NeRF, section 3.2).
@@ -422,10 +421,10 @@ class Occupancy(Sampler):
         radiance = radiance_of(field, (rays.origins, rays.directions))
         if isinstance(radiance, str):
             return None
-        arguments = radiance.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32))
-        if "cells" in arguments:  # each sample has its own cell
+        cells = router.places(rays.origins)
+        if cells.cells is not None:  # each sample has its own cell
             return None
-        return {"network": {name: value for name, value in arguments.items() if name in NETWORK}, **radiance.activation}
+        return {"network": radiance.network(radiance.networks.program), "cells": cells._replace(coords=None)}
 
     def _leave_empty(self) -> None:
         if self.empty is not None:

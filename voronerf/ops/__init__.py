@@ -21,7 +21,6 @@ from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
 from voronerf.ops.draw_pixels.reference import KnownPixels, PixelRuns
 from voronerf.ops.draw_points import draw_points
-from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
@@ -32,6 +31,7 @@ from voronerf.ops.keep_heaviest import keep_heaviest
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import index_centres, nearest_centre
+from voronerf.ops.network import Cells, Network, Tape
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 from voronerf.ops.ray_losses import smooth_depth_loss, sparse_depth_loss, surface_loss
@@ -46,12 +46,14 @@ from voronerf.ops.unseen_rays import unseen_rays
 
 __all__ = [
     "MLP",
+    "Cells",
     "Composite",
     "Guard",
     "HashGrid",
     "KnownPixels",
     "Layer",
     "March",
+    "Network",
     "PixelRays",
     "PixelRuns",
     "RenderLoss",
@@ -65,7 +67,6 @@ __all__ = [
     "composite",
     "draw_pixels",
     "draw_points",
-    "forward_with_tape",
     "frequency_encode",
     "grouped_linear",
     "grouped_mlp",

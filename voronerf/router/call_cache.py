@@ -8,6 +8,7 @@ Letters: n samples, k cells, d coordinates.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -18,12 +19,14 @@ from torch import Tensor, nn
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.checks import MAX_COUNT
+from voronerf.ops.network import Names, Network
 from voronerf.router.fused import HALF, Fused, WholeProgram
 from voronerf.router.grouping import Grouping
 from voronerf.router.labels import Labels
 from voronerf.router.layout import SAMPLE, Call, rebuild, tensors_of
 from voronerf.router.plan import CallPlan
 
+_NAMES = Names("VoronoiRouter")
 _VALUES = {type(None), bool, int, float, str}
 
 
@@ -68,24 +71,23 @@ class CachedCall:
     def __init__(
         self, plan: CallPlan, fused: Fused, whole_program: WholeProgram, call: Call, grouping: Grouping
     ) -> None:
-        from voronerf.ops.routed_program.native import RunOptions, run_checked
-
         (program, reads, results), arguments = whole_program, (*call.args, *call.kwargs.values())
         self._tensors = [i for i, value in enumerate(arguments) if isinstance(value, Tensor)]
         self._reads = [self._tensors[number] for number in reads]
         self._learns = torch.is_grad_enabled() and any(arguments[i].requires_grad for i in self._reads)
         self.module = call.module
-        self.plan, self._method, self._run = plan, call.method, run_checked
-        self._options = RunOptions(program.text, caller="routed_program")
+        self.plan, self._method, self._program = plan, call.method, program
         self._leading, device = len(call.layout.lead), grouping.device
         half = torch.is_autocast_enabled(device.type) or any(arguments[i].dtype in HALF for i in self._tensors)
         ones = 0 if call.layout.flat else self._leading - 1
         self._results = [(shape[ones:], dtype if half and dtype in HALF else torch.float32) for shape, dtype in results]
         is_plain = all(len(tail) == 1 and dtype is torch.float32 for tail, dtype in self._results)
         self._is_plain = self._leading == 1 and is_plain
-        self._parameters, self._shapes, self._is_compilable = fused.parameters, program.parameters, not fused.computes
-        parameters = fused.parameters(grouping.k, device, grouping.backend)
-        self._shares = any(p.dim() == len(size) for p, size in zip(parameters, self._shapes, strict=True))
+        self._parameters, self._is_compilable = fused.parameters, not fused.computes
+        in_half = functools.partial(torch.autocast, device.type, enabled=False)  # results are rounded at the end
+        self._precision: Callable[[], Any] = (
+            in_half if torch.is_autocast_enabled(device.type) else contextlib.nullcontext
+        )
         value = fused.result
         self._value: Callable[[list[Tensor]], Any] = functools.partial(rebuild, value)
         if isinstance(value, Tensor):
@@ -146,9 +148,9 @@ class CachedCall:
             # backward pass whether a view's gradient is used, but not whether a leaf's is (`needed_gradients`).
             rows.append(x.view_as(x) if x.requires_grad and self._learns else x)
         parameters = self._parameters(k, rows[0].device, router.backend)
-        if self._shares:
-            parameters = [p.unsqueeze(0) if p.dim() == len(size) else p for p, size in zip(parameters, self._shapes)]
-        results = self._run(self._options, rows, parameters, k, **router._places_of(self._method, positions))
+        network, cells = Network(self._program, parameters, names=_NAMES), router._places_of(self._method, positions)
+        with self._precision():
+            results, _ = network.run(rows, cells, backend="native")
         if not self._is_plain:
             results = [rows.reshape(*lead, *tail).to(dtype) for rows, (tail, dtype) in zip(results, self._results)]
         return self._value(results)

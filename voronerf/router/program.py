@@ -20,7 +20,7 @@ from voronerf.ops._core.program import Builder, Program
 from voronerf.ops._core.tolerances import agree
 from voronerf.ops._core.unchanged import Stale, unchanged
 from voronerf.ops.grouped_program import grouped_program
-from voronerf.ops.routed_program import routed_program
+from voronerf.ops.network import Names, Network
 from voronerf.router.axes import Axis
 from voronerf.router.double import Double
 from voronerf.router.grouping import cell_parameters, parts_of
@@ -251,7 +251,8 @@ class FieldProgram:
             parameters = [parameters[0].expand(k, *parameters[0].shape), *parameters[1:]]
         rows = [(positions, directions)[number] for number in layers.reads]
         places = router.places(positions, router._positions(args, kwargs, coords))
-        results, _ = routed_program(program, rows, parameters, ray_index=ray_index, **places, backend=router.backend)
+        network = Network(program, parameters, names=Names(_OP))
+        results, _ = network(rows, places, ray_index=ray_index, backend=router.backend)
         if layers.activate is not None:
             return layers.activate(*results)
         results = [out.reshape(-1, *shape) for out, shape in zip(results, layers.shapes)]

@@ -22,6 +22,7 @@ from voronerf.diagram.subdivision import finer_diagram
 from voronerf.diagram.voronoi import MANY_CELLS
 from voronerf.ops._core.backends import BACKENDS
 from voronerf.ops._core.compiler import not_compiled
+from voronerf.ops.network import Cells
 from voronerf.router.call_cache import CachedCall, call_key
 from voronerf.router.cells import (
     apply_to_cells,
@@ -622,8 +623,8 @@ class VoronoiRouter(nn.Module):
         if warning:
             self._dispatch.warn_once("positions", warning)
 
-    def places(self, positions: Tensor, coords: Tensor | None = None) -> dict[str, Any]:
-        """Returns the arguments of `routed_mlp` that choose the cells of samples and name the frozen cells.
+    def places(self, positions: Tensor, coords: Tensor | None = None) -> Cells:
+        """Returns the cells of samples, with the frozen cells.
 
         Args:
             positions: Positions [n, 3] in scene units, or Gaussians [n, 6], means and variances.
@@ -635,25 +636,25 @@ class VoronoiRouter(nn.Module):
         if not torch.compiler.is_compiling() and self._training_checks:
             self._run_training_checks()
         if k == 1:
-            return {"frozen": frozen}
+            return Cells(frozen=frozen)
         if coords is not None and not coords.is_floating_point():
-            return {"frozen": frozen, "cells": coords.flatten()}
+            return Cells(cells=coords.flatten(), frozen=frozen)
         d, drawn = centres.shape[1], self.assignment == "stochastic" and self.training
         if coords is None:
             coords = positions[:, :d] if positions.shape[1] > d else positions
         if drawn or d != 3:
-            return {"frozen": frozen, "cells": self.assign(coords.detach() if drawn else coords)}
+            return Cells(cells=self.assign(coords.detach() if drawn else coords), frozen=frozen)
         if diagram.depth == 1:
-            flat = {"frozen": frozen, "centres": centres, "coords": coords}
-            return {**flat, "centre_index": diagram.index()} if k >= MANY_CELLS else flat
-        tables = {"child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
-        return {"frozen": frozen, "centres": centres, "coords": coords, **tables}
+            index = diagram.index() if k >= MANY_CELLS else None
+            return Cells(centres=centres, coords=coords, centre_index=index, frozen=frozen)
+        tree = {"child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
+        return Cells(centres=centres, coords=coords, frozen=frozen, **tree)
 
-    def _places_of(self, method: str, positions: Tensor) -> dict[str, Any]:
+    def _places_of(self, method: str, positions: Tensor) -> Cells:
         """Returns :meth:`places` for a call of a method; methods with the same positions share their cells."""
         if self.methods:
             self._run_training_checks()
-            return {"frozen": self.frozen_cells, "cells": self._group(method, positions).cells}
+            return Cells(cells=self._group(method, positions).cells, frozen=self.frozen_cells)
         flat = positions if positions.dim() == 2 else positions.flatten(0, -2)
         return self.places(flat, flat)
 

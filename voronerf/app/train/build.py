@@ -325,7 +325,7 @@ def check_backend(config: TrainConfig, device: torch.device) -> None:
     """Looks up every op of a step, so that a backend that cannot train fails before any file is written."""
     ops = ["pixel_rays", "nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", "adam"]
     if config.occupancy:
-        ops += ["march_rays", "observe_occupancy", "forward_with_tape", "render_loss"]
+        ops += ["march_rays", "observe_occupancy", "grouped_program", "render_loss"]
         ops += ["sparse_depth_loss", "rendered_gradient"] if config.sparse_depth else []
     ops += ["resample"] if SAMPLERS[config.sampling].passes > 1 else []
     for op in ops:

@@ -130,7 +130,7 @@ def _networks(run: Run) -> Radiance:
     radiance = radiance_of(renderer.field, (samples[0].to(renderer.device), samples[1].to(renderer.device)))
     if isinstance(radiance, str):
         raise CannotDraw(f"its field does not have one network per cell ({radiance})")
-    if "cells" in radiance.router.places(samples[0].to(renderer.device)):
+    if radiance.router.places(samples[0].to(renderer.device)).cells is not None:
         raise CannotDraw("its cells are not assigned by the nearest centre")
     return radiance
 

@@ -107,12 +107,7 @@ def networks_text(networks: Networks, layout: ParameterOffsets) -> str:
             step, name = step._replace(out=after.out), "relu"
         lines += _step(program, step, name, layout, grids, steps)
     (out,) = program.outputs
-    raw = ", ".join(_column(out, steps, number) for number in range(4))
-    lines.append(f"let raw = vec4f({raw});")
-    if networks.density_scale is None:
-        lines.append("return raw;")
-    else:
-        lines.append(f"return vec4f(sigmoid(raw).rgb, {_number(networks.density_scale)} * softplus(raw).w);")
+    lines.append(f"return vec4f({', '.join(_column(out, steps, number) for number in range(4))});")
     body = "".join(f"  {line}\n" for line in lines)
     return (
         "// Colour and density of a cell's networks at a place, seen along a direction.\n"

@@ -24,7 +24,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -102,7 +102,7 @@ def declare(
     ``runs`` names another op, whose row and implementations this op shares.
     """
     if runs is not None:
-        reference, native, warp = (replace(_TABLE[runs, backend], function=runs) for backend in BACKENDS)
+        reference, native, warp = (_TABLE[runs, backend] for backend in BACKENDS)
     for backend, implementation in zip(BACKENDS, (reference, native, warp), strict=True):
         if implementation is not None:
             _TABLE[op, backend] = implementation

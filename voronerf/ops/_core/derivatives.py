@@ -184,22 +184,59 @@ def run_backward(loss: Tensor, defer: bool) -> Tensor:
 
 def with_gradients(loss: Tensor, tensors: Sequence[Tensor], gradients: Sequence[Tensor]) -> Tensor:
     """Returns a loss [] whose single backward pass gives precomputed gradients to ``tensors``."""
-    total: Tensor = _KnownGradients.apply(loss, list(gradients), *tensors)
+
+    def scaled(scale: Tensor | None) -> Sequence[Tensor]:
+        return gradients if scale is None else [gradient * scale for gradient in gradients]
+
+    total: Tensor = _KnownGradients.apply(loss, scaled, *tensors)
     return total
+
+
+def add_gradients(
+    loss: Tensor, tensors: Sequence[Tensor], slopes: Callable[[Tensor | None], Sequence[Tensor | None]], defer: bool
+) -> Tensor:
+    """Adds the gradients of a loss to ``.grad`` of tensors that require gradients.
+
+    If autograd would only add the gradients to ``.grad``, this function does so itself, because autograd's operations
+    would prevent the recording of a step (voronerf/ops/_core/recording.py).
+
+    Args:
+        loss: [], the loss.
+        tensors: the tensors.
+        slopes: a function from the factor of the loss (None: 1) to the gradient of each tensor, or None.
+        defer: whether to add the gradients only when ``backward`` of the returned loss is called.
+
+    Returns:
+        The loss [], detached unless deferred.
+    """
+    if not tensors:
+        return loss
+    if defer or not all(map(_takes_gradients, tensors)):
+        return run_backward(_KnownGradients.apply(loss, slopes, *tensors), defer)
+    for tensor, slope in zip(tensors, slopes(None), strict=True):
+        if slope is not None:
+            tensor.grad = slope if tensor.grad is None else tensor.grad.add_(slope)
+    return loss
+
+
+def _takes_gradients(tensor: Tensor) -> bool:
+    """Returns whether autograd would only add to ``.grad``: a leaf tensor without hooks."""
+    return tensor.is_leaf and not tensor._backward_hooks and not tensor._post_accumulate_grad_hooks
 
 
 class _KnownGradients(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, loss: Tensor, gradients: list[Tensor], *tensors: Tensor) -> Tensor:
-        ctx.gradients, ctx.dtypes = gradients, [tensor.dtype for tensor in tensors]
+    def forward(ctx: Any, loss: Tensor, slopes: Callable[[Tensor | None], Sequence[Any]], *tensors: Tensor) -> Tensor:
+        ctx.slopes, ctx.dtypes = slopes, [tensor.dtype for tensor in tensors]
         return loss.clone()
 
     @staticmethod
     def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():  # the precomputed gradients have no graph
-            raise RuntimeError("forward_with_tape: the gradients cannot be differentiated again, got create_graph=True")
-        gradients, ctx.gradients = ctx.gradients, None  # released, so that autograd can take them without a copy
-        if not of_loss.is_cpu or float(of_loss) != 1:  # reading the value on a GPU would synchronise
-            gradients = [gradient * of_loss for gradient in gradients]
+        if torch.is_grad_enabled():  # the gradients have no graph
+            raise RuntimeError("Tape.learn: the gradients cannot be differentiated again, got create_graph=True")
+        slopes, ctx.slopes = ctx.slopes, None  # released, so that autograd can take the gradients without a copy
+        is_one = of_loss.is_cpu and float(of_loss) == 1  # reading the value on a GPU would synchronise
+        gradients = slopes(None if is_one else of_loss)
         # The cast comes last, so that a scaled loss keeps small gradients.
-        return (None, None, *(gradient.to(dtype) for gradient, dtype in zip(gradients, ctx.dtypes, strict=True)))
+        cast = [None if g is None else g.to(dtype) for g, dtype in zip(gradients, ctx.dtypes, strict=True)]
+        return None, None, *cast

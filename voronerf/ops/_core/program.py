@@ -180,6 +180,7 @@ class Program:
     text: str = field(init=False, compare=False)  # the program as JSON, the argument of ops
     orders: int = field(init=False, compare=False)  # the highest order of derivative of a step; see _order
     tables: tuple[int, ...] = field(init=False, compare=False)  # the parameters that are tables of grids
+    first_layer: int = field(init=False, compare=False)  # the first parameter that is no table, or -1
     sum_tables: tuple[int | None, ...] = field(init=False, compare=False)  # the table whose gradient each sum is
 
     def __post_init__(self) -> None:
@@ -189,6 +190,8 @@ class Program:
         object.__setattr__(self, "orders", max(map(_order, self.steps), default=0))
         read = {int(step.numbers[1]) for step in self.steps if _reads_table(step)}
         object.__setattr__(self, "tables", tuple(sorted(read)))
+        first = next((i for i in range(len(self.parameters)) if i not in read), -1)
+        object.__setattr__(self, "first_layer", first)
         tables_of_sums = {step.out: int(step.numbers[1]) for step in self.steps if step.op == "scatter"}
         object.__setattr__(self, "sum_tables", tuple(tables_of_sums.get(index) for index in range(len(self.sums))))
 

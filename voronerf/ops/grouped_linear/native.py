@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer, program_text
-from voronerf.ops.grouped_program.native import PRODUCTS, RunOptions, RunTensors, run_program
+from voronerf.ops.network.native import PRODUCTS, Run
 
 # The text of a one-layer table for each activation. The width of the weight replaces the width 1.
 _TABLES = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
@@ -25,9 +25,9 @@ def grouped_linear(
         dtype = torch.get_autocast_dtype(x.device.type)
     stored = dtype if dtype == torch.bfloat16 else torch.float32
     rounded = [p.to(dtype).float() for p in (weight, bias) if p is not None]
-    rows = RunTensors([x.to(dtype).to(stored)], rounded, offsets, None, None)
     o, i = len(range(weight.shape[1])), len(range(weight.shape[2]))  # plain ints, not symbolic ones
     shape = i, 0, (o,), (bias is not None,), False
-    options = RunOptions(program_text(_TABLES[activation], *shape), "grouped_linear", PRODUCTS.get(dtype, "float32"))
-    (out,) = run_program(rows, options)
+    text, products = program_text(_TABLES[activation], *shape), PRODUCTS.get(dtype, "float32")
+    layer = Run([x.to(dtype).to(stored)], rounded, offsets, None, None, (), text, "grouped_linear", products=products)
+    (out,) = layer.results()
     return out.to(dtype)

@@ -5,27 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
-from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import (
-    FLOATING,
-    INDEX,
-    Default,
-    Others,
-    TensorRule,
-    TensorRules,
-    check_rules,
-    check_tensor,
-)
 from voronerf.ops._core.program import Program
-from voronerf.ops.grouped_program.arguments import ProgramArguments
+from voronerf.ops.network import OP, Cells, Names, Network
 
-_OP = backends.declare(
-    "grouped_program", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
-)
+_NAMES = Names(OP)
 
 
 def grouped_program(
@@ -83,82 +68,6 @@ def grouped_program(
         >>> out.flatten()
         tensor([1., 1.])
     """
-    cells: Others = ([_OFFSETS], [offsets])
-    sorting: Others = ((), ()) if order is None else ([_ORDER], [order])
-    check_program(_OP, program, inputs, parameters, ray_index, cells, sorting)
-    return ProgramArguments.of(_OP, program.text, inputs, parameters, ray_index).run(offsets, order, backend=backend)
-
-
-def check_program(
-    op: str,
-    program: Program,
-    inputs: Sequence[Tensor],
-    parameters: Sequence[Tensor],
-    ray_index: Tensor | None,
-    first: Others = ((), ()),
-    last: Others = ((), ()),
-) -> dict[str, int]:
-    """Checks a program and its tensors, and returns the size of each letter in their shapes.
-
-    Args:
-        op: the name of the operation for error messages.
-        program: the program.
-        inputs: the inputs of the program.
-        parameters: the parameters of the program.
-        ray_index: int32 [n], or None.
-        first: additional rules and their tensors, checked first.
-        last: additional rules and their tensors, checked last.
-    """
-    if not isinstance(program, Program):
-        raise TypeError(f"{op}: program must be a Program, got {type(program).__name__}")
-    for name, values, wanted in (("inputs", inputs, program.inputs), ("parameters", parameters, program.parameters)):
-        if not isinstance(values, Sequence):
-            raise TypeError(f"{op}: {name} must be a list, got {type(values).__name__}")
-        if name == "inputs" and not wanted:
-            raise ValueError(f"{op}: program must have at least one input, got none")
-        if len(values) != len(wanted):
-            raise ValueError(f"{op}: {name} must have {len(wanted)} tensors, got {len(values)}")
-    if (ray_index is not None) != (len(program.rays) > 0):
-        rule = "given for a program with" if program.rays else "None for a program without"
-        came = "None" if ray_index is None else "an index"
-        raise ValueError(f"{op}: ray_index must be {rule} inputs of rays, got {came}")
-    check_tensor(op, "inputs[0]", inputs[0])
-    rays = () if ray_index is None else (ray_index,)
-    tensors = [*first[1], *inputs, *parameters, *rays, *last[1]]
-    layers = [p for i, p in enumerate(parameters) if not _among(i, program.tables)]
-    if layers:
-        check_tensor(op, "parameters", layers[0])
-    dtype = layers[0].dtype if layers else None
-    sizes = check_rules(op, _rows, tensors, program, dtype, tuple(first[0]), tuple(last[0]))
-    if ray_index is not None and not sizes["r"] and sizes["n"]:
-        at = next(i for i in range(len(inputs)) if _among(i, program.rays))
-        shape = list(inputs[at].shape)
-        raise ValueError(f"{op}: inputs[{at}] must hold a row for the ray_index, got {shape}")
-    return sizes
-
-
-_OFFSETS = TensorRule("offsets", INDEX, ("k+1",), empty="must have at least two entries")
-_ORDER = TensorRule("order", INDEX, ("n",))
-
-
-def _rows(
-    program: Program, dtype: torch.dtype | None, first: Sequence[TensorRule], last: Sequence[TensorRule]
-) -> TensorRules:
-    """Returns the rules for the tensors of a program: ``first``, inputs, parameters, the ray index and ``last``.
-
-    ``dtype`` is the dtype of all parameters except tables, or None without such parameters.
-    """
-    rows: list[TensorRule | Default] = [*first]
-    for i, width in enumerate(program.inputs):
-        rows.append(TensorRule(f"inputs[{i}]", FLOATING, ("r" if _among(i, program.rays) else "n", width)))
-    for i, shape in enumerate(program.parameters):
-        dtypes = FLOATING if dtype not in FLOATING or _among(i, program.tables) else (dtype,)
-        rows.append(TensorRule(f"parameters[{i}]", dtypes, ("1|k", *shape)))
-    if program.rays:
-        rows.append(TensorRule("ray_index", INDEX, ("n",)))
-    return [*rows, Default("k", 1), *last]
-
-
-def _among(i: int, numbers: Sequence[int]) -> bool:
-    """Returns whether a number is in a list; ``in`` fails if torch.compile makes the list's numbers symbolic."""
-    return any(i == number for number in numbers)
+    cells, network = Cells(offsets, order), Network(program, parameters, names=_NAMES)
+    results, _ = network(inputs, cells, ray_index=ray_index, backend=backend)
+    return results

@@ -1,8 +1,8 @@
 """``render_opaque`` of the compiled module.
 
 Each thread takes one wave of samples at a time through all steps, from marching to compositing, so that each thread
-stores the intermediate values of only one wave. The function is not a custom op, because custom ops cannot take the
-dictionary ``network``.
+stores the intermediate values of only one wave. The function is not a custom op, because custom ops cannot take a
+network.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import torch
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 from voronerf.ops.formulas import RenderedRays
-from voronerf.ops.grouped_program.lowering import lower
-from voronerf.ops.grouped_program.native import Network, program_inputs
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.nearest_centre.native import check_index
+from voronerf.ops.network import Cells
+from voronerf.ops.network.lowering import lower
+from voronerf.ops.network.native import Run, inputs_of
 from voronerf.ops.render_opaque import reference
-from voronerf.ops.routed_program.reference import count_cells
 
 _OP = declared("render_opaque")
 _rays = _OP.inputs(
@@ -35,43 +35,42 @@ _outputs = _OP.outputs(native.compiled.SeeOutputs)
 def render_opaque(*flat: Any) -> RenderedRays:
     """Renders every ray until it is opaque, in float32; see ``voronerf.ops.render_opaque``."""
     arguments = _OP.Inputs._make(flat)
-    routed = arguments.network
-    none = arguments.near.new_empty(0, dtype=torch.int32)  # an empty ray index
-    network = Network.of(
-        routed._replace(ray_index=None if routed.ray_index is None else none).arguments("render_opaque")
-    )
-    (centres, child_offsets, child, depth, *_, index), k = routed.routing, count_cells(network.parameters)
-    tensors = (*routed.inputs, *routed.parameters, centres)
+    network, cells, none = arguments.network, arguments.cells, torch.empty(0, dtype=torch.int32)
+    centres, index, k = cells.centres, cells.centre_index, network.count(cells)
+    inputs, rays = [arguments.origins, arguments.directions], bool(network.program.rays)
+    inputs = inputs[: len(network.program.inputs)]
+    tensors = (*inputs, *network.parameters, centres)
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in tensors)
     if not plain or torch.is_autocast_enabled("cpu"):
         composed: RenderedRays = partial(reference.render_opaque, backend="native")(*arguments)
         return composed
-    rows = network.rows(torch.zeros(k + 1, dtype=torch.int32))
-    lowered = lower(network.options.text)
+    offsets = torch.zeros(k + 1, dtype=torch.int32)
+    run = Run.of(network.arguments(inputs, none if rays else None), offsets, None)
+    lowered = lower(run.text)
     if k == 1:
-        centres = child_offsets = child = index = None
-    if child_offsets is not None:
-        check_tree(child_offsets, child, len(centres), "render_opaque")
+        cells, centres, index = Cells(), None, None
+    if cells.child_offsets is not None:
+        check_tree(cells.child_offsets, cells.child, len(centres), "render_opaque")
     if index is not None:
         check_index("render_opaque", centres, index)
     seen: RenderedRays = _OP.allocate(arguments)
     outputs, compiled = _outputs(seen), native.compiled
     sound = compiled.render_opaque(
         lowered.program,
-        program_inputs(lowered, rows, 0, 0, caller="render_opaque"),
+        inputs_of(lowered, run, 0, 0),
         _rays(arguments),
         compiled.SeeCells(
             centres=centres,
-            child_offsets=child_offsets,
-            child=child,
+            child_offsets=cells.child_offsets,
+            child=cells.child,
             centre_index=index,
             m=0 if centres is None else len(centres),
-            depth=depth,
+            depth=cells.depth,
         ),
         _options(arguments),
         outputs if arguments.heaviest else outputs._replace(heaviest=None),
         native.cpu(),
     )
     if not sound:
-        raise too_shallow(depth, "render_opaque")
+        raise too_shallow(cells.depth, "render_opaque")
     return seen if arguments.heaviest else seen._replace(heaviest=arguments.far)

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from voronerf.ops._core.declare import declared
 from voronerf.ops.composite import composite
-from voronerf.ops.formulas import RenderedRays, Wave, activate, walk
+from voronerf.ops.formulas import RenderedRays, Wave, walk
 from voronerf.ops.march_rays import march_rays
-from voronerf.ops.routed_program import run
 
 
 @torch.no_grad()
@@ -21,8 +20,7 @@ def render_opaque(*flat: Any, backend: str = "reference") -> RenderedRays:
     ``backend`` is the backend of the operations that this function calls.
     """
     arguments = declared("render_opaque").Inputs._make(flat)
-    routed, wave = arguments.network, arguments.wave
-    (origins, *seen), routing = routed.inputs, routed.routing
+    network, cells, wave = arguments.network, arguments.cells, arguments.wave
     space: dict[str, Any] = {"spacing": arguments.spacing, "max_samples": wave, "contraction": arguments.contraction}
 
     def look(live: Tensor, start: Tensor | None) -> Wave:
@@ -30,14 +28,12 @@ def render_opaque(*flat: Any, backend: str = "reference") -> RenderedRays:
         march = march_rays(
             *of_rays, arguments.occupied, arguments.box, arguments.samples, start=start, **space, backend=backend
         )
-        positions = march.positions.to(origins.dtype)
-        coords = None if routing.centres is None else positions.to(routing.centres.dtype)
-        inputs, index = [positions, *(x[live] for x in seen)], march.ray_index if seen else None
-        network = routed._replace(inputs=inputs, ray_index=index).arguments("render_opaque")
-        (raw,), _ = run(network, routing._replace(coords=coords), backend=backend)
-        colours, density = activate(raw.to(arguments.near.dtype), arguments.density_scale, arguments.activated)
+        inputs = [march.positions, arguments.directions[live]][: len(network.program.inputs)]
+        index = march.ray_index if network.program.rays else None
+        (raw,), _ = network.run(inputs, cells, index, backend)
+        raw = raw.to(arguments.near.dtype)
         packed: dict[str, Any] = {"ray_offsets": march.ray_offsets, "backend": backend}
-        along = composite(density, colours, march.depths, march.deltas, **packed)
+        along = composite(raw[:, 3], raw[:, :3], march.depths, march.deltas, **packed)
         return Wave(along, march.ray_index, march.ray_offsets, march.depths, march.stop)
 
     return walk(

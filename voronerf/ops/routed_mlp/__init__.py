@@ -9,11 +9,10 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.layers import MLP
-from voronerf.ops.grouped_mlp.checks import Layered
-from voronerf.ops.routed_program import run
-from voronerf.ops.routed_program.routing import Routing
+from voronerf.ops.grouped_mlp import layered
+from voronerf.ops.network import OP, Cells
 
-_OP = backends.declare("routed_mlp", runs="routed_program")
+_OP = backends.declare("routed_mlp", runs=OP)
 
 
 def routed_mlp(
@@ -91,8 +90,8 @@ def routed_mlp(
         >>> out.flatten().round(decimals=4)  # in the order of the positions
         tensor([90.0000,  0.1000, 80.0000])
     """
-    routing = Routing(centres, child_offsets, child, depth, cells, coords, rows, frozen, centre_index)
-    network = Layered(positions, weights, biases, layers, directions, direction_index, features)
-    routing = routing.at(_OP, positions, network.check(_OP, last=routing.to_check(_OP)))
-    (out,), result_cells = run(network.arguments(_OP), routing, backend=backend, op=_OP)
-    return out, result_cells
+    where = Cells(None, None, cells, centres, child_offsets, child, depth, coords, centre_index, rows, frozen)
+    network, inputs = layered(_OP, layers, positions, directions, direction_index, weights, biases, features)
+    (out,), found = network(inputs, where, ray_index=direction_index if len(inputs) > 1 else None, backend=backend)
+    assert found is not None
+    return out, found

@@ -9,11 +9,11 @@ import torch
 from op_cases import refused
 
 from voronerf import MLP, HashGrid, Layer
-from voronerf.ops import forward_with_tape, routed_mlp
+from voronerf.ops import Cells, Network, routed_mlp
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.ops._core.program import Builder
 
-pytestmark = pytest.mark.op("forward_with_tape")
+pytestmark = pytest.mark.op("grouped_program")
 
 GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
 TABLE = MLP(
@@ -22,6 +22,7 @@ TABLE = MLP(
     position_encoding="hash",
     grid=GRID,
 )
+PROGRAM = TABLE.program(3, 2, None, (True, False), ray=True)
 
 
 def network(device, n=40, k=3):
@@ -45,17 +46,14 @@ def network(device, n=40, k=3):
     }
 
 
-def as_program(arguments):
-    """Returns the arguments of the same network as a program."""
-    names = ("weights", "biases", "layers", "positions", "directions", "direction_index", "features")
-    places = {name: value for name, value in arguments.items() if name not in names}
-    return {
-        "program": TABLE.program(3, 2, None, (True, False), ray=True),
-        "inputs": [arguments["positions"], arguments["directions"]],
-        "parameters": parameters_of(arguments),
-        "ray_index": arguments["direction_index"],
-        **places,
-    }
+def forward(arguments, backend="auto"):
+    """Returns the outputs of the same network as a program, and their tape."""
+    cells = Cells(**{name: arguments[name] for name in ("centres", "frozen", "rows") if name in arguments})
+    network = Network(PROGRAM, parameters_of(arguments))
+    inputs, index = [arguments["positions"], arguments["directions"]], arguments["direction_index"]
+    (raw,), tape = network.fwd(inputs, cells, ray_index=index, backend=backend)
+    assert not raw.requires_grad
+    return raw.float(), tape
 
 
 def parameters_of(arguments):
@@ -70,9 +68,9 @@ def squares(out):
 
 def learn(arguments, *, backward=False, backend="auto"):
     """Returns the loss; with ``backward`` its gradients are added immediately instead of deferred."""
-    tape = forward_with_tape(as_program(arguments), backend=backend)
-    assert not tape.raw.requires_grad
-    return tape.backward(*squares(tape.raw), defer=not backward)
+    raw, tape = forward(arguments, backend)
+    loss, gradient = squares(raw)
+    return tape.learn(loss, [gradient], defer=not backward)
 
 
 def composed(arguments):
@@ -135,9 +133,9 @@ def test_a_detached_layer_gets_no_gradient(device, backend):
         torch.randn(1, 4, 3, device=device).requires_grad_(),
         torch.randn(1, 2, 4, device=device).requires_grad_(),
     ]
-    network = {"program": program, "inputs": [torch.randn(5, 3, device=device)], "parameters": weights}
-    tape = forward_with_tape(network, backend=backend)
-    tape.backward(*squares(tape.raw))
+    (raw,), tape = Network(program, weights).fwd([torch.randn(5, 3, device=device)], Cells(), backend=backend)
+    loss, gradient = squares(raw)
+    tape.learn(loss, [gradient])
     assert weights[0].grad is None and weights[1].grad is not None
 
 
@@ -201,68 +199,67 @@ def test_is_once_differentiable(device, backend):
         torch.autograd.grad(sum(gradient.square().sum() for gradient in gradients), arguments["weights"][0])
 
 
-def test_refuses_a_program_that_makes_no_sense(backend):
-    arguments = as_program(network("cpu"))
-    wrong = {
-        "network must hold program, inputs and parameters, got no inputs": {"inputs": ...},
-        "program must be a Program, got str": {"program": "x"},
-        "unknown arguments layers": {"layers": TABLE},
-        "parameters must have 4 tensors, got 1": {"parameters": arguments["parameters"][:1]},
-        "parameters[1] must have shape [k, 3, 10] with k = 3, got [2, 3, 10]": {
-            "parameters": [arguments["parameters"][0], torch.ones(2, 3, 10), *arguments["parameters"][2:]]
-        },
-        "ray_index must be given for a program with inputs of rays, got None": {"ray_index": None},
-        "frozen must have shape [k] with k = 3, got [2]": {"frozen": torch.zeros(2, dtype=torch.bool)},
-        "program must have one output [n, w], and inputs[0] with one row for each sample": {
-            "program": replace(arguments["program"], outputs=2 * arguments["program"].outputs)
-        },
-    }
-    for message, change in wrong.items():
-        network_ = {name: value for name, value in {**arguments, **change}.items() if value is not ...}
-        error = TypeError if "must be a" in message or "unknown" in message else ValueError
-        with refused(error, f"forward_with_tape: {message}"):
-            forward_with_tape(network_, backend=backend)
+def test_a_tape_gives_the_gradients_that_autograd_gives(device, backend):
+    """Each gradient alone equals the gradient by autograd, and is None if it is unwanted."""
+    arguments, index = network(device), 0
+    out, _ = routed_mlp(**arguments, backend="reference")
+    leaves = [arguments["positions"], arguments["directions"], *parameters_of(arguments)]
+    for leaf in leaves:
+        leaf.requires_grad_()
+    out, _ = routed_mlp(**arguments, backend="reference")
+    arriving = torch.randn_like(out)
+    expected = torch.autograd.grad(out, leaves, arriving)
+    for index in range(len(leaves)):
+        _, tape = forward(arguments, backend)
+        actual = tape.backward([arriving], [i == index for i in range(len(leaves))])
+        assert [g is None for g in actual] == [i != index for i in range(len(leaves))]
+        torch.testing.assert_close(actual[index], expected[index], rtol=1e-4, atol=1e-4)
 
 
 def test_refuses_what_makes_no_sense(device, backend):
     arguments = network(device)
-    with refused(ValueError, "forward_with_tape: network must hold program, inputs and parameters, got no program"):
-        forward_with_tape({"inputs": [arguments["positions"]], "parameters": []})
-    tape = forward_with_tape(as_program(arguments), backend=backend)
-    loss, gradient = squares(tape.raw)
-    with refused(ValueError, "forward_with_tape: loss must have shape [], got [40, 3]"):
-        tape.backward(gradient, gradient)
-    with refused(ValueError, "forward_with_tape: gradient must have shape [40, 3], got [3]"):
-        tape.backward(loss, gradient[0])
-    with refused(TypeError, "forward_with_tape: loss must be a tensor, got float"):
-        tape.backward(0.0, gradient)
-    with refused(TypeError, "forward_with_tape: defer must be True or False, got int"):
-        tape.backward(loss, gradient, defer=1)
-    assert all(parameter.grad is None for parameter in parameters_of(arguments))
-
-
-@pytest.mark.parametrize(
-    ("error", "message", "change"),
-    [
-        (ValueError, "network must hold program, inputs and parameters, got no program", {"program": ...}),
-        (TypeError, "inputs must be a list, got Tensor", {"inputs": torch.ones(3)}),
-        (TypeError, "unknown arguments op", {"op": 1}),
-        (TypeError, "unknown arguments where", {"where": 1}),
-        (TypeError, "network must hold arguments by name, got ...", {3: 1}),
-    ],
-)
-def test_a_network_of_other_entries_is_refused(error, message, change, backend):
-    arguments = {name: value for name, value in {**as_program(network("cpu")), **change}.items() if value is not ...}
-    with refused(error, f"forward_with_tape: {message}"):
-        forward_with_tape(arguments, backend=backend)
+    parameters, inputs = parameters_of(arguments), [arguments["positions"], arguments["directions"]]
+    cells, index = Cells(centres=arguments["centres"]), arguments["direction_index"]
+    sums, k = replace(PROGRAM, steps=PROGRAM.steps, sums=((3,),)), [p.detach() for p in parameters]
+    wrong = {
+        "program must be a Program, got str": lambda: Network("x", parameters),
+        "parameters must have 4 tensors, got 1": lambda: Network(PROGRAM, parameters[:1]),
+        "parameters must be a list, got Tensor": lambda: Network(PROGRAM, parameters[0]),
+        "inputs must be a list, got Tensor": lambda: Network(PROGRAM, parameters).fwd(inputs[0], cells),
+        "ray_index must be given for a program with inputs of rays, got None": lambda: Network(PROGRAM, parameters).fwd(
+            inputs, cells
+        ),
+        "parameters[1] must have shape [k, 3, 10] with k = 3, got [2, 3, 10]": lambda: Network(
+            PROGRAM, [k[0], torch.ones(2, 3, 10, device=device), *k[2:]]
+        ).fwd(inputs, cells, ray_index=index),
+        "program must have outputs [n, w], and inputs[0] with one row for each sample": lambda: Network(
+            sums, parameters
+        ).fwd(inputs, cells, ray_index=index),
+    }
+    for message, call in wrong.items():
+        with refused(TypeError if "must be a" in message else ValueError, f"Network: {message}"):
+            call()
+    raw, tape = forward(arguments, backend)
+    loss, gradient = squares(raw)
+    with refused(ValueError, "learn: loss must have shape [], got [40, 3]"):
+        tape.learn(gradient, [gradient])
+    with refused(ValueError, "learn: gradients[0] must have shape [40, 3], got [3]"):
+        tape.learn(loss, [gradient[0]])
+    with refused(TypeError, "learn: loss must be a tensor, got float"):
+        tape.learn(0.0, [gradient])
+    with refused(TypeError, "learn: defer must be True or False, got int"):
+        tape.learn(loss, [gradient], defer=1)
+    assert all(parameter.grad is None for parameter in parameters)
 
 
 @pytest.mark.native
 def test_the_dtype_of_the_parameters_decides_who_runs():
-    arguments = as_program(network("cpu"))
-    wide = {**arguments, "inputs": [x.double() for x in arguments["inputs"]]}
-    torch.testing.assert_close(forward_with_tape(wide, backend="native").raw, forward_with_tape(arguments).raw)
-    exact = {**arguments, "parameters": [p.detach().double() for p in arguments["parameters"]]}
-    assert torch.equal(forward_with_tape(exact).raw, forward_with_tape(exact, backend="reference").raw)
-    with pytest.raises(BackendUnavailable, match=r"forward_with_tape takes .* not float64"):
-        forward_with_tape(exact, backend="native")
+    arguments = network("cpu")
+    wide = {name: arguments[name].double() for name in ("positions", "directions")}
+    torch.testing.assert_close(forward({**arguments, **wide}, "native")[0], forward(arguments)[0])
+    exact = {"weights": [w.detach().double() for w in arguments["weights"]]}
+    exact |= {"biases": [arguments["biases"][0].detach().double(), None]}
+    exact = {**arguments, **exact, "features": arguments["features"].detach().double()}
+    assert torch.equal(forward(exact)[0], forward(exact, "reference")[0])
+    with pytest.raises(BackendUnavailable, match=r"grouped_program takes .* not float64"):
+        forward(exact, "native")

@@ -26,9 +26,9 @@ from voronerf.ops._core.layers import (
     Layer,
 )
 from voronerf.ops._core.program import HASH, VALUE, Builder, Columns, Program, Step
-from voronerf.ops.grouped_program.arguments import ProgramArguments
-from voronerf.ops.grouped_program.reference import check_rows, evaluate_rows, parsed
-from voronerf.ops.grouped_program.reference import grouped_program as in_torch
+from voronerf.ops.network.arguments import Arguments
+from voronerf.ops.network.reference import check_rows, evaluate_rows
+from voronerf.ops.network.reference import network as in_torch
 
 
 class Chain(NamedTuple):
@@ -40,7 +40,7 @@ class Chain(NamedTuple):
         weights: the index of each layer's weight among the program's parameters.
         biases: the index of each layer's bias, or None.
         features: the index of the hash grid's table, or None.
-        behind: the text of the second program; its single input is the concatenated outputs of the table.
+        behind: the second program; its single input is the concatenated outputs of the table.
     """
 
     layers: MLP
@@ -48,18 +48,18 @@ class Chain(NamedTuple):
     weights: tuple[int, ...]
     biases: tuple[int | None, ...]
     features: int | None
-    behind: str
+    behind: Program
 
 
-def grouped_program(arguments: ProgramArguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
-    """Runs a program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
-    text, inputs, parameters, ray_index, dtype, _ = arguments
-    chain, k = chain_of(text), offsets.shape[0] - 1
+def network(arguments: Arguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
+    """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``."""
+    program, inputs, parameters, ray_index, dtype, *_ = arguments
+    chain, k = chain_of(program.text), offsets.shape[0] - 1
     if chain is None:
         return in_torch(arguments, offsets, order)
     check_rows(arguments, offsets, order)
     with torch.autocast(inputs[0].device.type, enabled=False):
-        rays = parsed(text).rays
+        rays = program.rays
         if order is not None:
             inputs = [x if i in rays else x.index_select(0, order) for i, x in enumerate(inputs)]
             ray_index = None if ray_index is None else ray_index.index_select(0, order)
@@ -153,7 +153,7 @@ class _Reader:
             tuple(layer.weight for layer in self.finished),
             tuple(layer.bias for layer in self.finished),
             features[0] if features else None,
-            b.program(map(operand, self.program.outputs)).text,
+            b.program(map(operand, self.program.outputs)),
         )
 
     def _takes(self, step: Step) -> bool:

@@ -15,21 +15,21 @@ from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.program import BINARY, FUNCTIONS, PARAMETER, VALUE, Columns, Program, Step
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
-from voronerf.ops.grouped_program.arguments import ProgramArguments, index_name
 from voronerf.ops.hash_encode.reference import interpolate
+from voronerf.ops.network.arguments import Arguments
 
 
-def grouped_program(arguments: ProgramArguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
-    """Runs a program on the rows of each cell; see ``voronerf.ops.grouped_program``.
+def network(arguments: Arguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
+    """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``.
 
     With half types, the operands and results of products are rounded.
     """
     check_rows(arguments, offsets, order)
-    text, inputs, parameters, ray_index, dtype, _ = arguments
+    program, inputs, parameters, ray_index, dtype, *_ = arguments
     wide = torch.promote_types(dtype, torch.float32)
     with torch.autocast(offsets.device.type, enabled=False):
         cast = [x.to(wide) for x in inputs], [p.to(wide) for p in parameters]
-        results = evaluate(*cast, offsets, order, ray_index, text, dtype)
+        results = evaluate(*cast, offsets, order, ray_index, program, dtype)
     return [result.to(dtype) for result in results]
 
 
@@ -39,14 +39,13 @@ def evaluate(
     offsets: Tensor,
     order: Tensor | None,
     ray_index: Tensor | None,
-    text: str,
+    program: Program,
     products: torch.dtype | None = None,
 ) -> list[Tensor]:
     """Returns the results of a program, for checked tensors of one dtype.
 
     ``products`` is the dtype to which products and their operands are rounded, or None.
     """
-    program = parsed(text)
     n = len(inputs[0] if ray_index is None else ray_index)
     if order is not None and ray_index is not None:
         ray_index = ray_index.index_select(0, order)
@@ -68,37 +67,30 @@ def evaluate(
 
 
 @constant_result
-def parsed(text: str) -> Program:
-    """Parses a program, with a cache."""
-    return Program.parse(text)
-
-
-@constant_result
 def _grid(text: str) -> HashGrid:
     grid = HashGrid.parse(text)
     assert grid.rows  # fills the cached property, which a compiler can read but not compute
     return grid
 
 
-def check_rows(arguments: ProgramArguments, offsets: Tensor, order: Tensor | None) -> None:
+def check_rows(arguments: Arguments, offsets: Tensor, order: Tensor | None) -> None:
     """Raises ValueError if offsets, an order or a ray index on the CPU are out of range."""
     if offsets.device.type != "cpu" or torch.compiler.is_compiling():
         return
     index, n = arguments.ray_index, len(arguments.inputs[0] if arguments.ray_index is None else arguments.ray_index)
-    check_offsets(arguments.caller, offsets, n)
+    check_offsets(arguments.op, offsets, n)
     if order is not None:
-        check_range(arguments.caller, "order", order, n)
+        check_range(arguments.op, "order", order, n)
     if index is not None and len(index):
-        last = len(arguments.inputs[parsed(arguments.text).rays[0]]) - 1
+        last = len(arguments.inputs[arguments.program.rays[0]]) - 1
         low, high = (int(bound) for bound in index.aminmax())
         if low < 0 or high > last:
             wrong = low if low < 0 else high
-            raise ValueError(f"{arguments.caller}: {index_name(arguments.caller)} must be 0 to {last}, got {wrong}")
+            raise ValueError(f"{arguments.op}: {arguments.index_name} must be 0 to {last}, got {wrong}")
 
 
-def evaluate_rows(inputs: Sequence[Tensor], text: str) -> list[Tensor]:
+def evaluate_rows(inputs: Sequence[Tensor], program: Program) -> list[Tensor]:
     """Returns the outputs of a program without parameters, whose rows need no cells; the host reads no values."""
-    program = parsed(text)
     run = _Run(program, inputs, [], torch.zeros(1, dtype=torch.int32), None)
     return [run.columns(columns) for columns in program.outputs]
 

@@ -1,0 +1,363 @@
+"""One network per cell: a program with the parameters of all cells, evaluated on the rows of each cell.
+
+n rows, r rays, k cells, w columns, o outputs and i inputs of a matrix, e entries and f features of a table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import (
+    FLOATING,
+    INDEX,
+    Default,
+    TensorRule,
+    TensorRules,
+    check_flag,
+    check_rules,
+    check_shape,
+    check_tensor,
+)
+from voronerf.ops._core.derivatives import add_gradients
+from voronerf.ops._core.program import Program
+from voronerf.ops.network.arguments import Arguments
+from voronerf.ops.network.cells import Cells
+
+OP = backends.declare(
+    "grouped_program",
+    native=Implementation(EVERYWHERE, FLOATS, function="network"),
+    warp=Implementation(EVERYWHERE, FLOATS, function="network"),
+    reference=Implementation(function="network"),
+)
+"""The op whose row in the table of backends all networks share."""
+
+
+class Names(NamedTuple):
+    """The names of an op and of its tensors in error messages; by default ``inputs[0]``, ``parameters[0]`` and so on.
+
+    Attributes:
+        op: the name of the op.
+        inputs: the name of each input.
+        parameters: the name of each parameter.
+        index: the name of the ray index.
+    """
+
+    op: str = "Network"
+    inputs: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    ray_index: str = "ray_index"
+
+    def of(self, kind: str, i: int) -> str:
+        """Returns the name of input or parameter ``i``; ``kind`` is "inputs" or "parameters"."""
+        names: tuple[str, ...] = getattr(self, kind)
+        return names[i] if names else f"{kind}[{i}]"
+
+
+_NAMES = Names()
+
+
+class Network:
+    """One network per cell: a program and the parameters of all cells.
+
+    A program is a list of steps: layers, activations, encodings, sums, products and moves of columns
+    (:mod:`voronerf.ops._core.program`). All values of a tile of rows stay in cache. Inputs and parameters have
+    gradients of every order; the gradient of a program is a program itself.
+
+    Args:
+        program: the program to run, with at least one input.
+        parameters: [k, o, i] or [k, w] for each parameter of the program, or [1, ...] or [...] if all cells share it;
+            all of one dtype, except the table [k, e, f], [1, e, f] or [e, f] of a hash grid.
+        names: the names in error messages.
+
+    Raises:
+        TypeError: ``program`` is no Program, or ``parameters`` are no list.
+        ValueError: there are not as many parameters as in the program.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import Cells, Network
+        >>> from voronerf.ops._core.program import Builder
+        >>> b = Builder()
+        >>> x = b.input(2)
+        >>> program = b.program([b.apply("exp", b.linear(x, b.parameter(1, 2), 1))])  # exp(W x), W [1, 2]
+        >>> network = Network(program, [torch.tensor([[[1.0, 0.0]], [[0.0, 2.0]]], requires_grad=True)])
+        >>> two_cells = Cells(cells=torch.tensor([0, 1], dtype=torch.int32))
+        >>> (out,), tape = network.fwd([torch.zeros(2, 2)], two_cells)
+        >>> out.flatten()
+        tensor([1., 1.])
+        >>> tape.backward([torch.ones(2, 1)])[1].shape  # of the input, then of the parameter
+        torch.Size([2, 1, 2])
+    """
+
+    def __init__(self, program: Program, parameters: Sequence[Tensor], *, names: Names = _NAMES) -> None:
+        if not isinstance(program, Program):
+            raise TypeError(f"{names.op}: program must be a Program, got {type(program).__name__}")
+        _check_list(names.op, "parameters", parameters, len(program.parameters))
+        self.program, self.names, self._parameters = program, names, parameters
+        cells = zip(parameters, program.parameters)
+        self.shared = tuple([isinstance(p, Tensor) and p.dim() == len(shape) for p, shape in cells])
+        self.parameters = [p.unsqueeze(0) if alone else p for p, alone in zip(parameters, self.shared)]
+
+    def __call__(
+        self, inputs: Sequence[Tensor], cells: Cells, *, ray_index: Tensor | None = None, backend: str = "auto"
+    ) -> tuple[list[Tensor], Tensor | None]:
+        """Evaluates every row with the parameters of its cell.
+
+        Args:
+            inputs: one floating-point tensor for each input of the program: [n, w]; or [r, w], one row for each ray,
+                for the inputs in ``program.rays``. n and r < 2**31.
+            cells: the cell of each row. Rows outside all cells have outputs 0; cells may be empty.
+            ray_index: int32 [n], values 0 to r - 1, the ray of each row; None for a program without inputs of rays.
+            backend: "auto", "reference", "native" or "warp". Warp runs a chain of layers in a kernel, and the steps
+                after the chain in PyTorch. Any other program runs in PyTorch.
+
+        Returns:
+            The outputs of the program, in the order of the rows: [n, w] each, or [r, w] for the outputs in
+            ``program.by_ray``, which are summed over the rows of each ray. Then the sums over the rows of a cell:
+            [k, ...] each, or [1, e, f] for the gradient of a table that all cells share. The results have the dtype of
+            the parameters (or of autocast, if it is enabled); without parameters, the dtype of the first input. Then
+            the cells, int32 [n], or None for sorted rows.
+
+        Raises:
+            ValueError: offsets decrease or exceed n, a cell is outside 0 to k - 1, or an order or a ray_index is out of
+                range (checked on the CPU only).
+        """
+        self.check(inputs, cells, ray_index)
+        return self.run(inputs, cells, ray_index, backend)
+
+    def fwd(
+        self, inputs: Sequence[Tensor], cells: Cells, *, ray_index: Tensor | None = None, backend: str = "auto"
+    ) -> tuple[list[Tensor], Tape]:
+        """Evaluates every row as a call does; returns results without an autograd graph, and their tape.
+
+        The arguments are the arguments of a call.
+        """
+        self.check(inputs, cells, ray_index)
+        learns = torch.is_grad_enabled()
+        leaves = [*inputs, *self._parameters]
+        wanted, arguments = [learns and tensor.requires_grad for tensor in leaves], self.arguments(inputs, ray_index)
+        place: dict[str, Any] = {"device": inputs[0].device, "dtype": arguments.dtype}
+        plain = all(tensor.dtype is torch.float32 for tensor in leaves)
+        if plain and backends.chosen(OP, backend=backend, **place) == "native":
+            from voronerf.ops.network.native import Run
+
+            with torch.no_grad():
+                rows = cells.sort(inputs[0], self.count(cells), backend)
+                results, tape = Run.of(arguments, rows.offsets, rows.order).with_tape(any(wanted))
+            return results, Tape(results, rows.cells, cells.frozen, leaves, wanted, tape.backward)
+        own = [leaf.detach().requires_grad_(want) for leaf, want in zip(leaves, wanted)]  # leaves without hooks
+        network = Network(self.program, own[len(inputs) :], names=self.names)
+        outputs, found = network.run(own[: len(inputs)], cells._replace(frozen=None), ray_index, backend)
+
+        def backward(gradients: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor | None]:
+            pairs = [(out, g) for out, g in zip(outputs, gradients) if g is not None and out.requires_grad]
+            chosen = [leaf for leaf, want in zip(own, wanted) if want]
+            if not pairs or not chosen:
+                return [None] * len(leaves)
+            arriving = [g.to(out.dtype) for out, g in pairs]
+            slopes = iter(torch.autograd.grad([out for out, _ in pairs], chosen, arriving, allow_unused=True))
+            return [next(slopes) if want else None for want in wanted]
+
+        return [out.detach() for out in outputs], Tape(outputs, found, cells.frozen, leaves, wanted, backward)
+
+    def run(
+        self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None = None, backend: str = "auto"
+    ) -> tuple[list[Tensor], Tensor | None]:
+        """Evaluates tensors that have been checked; see :meth:`__call__`."""
+        arguments = self.arguments(inputs, ray_index)
+        place: dict[str, Any] = {"device": inputs[0].device, "dtype": arguments.dtype}
+        run = backends.resolve(OP, backend=backend, **place)
+        rows = cells.sort(inputs[0], self.count(cells), backend)
+        results: list[Tensor] = run(arguments, rows.offsets, rows.order)
+        if cells.frozen is not None and rows.cells is not None:
+            held = frozen_rows(cells.frozen, rows.cells)
+            results = [stop_gradients(out, held) for out in results]
+        return results, rows.cells
+
+    def arguments(self, inputs: Sequence[Tensor], ray_index: Tensor | None) -> Arguments:
+        """Returns the arguments of the implementations."""
+        return Arguments.of(self.program, inputs, self.parameters, ray_index, self.names.op, self.names.ray_index)
+
+    def count(self, cells: Cells) -> int:
+        """Returns the number of cells k."""
+        if cells.offsets is not None:
+            return cells.offsets.shape[0] - 1
+        return next((p.shape[0] for p in self.parameters if p.shape[0] != 1), 1)
+
+    def check(self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None) -> None:
+        """Raises the errors of a call with these arguments; reads values on the CPU alone."""
+        op, program, parameters, names = self.names.op, self.program, self._parameters, self.names
+        if not program.inputs:
+            raise ValueError(f"{op}: program must have at least one input, got none")
+        _check_list(op, "inputs", inputs, len(program.inputs))
+        if (ray_index is not None) != (len(program.rays) > 0):
+            rule = "given for a program with" if program.rays else "None for a program without"
+            came = "None" if ray_index is None else "an index"
+            raise ValueError(f"{op}: {names.ray_index} must be {rule} inputs of rays, got {came}")
+        rules, tensors = cells.to_check(op)
+        check_tensor(op, names.of("inputs", 0), inputs[0])
+        layers = [p for i, p in enumerate(parameters) if not _among(i, program.tables)]
+        if layers:
+            check_tensor(op, names.of("parameters", 0), layers[0])
+        first = 1 if cells.offsets is not None else 0  # offsets tell the number of cells
+        all_tensors = [*tensors[:first], *inputs, *parameters, *tensors[first:]]
+        if ray_index is not None:
+            all_tensors.append(ray_index)
+        dtype = layers[0].dtype if layers else None
+        others = tuple(rules[:first]), tuple(rules[first:])
+        sizes = check_rules(op, _rules, all_tensors, program, names, dtype, self.shared, *others)
+        if ray_index is not None and not sizes["r"] and sizes["n"]:
+            at = next(i for i in range(len(inputs)) if _among(i, program.rays))
+            shape = list(inputs[at].shape)
+            raise ValueError(f"{op}: {names.of('inputs', at)} must hold a row for the {names.ray_index}, got {shape}")
+        if cells.offsets is None and (program.sums or program.by_ray or _among(0, program.rays)):
+            raise ValueError(f"{op}: program must have outputs [n, w], and inputs[0] with one row for each sample")
+        cells.check(op, inputs[0], sizes)
+
+
+def _check_list(op: str, name: str, tensors: Any, count: int) -> None:
+    if not isinstance(tensors, Sequence):
+        raise TypeError(f"{op}: {name} must be a list, got {type(tensors).__name__}")
+    if len(tensors) != count:
+        raise ValueError(f"{op}: {name} must have {count} tensors, got {len(tensors)}")
+
+
+def _rules(
+    program: Program,
+    names: Names,
+    dtype: torch.dtype | None,
+    shared: Sequence[bool],
+    first: Sequence[TensorRule],
+    last: Sequence[TensorRule],
+) -> TensorRules:
+    """Returns the rules for the tensors of a network: ``first``, inputs, parameters, ``last`` and the ray index.
+
+    ``dtype`` is the dtype of all parameters except tables, or None without such parameters. ``shared`` tells for each
+    parameter whether it lacks the dimension of cells.
+    """
+    rules: list[TensorRule | Default] = [*first]
+    for i, width in enumerate(program.inputs):
+        rules.append(TensorRule(names.of("inputs", i), FLOATING, ("r" if _among(i, program.rays) else "n", width)))
+    like = ""
+    for i, shape in enumerate(program.parameters):
+        name, table = names.of("parameters", i), _among(i, program.tables)
+        dtypes = FLOATING if dtype not in FLOATING or table or not like else (dtype,)
+        empty = "" if shared[i] else "must hold at least one cell"
+        rules.append(TensorRule(name, dtypes, shape if shared[i] else ("1|k", *shape), "" if table else like, empty))
+        like = like if like or table else name
+    rules += [Default("k", 1), *last]
+    if program.rays:
+        rules.append(TensorRule(names.ray_index, INDEX, ("n",)))
+    return rules
+
+
+def _among(i: int, numbers: Sequence[int]) -> bool:
+    """Returns whether a number is in a list; ``in`` fails if torch.compile makes the list's numbers symbolic."""
+    return any(i == number for number in numbers)
+
+
+class Tape:
+    """The tape of a forward pass: what its backward pass needs.
+
+    Attributes:
+        cells: int32 [n], the cell of each row; None for sorted rows.
+    """
+
+    def __init__(
+        self,
+        outputs: Sequence[Tensor],
+        cells: Tensor | None,
+        frozen: Tensor | None,
+        leaves: Sequence[Tensor],
+        wanted: Sequence[bool],
+        backward: Callable[[Sequence[Tensor | None], Sequence[bool]], list[Tensor | None]],
+    ) -> None:
+        self.cells, self._frozen, self._backward = cells, frozen, backward
+        self._shapes, self._leaves, self._wanted = [out.shape for out in outputs], leaves, wanted
+
+    def backward(self, gradients: Sequence[Tensor | None], wanted: Sequence[bool] | None = None) -> list[Tensor | None]:
+        """Returns the gradients of the inputs, then of the parameters, without an autograd graph.
+
+        Args:
+            gradients: the gradient of a loss with respect to each result, or None.
+            wanted: for each input, then for each parameter, whether to return its gradient; by default if it requires a
+                gradient.
+
+        Returns:
+            The gradients; None if it is unwanted, or if no result depends on the tensor.
+        """
+        if self._frozen is not None and self.cells is not None:  # the backward pass drops rows with a zero gradient
+            held = frozen_rows(self._frozen, self.cells)
+            gradients = [None if g is None else g.masked_fill(held, 0) for g in gradients]
+        with torch.no_grad():
+            slopes = self._backward(gradients, self._wanted if wanted is None else wanted)
+            pairs = zip(slopes, self._leaves, strict=True)
+            return [g if g is None or g.dim() == leaf.dim() else g.view_as(leaf) for g, leaf in pairs]
+
+    def learn(self, loss: Tensor, gradients: Sequence[Tensor], *, defer: bool = False) -> Tensor:
+        """Adds the gradients of a loss to ``.grad`` of the inputs and parameters. Call ``learn`` only once.
+
+        Args:
+            loss: [], the loss.
+            gradients: the gradient of the loss with respect to each result.
+            defer: whether to add the gradients only when ``backward`` of the returned loss is called.
+
+        Returns:
+            The loss [], detached unless deferred.
+
+        Raises:
+            ValueError: ``loss`` or a gradient has another shape.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import MLP, Layer
+            >>> from voronerf.ops import Cells, Network
+            >>> weight = torch.tensor([[[2.0]]], requires_grad=True)
+            >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))
+            >>> network = Network(table.program(1, 0, None, (False,)), [weight])
+            >>> (out,), tape = network.fwd([torch.ones(4, 1)], Cells())
+            >>> loss = tape.learn(out.square().mean(), [out * (2 / 4)])
+            >>> float(loss), float(weight.grad)
+            (4.0, 4.0)
+        """
+        check_shape("learn", "loss", loss, ())
+        check_flag("learn", "defer", defer)
+        for i, (gradient, shape) in enumerate(zip(gradients, self._shapes, strict=True)):
+            check_shape("learn", f"gradients[{i}]", gradient, shape)
+        learning = [leaf for leaf, want in zip(self._leaves, self._wanted) if want]
+
+        def slopes(scale: Tensor | None) -> list[Tensor | None]:
+            arriving = [g.detach() if scale is None else g.detach() * scale for g in gradients]
+            return [g for g, want in zip(self.backward(arriving), self._wanted) if want]
+
+        return add_gradients(loss.detach(), learning, slopes, defer)
+
+
+def frozen_rows(frozen: Tensor, cells: Tensor) -> Tensor:
+    """Returns bool [n, 1], whether each row's cell is frozen; a row in no cell (-1) counts as in cell 0."""
+    return frozen.index_select(0, cells.clamp(min=0))[:, None]
+
+
+def stop_gradients(out: Tensor, rows: Tensor) -> Tensor:
+    """Returns ``out`` with zero gradients in ``rows``, bool [n, 1]; the native backward pass drops these rows."""
+    return _StopGradients.apply(out, rows) if out.requires_grad else out
+
+
+class _StopGradients(torch.autograd.Function):
+    @staticmethod
+    def forward(out: Tensor, rows: Tensor) -> Tensor:
+        return out.view_as(out)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[1])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return gradient.masked_fill(ctx.saved_tensors[0], 0), None
