@@ -342,7 +342,7 @@ def _lower(text: str) -> Lowered | None:
     before, layers = _terms(program, whole)
 
     def after(outputs: Sequence[int]) -> Program:
-        """Returns the program that takes the values of layers as additional inputs."""
+        """Returns the program that takes some layers as additional inputs."""
         place = {out: i for i, out in enumerate(outputs, len(program.inputs))}
         steps = [Step("input", s.out, s.width, (), (place[s.out],)) if s.out in place else s for s in program.steps]
         inputs = (*program.inputs, *(whole[out].width for out in outputs))
@@ -355,25 +355,25 @@ def _lower(text: str) -> Lowered | None:
     for out in reversed(layers):
         if out in needed:
             needed.update(term.source.index for term in layers[out] if isinstance(term, Product))
+    read, kept = ([out for out in values if out in needed] for values in (before, layers))
     columns, count = dict[int, int](), 0  # value -> its first column
-    for out in filter(needed.__contains__, (*before, *layers)):
+    for out in (*read, *kept):
         columns[out], count = count, _span(whole[out], count).stop
     table, first, source, activation = list[Layer](), [0], list[int](), list[int]()
-    for out in filter(needed.__contains__, layers):
+    for out in kept:
         products = tuple(term for term in layers[out] if isinstance(term, Product))
         biases = tuple(term for term in layers[out] if isinstance(term, Columns))
         table.append(Layer(whole[out].width, products, biases))
         for _ in _span(whole[out]):
             for product in products:
-                read = _span(product.source, columns[product.source.index])
-                source += read
-                activation += [product.activation] * len(read)
+                sources = _span(product.source, columns[product.source.index])
+                source += sources
+                activation += [product.activation] * len(sources)
             first.append(len(source))
     written = [column for out in outputs for column in _span(whole[out], columns[out])]
     steps = tuple(step for step in program.steps if step.out in before)
-    inputs = tuple(whole[out] for out in before if out in needed)
     return Lowered(
-        pruned(replace(program, steps=steps, outputs=inputs, by_ray=())),
+        pruned(replace(program, steps=steps, outputs=tuple(whole[out] for out in read), by_ray=())),
         tuple(table),
         json.dumps([first, source, activation, written]),
         tuple(whole[out].width for out in outputs),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import pytest
 import torch
 from op_cases import offsets_of
@@ -17,26 +19,7 @@ pytest.importorskip("warp")
 from voronerf.kernels.grouped_program import lower  # imports Warp
 
 GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
-KINDS = {
-    **TABLES,
-    "hash": MLP((Layer((POSITIONS,), 8, "relu"), Layer((0, DIRECTIONS), 3)), (1,), None, 2, "hash", GRID),
-    "gaussians": MLP((Layer((POSITIONS,), 8, "relu"), Layer((0,), 4)), (1,), 2, None, "integrated"),
-}
-
-
-def call_of(name, shared, ray):
-    table = KINDS[name]
-    shapes = table.weight_shapes(6 if table.integrated else 3, 3)
-    biased = tuple(number != 1 for number in range(len(shapes)))
-    q = 3 if table.uses_directions else 0
-    program = table.program(6 if table.integrated else 3, q, None, biased, ray and table.uses_directions)
-    generator = torch.Generator().manual_seed(0)
-    inputs = [torch.rand(5 if i in program.rays else 40, w, generator=generator) for i, w in enumerate(program.inputs)]
-    if len(inputs) > 1:
-        inputs[1] = torch.nn.functional.normalize(inputs[1], dim=-1)
-    parameters = [torch.randn(1 if shared else 3, *shape, generator=generator) / 3 for shape in program.parameters]
-    index = torch.randint(0, 5, (40,), generator=generator).int() if program.rays else None
-    return program, [x.requires_grad_() for x in (*inputs, *parameters)], len(inputs), index
+HASHED = MLP((Layer((POSITIONS,), 8, "relu"), Layer((0, DIRECTIONS), 3)), (1,), None, 2, "hash", GRID)
 
 
 def layers_of(program):
@@ -48,20 +31,25 @@ def layers_of(program):
     return counts, sum(step.op == "linear" for step in Program.parse(text).steps)
 
 
-@pytest.mark.parametrize("name", KINDS)
-@pytest.mark.parametrize(("shared", "ray", "ordered"), [(False, True, True), (True, False, False)])
-def test_networks_are_those_of_the_reference(name, shared, ray, ordered):
-    program, tensors, count, index = call_of(name, shared, ray)
+@pytest.mark.parametrize("table", [*TABLES.values(), HASHED], ids=[*TABLES, "hash"])
+@pytest.mark.parametrize(("k", "ray"), [(3, True), (1, False)])
+def test_networks_run_in_the_kernel_at_once(table, k, ray):
+    biased = tuple(layer != 1 for layer in range(len(table.layers)))
+    widths = 6 if table.integrated else 3, 3 * table.uses_directions
+    program = table.program(*widths, None, biased, ray and table.uses_directions)
     (_,), left = layers_of(program)
     assert left == 0
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(1)).int() if ordered else None
+    directions = torch.nn.functional.normalize(torch.randn(5 if program.rays else 40, 3))
+    inputs = [torch.rand(40, widths[0]), directions][: len(program.inputs)]
+    parameters = [torch.randn(k, *shape) / 3 for shape in program.parameters]
+    leaves = [tensor.requires_grad_() for tensor in (*inputs, *parameters)]
     offsets = offsets_of([11, 0, 25]) + 2  # two rows before the cells and two after them
+    options = {"order": torch.randperm(40).int() if ray else None}
+    options["ray_index"] = torch.randint(0, 5, (40,)).int() if program.rays else None
     outcomes = []
     for backend in ("warp", "reference"):
-        arguments = {"program": program, "order": order, "ray_index": index, "backend": backend}
-        results = grouped_program(tensors[:count], tensors[count:], offsets, **arguments)
-        total = sum(result.square().sum() for result in results)
-        outcomes.append([*results, *torch.autograd.grad(total, tensors, materialize_grads=True, allow_unused=True)])
+        (y,) = grouped_program(inputs, parameters, offsets, program=program, **options, backend=backend)
+        outcomes.append([y, *torch.autograd.grad(y.square().sum(), leaves, materialize_grads=True, allow_unused=True)])
     for a, b in zip(*outcomes, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
@@ -74,6 +62,7 @@ def vector(b, start, width, spread=False):
 CASES = {
     "another activation": (lambda b, x, h, m: b.linear(b.apply("tanh", h), m, 2), [1, 1], 0),
     "another softplus": (lambda b, x, h, m: b.linear(b.apply("softplus", h, 2.0, 20.0), m, 2), [1, 1], 0),
+    "a scaled activation": (lambda b, x, h, m: b.linear(b.function("relu", h, times=h), m, 2), [1, 1], 0),
     "features": (lambda b, x, h, m: b.linear(h.part(13, 20), m, 2, add=b.linear(x.part(1, 2), m, 2, 20)), [2], 0),
     "activated features": (lambda b, x, h, m: b.linear(b.apply("sigmoid", h.part(3, 30)).part(11, 18), m, 2), [2], 0),
     "a layer and its activation": (
@@ -83,11 +72,7 @@ CASES = {
     ),
     "an output and its activation": (lambda b, x, h, m: b.move(80, [(h, 0), (b.apply("relu", h), 40)]), [1], 0),
     "an activation as an output": (lambda b, x, h, m: b.apply("sigmoid", h.part(2, 2)), [1], 0),
-    "a broadcast feature": (
-        lambda b, x, h, m: b.linear(b.apply("sine", h.part(2, 1)._replace(width=9, spread=True), 1.0), m, 2),
-        [1, 1],
-        0,
-    ),
+    "spread": (lambda b, x, h, m: b.linear(b.apply("relu", h._replace(width=9, spread=True)), m, 2), [1, 1], 0),
     "a transposed matrix": (lambda b, x, h, m: b.linear(b.linear(h, m, 2), m, 17, 20, transposed=True), [3], 0),
     "a sum of layers": (lambda b, x, h, m: b.linear(b.binary("add", h, b.linear(x, 0, 40)), m, 2), [2], 0),
     "a late bias": (lambda b, x, h, m: b.linear(b.binary("add", h, vector(b, 7, 40)), m, 2), [2], 0),
@@ -97,6 +82,7 @@ CASES = {
     "a function of an input": (lambda b, x, h, m: b.linear(b.apply("tanh", x), m, 2), [1], 0),
     "an encoded layer": (lambda b, x, h, m: b.linear(b.encode("frequency", h.part(0, 2), 1), m, 2), [1, 1], 0),
     "encodings": (lambda b, x, h, m: b.linear(b.encode("frequency", b.encode("frequency", x, 1), 1), m, 2), [1], 0),
+    "a slope": (lambda b, x, h, m: b.linear(b.encode("frequency", x, 1, along=[x]), m, 2), [1], 0),
     "an addend that is no layer": (lambda b, x, h, m: b.linear(b.linear(h, m, 2, add=x.part(0, 2)), m, 2), [1], 2),
     "a fused activation": (lambda b, x, h, m: b.emit("linear", 2, [h], (m, 0, 0), "relu"), [1], 1),
     "no layer": (lambda b, x, h, m: b.apply("relu", x), [], 0),
@@ -126,3 +112,13 @@ def test_inputs_and_outputs_of_rays():
     samples, sums = grouped_program([rays], [weight], offsets_of([5]), **arguments)
     torch.testing.assert_close(samples, rays[index] @ weight[0].T)
     torch.testing.assert_close(sums, torch.tensor([[2.0], [3.0]]) * (rays @ weight[0].T))
+
+
+def test_several_runs_of_the_kernel_compile():
+    b = Builder()
+    h = b.apply("tanh", b.linear(b.input(3), b.parameter(4, 3), 4))
+    program, offsets = b.program([b.linear(h, b.parameter(2, 4), 2)]), offsets_of([3, 2])
+    parameters = [torch.randn(2, *shape) for shape in program.parameters]
+    run = functools.partial(grouped_program, parameters=parameters, offsets=offsets, program=program, backend="warp")
+    compiled = torch.compile(run, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled([x := torch.rand(5, 3)]), run([x]))
