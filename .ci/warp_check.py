@@ -21,8 +21,8 @@ import warp as wp
 
 import voronerf.ops  # noqa: F401  # declares the ops of the kernels
 from voronerf import kernels
-from voronerf.kernels.grouped_mlp import THREADS
-from voronerf.kernels.grouped_mlp import kernels as of_networks
+from voronerf.kernels.network import THREADS
+from voronerf.kernels.network import kernels as of_networks
 
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
 REGISTERS, FRAME = 0x2F, 0x11  # attributes of a kernel in the section .nv.info of a cubin
@@ -67,7 +67,7 @@ def main(arguments: list[str]) -> int:
                 shared = json.loads(next(Path(folder).glob(f"{cubin.name.split('.sm')[0]}*.meta")).read_text())
                 for name, (registers, stack) in resources(cubin.read_bytes()).items():
                     short = "_".join(part for part in name.split("_")[:-4] if part not in ("", "kernels", "locals"))
-                    file = module.name.rpartition("kernels.")[2] if "voronerf" in module.name else "grouped_mlp"
+                    file = module.name.rpartition("kernels.")[2] if "voronerf" in module.name else "grouped_program"
                     row = found.setdefault(f"{file}: {short.removesuffix('_kernel')}", [0, 0, 0])
                     row[:] = map(max, row, (registers, stack, shared.get(f"{name}_smem_bytes", 0)))
     print("| kernel | registers | stack | shared memory of a block |\n|---|---|---|---|")

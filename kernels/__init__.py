@@ -94,7 +94,7 @@ def loads(device: torch.device, dtype: torch.dtype) -> list[Callable[[], None]]:
 
     Each function loads one module of kernels. It compiles the module first if Warp's cache does not hold it.
     """
-    from voronerf.kernels.grouped_mlp import THREADS, kernels
+    from voronerf.kernels.network import THREADS, kernels
 
     where = wp.device_from_torch(device)
     names = [f"voronerf.kernels.{name}" for name in _STEP_FILES]

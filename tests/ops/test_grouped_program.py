@@ -98,12 +98,14 @@ def derivatives(program: Program, rows: list, parameters: list, offsets: Tensor,
     return [t.detach() for t in (*results, *firsts, *seconds)]
 
 
-def check(program: Program, sizes: list[int], shared: bool = False, order: Tensor | None = None) -> None:
-    """Compares the native backend with the float64 reference; allows twice the error of the float32 reference."""
+def check(
+    program: Program, sizes: list[int], shared: bool = False, order: Tensor | None = None, backend: str = "native"
+) -> None:
+    """Compares a backend with the float64 reference; allows twice the error of the float32 reference."""
     wide = derivatives(program, *arguments(program, sizes, torch.float64, shared), "reference", order)
     narrow = derivatives(program, *arguments(program, sizes, torch.float32, shared), "reference", order)
-    native = derivatives(program, *arguments(program, sizes, torch.float32, shared), "native", order)
-    for exact, other, ours in zip(wide, narrow, native, strict=True):
+    actual = derivatives(program, *arguments(program, sizes, torch.float32, shared), backend, order)
+    for exact, other, ours in zip(wide, narrow, actual, strict=True):
         assert ours.shape == exact.shape
         if exact.numel():
             size = float(exact.abs().max())

@@ -14,7 +14,6 @@ import functools
 import json
 from dataclasses import dataclass, field, replace
 
-from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.program import HASH, PARAMETER, Builder, Columns, Program, encoded_columns, pruned
@@ -280,12 +279,6 @@ def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: 
         parts.append((values[output], at))
         at += values[output].width
     return pruned(builder.program([builder.move(at, parts)]))
-
-
-@constant_result
-def program_text(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool) -> str:
-    """Returns the text of :meth:`MLP.program` for the table in ``text``; ``torch.compile`` treats it as a constant."""
-    return _program(text, p, q, widths, biased, ray).text
 
 
 def _check_layer(index: int, layer: Layer) -> None:

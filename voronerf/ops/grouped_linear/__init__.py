@@ -23,7 +23,7 @@ def _prepare(arguments: Any) -> Any:
 
 @declare(
     native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS, "grouped_mlp"),
+    warp=Implementation(EVERYWHERE, FLOATS, "network"),
     smooth=["x", "weight", "bias"],
     prepare=_prepare,
 )

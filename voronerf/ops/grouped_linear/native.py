@@ -9,11 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer, program_text
+from voronerf.ops.grouped_linear.activation import one_layer
 from voronerf.ops.network.native import PRODUCTS, Run
-
-# The text of a one-layer table for each activation. The width of the weight replaces the width 1.
-_TABLES = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
 
 
 def grouped_linear(
@@ -25,9 +22,7 @@ def grouped_linear(
         dtype = torch.get_autocast_dtype(x.device.type)
     stored = dtype if dtype == torch.bfloat16 else torch.float32
     rounded = [p.to(dtype).float() for p in (weight, bias) if p is not None]
-    o, i = len(range(weight.shape[1])), len(range(weight.shape[2]))  # plain ints, not symbolic ones
-    shape = i, 0, (o,), (bias is not None,), False
-    text, products = program_text(_TABLES[activation], *shape), PRODUCTS.get(dtype, "float32")
+    text, products = one_layer(weight, bias, activation).text, PRODUCTS.get(dtype, "float32")
     layer = Run([x.to(dtype).to(stored)], rounded, offsets, None, None, (), text, "grouped_linear", products=products)
     (out,) = layer.results()
     return out.to(dtype)

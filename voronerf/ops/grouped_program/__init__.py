@@ -41,8 +41,8 @@ def grouped_program(
             sorted rows.
         ray_index: int32 [n], values 0 to r - 1: the ray of each row of inputs and results, before sorting by ``order``.
             None for a program without inputs of rays.
-        backend: "auto", "reference", "native" or "warp". Warp runs a chain of layers in a kernel, and the steps
-            after the chain in PyTorch. Any other program runs in PyTorch.
+        backend: "auto", "reference", "native" or "warp". Warp runs layers and their encodings in kernels, and all
+            other steps in PyTorch. A program with sums runs in PyTorch.
 
     Returns:
         The outputs of the program: [n, w] each, or [r, w] for the outputs in ``program.by_ray``, which are summed over

@@ -19,17 +19,19 @@ from voronerf.ops.hash_encode.reference import interpolate
 from voronerf.ops.network.arguments import Arguments
 
 
-def network(arguments: Arguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
+def network(
+    arguments: Arguments, offsets: Tensor, order: Tensor | None, run: Callable[..., Run] | None = None
+) -> list[Tensor]:
     """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``.
 
-    With half types, the operands and results of products are rounded.
+    With half types, the operands and results of products are rounded. ``run`` replaces the class `Run`.
     """
     check_rows(arguments, offsets, order)
     program, inputs, parameters, ray_index, dtype, *_ = arguments
     wide = torch.promote_types(dtype, torch.float32)
     with torch.autocast(offsets.device.type, enabled=False):
         cast = [x.to(wide) for x in inputs], [p.to(wide) for p in parameters]
-        results = evaluate(*cast, offsets, order, ray_index, program, dtype)
+        results = evaluate(*cast, offsets, order, ray_index, program, dtype, run)
     return [result.to(dtype) for result in results]
 
 
@@ -41,10 +43,12 @@ def evaluate(
     ray_index: Tensor | None,
     program: Program,
     products: torch.dtype | None = None,
+    run: Callable[..., Run] | None = None,
 ) -> list[Tensor]:
     """Returns the results of a program, for checked tensors of one dtype.
 
-    ``products`` is the dtype to which products and their operands are rounded, or None.
+    ``products`` is the dtype to which products and their operands are rounded, or None. ``run`` replaces the class
+    `Run`.
     """
     n = len(inputs[0] if ray_index is None else ray_index)
     if order is not None and ray_index is not None:
@@ -55,15 +59,15 @@ def evaluate(
     for i, x in enumerate(inputs):
         place = ray_index if i in program.rays else order
         rows.append(torch.where(inside, x if place is None else x.index_select(0, place), 0))
-    run = _Run(program, rows, parameters, offsets, inside, products)
-    results = [torch.where(inside, run.columns(columns), 0) for columns in program.outputs]
+    values = (run or Run)(program, rows, parameters, offsets, inside, products)
+    results = [torch.where(inside, values.columns(columns), 0) for columns in program.outputs]
     for i, result in enumerate(results):
         if i in program.by_ray:
             assert ray_index is not None
             results[i] = result.new_zeros(len(inputs[program.rays[0]]), result.shape[1]).index_add(0, ray_index, result)
         elif order is not None:
             results[i] = torch.empty_like(result).index_copy(0, order.long(), result)
-    return [*results, *run.sums]
+    return [*results, *values.sums]
 
 
 @constant_result
@@ -89,13 +93,7 @@ def check_rows(arguments: Arguments, offsets: Tensor, order: Tensor | None) -> N
             raise ValueError(f"{arguments.op}: {arguments.index_name} must be 0 to {last}, got {wrong}")
 
 
-def evaluate_rows(inputs: Sequence[Tensor], program: Program) -> list[Tensor]:
-    """Returns the outputs of a program without parameters, whose rows need no cells; the host reads no values."""
-    run = _Run(program, inputs, [], torch.zeros(1, dtype=torch.int32), None)
-    return [run.columns(columns) for columns in program.outputs]
-
-
-class _Run:
+class Run:
     """One run of a program and its values. ``inside``: bool [n, 1], whether a row belongs to a cell."""
 
     def __init__(
@@ -104,7 +102,7 @@ class _Run:
         inputs: Sequence[Tensor],
         parameters: Sequence[Tensor],
         offsets: Tensor,
-        inside: Tensor | None,
+        inside: Tensor,
         products: torch.dtype | None = None,
     ) -> None:
         self.inputs, self.offsets, self.k, self.inside = inputs, offsets, len(offsets) - 1, inside
@@ -163,16 +161,21 @@ class _Run:
 
     def layer(self, step: Step) -> Tensor:
         """Returns the value of a linear step, [n, w]: a product, with its addends and its ReLU."""
-        (read, *others), (matrix, start, transposed) = step.operands, map(int, step.numbers)
-        x, weight = self.columns(read), self.parameters[matrix][:, :, start:]
-        weight = weight[:, :, : step.width].transpose(1, 2) if transposed else weight[:, :, : x.shape[1]]
+        x, others = self.columns(step.operands[0]), [*step.operands[1:]]
         bias = self.vectors(others.pop(0), step.width) if others and others[0].of == PARAMETER else None
-        y = grouped_linear(x.to(self.products), self.offsets, weight.to(self.products), bias).to(x.dtype)
+        y = grouped_linear(x.to(self.products), self.offsets, self.matrix(step).to(self.products), bias).to(x.dtype)
         if len(others) > (step.name == "relu_slope"):
             y = y + self.columns(others[0])
         if step.name == "relu_slope":
             return torch.where(self.columns(others[-1]) > 0, y, 0)
         return y.relu() if step.name == "relu" else y
+
+    def matrix(self, step: Step) -> Tensor:
+        """Returns the matrix of a linear step, [k, o, i]: some columns of a parameter, or their transpose."""
+        matrix, start, transposed = map(int, step.numbers)
+        width = step.width if transposed else step.operands[0].width
+        part = self.parameters[matrix][:, :, start : start + width]
+        return part.transpose(1, 2) if transposed else part
 
     def encoded(self, step: Step, operands: Sequence[Tensor]) -> Tensor:
         """Returns an encoding or one of its derivatives, [n, w]."""
@@ -197,7 +200,6 @@ class _Run:
     def scattered(self, step: Step) -> Tensor:
         """Returns the gradient that a step adds to the sum of a table, [k, e, f] or [1, e, f]."""
         grid, parameter, _ = map(int, step.numbers)
-        assert self.inside is not None
         x, g, *directions = (self.columns(columns) for columns in step.operands)
 
         def encoded(table: Tensor) -> Tensor:
