@@ -319,7 +319,7 @@ def test_errors():
         weights=[*weights[:2], weights[1], *weights[3:]],
     )
     refuses(
-        "weights[1] must have dtype float32, got float64",
+        "weights[1] must have the dtype of weights[0], float32, got float64",
         weights=[weights[0], *(weight.double() for weight in weights[1:])],
     )
     refuses("biases[0] must have shape [k, 16] with k = 2, got [2, 15]", biases=[torch.zeros(2, 15), *[None] * 6])
@@ -328,5 +328,5 @@ def test_errors():
         biases=[torch.zeros(2, 16).half(), *[None] * 6],
     )
     refuses(
-        "weights[0] must be on the device of positions, cpu, got meta", weights=[weights[0].to("meta"), *weights[1:]]
+        "weights[0] must be on the device of offsets, cpu, got meta", weights=[weights[0].to("meta"), *weights[1:]]
     )

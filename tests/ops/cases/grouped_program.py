@@ -100,7 +100,7 @@ CASE = Case(
         "parameters[0] must have shape [k, 7, 8] with k = 3, got [4, 7, 8]": {
             "parameters": [torch.ones(4, 7, 8), torch.ones(3, 7)]
         },
-        "parameters[1] must have dtype float64, got float32": {
+        "parameters[1] must have the dtype of parameters[0], float64, got float32": {
             "parameters": [torch.ones(3, 7, 8).double(), torch.ones(3, 7)]
         },
         "order must have shape [n] with n = 6, got [3]": {"order": torch.zeros(3, dtype=torch.int32)},
