@@ -675,14 +675,14 @@ FAULTS = (
     ),
     _python(
         "float64 positions are compared with the index of float32 centres",
-        "ops/routed_program/native.py",
-        "    index = index if coords.dtype is centres.dtype else None",
-        "",
+        "ops/network/cells.py",
+        "index = self.centre_index if centres is self.centres else None",
+        "index = self.centre_index",
         "tests/router/test_call_cache.py",
     ),
     _python(
         "The gradient of one table reads the kept features of another",
-        "ops/grouped_program/native.py",
+        "ops/network/native.py",
         "    keeps = keeps and lower(derived.text).lookups == lower(text).lookups",
         "",
         "tests/ops/test_grouped_program.py",
@@ -880,7 +880,7 @@ FAULTS = (
     ),
     _python(
         "A product has one source more than there is room for",
-        "ops/grouped_program/lowering.py",
+        "ops/network/lowering.py",
         "count >= native.compiled.most_sources",
         "count > native.compiled.most_sources",
         "tests/native/test_bindings.py",

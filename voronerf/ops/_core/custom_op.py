@@ -123,15 +123,9 @@ class Op:
     Attributes:
         tensors: the indices of the custom op's arguments that are tensors or None.
         plan: the description with which the compiled module makes the call (`Declaration.compiled_op`), or None.
-        without_gradients: a function for calls without gradients. It returns the results, or None if this class must
-            handle the call.
-        with_gradients: a function that returns the results, with an autograd node, for plain CPU tensors with
-            gradients; None if this class makes the node.
     """
 
     plan: Any = None
-    without_gradients: Callable[..., Any] | None = None
-    with_gradients: Callable[..., Any] | None = None
     way: Callable[[tuple[Any, ...]], int] = staticmethod(lambda flat: 2)
     """The compiled module's classification of a call, once the module is loaded (csrc/bindings/signature.cpp).
 
@@ -183,19 +177,14 @@ class Op:
 
     def __call__(self, *arguments: Any) -> Any:
         """Calls the op and returns its results."""
-        traced = torch.compiler.is_dynamo_compiling()
-        if self.without_gradients is not None and not traced and not torch.is_grad_enabled():
-            results = self.without_gradients(*arguments)
-            if results is not None:
-                return results
         flat = self._flat(arguments) if self._nested else arguments
-        if traced:
+        if torch.compiler.is_dynamo_compiling():
             return self._op(*flat)
         way = self.way(tuple(flat))
         if way == 0:
             return self._run(arguments)
         if way == 1 and self._backward is not None:
-            return self._with_node(flat, arguments) if self.with_gradients is None else self.with_gradients(*arguments)
+            return self._with_node(flat, arguments)
         if forward_ad._current_level >= 0:
             self._refuse_tangents(flat)
         if active.recording is None and has_listeners():

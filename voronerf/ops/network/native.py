@@ -236,22 +236,19 @@ def _memory(call: Run) -> list[Tensor]:
     return results
 
 
-def _direct(call: Run, asked: bool) -> list[Tensor] | None:
-    """Returns the results of a CPU call, for which the compiled module allocates them; None if Python has to do it.
-
-    ``asked`` refuses calls that modes, transforms or profilers of torch observe.
-    """
+def _direct(call: Run) -> list[Tensor] | None:
+    """Returns the results of a CPU call, for which the compiled module allocates them; None if Python has to do it."""
     if not compiled_runs(call.text) or native.on_cuda(call.offsets):
         return None
     lowered = lower(call.text, _layout(call.products, call.offsets), False)
-    results: list[Tensor] | None = lowered.call(call[:6], call.keep, call.gradients, call.op, call.index_name, asked)
+    results: list[Tensor] | None = lowered.call(call[:6], call.keep, call.gradients, call.op, call.index_name)
     return results
 
 
 @custom_op("network", _memory, counted=True)
 def run(call: Run) -> list[Tensor]:
     """Runs a program: returns its outputs, its sums and, if ``keep``, the features looked up in hash grids."""
-    results = _direct(call, False)
+    results = _direct(call)
     if results is not None:
         return results
     program, results = Program.parse(call.text), _memory(call)
@@ -268,9 +265,6 @@ def run(call: Run) -> list[Tensor]:
     fill = _fill_on_cuda if on_cuda else _fill
     fill(program, lowered, call, inputs_of(lowered, call, *_sizes(program, call), keeps), outputs, sums)
     return results
-
-
-run.without_gradients = lambda *call: _direct(Run._make(call), True)
 
 
 def inputs_of(lowered: Lowered, call: Run, n: int, r: int, keeps: Sequence[Tensor] = ()) -> tuple[Any, ...]:
