@@ -159,7 +159,7 @@ def random_program(draw: random.Random, number: int) -> tuple[Program, int]:
                 tuple(shown),
                 tuple(True for _ in program.sums),
             )
-            first = len(program.inputs)  # as in Tape.backward of network/native.py
+            first = len(program.inputs)  # as in Run.backward of network/native.py
             first = first if not own.outputs and not program.sums and max(own.rays, default=-1) < first else -1
             program = own
         if (program.outputs or program.sums) and lowering.compiled_runs(program.text):

@@ -114,8 +114,8 @@ class Network:
                 for the inputs in ``program.rays``. n and r < 2**31.
             cells: the cell of each row. Rows outside all cells have outputs 0; cells may be empty.
             ray_index: int32 [n], values 0 to r - 1, the ray of each row; None for a program without inputs of rays.
-            backend: "auto", "reference", "native" or "warp". Warp runs a chain of layers in a kernel, and the steps
-                after the chain in PyTorch. Any other program runs in PyTorch.
+            backend: "auto", "reference", "native" or "warp". Warp runs layers and their encodings in kernels, and all
+                other steps in PyTorch. A program with sums runs in PyTorch.
 
         Returns:
             The outputs of the program, in the order of the rows: [n, w] each, or [r, w] for the outputs in
@@ -143,14 +143,14 @@ class Network:
         leaves = [*inputs, *self._parameters]
         wanted, arguments = [learns and tensor.requires_grad for tensor in leaves], self.arguments(inputs, ray_index)
         place: dict[str, Any] = {"device": inputs[0].device, "dtype": arguments.dtype}
-        plain = all(tensor.dtype is torch.float32 for tensor in leaves)
+        plain = arguments.dtype is torch.float32 and all(leaf.dtype is torch.float32 for leaf in leaves)
         if plain and backends.chosen(OP, backend=backend, **place) == "native":
             from voronerf.ops.network.native import Run
 
             with torch.no_grad():
                 rows = cells.sort(inputs[0], self.count(cells), backend)
-                results, tape = Run.of(arguments, rows.offsets, rows.order).with_tape(any(wanted))
-            return results, Tape(results, rows.cells, cells.frozen, leaves, wanted, tape.backward)
+                results, run = Run.of(arguments, rows.offsets, rows.order).forward(any(wanted))
+            return results, Tape(results, rows.cells, cells.frozen, leaves, wanted, run.backward)
         own = [leaf.detach().requires_grad_(want) for leaf, want in zip(leaves, wanted)]  # leaves without hooks
         network = Network(self.program, own[len(inputs) :], names=self.names)
         outputs, found = network.run(own[: len(inputs)], cells._replace(frozen=None), ray_index, backend)

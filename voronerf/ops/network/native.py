@@ -89,20 +89,14 @@ class Run(NamedTuple):
         results: list[Tensor] = run(*(self._replace(keep=True) if keep else self))
         return results[: _results(self.text)] if keep else results
 
-    def with_tape(self, keep: bool) -> tuple[list[Tensor], Tape]:
-        """Returns the outputs and sums without an autograd graph, and the tape of their backward pass.
+    def forward(self, keep: bool) -> tuple[list[Tensor], Run]:
+        """Returns the outputs and sums without an autograd graph, and the run from which :meth:`backward` starts.
 
-        ``keep`` tells whether the tape holds the features of hash grids, which the backward pass needs.
+        ``keep`` tells whether this run holds the features of hash grids, which the backward pass needs.
         """
         with torch.no_grad():
             results, count = run(*self._replace(keep=keep)), _results(self.text)
-        return results[:count], Tape(self._replace(kept=results[count:]))
-
-
-class Tape(NamedTuple):
-    """The tape of a forward pass: its tensors and the kept features, from which its backward pass starts."""
-
-    run: Run
+        return results[:count], self._replace(kept=results[count:])
 
     def backward(self, gradients: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor | None]:
         """Returns the gradients of the inputs, then of the parameters; with gradients enabled, they have gradients.
@@ -113,12 +107,8 @@ class Tape(NamedTuple):
             gradients: the gradient of each result of the program, or None.
             wanted: whether to return the gradient, for each input, then for each parameter.
         """
-        first, results = self.run, list[Tensor | None]([None] * len(wanted))
-        program, count, present = (
-            Program.parse(first.text),
-            len(first.inputs),
-            tuple([g is not None for g in gradients]),
-        )
+        program, count, present = Program.parse(self.text), len(self.inputs), tuple([g is not None for g in gradients])
+        results = list[Tensor | None]([None] * len(wanted))
         if not any(wanted) or not any(present):
             return results
         split, tensors = len(program.outputs), [g for g in gradients if g is not None]
@@ -126,10 +116,10 @@ class Tape(NamedTuple):
         if not derived.places:
             return results
         of_outputs = sum(present[:split])
-        second = first._replace(
-            inputs=[*first.inputs, *tensors[:of_outputs]],
-            parameters=[*first.parameters, *tensors[of_outputs:]],
-            kept=first.kept if derived.keeps else (),
+        second = self._replace(
+            inputs=[*self.inputs, *tensors[:of_outputs]],
+            parameters=[*self.parameters, *tensors[of_outputs:]],
+            kept=self.kept if derived.keeps else (),
             text=derived.text,
             keep=False,
             gradients=count if derived.sifts else -1,
@@ -138,7 +128,7 @@ class Tape(NamedTuple):
         values = second.results() if torch.is_grad_enabled() else run(*second)
         for place, total in zip(derived.places, values, strict=True):
             if place >= count:
-                p = first.parameters[place - count]
+                p = self.parameters[place - count]
                 if p.shape[0] == 1 and total.shape[0] > 1:
                     total = total.sum(0, keepdim=True)
                 total = total if p.dtype is total.dtype else total.to(p.dtype)
@@ -376,7 +366,7 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> Sequence[Any]:
     lists = saved[:inputs], saved[inputs:tensors], *saved[tensors : tensors + 3], saved[tensors + 3 :]
     call = Run._make((*lists, *ctx.options))
     wanted = needed_gradients(ctx, saved[:tensors])
-    gradients = Tape(call).backward(arriving[: _results(call.text)], wanted)
+    gradients = call.backward(arriving[: _results(call.text)], wanted)
     nothing = [None] * (len(Run._fields) - 6)
     return gradients[:inputs], gradients[inputs:], None, None, None, [None] * kept, *nothing
 
