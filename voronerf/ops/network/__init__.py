@@ -26,7 +26,7 @@ from voronerf.ops._core.checks import (
 )
 from voronerf.ops._core.derivatives import add_gradients
 from voronerf.ops._core.program import Program
-from voronerf.ops.network.arguments import Arguments
+from voronerf.ops.network.arguments import Arguments, among
 from voronerf.ops.network.cells import Cells
 
 OP = backends.declare(
@@ -100,9 +100,11 @@ class Network:
             raise TypeError(f"{names.op}: program must be a Program, got {type(program).__name__}")
         _check_list(names.op, "parameters", parameters, len(program.parameters))
         self.program, self.names, self._parameters = program, names, parameters
-        cells = zip(parameters, program.parameters)
-        self.shared = tuple([isinstance(p, Tensor) and p.dim() == len(shape) for p, shape in cells])
-        self.parameters = [p.unsqueeze(0) if alone else p for p, alone in zip(parameters, self.shared)]
+        shapes = zip(parameters, program.parameters)
+        self.shared = tuple([isinstance(p, Tensor) and p.dim() == len(shape) for p, shape in shapes])
+        self.parameters = parameters
+        if True in self.shared:
+            self.parameters = [p.unsqueeze(0) if alone else p for p, alone in zip(parameters, self.shared)]
 
     def __call__(
         self, inputs: Sequence[Tensor], cells: Cells, *, ray_index: Tensor | None = None, backend: str = "auto"
@@ -188,7 +190,10 @@ class Network:
         """Returns the number of cells k."""
         if cells.offsets is not None:
             return cells.offsets.shape[0] - 1
-        return next((p.shape[0] for p in self.parameters if p.shape[0] != 1), 1)
+        for p in self.parameters:
+            if p.shape[0] != 1:
+                return p.shape[0]
+        return 1
 
     def check(self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None) -> None:
         """Raises the errors of a call with these arguments; reads values on the CPU alone."""
@@ -202,21 +207,21 @@ class Network:
             raise ValueError(f"{op}: {names.ray_index} must be {rule} inputs of rays, got {came}")
         rules, tensors = cells.to_check(op)
         check_tensor(op, names.of("inputs", 0), inputs[0])
-        layers = [p for i, p in enumerate(parameters) if not _among(i, program.tables)]
-        if layers:
-            check_tensor(op, names.of("parameters", 0), layers[0])
+        dtype = None
+        if (layer := program.first_layer) >= 0:
+            check_tensor(op, names.of("parameters", layer), parameters[layer])
+            dtype = parameters[layer].dtype
         first = 1 if cells.offsets is not None else 0  # offsets tell the number of cells
         all_tensors = [*tensors[:first], *inputs, *parameters, *tensors[first:]]
         if ray_index is not None:
             all_tensors.append(ray_index)
-        dtype = layers[0].dtype if layers else None
         others = tuple(rules[:first]), tuple(rules[first:])
         sizes = check_rules(op, _rules, all_tensors, program, names, dtype, self.shared, *others)
         if ray_index is not None and not sizes["r"] and sizes["n"]:
-            at = next(i for i in range(len(inputs)) if _among(i, program.rays))
+            at = next(i for i in range(len(inputs)) if among(i, program.rays))
             shape = list(inputs[at].shape)
             raise ValueError(f"{op}: {names.of('inputs', at)} must hold a row for the {names.ray_index}, got {shape}")
-        if cells.offsets is None and (program.sums or program.by_ray or _among(0, program.rays)):
+        if cells.offsets is None and (program.sums or program.by_ray or among(0, program.rays)):
             raise ValueError(f"{op}: program must have outputs [n, w], and inputs[0] with one row for each sample")
         cells.check(op, inputs[0], sizes)
 
@@ -243,10 +248,10 @@ def _rules(
     """
     rules: list[TensorRule | Default] = [*first]
     for i, width in enumerate(program.inputs):
-        rules.append(TensorRule(names.of("inputs", i), FLOATING, ("r" if _among(i, program.rays) else "n", width)))
+        rules.append(TensorRule(names.of("inputs", i), FLOATING, ("r" if among(i, program.rays) else "n", width)))
     like = ""
     for i, shape in enumerate(program.parameters):
-        name, table = names.of("parameters", i), _among(i, program.tables)
+        name, table = names.of("parameters", i), among(i, program.tables)
         dtypes = FLOATING if dtype not in FLOATING or table or not like else (dtype,)
         empty = "" if shared[i] else "must hold at least one cell"
         rules.append(TensorRule(name, dtypes, shape if shared[i] else ("1|k", *shape), "" if table else like, empty))
@@ -255,11 +260,6 @@ def _rules(
     if program.rays:
         rules.append(TensorRule(names.ray_index, INDEX, ("n",)))
     return rules
-
-
-def _among(i: int, numbers: Sequence[int]) -> bool:
-    """Returns whether a number is in a list; ``in`` fails if torch.compile makes the list's numbers symbolic."""
-    return any(i == number for number in numbers)
 
 
 class Tape:

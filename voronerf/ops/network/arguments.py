@@ -65,3 +65,8 @@ class Arguments(NamedTuple):
 @constant_result
 def _encoded_ahead(text: str, wide: tuple[bool, ...]) -> tuple[Program, tuple[Ahead, ...]]:
     return encoded_ahead(Program.parse(text), wide)
+
+
+def among(i: int, numbers: Sequence[int]) -> bool:
+    """Returns whether a number is in a list; ``in`` fails if torch.compile makes the list's numbers symbolic."""
+    return any(i == number for number in numbers)

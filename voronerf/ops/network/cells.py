@@ -109,8 +109,8 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
             if self.child is None and self.depth != 1:
                 raise ValueError(f"{op}: depth must be 1 for a flat diagram, got {self.depth}")
         rules: dict[str, TensorRule] = _RULES if self.child is None else _RULES_OF_A_TREE
-        names = [name for name in rules if getattr(self, name) is not None]
-        return [rules[name] for name in names], [getattr(self, name) for name in names]
+        given = [(rules[name], value) for name, value in zip(self._fields, self) if value is not None and name in rules]
+        return [rule for rule, _ in given], [value for _, value in given]
 
     def check(self, op: str, positions: Tensor, sizes: dict[str, int]) -> None:
         """Checks the rules that depend on the sizes of the letters in the checked shapes.

@@ -21,7 +21,7 @@ from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import needed_gradients
 from voronerf.ops._core.program import Program, gradient, gradient_reaches
 from voronerf.ops._core.rows import new_empty, rows_of
-from voronerf.ops.network.arguments import Arguments
+from voronerf.ops.network.arguments import Arguments, among
 from voronerf.ops.network.lowering import Lowered, compiled_runs, lower
 from voronerf.ops.network.reference import evaluate
 
@@ -72,15 +72,17 @@ class Run(NamedTuple):
         elsewhere. Sums are always float32.
         """
         program, inputs, parameters, ray_index, dtype, op, index_name = arguments
-        tables = program.tables  # hash grids take positions in float32
-        stored = dtype is torch.bfloat16 and not tables and all(x.dtype is dtype for x in inputs)
-        rows = inputs if stored else [x if x.dtype is torch.float32 else x.float() for x in inputs]
-        cast = [
-            p if p.dtype is torch.float32 or (any(i == table for table in tables) and p.dtype in _NAMES) else p.float()
-            for i, p in enumerate(parameters)
-        ]
-        products = PRODUCTS.get(dtype, "float32")
-        return Run(rows, cast, offsets, order, ray_index, (), program.text, op, index_name, products)
+        products = "float32"
+        if dtype is not torch.float32 or program.tables:
+            products = PRODUCTS.get(dtype, "float32")
+            parameters = [
+                p if p.dtype is torch.float32 or (among(i, program.tables) and p.dtype in _NAMES) else p.float()
+                for i, p in enumerate(parameters)
+            ]
+        stored = dtype is torch.bfloat16 and not program.tables and all(x.dtype is dtype for x in inputs)
+        if not stored:  # hash grids take positions in float32
+            inputs = [x if x.dtype is torch.float32 else x.float() for x in inputs]
+        return Run(inputs, parameters, offsets, order, ray_index, (), program.text, op, index_name, products)
 
     def results(self) -> list[Tensor]:
         """Returns the outputs and sums, with gradients of every order."""
