@@ -180,8 +180,8 @@ def test_a_tape_leaves_frozen_cells_out(backend):
     router, points = make("table"), torch.rand(100, 3)
     router.freeze(FROZEN)
     radiance, rays = radiance_of(router), torch.arange(100, dtype=torch.int32)
-    rows = radiance.rows(points, torch.ones(100, 3), rays)
-    (raw,), tape = radiance.network.fwd(**rows, backend=backend)
+    rows, network = radiance.rows(points, torch.ones(100, 3), rays), radiance.network(radiance.networks.raw)
+    (raw,), tape = network.fwd(**rows, backend=backend)
     tape.learn(raw.square().sum(), [2 * raw])
     for p in router.parameters():
         assert not p.grad[FROZEN].any() and p.grad[LEARNING].any()
@@ -190,7 +190,7 @@ def test_a_tape_leaves_frozen_cells_out(backend):
         (torch.zeros(4), TypeError, "frozen must have dtype bool, got float32"),
     ):
         with pytest.raises(error, match=message):
-            radiance.network.fwd(**{**rows, "cells": rows["cells"]._replace(frozen=frozen)})
+            network.fwd(**{**rows, "cells": rows["cells"]._replace(frozen=frozen)})
 
 
 def test_averages_of_frozen_cells_stay():
