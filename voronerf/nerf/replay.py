@@ -416,25 +416,18 @@ class Replay:
                 waiting += _note_object(noted, held, gpu)
         self._dependencies, self._reads = noted, reads
 
-    @property
-    def obstacles(self) -> list[str]:
-        """The reasons why recorded segments cannot be replayed."""
-        return [segment.obstacle for segment in self._segments if segment.obstacle]
-
     def _obstacle_now(self) -> str:
         listening = "a mode, a transform or a profiler of torch is active"
         return listening if has_listeners() else self._find_obstacle() or ""
 
-    def explain(self, others: Iterable[str] = ()) -> str:
-        """Describes whether the stages are replayed or why they are not, and lists the stages that run in Python.
-
-        Args:
-            others: The obstacles of other replays to list.
-        """
+    def explain(self, *others: Replay) -> str:
+        """Describes whether the stages are replayed, here and in other replays, and lists the stages in Python."""
         recorded = [segment.recording for segment in self._segments if segment.recorded is not None]
         if recorded and isinstance(recorded[0], Capture):
             return "captured and replayed as a CUDA graph"
-        obstacle = next(filter(None, (self._obstacle, self._obstacle_now(), *self.obstacles)), "")
+        obstacles = [each.obstacle for replay in (self, *others) for each in replay._segments if each.obstacle]
+        own = next((each.obstacle for each in self._segments if each.obstacle), "")
+        obstacle = self._obstacle or self._obstacle_now() or own
         if obstacle and not recorded:
             return f"runs eagerly, since {obstacle}"
         eager = max((segment.eager_calls for segment in self._segments), default=0)
@@ -445,7 +438,7 @@ class Replay:
             return f"will be recorded{' again, since something that it reads has changed' * bool(recorded)}"
         calls, several = sum(map(len, recorded)), f" in {len(recorded)} segments" if len(recorded) > 1 else ""
         lines = [f"recorded and replayed, {calls} calls{several}"]
-        lines += [f"another segment runs eagerly, since {each}" for each in (*self.obstacles, *others)]
+        lines += [f"another segment runs eagerly, since {each}" for each in obstacles]
         spent = self._spent.items()
         lines += [f"in Python: {name}, {1e3 * seconds / calls:.3f} ms a call" for name, (seconds, calls) in spent]
         return "\n".join(lines)

@@ -5,7 +5,6 @@ r rays, m samples of all rays.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
@@ -135,12 +134,10 @@ class TrainingStep:
 
     def _start_anew(self) -> None:
         self._is_running, self._done = False, 0  # `_done`: the steps done before, for the hooks before and after a step
-        self._step = Replay(
-            self._stages, lambda: self._standing_obstacle(), within=lambda: self._context(), gpu=self._gpu
-        )
-        self._before, self._after = (
-            Replay(stages, self._obstacle_of_hooks) for stages in (self._stage_before, self._stage_after)
-        )
+        obstacle = lambda: self._standing_obstacle()  # noqa: E731
+        self._step = Replay(self._stages, obstacle, within=lambda: self._context(), gpu=self._gpu)
+        hooks_obstacle = lambda: "it runs on a GPU" if self._on_gpu() else obstacle()  # noqa: E731
+        self._before, self._after = Replay(self._before_step, hooks_obstacle), Replay(self._after_step, hooks_obstacle)
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns the attributes without recordings, which a copy makes for itself."""
@@ -167,7 +164,7 @@ class TrainingStep:
 
     def explain(self) -> str:
         """Describes whether steps are replayed or why they are not, and lists the hooks that run in Python."""
-        return "step: " + self._step.explain((*self._before.obstacles, *self._after.obstacles))
+        return "step: " + self._step.explain(self._before, self._after)
 
     def __call__(self, rays: int, steps: int = 1, *, at: int | None = None) -> StepOutput:
         """Runs steps in a row, with the same learning rate.
@@ -225,47 +222,44 @@ class TrainingStep:
 
     def _stages(self) -> list[Stage]:
         """Returns the stages of a step."""
-        loss, optimizer, update = self.loss, self.optimizer, Stage("update", self._update, ("output",), self._uses)
+        loss, generator, backward = self.loss, self.generator, self.autocast is None
         draw = Stage.of_hook(self.batches, "draw", "fetch", function=self._draw, reads=("rays",))
-        clear = Stage("clear", functools.partial(optimizer.zero_grad, set_to_none=True))
-        stages = loss.stages(self.generator, backward=self.autocast is None)
+        stages = loss.stages(generator, backward)
         if in_python(loss, "__call__"):
-            stages = [Stage("loss", self._call_loss, ("batch",))]
+            stages = [Stage("loss", lambda batch: {"output": loss(batch, generator, backward=backward)}, ("batch",))]
         if self.autocast is not None:
             stages = [stage._replace(function=self._in_precision()(stage.function)) for stage in stages]
         *evaluate, learn = stages
-        parts = (part for part in (loss.renderer.sampler, self.strategy) if part is not None)
+        clear = Stage("clear", self.optimizer.zero_grad)
+        update = Stage("update", self._update, ("output",), self._uses, restore=_set_gradients)
         hook = "step_post_backward"
-        post = [Stage.of_hook(part, hook, function=getattr(part, hook), reads=("output",)) for part in parts]
-        return [draw, *evaluate, clear, learn, update._replace(restore=_set_gradients), *post]
+        parts = [part for part in (loss.renderer.sampler, self.strategy) if part is not None]
+        post = (Stage.of_hook(part, hook, function=getattr(part, hook), reads=("output",)) for part in parts)
+        return [draw, *evaluate, clear, learn, update, *post]
 
-    def _stage_before(self) -> list[Stage]:
-        """Returns the stage before a step, which updates the sampler."""
-        stage = Stage.of_hook(self.loss.renderer.sampler, "step_pre_backward", function=self._pre_backward, reads=())
+    def _before_step(self) -> list[Stage]:
+        sampler = self.loss.renderer.sampler
+        stage = Stage.of_hook(sampler, "step_pre_backward", function=self._pre_backward, reads=())
         return [stage._replace(uses=self._uses)]
 
-    def _stage_after(self) -> list[Stage]:
-        """Returns the stage after a group of steps, which decays and averages the weights."""
+    def _after_step(self) -> list[Stage]:
         return [Stage("after_step", lambda: self.optimizer.after_step(self._done), (), self._uses)]
 
     def _uses(self) -> Iterable[Any]:
         return self, self.optimizer, self.guard, *self.loss.uses()
 
-    def note_dependencies(self, noted: Any) -> Iterable[Any]:
-        """Notes the attributes of this object; see :class:`voronerf.nerf.replay.Stage`."""
+    def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
+        """Notes the attributes that a recorded step depends on; see `voronerf.nerf.replay.Stage`."""
         names = "batches", "loss", "optimizer", "strategy", "guard", "generator", "autocast", "scaler"
         noted.entries(vars(self), names)
         return ()
 
-    def _pre_backward(self) -> None:
-        renderer = self.loss.renderer
-        renderer.sampler.step_pre_backward(renderer.field, self._done, self.generator)
-
     def _draw(self, rays: int) -> dict[str, Any]:
         return {"batch": self.batches.draw(rays, self.generator)}
 
-    def _call_loss(self, batch: Batch) -> dict[str, Any]:
-        return {"output": self.loss(batch, self.generator, backward=self.autocast is None)}
+    def _pre_backward(self) -> None:
+        renderer = self.loss.renderer
+        renderer.sampler.step_pre_backward(renderer.field, self._done, self.generator)
 
     def _update(self, output: RenderOutput) -> dict[str, Any]:
         """Updates the parameters, and returns them with the gradients, which replays write.
@@ -314,9 +308,6 @@ class TrainingStep:
         """Returns the device and the generator of a capture; None on the CPU."""
         return (getattr(self.batches, "place", self.batches.device), self.generator) if self._on_gpu() else None
 
-    def _obstacle_of_hooks(self) -> str | None:
-        return "it runs on a GPU" if self._on_gpu() else self._standing_obstacle()
-
     def _standing_obstacle(self) -> str | None:
         """Returns the reason why no step can be replayed, or None; other obstacles may appear in the recording."""
         renderer, device = self.loss.renderer, self.batches.device
@@ -343,7 +334,7 @@ class TrainingStep:
             reason = self.loss.why_not_fused()
         if reason is not None:
             return reason
-        if self._on_gpu() and any(stage.python for stage in (*self._stages(), *self._stage_before())):
+        if self._on_gpu() and any(stage.python for stage in (*self._stages(), *self._before_step())):
             return "it calls a Python hook, which a CUDA graph cannot replay"
         learning = {id(p) for group in self.optimizer.param_groups for p in group["params"]}
         for name, parameter in cast(nn.Module, renderer.field).named_parameters():
