@@ -48,6 +48,15 @@ class _Memory(NamedTuple):
     rows: Count | None = None
 
 
+class _Held(NamedTuple):
+    """An object that holds tensors of the recorded run, and its copy with the rows of the last run."""
+
+    recorded: Any
+    counts: list[Count]
+    rows: list[int]
+    value: Any
+
+
 class _Computed(NamedTuple):
     """A torch operation to repeat after the first ``after`` compiled calls; ``result`` is None if it is in place."""
 
@@ -98,6 +107,7 @@ class Recording(TorchDispatchMode):
         self._rows = {count: count.now for count in held}  # numbers of rows in the recorded run
         self._places: dict[Tensor, RowCount | None] = {}
         self._views: dict[Tensor, Tensor] = {}
+        self._held: dict[int, _Held] = {}  # by the id of the object
         self._is_paused = False  # whether torch operations run without an inspection
         self.obstacle: str | None = None
 
@@ -296,13 +306,29 @@ class Recording(TorchDispatchMode):
             return self._tensor_now(recorded)
         if isinstance(recorded, RowCount):
             return recorded.now
-        return mapped(self.now, recorded)
+        entries = entries_of(recorded)
+        if not entries:
+            return recorded
+        held = self._held.get(id(recorded))
+        if held is None:
+            held = self._held[id(recorded)] = _Held(recorded, self._counts_of(recorded), [], recorded)
+        rows = [count.now for count in held.counts]
+        if rows != held.rows:
+            held = self._held[id(recorded)] = held._replace(rows=rows, value=mapped(self.now, recorded))
+        return held.value
 
     def counted_now(self, recorded: Any) -> Any:
         """Returns an object as :meth:`now` does, for use in another recording: numbers of rows remain `RowCount`."""
         if isinstance(recorded, RowCount):
             return RowCount.of(recorded.count, recorded.offset)
         return self._tensor_now(recorded) if isinstance(recorded, Tensor) else mapped(self.counted_now, recorded)
+
+    def _counts_of(self, recorded: Any) -> list[Count]:
+        """Returns the distinct counts of the rows of all tensors in an object."""
+        if isinstance(recorded, (RowCount, Tensor)):
+            place = recorded if isinstance(recorded, RowCount) else self._place(recorded)
+            return [] if place is None else [place.count]
+        return [*dict.fromkeys(count for entry in entries_of(recorded) or () for count in self._counts_of(entry))]
 
     def _tensor_now(self, tensor: Tensor) -> Tensor:
         if tensor not in self._places:
