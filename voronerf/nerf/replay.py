@@ -229,11 +229,10 @@ class _Segment:
         def run_recorded() -> dict[str, Any]:
             results = {} if earlier.recording is None else dict(earlier.recording.counted_now(earlier.value))
             for name, held in inputs.items():
-                number = functools.partial(self._number, name)
-                results[name] = recording.count(number) if type(held) is int else take(held)
+                results[name] = take(held) if type(held) is not int else recording.count(lambda n=name: self._inputs[n])
             return run(self.stages, results)
 
-        self.recorded, value = None, recording.record(run_recorded)
+        value, self.recorded, self.recording = recording.record(run_recorded), None, None
         self.obstacle = recording.obstacle or ""
         if self.obstacle:
             return Results(value)
@@ -243,9 +242,6 @@ class _Segment:
             return Results(value)
         self.recorded = Results(value, recording)
         return self.recorded
-
-    def _number(self, name: str) -> int:
-        return cast(int, self._inputs[name])
 
 
 def _restore(stages: Iterable[Stage], results: Results) -> None:
@@ -316,7 +312,7 @@ class Replay:
         self._reads = list[tuple[Any, set[str]]]()  # objects, and the names of the attributes that recorded stages read
         self._stages, self._obstacle = list[Stage](), ""
         for segment in self._segments:
-            segment.recorded = None
+            segment.recorded = segment.recording = None
         self._spent = dict[str, tuple[float, int]]()  # seconds and calls of each stage in Python
 
     def __call__(self, inputs: dict[str, Any], times: int = 1) -> Results:
