@@ -66,13 +66,13 @@ class Training:
         self.step = TrainingStep(self.batches, self.loss, self.optimizer, **given)
         self.recorded = self.done = 0
         self.handles, self.other = [], None  # hook handles, and a second optimiser
-        run = self.step._run_stages
+        run = self.step._step._run
 
         def counted(*of):
             self.recorded += active.recording is not None
             return run(*of)
 
-        self.step._run_stages = counted
+        self.step._step._run = counted
 
     def run_as_it_is(self):
         """Makes all further steps run eagerly."""

@@ -41,7 +41,7 @@ def interrupted_step(rng: random.Random, folder: Path, inputs: Path) -> str:
     hooks, step = rng.sample([*HOOKS], rng.choice((0, 0, 1))), training.step
     for name in hooks:
         HOOKS[name](training)
-    del step._run_stages  # it counts recordings of this step alone
+    del step._step._run  # it counts recordings of this step alone
     for _ in range(steps):
         step(64)
     with Interrupt() as counting:

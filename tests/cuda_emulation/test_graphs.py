@@ -209,15 +209,15 @@ def test_no_graph_of_autograd_outlives_a_step():
     with emulated(), graphs() as seen:
         training, alive = Training(cells=2), list[weakref.ref]()
         training.step.autocast = torch.bfloat16
-        learn = training.step._learn_scaled
+        update = training.step._update
 
-        def marked(loss):
+        def marked(output):
             mark = contextlib.ExitStack()  # supports weak references
             alive.append(weakref.ref(mark))
-            loss.grad_fn.metadata["mark"] = mark
-            learn(loss)
+            output.loss.grad_fn.metadata["mark"] = mark
+            return update(output)
 
-        training.step._learn_scaled = marked
+        training.step._update = marked
         gc.disable()
         try:
             held = [training.step(64) for _ in range(4)]

@@ -270,6 +270,11 @@ class VoronoiDiagram(nn.Module):
                 kept = self._indexed = seen, ops.index_centres(values.detach().float().contiguous())
         return kept[1]
 
+    def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
+        """Notes the index, which is a new one if centres have changed in place, as a dependency of a recorded step."""
+        noted.answer(self.index)
+        return ()
+
     def snapshot(self) -> Values:
         """Returns an object that is replaced by another one when centres have changed, for caches.
 

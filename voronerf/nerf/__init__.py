@@ -9,9 +9,9 @@ from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import RenderedImage, Renderer, render_rays
+from voronerf.nerf.replay import replayed
 from voronerf.nerf.samplers import SAMPLERS, Hierarchical, Occupancy, Sampler, Stratified
 from voronerf.nerf.sampling import stratified_depths
-from voronerf.nerf.segment import replayed
 from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.nerf.terms import LossAlongRays, RayValues, Slopes, SmoothDepth, SparseDepth, Surface, Term

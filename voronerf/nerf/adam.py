@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.nerf import schedule
-from voronerf.nerf.segment import replayed
+from voronerf.nerf.replay import replayed
 from voronerf.ops._core.rows import varying
 from voronerf.ops.adam import Guard, UpdateRule, adam, average
 from voronerf.router import VoronoiRouter
@@ -137,6 +137,14 @@ class Adam(torch.optim.Adam):
         """
         _check_group(param_group)
         inspect.unwrap(torch.optim.Adam.add_param_group)(self, param_group)
+
+    def note_dependencies(self, noted: Any) -> list[Any]:
+        """Notes the attributes that a recorded update depends on; learning rates and ``steps_done`` may change."""
+        noted.contents(vars(self), ["steps_done"])
+        noted.contents(self.param_groups)
+        for group in self.param_groups:
+            noted.contents(group, ["lr"])
+        return [self.state, *(group[name] for group in self.param_groups for name in ("params", "betas"))]
 
     def set_learning_rate(self, rate: float) -> None:
         """Sets the learning rate of all groups."""

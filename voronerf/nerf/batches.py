@@ -10,7 +10,7 @@ from torch import Tensor
 
 from voronerf.nerf.cameras import Cameras, Rays
 from voronerf.nerf.occupancy import draw_seed
-from voronerf.nerf.segment import replayed
+from voronerf.nerf.replay import replayed
 from voronerf.nerf.volume import Batch
 from voronerf.ops._core.rows import following_count
 from voronerf.ops.draw_pixels import KnownPixels, PixelRuns, draw_pixels
@@ -119,7 +119,9 @@ class RayBatches:
         self.cameras, self.images, self.near, self.far = cameras.to(self.place), images, float(near), float(far)
         self.box, self.background = (None if each is None else each.to(self.place) for each in (box, background))
         self.random_background = random_background and (images.shape[-1] == 4 or background is None)
-        self.cones, self.fetch, self.backend = cones, fetch, backend
+        self.cones, self.backend = cones, backend
+        if fetch is not None:
+            self.fetch = fetch  # type: ignore[method-assign, assignment]
         if unseen and box is not None:
             message = "RayBatches: unseen must be 0 with a box, since unseen rays may miss it"
             raise ValueError(f"{message}, got {unseen}")
@@ -164,6 +166,9 @@ class RayBatches:
         """Stops drawing unseen rays."""
         self.unseen = 0.0
 
+    def fetch(self, pixels: Tensor) -> None:
+        """Prepares the pixels, int64 [r], that a batch reads next; does nothing without the argument ``fetch``."""
+
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """Draws ``count`` rays with replacement; the first rays go through points of the sparse model."""
         seed = draw_seed(self.place, generator)
@@ -174,8 +179,7 @@ class RayBatches:
             seed, count, len(self), runs=self.useful, known_pixels=known, backend=self.backend
         )
         depths = None if known is None else distances.to(self.device)
-        if self.fetch is not None:
-            self.fetch(index)
+        self.fetch(index)
         background = uniforms if self.random_background else self.background
         cameras = self.cameras
         rays_seen = cameras.pixel_rays(

@@ -12,7 +12,7 @@ from torch import Tensor
 from voronerf.nerf.occupancy import HIDDEN
 from voronerf.nerf.radiance import Radiance, radiance_of, router_of
 from voronerf.nerf.renderer import Renderer
-from voronerf.nerf.segment import Stage, in_python, replayed, run_stages
+from voronerf.nerf.replay import Stage, replayed, run_stages
 from voronerf.nerf.terms import LossAlongRays, RayValues, Slopes, Term, stage_of
 from voronerf.nerf.volume import (
     Batch,
@@ -88,44 +88,30 @@ class RayLoss:
         Raises:
             ValueError: A term returns no scalar, or a target or a background needs a gradient.
         """
-        field = self.radiance()
-        if isinstance(field, str) and self.renderer.sampler.grid is not None:  # the field may not be traced yet
-            middle = (batch.near + batch.far)[:, None] / 2
-            samples = self.renderer.sampler.space.samples(batch.rays, middle, middle.expand(-1, 2))
-            field = self.radiance((samples.inputs, batch.rays.directions))
-        output: RenderOutput = run_stages(self.stages(field, generator, backward), {"batch": batch})["output"]
+        output: RenderOutput = run_stages(self.stages(generator, backward), {"batch": batch})["output"]
         return output
 
-    def stages(
-        self,
-        field: Radiance | str,
-        generator: torch.Generator | None,
-        backward: bool,
-        now: Callable[[Any], Any] = lambda held: held,
-    ) -> list[Stage]:
+    def stages(self, generator: torch.Generator | None, backward: bool) -> list[Stage]:
         """Returns the stages that read the result named "batch" and write the result named "output".
 
         Args:
-            field: The result of :meth:`radiance`.
             generator: Random generator of the samples.
             backward: Whether to add the gradients at once, as in :meth:`__call__`.
-            now: Function that cuts recorded tensors to the rows of the present step, for stages that run in Python; the
-                identity if no step is recorded.
         """
-        sampler = self.renderer.sampler
-        if isinstance(field, str):
-            sample = Stage("sample", functools.partial(self._sample_passes, generator), ("batch",))
-            evaluate = Stage("evaluate", self._evaluate_unfused, ("batch", "samples", "before"))
-        else:
-            name, python = f"{type(sampler).__name__}.sample", in_python(sampler, "sample")
-            sample = Stage(name, functools.partial(self._sample, generator), ("batch",), python)
-            evaluate = Stage("evaluate", functools.partial(self._evaluate, field), ("batch", "samples"))
-        terms = [stage_of(term, now) for term in self.terms]
+        draw, sampler = functools.partial(self._sample, generator), self.renderer.sampler
+        sample = Stage.of_hook(sampler, "sample", "draw", function=draw, reads=("batch",))
+        evaluate = Stage("evaluate", self._evaluate_any, ("batch", "samples", "before"), self.uses)
+        terms = [stage_of(term) for term in self.terms]
         if terms:
             along = Stage("along", self._along, ("outputs", "rendered", "samples"))
             terms = [along, *terms, Stage("gradient", self._add_slopes, ("along", "rendered", "batch"))]
         learn = Stage("learn", functools.partial(self._learn, backward), ("rendered", "samples", "learning"))
         return [sample, evaluate, *terms, learn]
+
+    def uses(self) -> Iterable[Any]:
+        """Returns the objects that the stages use, except the terms."""
+        sampler = self.renderer.sampler
+        return self, self.renderer, self.renderer.field, sampler, sampler.grid, self.radiance()
 
     def why_not_fused(self) -> str | None:
         """Returns the reason why networks, colours, loss and gradients are not fused; None if they are.
@@ -143,9 +129,16 @@ class RayLoss:
             return "empty space is not skipped"
         return radiance_of(renderer.field, samples, inputs=6 if renderer.cones else 3)
 
-    def _sample(self, generator: torch.Generator | None, batch: Batch) -> dict[str, Any]:
-        draw = self.renderer.sampler.sample
-        return {"samples": draw(batch.rays, batch.near, batch.far, jitter=True, generator=generator)}
+    def _evaluate_any(self, batch: Batch, samples: Samples, before: Sequence[Rendered]) -> dict[str, Any]:
+        """Evaluates the networks, fused if possible."""
+        field, sampler = self.radiance(), self.renderer.sampler
+        if isinstance(field, str) and sampler.grid is not None:  # the field may not be traced yet
+            middle = (batch.near + batch.far)[:, None] / 2
+            points = sampler.space.samples(batch.rays, middle, middle.expand(-1, 2))
+            field = self.radiance((points.inputs, batch.rays.directions))
+        if isinstance(field, str):
+            return self._evaluate_unfused(batch, samples, before)
+        return self._evaluate(field, batch, samples)
 
     def _evaluate(self, field: Radiance, batch: Batch, samples: Samples) -> dict[str, Any]:
         """Evaluates the networks, and computes the loss of the colours and its gradient."""
@@ -158,7 +151,7 @@ class RayLoss:
         rendered = self._render(*outputs, batch, samples)
         return {"outputs": outputs, "rendered": rendered, "learning": (self._learn_fused, tape, samples)}
 
-    def _sample_passes(self, generator: torch.Generator | None, batch: Batch) -> dict[str, Any]:
+    def _sample(self, generator: torch.Generator | None, batch: Batch) -> dict[str, Any]:
         renderer = self.renderer
 
         def render(name: str, samples: Samples) -> Rendered:
@@ -232,7 +225,7 @@ class RayLoss:
         learn, *arguments = learning
         loss = learn(*arguments, rendered, not backward)
         rays = rendered.error, rendered.weights, rendered.density, samples, rendered.colour
-        return {"output": RenderOutput(loss, *rays)}
+        return {"output": RenderOutput(loss, *rays), "learning": ()}  # frees the autograd tape
 
     def _learn_fused(self, tape: Tape, samples: Samples, rendered: RenderLoss, defer: bool) -> Tensor:
         if (full := self.renderer.sampler.space.full_gradient) is not None:

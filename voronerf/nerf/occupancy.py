@@ -21,8 +21,8 @@ from voronerf.nerf.cameras import Rays
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
 from voronerf.nerf.radiance import radiance_of
+from voronerf.nerf.replay import replayed
 from voronerf.nerf.sampling import random_uniforms
-from voronerf.nerf.segment import replayed
 from voronerf.ops._core.checks import check_range
 from voronerf.ops.draw_points import draw_points
 from voronerf.ops.formulas import voxels_of

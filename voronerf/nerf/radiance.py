@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -69,6 +70,16 @@ class Radiance(NamedTuple):
         with torch.no_grad():
             (density,), _ = self.network(program)([points], router.places(points), backend=router.backend)
         return density[:, 0].float()
+
+    def note_dependencies(self, noted: Any) -> list[VoronoiRouter]:
+        """Notes that the programs and the parameters must stay the same."""
+        noted.answer(self._is_current)
+        return [self.router]
+
+    def _is_current(self) -> bool:
+        current = radiance_of(self.router, inputs=self.networks.program.inputs[0])
+        same = isinstance(current, Radiance) and current.networks is self.networks
+        return same and all(map(operator.is_, cast(Radiance, current).cells.parameters, self.cells.parameters))
 
 
 def radiance_of(field: Field, samples: tuple[Tensor, Tensor] | None = None, *, inputs: int = 3) -> Radiance | str:

@@ -15,8 +15,8 @@ from voronerf.nerf.cameras import Cameras, Rays
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
 from voronerf.nerf.occupancy import OccupancyGrid
+from voronerf.nerf.replay import replayed
 from voronerf.nerf.samplers import Sampler, Stratified
-from voronerf.nerf.segment import replayed
 from voronerf.nerf.volume import RayColours, Rendered, Samples, per_ray, render_samples
 
 

@@ -20,6 +20,7 @@ from voronerf.nerf.field import Field
 from voronerf.nerf.fields.hashgrid import LONG
 from voronerf.nerf.occupancy import DECAY, OccupancyGrid, draw_seed
 from voronerf.nerf.radiance import radiance_of, router_of
+from voronerf.nerf.replay import replayed
 from voronerf.nerf.sampling import (
     blurred_weights,
     colour_loss,
@@ -29,7 +30,6 @@ from voronerf.nerf.sampling import (
     union_depths,
 )
 from voronerf.nerf.schedule import WARMUP_STEPS
-from voronerf.nerf.segment import replayed
 from voronerf.nerf.volume import RayColours, Rendered, RenderOutput, Samples, Space
 from voronerf.ops._core.rows import fixed_count
 from voronerf.ops.composite import composite

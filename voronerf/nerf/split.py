@@ -15,7 +15,7 @@ from torch import Tensor
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.diagram.subdivision import Split, split_diagram
-from voronerf.nerf.segment import replayed
+from voronerf.nerf.replay import replayed
 from voronerf.nerf.volume import RenderOutput
 from voronerf.router import VoronoiRouter
 

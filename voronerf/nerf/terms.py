@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from voronerf.nerf.segment import Stage, in_python, replayed
+from voronerf.nerf.replay import Stage, replayed
 from voronerf.nerf.volume import Batch, Samples, normalised
 from voronerf.ops._core.rows import new_zeros, rows_of
 from voronerf.ops.formulas import activate
@@ -268,24 +268,22 @@ class RayValues:
         return samples
 
 
-def stage_of(term: Term | Callable[[RayValues, Batch], Tensor], now: Callable[[Any], Any]) -> Stage:
-    """Returns the stage that reads the results named "along" and "batch" and adds a term to the loss.
-
-    Args:
-        term: The term of :class:`RayLoss`.
-        now: Function that cuts recorded tensors to the rows of the present step, for stages that run in Python.
-    """
+def stage_of(term: Term | Callable[[RayValues, Batch], Tensor]) -> Stage:
+    """Returns the stage that reads the results named "along" and "batch" and adds a term to the loss."""
     reads = "along", "batch"
     if hasattr(term, "add"):
-        return Stage(f"{type(term).__name__}.add", term.add, reads, in_python(term, "add"))
+        return Stage.of_hook(term, "add", function=term.add, reads=reads)
     name = getattr(term, "__qualname__", type(term).__qualname__)
-    return Stage(name, functools.partial(_add_differentiated, term, now), reads, python=True, lazy=True)
+    return Stage(name, functools.partial(_add_differentiated, term), reads, python=True, lazy=True)
 
 
 def _add_differentiated(
     term: Callable[[RayValues, Batch], Tensor], now: Callable[[Any], Any], along: LossAlongRays, batch: Batch
 ) -> None:
-    """Adds a term that torch differentiates: a function of `RayValues` and their `Batch` that returns a scalar."""
+    """Adds a term that torch differentiates: a function of `RayValues` and their `Batch` that returns a scalar.
+
+    The function ``now`` cuts recorded tensors to the rows of the present step.
+    """
     values = RayValues(along, batch, now)
     with torch.enable_grad():
         added = term(values, now(batch))

@@ -701,6 +701,11 @@ class VoronoiRouter(nn.Module):
             else "all cells share all parameters"
         )
 
+    def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
+        """Notes the attributes that a recorded training step depends on."""
+        noted.entries(vars(self), ["assignment", "temperature", "backend", "coords"])
+        return ()
+
     def explain(self) -> str:
         """Returns a line for each method: the way in which its calls ran (fused, grouped or cell by cell), and why.
 

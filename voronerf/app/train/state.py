@@ -19,9 +19,9 @@ from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.renderer import Renderer
+from voronerf.nerf.replay import in_python
 from voronerf.nerf.samplers import Sampler
 from voronerf.nerf.schedule import learning_rate, next_rays
-from voronerf.nerf.segment import in_python
 from voronerf.nerf.split import SplitDone, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.ops import Guard

@@ -12,9 +12,9 @@ number of rows is fixed by the captured run.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,10 +25,11 @@ T = TypeVar("T")
 
 
 class Capture:
-    """A captured function on a GPU: call :meth:`warm_up` and :meth:`capture` once, then :meth:`replay` repeatedly.
+    """A captured function on a GPU: call :meth:`record` once, then :meth:`replay` repeatedly.
 
     Attributes:
         obstacle: The reason why the function cannot be captured; None if it can.
+        result: The result of the captured run, whose tensors each replay fills.
 
     Args:
         device: The GPU.
@@ -47,6 +48,14 @@ class Capture:
         self._taken = 0  # the count of numbers that the capture has read
         self._rows: list[tuple[int, Callable[[], int]]] = []
         self.obstacle: str | None = None
+        self.result: Any = None
+
+    def record(self, function: Callable[[], T]) -> T:
+        """Runs the function eagerly, and captures it if possible; returns the result of the eager run."""
+        result = self.warm_up(function)
+        if self.obstacle is None:
+            self.result = self.capture(function)
+        return result
 
     def warm_up(self, function: Callable[[], T]) -> T:
         """Runs the function eagerly, and sets ``obstacle`` if the function synchronises host and device."""
@@ -97,12 +106,10 @@ class Capture:
         self._taken += 1
         return self._numbers[self._taken - 1][0]
 
-    def replay(self, threads: int, times: int = 1) -> int:
+    def replay(self, threads: int, times: int = 1, inputs: Sequence[Tensor] = ()) -> int:
         """Launches the graph ``times`` times and returns ``times``, or 0 if the number of rows has changed.
 
-        Args:
-            threads: Unused; the signature matches `Recording.replay`.
-            times: The number of launches.
+        The signature matches `Recording.replay`; ``threads`` and ``inputs`` are not used.
         """
         if any(count() != rows for rows, count in self._rows):
             return 0
