@@ -209,9 +209,9 @@ def add_gradients(
     Returns:
         The loss [], detached unless deferred.
     """
-    if not tensors:
+    if not tensors and torch.is_grad_enabled():
         return loss
-    if defer or not all(map(_takes_gradients, tensors)):
+    if defer or not tensors or not all(map(_takes_gradients, tensors)):
         return run_backward(_KnownGradients.apply(loss, slopes, *tensors), defer)
     for tensor, slope in zip(tensors, slopes(None), strict=True):
         if slope is not None:

@@ -5,7 +5,8 @@ n rows, r rays, k cells, w columns, o outputs and i inputs of a matrix, e entrie
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -152,21 +153,13 @@ class Network:
             with torch.no_grad():
                 rows = cells.sort(inputs[0], self.count(cells), backend)
                 results, run = Run.of(arguments, rows.offsets, rows.order).forward(any(wanted))
-            return results, Tape(results, rows.cells, cells.frozen, leaves, wanted, run.backward)
+            return results, Tape(results, rows.cells, cells.frozen, leaves, wanted, run)
         own = [leaf.detach().requires_grad_(want) for leaf, want in zip(leaves, wanted)]  # leaves without hooks
         network = Network(self.program, own[len(inputs) :], names=self.names)
         outputs, found = network.run(own[: len(inputs)], cells._replace(frozen=None), ray_index, backend)
-
-        def backward(gradients: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor | None]:
-            pairs = [(out, g) for out, g in zip(outputs, gradients) if g is not None and out.requires_grad]
-            chosen = [leaf for leaf, want in zip(own, wanted) if want]
-            if not pairs or not chosen:
-                return [None] * len(leaves)
-            arriving = [g.to(out.dtype) for out, g in pairs]
-            slopes = iter(torch.autograd.grad([out for out, _ in pairs], chosen, arriving, allow_unused=True))
-            return [next(slopes) if want else None for want in wanted]
-
-        return [out.detach() for out in outputs], Tape(outputs, found, cells.frozen, leaves, wanted, backward)
+        return [out.detach() for out in outputs], Tape(
+            outputs, found, cells.frozen, leaves, wanted, _Graph(outputs, own)
+        )
 
     def run(
         self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None = None, backend: str = "auto"
@@ -262,24 +255,48 @@ def _rules(
     return rules
 
 
+class _Graph(NamedTuple):
+    """The graph of autograd, as the tape of an evaluation outside of the compiled module.
+
+    Attributes:
+        outputs: the results, with gradients.
+        leaves: the inputs, then the parameters.
+    """
+
+    outputs: Sequence[Tensor]
+    leaves: Sequence[Tensor]
+
+    def backward(self, gradients: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor | None]:
+        """Returns the gradients of the leaves; None for an unwanted gradient."""
+        pairs = [(out, g.to(out.dtype)) for out, g in zip(self.outputs, gradients) if g is not None]
+        pairs = [(out, g) for out, g in pairs if out.requires_grad]
+        chosen = [leaf for leaf, want in zip(self.leaves, wanted) if want]
+        if not pairs or not chosen:
+            return [None] * len(wanted)
+        outputs, arriving = zip(*pairs)
+        slopes = iter(torch.autograd.grad(outputs, chosen, arriving, allow_unused=True))
+        return [next(slopes) if want else None for want in wanted]
+
+
+@dataclass(eq=False)
 class Tape:
     """The tape of a forward pass: what its backward pass needs.
 
     Attributes:
+        outputs: the results of the forward pass.
         cells: int32 [n], the cell of each row; None for sorted rows.
+        frozen: bool [k], the frozen cells, or None.
+        leaves: the inputs, then the parameters, as the caller gave them.
+        wanted: for each leaf, whether it has a gradient.
+        run: the evaluation, whose ``backward`` computes the gradients.
     """
 
-    def __init__(
-        self,
-        outputs: Sequence[Tensor],
-        cells: Tensor | None,
-        frozen: Tensor | None,
-        leaves: Sequence[Tensor],
-        wanted: Sequence[bool],
-        backward: Callable[[Sequence[Tensor | None], Sequence[bool]], list[Tensor | None]],
-    ) -> None:
-        self.cells, self._frozen, self._backward = cells, frozen, backward
-        self._shapes, self._leaves, self._wanted = [out.shape for out in outputs], leaves, wanted
+    outputs: Sequence[Tensor]
+    cells: Tensor | None
+    frozen: Tensor | None
+    leaves: Sequence[Tensor]
+    wanted: Sequence[bool]
+    run: Any
 
     def backward(self, gradients: Sequence[Tensor | None], wanted: Sequence[bool] | None = None) -> list[Tensor | None]:
         """Returns the gradients of the inputs, then of the parameters, without an autograd graph.
@@ -292,12 +309,12 @@ class Tape:
         Returns:
             The gradients; None if it is unwanted, or if no result depends on the tensor.
         """
-        if self._frozen is not None and self.cells is not None:  # the backward pass drops rows with a zero gradient
-            held = frozen_rows(self._frozen, self.cells)
+        if self.frozen is not None and self.cells is not None:  # the backward pass drops rows with a zero gradient
+            held = frozen_rows(self.frozen, self.cells)
             gradients = [None if g is None else g.masked_fill(held, 0) for g in gradients]
         with torch.no_grad():
-            slopes = self._backward(gradients, self._wanted if wanted is None else wanted)
-            pairs = zip(slopes, self._leaves, strict=True)
+            slopes = self.run.backward(gradients, self.wanted if wanted is None else wanted)
+            pairs = zip(slopes, self.leaves, strict=True)
             return [g if g is None or g.dim() == leaf.dim() else g.view_as(leaf) for g, leaf in pairs]
 
     def learn(self, loss: Tensor, gradients: Sequence[Tensor], *, defer: bool = False) -> Tensor:
@@ -328,13 +345,13 @@ class Tape:
         """
         check_shape("learn", "loss", loss, ())
         check_flag("learn", "defer", defer)
-        for i, (gradient, shape) in enumerate(zip(gradients, self._shapes, strict=True)):
-            check_shape("learn", f"gradients[{i}]", gradient, shape)
-        learning = [leaf for leaf, want in zip(self._leaves, self._wanted) if want]
+        for i, (gradient, out) in enumerate(zip(gradients, self.outputs, strict=True)):
+            check_shape("learn", f"gradients[{i}]", gradient, out.shape)
+        learning = [leaf for leaf, want in zip(self.leaves, self.wanted) if want]
 
         def slopes(scale: Tensor | None) -> list[Tensor | None]:
             arriving = [g.detach() if scale is None else g.detach() * scale for g in gradients]
-            return [g for g, want in zip(self.backward(arriving), self._wanted) if want]
+            return [g for g, want in zip(self.backward(arriving), self.wanted) if want]
 
         return add_gradients(loss.detach(), learning, slopes, defer)
 
