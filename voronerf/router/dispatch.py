@@ -7,6 +7,7 @@ a router names the way to begin with.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import sys
@@ -26,7 +27,7 @@ from voronerf.ops._core.unchanged import Stale, unchanged
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.call_cache import CachedCall
 from voronerf.router.cells import refuse_statistics
-from voronerf.router.double import Forbidden
+from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable
 from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
@@ -333,7 +334,7 @@ class Dispatch:
         try:
             results = loop.run(call, grouping)
         except Exception as error:
-            shown = _misfit(error, call) or error
+            shown = _misfit(error, call, grouping) or error
             if len(layout.lead) > 1 and not layout.flat and len(shown.args) == 1 and isinstance(shown.args[0], str):
                 hint = f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]"
                 shown.args = (f"{shown.args[0]}\n{hint}",)
@@ -395,7 +396,7 @@ def _own_randomness(grouping: Grouping) -> Any:
     return torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else [])
 
 
-def _misfit(error: Exception, call: Call) -> Exception | None:
+def _misfit(error: Exception, call: Call, grouping: Grouping) -> Exception | None:
     """Returns a clearer error than PyTorch's if arguments do not fit the module's layers, else None."""
     if not isinstance(error, RuntimeError):
         return None
@@ -408,16 +409,25 @@ def _misfit(error: Exception, call: Call) -> Exception | None:
             f"{_OP}: {names} must be {dtype}, as the parameters of {type(call.module).__name__} are, got "
             f"{', '.join(map(str, other.values()))}; pass {next(iter(other))}.to({dtype}), or call router.to(dtype)"
         )
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        layer, x = frame.f_locals.get("self"), frame.f_locals.get("input")
-        if not isinstance(layer, nn.Linear) or not isinstance(x, Tensor) or x.shape[-1:] == (layer.in_features,):
-            continue
-        shapes = ", ".join(str(list(tensor.shape)) for tensor in tensors.values())
-        rule = f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {x.shape[-1]} features"
-        fits = any(tensor.shape[-1:] == x.shape[-1:] for tensor in tensors.values())
-        remedy = "; pass the module's own arguments, and separate positions as coords=" if fits else ""
-        return ValueError(f"{rule}, got {shapes}{remedy}")
-    return None
+    double, misfits = Double(call.module), list[tuple[nn.Module, int]]()
+
+    def note(layer: Any, args: tuple[Any, ...]) -> None:
+        if args and isinstance(args[0], Tensor) and args[0].shape[-1:] != (layer.in_features,):
+            misfits.append((layer, args[0].shape[-1]))
+
+    for place, layer in enumerate(double.parts):
+        if isinstance(layer, nn.Linear):
+            double.replace(place, "_forward_pre_hooks", {**layer._forward_pre_hooks, "misfit": note})
+    with torch.no_grad(), contextlib.suppress(Exception):  # the call fails again
+        double.run(call, call.arranged(grouping), {key: stacked[0] for key, stacked in double.stacked.items()})
+    if not misfits:
+        return None
+    layer, features = misfits[0]
+    shapes = ", ".join(str(list(tensor.shape)) for tensor in tensors.values())
+    rule = f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {features} features"
+    fits = any(tensor.shape[-1:] == (features,) for tensor in tensors.values())
+    remedy = "; pass the module's own arguments, and separate positions as coords=" if fits else ""
+    return ValueError(f"{rule}, got {shapes}{remedy}")
 
 
 def _plan_key(call: Call, device: torch.device) -> Any:
