@@ -1,4 +1,4 @@
-"""Guards of cached results: have the objects that a result depends on changed? Used by routers, fields and steps."""
+"""Dependencies of cached results: have the objects that a result depends on changed? Used by routers and steps."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _COPIED = 1 << 20  # maximum number of bytes of a tensor whose values are copied
 
 
 class Stale:
-    """A guard for use without the compiled module; `holds` is always False, so every call checks its dependencies."""
+    """Dependencies without the compiled module; `holds` is always False, so every call checks all objects."""
 
     def holds(self) -> bool:
-        """Returns False, since this guard notes no objects."""
+        """Returns False, since no objects are noted."""
         return False
 
     def _note(self, *noted: Any) -> None:
@@ -26,7 +26,7 @@ class Stale:
 
 
 def unchanged() -> Any:
-    """Creates an empty guard; csrc/bindings/unchanged.h lists the properties that it can note."""
+    """Returns dependencies on no object; csrc/bindings/unchanged.h lists the properties that they can note."""
     module = backends.compiled()
     return Stale() if module is None else module.compiled.Unchanged()
 
@@ -57,23 +57,23 @@ class Values:
         version = 0 if self.tensor.is_inference() else self.tensor._version  # inference tensors have no version
         return self.tensor.data_ptr() if self._is_plain else 0, version
 
-    def note(self, guard: Any) -> None:
-        """Adds the tensor to a guard, which then detects other values than when this object was made."""
+    def note(self, dependencies: Any) -> None:
+        """Adds the tensor to dependencies, which then detect other values than when this object was made."""
         if self.copy is not None:
-            guard.values(self.tensor, self.copy)
+            dependencies.values(self.tensor, self.copy)
             return
         if self._is_plain:
-            guard.place(self.tensor)
+            dependencies.place(self.tensor)
         if not self.tensor.is_inference():
-            guard.attributes(self.tensor, ["_version"])
+            dependencies.attributes(self.tensor, ["_version"])
 
     def changed(self) -> bool:
         """Returns whether the tensor has other values than when this object was made."""
         if self.copy is None:
             return self._marked() != self._mark
-        guard = unchanged()
-        guard.values(self.tensor, self.copy)
-        return not (guard.holds() or _same_bytes(self.copy, self.tensor))
+        dependencies = unchanged()
+        dependencies.values(self.tensor, self.copy)
+        return not (dependencies.holds() or _same_bytes(self.copy, self.tensor))
 
 
 def _same_bytes(one: Tensor, other: Tensor) -> bool:
