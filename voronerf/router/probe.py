@@ -22,11 +22,11 @@ from voronerf.router.cells import clone_module
 from voronerf.router.double import Double, Forbidden, items_of, restore_items
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import (
+    CallAxes,
     Grouped,
     Loop,
     NoRandomness,
     Recorder,
-    Step,
     Ungroupable,
     Way,
     steps_of,
@@ -123,7 +123,7 @@ class Probe:
             ValueError: If fusion is required, but fails, and only one method of the module is routed.
         """
         call = self._call
-        steps: Callable[[], list[Step]] = self.steps
+        steps: Callable[[], list[CallAxes]] = self.steps
         with contextlib.suppress(Exception):  # the way names the reason
             steps = functools.partial(steps_of, self.note_changes(warn_once).runs, _COUNTS)
         for loop in (Loop(), Loop(again=True)):
@@ -166,11 +166,11 @@ class Probe:
         self._check_rows(loop)
         return loop, loop, may_group
 
-    def steps(self) -> list[Step]:
+    def steps(self) -> list[CallAxes]:
         """Returns the steps of the module; see :class:`ProbeRuns`."""
         return steps_of(self.record().runs, _COUNTS)
 
-    def confirmed_steps(self) -> list[Step]:
+    def confirmed_steps(self) -> list[CallAxes]:
         """Returns the steps of the module, with which it runs grouped like the loop; raises :class:`Ungroupable`."""
         steps, loop = self.steps(), Loop()
         if not self._agrees(Grouped([steps], quiet=True), loop, self._outcome(loop)):
