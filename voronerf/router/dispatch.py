@@ -433,7 +433,7 @@ def _misfit(error: Exception, call: Call, grouping: Grouping) -> Exception | Non
         if isinstance(layer, nn.Linear):
             double.replace(place, "_forward_pre_hooks", {**layer._forward_pre_hooks, "misfit": note})
     with torch.no_grad(), contextlib.suppress(Exception):  # the call fails again
-        double.run(call, call.arranged(grouping), {key: stacked[0] for key, stacked in double.stacked.items()})
+        double.run(call, call.arranged(grouping))
     if not misfits:
         return None
     layer, features = misfits[0]

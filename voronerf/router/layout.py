@@ -266,6 +266,15 @@ class Call:
         args, kwargs = self.changed(lambda tensor, kind: next(following))
         return (self.module if self.method == "forward" else getattr(self.module, self.method))(*args, **kwargs)
 
+    def _mapped(self, change: Callable[[str, Any, bool], Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """Applies ``change`` to every leaf of the arguments (see :func:`map_tree`); returns the new arguments."""
+        arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
+        values = [
+            change(name, value, False) if isinstance(value, Tensor) else map_tree(value, change, name)
+            for name, value in arguments
+        ]
+        return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
+
     def changed(self, change: Callable[[Tensor, str], Tensor]) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """Applies ``change`` (of a tensor and its kind) to every tensor that has rows; returns the new arguments."""
 
@@ -276,31 +285,25 @@ class Call:
                 self.kinds[name] = self.layout.kind(name, value, nested)
             return value if self.kinds[name] == SHARED else change(value, self.kinds[name])
 
-        arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
-        values = [
-            changed(name, value, False) if isinstance(value, Tensor) else map_tree(value, changed, name)
-            for name, value in arguments
-        ]
-        return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
+        return self._mapped(changed)
+
+    def _leaves(self) -> dict[str, Any]:
+        """Returns the leaves of the arguments, by name."""
+        leaves: dict[str, Any] = {}
+        self._mapped(lambda name, leaf, _: leaves.setdefault(name, leaf))
+        return leaves
 
     def constants(self) -> dict[str, Any]:
         """Returns the leaves of the arguments that are not tensors, by name."""
-        constants: dict[str, Any] = {}
+        return {name: leaf for name, leaf in self._leaves().items() if not isinstance(leaf, Tensor)}
 
-        def note(name: str, value: Any, nested: bool) -> Any:
-            if not isinstance(value, Tensor):
-                constants[name] = value
-            return value
-
-        for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True):
-            map_tree(value, note, name)
-        return constants
+    def shared(self) -> list[Tensor]:
+        """Lists the tensors that are the same for all samples; call :meth:`changed` first, which finds them."""
+        return [leaf for name, leaf in self._leaves().items() if self.kinds.get(name) == SHARED]
 
     def with_leaves(self, change: Callable[[str, Any], Any]) -> Call:
         """Returns the call with ``change(name, leaf)`` instead of each leaf of the arguments."""
-        arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
-        values = [map_tree(value, lambda name, leaf, _: change(name, leaf), name) for name, value in arguments]
-        args, kwargs = tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
+        args, kwargs = self._mapped(lambda name, leaf, _: change(name, leaf))
         call = dataclasses.replace(self, args=args, kwargs=kwargs, kinds=dict(self.kinds))
         call.changed(lambda tensor, kind: tensor)
         return call
@@ -312,19 +315,6 @@ class Call:
         args, kwargs = map_tensors((self.args, self.kwargs), as_plain)
         same = args is self.args and kwargs is self.kwargs
         return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)
-
-    def shared(self) -> list[Tensor]:
-        """Lists the tensors that are the same for all samples; call :meth:`changed` first, which finds them."""
-        tensors: list[Tensor] = []
-
-        def note(name: str, value: Any, nested: bool) -> Any:
-            if self.kinds.get(name) == SHARED:
-                tensors.append(value)
-            return value
-
-        for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True):
-            map_tree(value, note, name)
-        return tensors
 
     def arranged(self, grouping: Grouping | None) -> list[Tensor]:
         """Lists the rows of the arguments in the module's shapes, sorted by a grouping unless it is None."""
