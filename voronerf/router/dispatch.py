@@ -275,8 +275,8 @@ class Dispatch:
                 way, may_group = (loop := Loop()), False  # with one sample, a tensor [1, f] may also be shared
             if few and way is loop and options.way != "loop":
                 loop.why = f"first calls of fewer than {FEWEST} samples"
-        if len(self.plans) >= _PLANS:
-            self.plans, self.cached = {}, {}
+        self.plans = self.plans if len(self.plans) < _PLANS else {}
+        self.cached = self.cached if self.plans and key not in self.plans else {}  # drops calls of the old plans
         fused = way if isinstance(way, Fused) else None
         watch = None if fused is None else Watch(call.module, fused.reads, fused.inputs)
         new_plan = CallPlan(way, loop, may_group, few, constants, watch, probe.counts)
