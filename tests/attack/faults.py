@@ -534,9 +534,9 @@ FAULTS = (
     ),
     _python(
         "What few samples have shown is not looked at again with more of them",
-        "router/plan.py",
-        "return not self.skip and (not self.small or n < FEWEST)",
-        "return not self.skip",
+        "router/dispatch.py",
+        "most = FEWEST - 1 if plan.small else MAX_COUNT",
+        "most = MAX_COUNT",
         "tests/router/test_call_cache.py",
     ),
     _python(
@@ -631,18 +631,18 @@ FAULTS = (
         "test_router_inference.py",
     ),
     _router(
-        "A guard of parameters is seen before it is complete",
+        "The dependencies on parameters are seen before they are complete",
         "dispatch.py",
-        "        checked = self._checked = _Checked(k, cell_shapes, statistics, self._guard_of(call.module))",
-        "        self._checked = _Checked(k, cell_shapes, statistics, unchanged())\n"
-        "        checked = self._checked = _Checked(k, cell_shapes, statistics, self._guard_of(call.module))",
+        "        checked = self._checked = _Checked(k, cell_shapes, statistics, module_dependencies(call.module))",
+        "        self._checked = _Checked(k, cell_shapes, statistics, module_dependencies(nn.Module()))\n"
+        "        checked = self._checked = _Checked(k, cell_shapes, statistics, module_dependencies(call.module))",
         "test_router_threads.py",
     ),
     _router(
         "A tensor in a list is a constant of the trace",
         "watch.py",
-        "for item in (value,) if items is None else items:",
-        "for item in (value,) if items is None else ():",
+        "for item in (value, *items)",
+        "for item in (value,)",
         "test_router_schedules.py",
     ),
     _router(

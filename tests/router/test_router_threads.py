@@ -288,8 +288,8 @@ def ask_again(router: VoronoiRouter) -> None:
 
 #: Functions that make what is cached.
 CACHING = {
-    *("_look", "with_activation", "_check_parameters", "_guard", "_guard_of", "find", "evaluate", "_plan", "_group"),
-    *("snapshot", "index"),
+    *("_look", "with_activation", "_check_parameters", "module_dependencies", "find", "evaluate", "_plan", "_group"),
+    *("changed", "snapshot", "index"),
 }
 
 

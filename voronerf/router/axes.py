@@ -17,7 +17,7 @@ class Axis(NamedTuple):
     m: int = 1
 
 
-class Count(int):
+class SampleCount(int):
     """A multiple of the number of samples among the arguments of a function."""
 
 

@@ -7,6 +7,7 @@ a router names the way to begin with.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import sys
@@ -14,7 +15,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -22,21 +23,21 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.ops._core.backends import BackendUnavailable
-from voronerf.ops._core.unchanged import Stale, unchanged
+from voronerf.ops._core.checks import MAX_COUNT
+from voronerf.ops._core.unchanged import Stale
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.call_cache import CachedCall
 from voronerf.router.cells import refuse_statistics
-from voronerf.router.double import Forbidden
+from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
-from voronerf.router.grouped import Grouped, Loop, Ungroupable
-from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
+from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
+from voronerf.router.grouping import Grouping, cell_parameters, parts_of
 from voronerf.router.layout import SHARED, Call, Results, map_tree, tensors_of
-from voronerf.router.plan import CallPlan
 from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import CellProgram
 from voronerf.router.trace import Unfusable
 from voronerf.router.transforms import hooked, is_intercepted, untransformed
-from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup
+from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup, module_dependencies, same
 
 _OP = "VoronoiRouter"
 _PLANS = 256  # maximum number of kinds of calls with plans
@@ -54,13 +55,58 @@ class _Checked(NamedTuple):
         k: The number of cells.
         shapes: The names, shapes and dtypes of one cell's parameters.
         statistics: The submodules that mix the samples of a batch in training.
-        unchanged: A guard of the parameters and parts.
+        dependencies: The parameters and submodules.
     """
 
     k: int
     shapes: list[Any]
     statistics: list[nn.Module]
-    unchanged: Any
+    dependencies: Any
+
+
+@dataclass
+class CallPlan:
+    """The way in which calls of one kind run, and the values on which this way depends.
+
+    Attributes:
+        way: The first way that is possible and agrees with the loop.
+        loop: The loop over cells, which runs the batches for which ``way`` is impossible.
+        may_group: Whether another batch may run grouped although the first did not.
+        small: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another plan.
+        constants: The arguments of the traced call that are not tensors, by name; only for the fused way.
+        watch: The values of the module that the trace has read; only for the fused way.
+        counts: For each number in the results that counts samples, by name, its multiple of n.
+        skip: The number of calls that run cell by cell before another way is tried again.
+        wait: The value of ``skip`` after the next batch that cannot be grouped.
+    """
+
+    way: Way
+    loop: Loop
+    may_group: bool = False
+    small: bool = False
+    constants: dict[str, Any] = field(default_factory=dict)
+    watch: Watch | None = None
+    counts: dict[str, int] = field(default_factory=dict)
+    skip: int = 0
+    wait: int = 0
+
+    @property
+    def fused(self) -> Fused | None:
+        """The fused way, or None."""
+        return self.way if isinstance(self.way, Fused) else None
+
+    def changed(self, constants: dict[str, Any]) -> list[Source]:
+        """Lists the arguments, attributes and buffers that have changed since the module was traced."""
+        if self.fused is None or self.watch is None:
+            return []
+        both = constants.keys() | self.constants.keys() if constants.keys() != self.constants.keys() else constants
+        inputs = self.fused.inputs.sources
+        names = [n for n in both if not same(constants.get(n), self.constants.get(n)) and n not in inputs]
+        return [*names, *self.watch.changed()]
+
+    def postpone(self) -> None:
+        """Makes the next calls run cell by cell, twice as many after each failure."""
+        self.skip, self.wait = self.wait, 2 * self.wait or 1
 
 
 class Dispatch:
@@ -142,16 +188,12 @@ class Dispatch:
         if plan.counts:
             n, counts = call.layout.n, plan.counts
             results.value = map_tree(results.value, lambda name, leaf, _: n * counts[name] if name in counts else leaf)
-        if (
-            call.key is not None
-            and not plan.counts
-            and not is_intercepted()
-            and (cached := CachedCall.of(plan, call, grouping))
-        ):
-            if len(self.cached) >= _PLANS:
-                self.cached = {}
-            self._guard(cached)
-            self.cached[call.key] = cached
+        elif call.key is not None and plan.fused is not None and plan.watch is not None and not is_intercepted():
+            # A plan of few samples is not for many: the first larger call makes another plan.
+            most = FEWEST - 1 if plan.small else MAX_COUNT
+            if cached := CachedCall.of(plan.fused, plan.watch, most, call, grouping):
+                self.cached = self.cached if len(self.cached) < _PLANS else {}
+                self.cached[call.key] = cached
         return results
 
     def _plain(self, call: Call) -> Call:
@@ -167,34 +209,12 @@ class Dispatch:
             self._subclasses.add(key)
         return plain
 
-    def find(self, key: Any, k: int) -> CachedCall | None:
-        """Returns the cached call of a key, or None if the module has changed (not checked during compilation)."""
-        entry, checked = self.cached.get(key), self._checked
-        if entry is None or torch.compiler.is_compiling():
-            return entry
-        if is_intercepted() or k != checked.k:
-            return None
-        if not entry.unchanged.holds():
-            if not checked.unchanged.holds() or entry.plan.watch.changed():
-                return None
-            self._guard(entry)  # new values are equal, new parameters are of the same kind
-        return entry
-
-    def _guard(self, entry: CachedCall) -> None:
-        guard = self._guard_of(entry.module)
-        entry.plan.watch.note(guard)
-        entry.unchanged = guard
-
-    @staticmethod
-    def _guard_of(module: nn.Module) -> Any:
-        """Makes a guard of a module's parameters and submodules."""
-        guard = unchanged()
-        for part, name, _ in owned_parameters(module):
-            guard.kind(part._parameters, name)
-        for part in parts_of(module).values():
-            if part._modules:
-                guard.contents(part._modules)
-        return guard
+    def find(self, key: Any) -> CachedCall | None:
+        """Returns the cached call of a key; None if its dependencies have changed (not asked during compilation)."""
+        cached = self.cached.get(key)
+        if cached is None or torch.compiler.is_compiling():
+            return cached
+        return cached if not is_intercepted() and cached.dependencies.holds() else None
 
     def _check_parameters(self, call: Call, k: int, names: Collection[str]) -> _Checked:
         """Raises TypeError if the module lacks parameters, and ValueError if stacked ones are not [k, ...].
@@ -202,7 +222,7 @@ class Dispatch:
         With a parametrisation or another shape, kernels would access memory outside of the parameters.
         """
         checked = self._checked
-        if k == checked.k and checked.unchanged.holds():
+        if k == checked.k and checked.dependencies.holds():
             return checked
         named = dict(call.module.named_parameters())
         if lost := [name for name in names if name not in named]:
@@ -222,7 +242,7 @@ class Dispatch:
             self.forget()
         parts = parts_of(call.module).values()
         statistics: list[nn.Module] = [p for p in parts if isinstance(p, nn.modules.batchnorm._BatchNorm)]
-        checked = self._checked = _Checked(k, cell_shapes, statistics, self._guard_of(call.module))
+        checked = self._checked = _Checked(k, cell_shapes, statistics, module_dependencies(call.module))
         return checked
 
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
@@ -255,20 +275,15 @@ class Dispatch:
                 way, may_group = (loop := Loop()), False  # with one sample, a tensor [1, f] may also be shared
             if few and way is loop and options.way != "loop":
                 loop.why = f"first calls of fewer than {FEWEST} samples"
-        if len(self.plans) >= _PLANS:
-            self.plans, self.cached = {}, {}
-        new_plan = CallPlan(way, loop, may_group, few, constants=constants, counts=probe.counts)
-        if new_plan.fused is not None:
-            new_plan.watch = Watch.of(call.module, new_plan.fused.reads, new_plan.fused.inputs)
-        if probe.refused and new_plan.fused is not None:
+        self.plans = self.plans if len(self.plans) < _PLANS else {}
+        self.cached = self.cached if self.plans and key not in self.plans else {}  # drops calls of the old plans
+        fused = way if isinstance(way, Fused) else None
+        watch = None if fused is None else Watch(call.module, fused.reads, fused.inputs)
+        new_plan = CallPlan(way, loop, may_group, few, constants, watch, probe.counts)
+        if probe.refused and fused is not None:
             refused = self._refused_inputs.setdefault(key, (set(), probe.refused))[0]
-            refused.update(*(other.sources - new_plan.fused.inputs.sources for other in inputs))
-        old_plans = set(map(id, self.plans.get(key, [])))
-        cached = list(self.cached.items())  # another thread may add a call
-        self.cached = {call_key: other for call_key, other in cached if id(other.plan) not in old_plans}
-        self.plans[key] = (
-            [new_plan] if new_plan.fused is None else [new_plan, *(other for other in plans if other is not plan)]
-        )
+            refused.update(*(other.sources - fused.inputs.sources for other in inputs))
+        self.plans[key] = [new_plan, *(other for other in plans if fused is not None and other is not plan)]
         return new_plan
 
     def _inputs(
@@ -279,8 +294,8 @@ class Dispatch:
         Numbers, and tensors in attributes, that have changed since the last trace become inputs. If the module was
         traced too often, the list is empty, and the text is the reason.
         """
-        fused = plans[0].fused
-        assert fused is not None
+        fused, watch = plans[0].fused, plans[0].watch
+        assert fused is not None and watch is not None
         changed, parts = plans[0].changed(constants), list(parts_of(call.module).values())
         refused, why = self._refused_inputs.get(key, (set(), ""))
 
@@ -301,7 +316,7 @@ class Dispatch:
         new = {source for source in changed if source not in refused and is_number(value(source))}
         sources = frozenset(new | fused.inputs.sources)
         present = [fused.inputs] if fused.inputs.sources else []
-        earlier = [(s, plans[0].constants.get(s) if isinstance(s, str) else plans[0].watch.value(s)) for s in new]
+        earlier = [(s, plans[0].constants.get(s) if isinstance(s, str) else watch.value(s)) for s in new]
         others = tuple((source, old) for source, old in earlier if is_number(old) and old is not value(source))
         tried = [Inputs(sources, dtype, others) for dtype in NUMBERS] if new else []
         return [*tried, *present, Inputs()], ""
@@ -333,7 +348,7 @@ class Dispatch:
         try:
             results = loop.run(call, grouping)
         except Exception as error:
-            shown = _misfit(error, call) or error
+            shown = _misfit(error, call, grouping) or error
             if len(layout.lead) > 1 and not layout.flat and len(shown.args) == 1 and isinstance(shown.args[0], str):
                 hint = f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]"
                 shown.args = (f"{shown.args[0]}\n{hint}",)
@@ -395,7 +410,7 @@ def _own_randomness(grouping: Grouping) -> Any:
     return torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else [])
 
 
-def _misfit(error: Exception, call: Call) -> Exception | None:
+def _misfit(error: Exception, call: Call, grouping: Grouping) -> Exception | None:
     """Returns a clearer error than PyTorch's if arguments do not fit the module's layers, else None."""
     if not isinstance(error, RuntimeError):
         return None
@@ -408,16 +423,25 @@ def _misfit(error: Exception, call: Call) -> Exception | None:
             f"{_OP}: {names} must be {dtype}, as the parameters of {type(call.module).__name__} are, got "
             f"{', '.join(map(str, other.values()))}; pass {next(iter(other))}.to({dtype}), or call router.to(dtype)"
         )
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        layer, x = frame.f_locals.get("self"), frame.f_locals.get("input")
-        if not isinstance(layer, nn.Linear) or not isinstance(x, Tensor) or x.shape[-1:] == (layer.in_features,):
-            continue
-        shapes = ", ".join(str(list(tensor.shape)) for tensor in tensors.values())
-        rule = f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {x.shape[-1]} features"
-        fits = any(tensor.shape[-1:] == x.shape[-1:] for tensor in tensors.values())
-        remedy = "; pass the module's own arguments, and separate positions as coords=" if fits else ""
-        return ValueError(f"{rule}, got {shapes}{remedy}")
-    return None
+    double, misfits = Double(call.module), list[tuple[nn.Module, int]]()
+
+    def note(layer: Any, args: tuple[Any, ...]) -> None:
+        if args and isinstance(args[0], Tensor) and args[0].shape[-1:] != (layer.in_features,):
+            misfits.append((layer, args[0].shape[-1]))
+
+    for place, layer in enumerate(double.parts):
+        if isinstance(layer, nn.Linear):
+            double.replace(place, "_forward_pre_hooks", {**layer._forward_pre_hooks, "misfit": note})
+    with torch.no_grad(), contextlib.suppress(Exception):  # the call fails again
+        double.run(call, call.arranged(grouping))
+    if not misfits:
+        return None
+    layer, features = misfits[0]
+    shapes = ", ".join(str(list(tensor.shape)) for tensor in tensors.values())
+    rule = f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {features} features"
+    fits = any(tensor.shape[-1:] == (features,) for tensor in tensors.values())
+    remedy = "; pass the module's own arguments, and separate positions as coords=" if fits else ""
+    return ValueError(f"{rule}, got {shapes}{remedy}")
 
 
 def _plan_key(call: Call, device: torch.device) -> Any:

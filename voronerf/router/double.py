@@ -96,8 +96,9 @@ class Double:
                         self.stacked[id(parameter)] = parameter
             self._registries.append((twin, registry, set(registry)))
 
-    def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any], mode: Any = None) -> Any:
-        """Runs a call once; see :meth:`runs`."""
+    def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any] | None = None, mode: Any = None) -> Any:
+        """Runs a call once; see :meth:`runs`. Without ``values`` the parameters are the first cell's, as constants."""
+        values = {key: p.detach()[0] for key, p in self.stacked.items()} if values is None else values
         return self.runs(call, [rows], [values], mode)[0]
 
     def runs(

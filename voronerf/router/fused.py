@@ -22,7 +22,7 @@ from torch.fx.node import map_arg
 
 from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step
 from voronerf.ops.grouped_program import grouped_program
-from voronerf.router.axes import Count
+from voronerf.router.axes import SampleCount
 from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable, name_of
 from voronerf.router.grouping import Grouping, owned_parameters, parts_of
 from voronerf.router.layout import Call, Results, map_tensors, recordable, tensors_of
@@ -498,7 +498,7 @@ def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None
         if meets_cells and source.meta["on"] == SAMPLES:
             if isinstance(value, Tensor):
                 grouped.mark(value, source.meta["axis"])
-            return Count(value) if type(value) is int else value
+            return SampleCount(value) if type(value) is int else value
         return value
 
     args, kwargs = map_arg((node.args, node.kwargs), argument)

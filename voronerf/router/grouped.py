@@ -2,9 +2,9 @@
 
 The rows are sorted by cell, and :class:`PerCell` tensors replace the module's parameters. :class:`GroupedRun`
 intercepts every PyTorch function. A function of rows and parameters runs by a rule (:func:`register`), a function of
-parameters alone is mapped over cells, and any other function runs unchanged. A :class:`Step` tells which axis of each
+parameters alone is mapped over cells, and any other function runs unchanged. :class:`CallAxes` tell which axis of each
 argument has the samples. Tensors that depend on the samples are marked; the marks reveal host reads of samples' values.
-If a step has no rule, :class:`Ungroupable` names the step, and the call becomes a loop over cells.
+If a function has no rule, :class:`Ungroupable` names it, and the call becomes a loop over cells.
 
 Letters: n samples, k cells; a tensor of rows has n * m entries in one dimension, the m entries of each sample adjacent.
 """
@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.axes import Axis, Count, axis_of, multiple
+from voronerf.router.axes import Axis, SampleCount, axis_of, multiple
 from voronerf.router.double import Double
 from voronerf.router.grouping import Grouping, cell_parameters, cells_of
 from voronerf.router.layout import Call, Results, map_tensors, split_rows, tensors_of
@@ -167,7 +167,7 @@ class Ungroupable(Exception):
 
     Attributes:
         of_batch: Whether another batch may be groupable.
-        is_new: Whether the module did what no :class:`Step` tells, so that a new record may help.
+        is_new: Whether the module did what no :class:`CallAxes` tells, so that a new record may help.
     """
 
     def __init__(self, reason: str, of_batch: bool = False, is_new: bool = False) -> None:
@@ -276,7 +276,7 @@ def text_of_line(file: str, number: int) -> str:
     return f" ({os.path.basename(file)}:{number}{f': {code}' if code else ''})"
 
 
-class Step(NamedTuple):
+class CallAxes(NamedTuple):
     """One function that a module calls: the axes of the tensors among its arguments and among its results.
 
     ``integers`` are the integers among its arguments, and ``counts`` has the multiple of n of each that counts samples.
@@ -305,9 +305,9 @@ def integers_of(items: Iterable[Any]) -> list[int]:
 
 
 def with_counts(value: Any, counts: Iterator[int]) -> Any:
-    """Returns arguments in which the integers with a multiple in ``counts`` are a :class:`Count`."""
+    """Returns arguments in which the integers with a multiple in ``counts`` are a :class:`SampleCount`."""
     if isinstance(value, int):
-        return Count(value) if next(counts) else value
+        return SampleCount(value) if next(counts) else value
     if type(value) in (list, tuple, torch.Size):
         items = [with_counts(item, counts) for item in value]
         return items if type(value) is list else tuple(items)
@@ -333,12 +333,12 @@ class Recorder(TorchFunctionMode):
         return result
 
 
-def steps_of(runs: Sequence[Recorder], n: Sequence[int]) -> list[Step]:
+def steps_of(runs: Sequence[Recorder], n: Sequence[int]) -> list[CallAxes]:
     """Returns the steps of a module from two runs with different numbers of samples ``n``.
 
     Raises :class:`Ungroupable` if the runs call different functions.
     """
-    steps = list[Step]()
+    steps = list[CallAxes]()
     for one, other in itertools.zip_longest(*(run.calls for run in runs)):
         if one is None or other is None or one[0] != other[0] or [*map(len, one[1:])] != [*map(len, other[1:])]:
             raise Ungroupable("its forward calls other functions for another number of samples", of_batch=True)
@@ -347,7 +347,7 @@ def steps_of(runs: Sequence[Recorder], n: Sequence[int]) -> list[Step]:
         fits = all(told or a == b for told, (a, b) in zip((*axes, *counts), (*shapes, *integers)))
         results = tuple(axis_of(*pair, n) for pair in zip(one[3], other[3]))
         constants = tuple(0 if m else value for m, value in zip(counts, one[2]))
-        steps.append(Step(one[0], tuple(axes), constants, tuple(counts) if any(counts) else (), results, not fits))
+        steps.append(CallAxes(one[0], tuple(axes), constants, tuple(counts) if any(counts) else (), results, not fits))
     return steps
 
 
@@ -370,7 +370,7 @@ class GroupedRun(TorchFunctionMode):
         self,
         grouping: Grouping,
         tables: dict[Any, Any],
-        steps: list[Step] | None = None,
+        steps: list[CallAxes] | None = None,
         quiet: bool = False,
     ) -> None:
         super().__init__()
@@ -378,7 +378,7 @@ class GroupedRun(TorchFunctionMode):
         self.failed: Ungroupable | None = None
         self.widest = 1
         self._token = object()
-        self.counted = False  # whether an argument of the function is a Count
+        self.counted = False  # whether an argument of the function is a SampleCount
         self._steps = None if steps is None else iter(steps)
 
     # For rules --------------------------------------------------------------------------------------------------------
@@ -423,7 +423,7 @@ class GroupedRun(TorchFunctionMode):
 
     # Functions --------------------------------------------------------------------------------------------------------
 
-    def _step(self, func: Any, args: Any, kwargs: Any) -> Step | None:
+    def _step(self, func: Any, args: Any, kwargs: Any) -> CallAxes | None:
         """Returns the step of the next function, after a comparison with its name and its integers."""
         if self._steps is None:
             return None
@@ -476,7 +476,7 @@ class GroupedRun(TorchFunctionMode):
             return
         raise self.fail(f"{name_of(func)} reads values of the samples", of_batch=True)
 
-    def _with_parameters(self, func: Any, args: Any, kwargs: Any, operands: list[Tensor], step: Step | None) -> Any:
+    def _with_parameters(self, func: Any, args: Any, kwargs: Any, operands: list[Tensor], step: CallAxes | None) -> Any:
         if step is not None:
             for tensor, axis in zip(operands, step.axes, strict=False):
                 if axis is not None and tensor.shape[axis.dim : axis.dim + 1] != (self.n * axis.m,):
@@ -525,7 +525,7 @@ class Grouped:
     On a CPU, ``forward`` runs on pieces of the rows, so that its tensors fit in the cache.
     """
 
-    records: list[list[Step]]  # the known sequences of the module's functions, the latest last
+    records: list[list[CallAxes]]  # the known sequences of the module's functions, the latest last
     piece: int = 1 << 16  # maximum number of rows in a piece
     name: str = "grouped"
     why: str = ""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-import inspect
 import math
 import types
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -137,6 +136,11 @@ def as_plain(value: Any) -> Any:
 
 def rebuild(value: Any, tensors: Iterable[Any]) -> Any:
     """Returns the structure with its tensors replaced, in the order of :func:`tensors_of`."""
+    if isinstance(value, Tensor):
+        (tensor,) = tensors
+        return tensor
+    if type(value) in (list, tuple) and all(isinstance(item, Tensor) for item in value):
+        return type(value)(tensors)
     following = iter(tensors)
     return map_tensors(value, lambda tensor: next(following))
 
@@ -262,6 +266,15 @@ class Call:
         args, kwargs = self.changed(lambda tensor, kind: next(following))
         return (self.module if self.method == "forward" else getattr(self.module, self.method))(*args, **kwargs)
 
+    def _mapped(self, change: Callable[[str, Any, bool], Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """Applies ``change`` to every leaf of the arguments (see :func:`map_tree`); returns the new arguments."""
+        arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
+        values = [
+            change(name, value, False) if isinstance(value, Tensor) else map_tree(value, change, name)
+            for name, value in arguments
+        ]
+        return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
+
     def changed(self, change: Callable[[Tensor, str], Tensor]) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """Applies ``change`` (of a tensor and its kind) to every tensor that has rows; returns the new arguments."""
 
@@ -272,31 +285,25 @@ class Call:
                 self.kinds[name] = self.layout.kind(name, value, nested)
             return value if self.kinds[name] == SHARED else change(value, self.kinds[name])
 
-        arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
-        values = [
-            changed(name, value, False) if isinstance(value, Tensor) else map_tree(value, changed, name)
-            for name, value in arguments
-        ]
-        return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
+        return self._mapped(changed)
+
+    def _leaves(self) -> dict[str, Any]:
+        """Returns the leaves of the arguments, by name."""
+        leaves: dict[str, Any] = {}
+        self._mapped(lambda name, leaf, _: leaves.setdefault(name, leaf))
+        return leaves
 
     def constants(self) -> dict[str, Any]:
         """Returns the leaves of the arguments that are not tensors, by name."""
-        constants: dict[str, Any] = {}
+        return {name: leaf for name, leaf in self._leaves().items() if not isinstance(leaf, Tensor)}
 
-        def note(name: str, value: Any, nested: bool) -> Any:
-            if not isinstance(value, Tensor):
-                constants[name] = value
-            return value
-
-        for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True):
-            map_tree(value, note, name)
-        return constants
+    def shared(self) -> list[Tensor]:
+        """Lists the tensors that are the same for all samples; call :meth:`changed` first, which finds them."""
+        return [leaf for name, leaf in self._leaves().items() if self.kinds.get(name) == SHARED]
 
     def with_leaves(self, change: Callable[[str, Any], Any]) -> Call:
         """Returns the call with ``change(name, leaf)`` instead of each leaf of the arguments."""
-        arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
-        values = [map_tree(value, lambda name, leaf, _: change(name, leaf), name) for name, value in arguments]
-        args, kwargs = tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
+        args, kwargs = self._mapped(lambda name, leaf, _: change(name, leaf))
         call = dataclasses.replace(self, args=args, kwargs=kwargs, kinds=dict(self.kinds))
         call.changed(lambda tensor, kind: tensor)
         return call
@@ -308,19 +315,6 @@ class Call:
         args, kwargs = map_tensors((self.args, self.kwargs), as_plain)
         same = args is self.args and kwargs is self.kwargs
         return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)
-
-    def shared(self) -> list[Tensor]:
-        """Lists the tensors that are the same for all samples; call :meth:`changed` first, which finds them."""
-        tensors: list[Tensor] = []
-
-        def note(name: str, value: Any, nested: bool) -> Any:
-            if self.kinds.get(name) == SHARED:
-                tensors.append(value)
-            return value
-
-        for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True):
-            map_tree(value, note, name)
-        return tensors
 
     def arranged(self, grouping: Grouping | None) -> list[Tensor]:
         """Lists the rows of the arguments in the module's shapes, sorted by a grouping unless it is None."""
@@ -392,101 +386,3 @@ class Results:
     def restored(self, layout: Layout) -> Any:
         """Returns the results in the order of the call, with its leading dimensions."""
         return rebuild(self.value, [layout.restore(rows if layout.n else rows[:0]) for rows in self.unsorted])
-
-
-def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
-    """Returns the first tensor among the arguments of a call, or None."""
-    for value in (*args, *kwargs.values()) if kwargs else args:
-        if isinstance(value, Tensor) and value.dim():
-            return value if type(value) is Tensor else as_plain(value)
-    return None
-
-
-def find_positions(coords: Any, args: Sequence[Any], kwargs: dict[str, Any], d: int = 3) -> Tensor:
-    """Returns the positions of a call's samples, [..., d]; ``coords`` finds them or is the positions."""
-    if coords is None:
-        raise ValueError(
-            f"{_OP}: coords must name the positions among the module's arguments: pass "
-            f"coords='first{d}', a slice of the features or a function of the arguments to the router, or "
-            f"coords=positions [..., {d}] to this call"
-        )
-    source = None
-    if isinstance(coords, Tensor):
-        positions = as_plain(coords)
-    elif callable(coords):
-        positions = as_plain(coords(*args, **kwargs))
-    elif not isinstance(coords, (str, slice)):
-        raise TypeError(f"{_OP}: coords must be a tensor, got {type(coords).__name__}; {AS_TENSOR}")
-    else:
-        source = first_tensor(args, kwargs)
-        if source is None:
-            got = ", ".join(type(value).__name__ for value in (*args, *kwargs.values())) or "nothing"
-            raise ValueError(
-                f"{_OP}: coords={coords!r} must find a tensor among the arguments, got {got}; {AS_TENSOR}, or as "
-                "coords a function of the arguments"
-            )
-        whole = isinstance(coords, str) and source.shape[-1] == d == int(coords[5:])
-        positions = (
-            source if whole else source[..., : int(coords[5:])] if isinstance(coords, str) else source[..., coords]
-        )
-    if isinstance(positions, Tensor) and positions.shape[-1:] == (d,) and positions.is_floating_point():
-        return positions
-    what = "coords" if isinstance(coords, Tensor) else "the result of coords"
-    if source is not None:
-        what = f"coords={coords!r} of the first tensor, {list(source.shape)},"
-    if not isinstance(positions, Tensor):
-        raise TypeError(f"{_OP}: {what} must be a tensor, got {type(positions).__name__}")
-    if positions.shape[-1:] != (d,):
-        raise ValueError(f"{_OP}: {what} must have shape [..., {d}], got {list(positions.shape)}")
-    raise TypeError(f"{_OP}: {what} must be floating-point, got {positions.dtype}")
-
-
-_MANY = 4  # minimum number of cells for the warning that one cell has nearly all samples
-
-
-@torch.no_grad()
-def position_warning(coords: Any, source: Tensor | None, positions: Tensor, counts: Tensor, centres: Tensor) -> str:
-    """Returns the reason why positions [n, d] may be another quantity, or an empty text.
-
-    ``source`` is the call's first tensor; ``counts`` [k] is the number of samples in each cell.
-    """
-    flat, k, d = positions.detach().flatten(0, -2), len(counts), positions.shape[-1]
-    if isinstance(coords, str) and source is not None:
-        x = source.detach().flatten(0, -2)[:256].float()
-        circle = (x[:, :1].square() + x.square() - 1).abs().amax(0) < 1e-3
-        if x.shape[1] > d and float(x[:, 0].std()) > 1e-3 and bool(circle.any()):
-            return (
-                f"coords={coords!r} takes sines and cosines of an encoding for positions; let the encoding begin with "
-                "the position, or pass coords=positions to each call"
-            )
-        if d == 3 and float((x[:, :3].norm(dim=1) - 1).abs().max()) < 1e-3:
-            return f"coords={coords!r} takes unit vectors, such as directions, for positions; pass coords=positions"
-    most = int(counts.max())
-    if k < _MANY or most <= 0.9 * len(flat):
-        return ""
-    spans = (f"{float(x.min()):.3g} to {float(x.max()):.3g}" for x in (centres, flat))
-    return (
-        f"{most:,} of {len(flat):,} samples are in one of {k} cells; centres (coordinates {next(spans)}) must be in "
-        f"the units of positions ({next(spans)}): VoronoiDiagram.from_points(positions, {k}) places them"
-    )
-
-
-def argument_names(function: Callable[..., Any]) -> list[str]:
-    """Returns the names of a function's positional arguments; for methods they are cached."""
-    return list(
-        _names(function.__func__)[1:] if isinstance(function, types.MethodType) else _names.__wrapped__(function)
-    )
-
-
-@functools.lru_cache(maxsize=256)
-def _names(function: Callable[..., Any]) -> list[str]:
-    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return [parameter.name for parameter in inspect.signature(function).parameters.values() if parameter.kind in kinds]
-
-
-def accepted_names(functions: Iterable[Callable[..., Any]]) -> list[str] | None:
-    """Returns the names of all arguments of some functions; None if one of them takes any keyword."""
-    parameters = [p for function in functions for p in inspect.signature(function).parameters.values()]
-    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-        return None
-    return list(dict.fromkeys(p.name for p in parameters))

@@ -22,11 +22,11 @@ from voronerf.router.cells import clone_module
 from voronerf.router.double import Double, Forbidden, items_of, restore_items
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import (
+    CallAxes,
     Grouped,
     Loop,
     NoRandomness,
     Recorder,
-    Step,
     Ungroupable,
     Way,
     steps_of,
@@ -123,7 +123,7 @@ class Probe:
             ValueError: If fusion is required, but fails, and only one method of the module is routed.
         """
         call = self._call
-        steps: Callable[[], list[Step]] = self.steps
+        steps: Callable[[], list[CallAxes]] = self.steps
         with contextlib.suppress(Exception):  # the way names the reason
             steps = functools.partial(steps_of, self.note_changes(warn_once).runs, _COUNTS)
         for loop in (Loop(), Loop(again=True)):
@@ -166,11 +166,11 @@ class Probe:
         self._check_rows(loop)
         return loop, loop, may_group
 
-    def steps(self) -> list[Step]:
+    def steps(self) -> list[CallAxes]:
         """Returns the steps of the module; see :class:`ProbeRuns`."""
         return steps_of(self.record().runs, _COUNTS)
 
-    def confirmed_steps(self) -> list[Step]:
+    def confirmed_steps(self) -> list[CallAxes]:
         """Returns the steps of the module, with which it runs grouped like the loop; raises :class:`Ungroupable`."""
         steps, loop = self.steps(), Loop()
         if not self._agrees(Grouped([steps], quiet=True), loop, self._outcome(loop)):
@@ -197,9 +197,9 @@ class Probe:
 
     def run_once(self, module: nn.Module) -> None:
         """Runs the first cell of a module for both numbers of samples, which fills caches in dicts and lists."""
-        rows, cell = self._call.arranged(self._entries), {id(p): p.detach()[0] for p in cell_parameters(module)}
+        rows = self._call.arranged(self._entries)
         for count in _COUNTS:
-            Double(module).run(self._call, [tensor[:count] for tensor in rows], cell)
+            Double(module).run(self._call, [tensor[:count] for tensor in rows])
 
     def _containers(self) -> dict[tuple[int, str], Any]:
         """Returns the items of the lists, dicts and sets of the module, by submodule and attribute."""
@@ -438,9 +438,8 @@ def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
 
     args, kwargs = call.changed(first)
     small = replace(call, layout=replace(call.layout, lead=few), args=args, kwargs=kwargs)
-    cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
     with torch.no_grad(), NoRandomness():
-        return [tensors_of(Double(call.module).run(small, rows, cell)) for rows in (tensors, small.arranged(None))]
+        return [tensors_of(Double(call.module).run(small, rows)) for rows in (tensors, small.arranged(None))]
 
 
 def check_subclasses(call: Call, plain: Call) -> None:
@@ -451,16 +450,15 @@ def check_subclasses(call: Call, plain: Call) -> None:
         rows.append(tensor[:_CHECKED])
         return tensor
 
-    cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
     with torch.no_grad(), NoRandomness():
         expected = None
         with contextlib.suppress(Exception):  # a slice of a subclass may be invalid
             call.changed(first)
-            expected = tensors_of(Double(call.module).run(call, rows, cell))
+            expected = tensors_of(Double(call.module).run(call, rows))
         try:
             rows.clear()
             plain.changed(first)
-            results = tensors_of(Double(call.module).run(plain, rows, cell))
+            results = tensors_of(Double(call.module).run(plain, rows))
             same = expected is None or (
                 len(results) == len(expected) and all(map(agree, map(as_plain, results), map(as_plain, expected)))
             )

@@ -21,6 +21,7 @@ from voronerf.ops._core.tolerances import agree
 from voronerf.ops._core.unchanged import Stale, unchanged
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.network import Names, Network
+from voronerf.router.arrange import find_positions
 from voronerf.router.axes import Axis
 from voronerf.router.double import Double
 from voronerf.router.grouping import cell_parameters, parts_of
@@ -121,13 +122,13 @@ class _Looked(NamedTuple):
         field: The field; None before the first call.
         program: The program, or the reason why it is unknown.
         ray_program: The program with a direction for each ray.
-        unchanged: A guard of the field's attributes and parts.
+        dependencies: The field's attributes and submodules.
     """
 
     field: nn.Module | None
     program: CellProgram | str
     ray_program: Program | None
-    unchanged: Any
+    dependencies: Any
 
 
 class _Activation(NamedTuple):
@@ -137,13 +138,11 @@ class _Activation(NamedTuple):
         key: The field, its activation, and the shapes of the activation's arguments.
         steps: The activation's program and the shapes of its results; None if there is none.
         watch: The attributes that the activation reads.
-        unchanged: A guard of these attributes.
     """
 
     key: Any
     steps: tuple[Program, tuple[tuple[int, ...], ...]] | None
     watch: Watch
-    unchanged: Any
 
 
 class FieldProgram:
@@ -176,10 +175,10 @@ class FieldProgram:
         looked = self._looked
         if torch.compiler.is_compiling():  # the last program is assumed to hold
             return looked
-        if field is not looked.field or not looked.unchanged.holds():
+        if field is not looked.field or not looked.dependencies.holds():
             name, field_type, parts = type(field).__name__, cast(Any, type(field)), [*parts_of(field).values()]
             program: CellProgram | str = f"{name} computes more than its program"
-            ray_program, guard = None, unchanged()
+            ray_program, dependencies = None, unchanged()
             if _describes(field_type) and "forward" not in vars(field) and all(map(_is_plain, parts)):
                 with torch.inference_mode(False):  # turns gradients on, too: later calls use views of parameters
                     program = _checked(name, cast(Any, field).program())
@@ -190,14 +189,14 @@ class FieldProgram:
                 ray_program = _by_ray(program.program.text, program.reads)
                 for p in program.parameters:
                     if p._base is not None:  # a view keeps the memory that `p.data = values` replaces
-                        guard.layout(p._base)
-            guard.attributes(field_type, ["forward", "program"])
+                        dependencies.layout(p._base)
+            dependencies.attributes(field_type, ["forward", "program"])
             for part in parts:
-                guard.contents(vars(part))
+                dependencies.contents(vars(part))
                 for value in vars(part).values():
                     if isinstance(value, (dict, list, set)):  # such as parameters, submodules and hooks
-                        guard.contents(value)
-            looked = self._looked = _Looked(field, program, ray_program, guard)
+                        dependencies.contents(value)
+            looked = self._looked = _Looked(field, program, ray_program, dependencies)
         return looked
 
     def with_activation(self, field: nn.Module) -> CellProgram | str:
@@ -206,7 +205,7 @@ class FieldProgram:
         if isinstance(layers, str) or layers.activate is None:
             return layers
         key, known = (field, layers.activate, layers.shapes), self._activation
-        if known is None or key != known.key or (not known.unchanged.holds() and known.watch.changed()):
+        if known is None or key != known.key or known.watch.changed():
             steps: tuple[Program, tuple[tuple[int, ...], ...]] | None = None
             reads = set[tuple[int, str]]()
             with contextlib.suppress(Exception), outside():  # if tracing fails, PyTorch computes the activation
@@ -215,11 +214,7 @@ class FieldProgram:
                 traced, parts = _steps_of(double.activate, layers.shapes[0][0]), [*parts_of(field).values()]
                 if not any(name in parts[place]._parameters for place, name in reads):
                     steps = traced
-            known = _Activation(key, steps, Watch.of(field, reads, Inputs()), Stale())
-        if not known.unchanged.holds():
-            guard = unchanged()
-            known.watch.note(guard)
-            known = self._activation = known._replace(unchanged=guard)
+            known = self._activation = _Activation(key, steps, Watch(field, reads, Inputs()))
         if known.steps is None:
             return f"activate of {type(field).__name__} cannot be written as steps of a program"
         program, shapes = known.steps
@@ -250,7 +245,7 @@ class FieldProgram:
         if all(p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)):  # cells share all parameters
             parameters = [parameters[0].expand(k, *parameters[0].shape), *parameters[1:]]
         rows = [(positions, directions)[number] for number in layers.reads]
-        places = router.places(positions, router._positions(args, kwargs, coords))
+        places = router.places(find_positions(router, args, kwargs, coords))
         network = Network(program, parameters, names=Names(_OP))
         results, _ = network(rows, places, ray_index=ray_index, backend=router.backend)
         if layers.activate is not None:

@@ -23,6 +23,7 @@ from voronerf.diagram.voronoi import MANY_CELLS
 from voronerf.ops._core.backends import BACKENDS
 from voronerf.ops._core.compiler import not_compiled
 from voronerf.ops.network import Cells
+from voronerf.router.arrange import COLUMNS, accepted_names, argument_names, describe_call, find_positions, with_labels
 from voronerf.router.call_cache import CachedCall, call_key
 from voronerf.router.cells import (
     apply_to_cells,
@@ -38,15 +39,6 @@ from voronerf.router.cells import (
 from voronerf.router.dispatch import Dispatch
 from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.labels import Labels
-from voronerf.router.layout import (
-    Call,
-    Layout,
-    accepted_names,
-    argument_names,
-    find_positions,
-    first_tensor,
-    position_warning,
-)
 from voronerf.router.optimizers import (
     FrozenRows,
     Untrained,
@@ -65,8 +57,8 @@ _NO_GRAPH = (
     "VoronoiRouter: a routed module runs eagerly between two graphs of torch.compile; omit fullgraph=True, or call a "
     "router with fuse=True once beforehand, with gradients on or off as in the graph"
 )
-_READ = ("backend", "coords", "layout", "methods", "per_ray", "shared", "way")  # attributes that cached calls depend on
-_LARGE = 512  # minimum number of samples for a check of the positions
+# Attributes whose assignment drops all cached calls.
+_READ = ("backend", "coords", "diagram", "layout", "methods", "module", "per_ray", "shared", "way")
 Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first1", "first2", "first3", "first4"] | slice | Callable[..., Tensor]
 
@@ -586,62 +578,31 @@ class VoronoiRouter(nn.Module):
 
     @property
     def _d(self) -> int:
-        diagram: Any = self._modules["diagram"]
+        """The number of coordinates; 0 for a router without centres."""
+        diagram: Any = self._modules["diagram"]  # attribute access is six times slower
         d: int = diagram._buffers["centres"].shape[1]
         return d
 
-    def _positions(self, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None) -> Tensor:
-        """Returns the positions [..., d] that choose the cells of a call, or its labels, int32 [..., 1]."""
-        if isinstance(coords, Labels):
-            return coords.cells
-        if not self._d:
-            raise ValueError(
-                "VoronoiRouter: cells must be given to each call of a router without centres: pass cells=labels, "
-                "integers of the leading shape of the samples"
-            )
-        positions = find_positions(self.coords if coords is None else coords, args, kwargs, self._d)
-        if self._positions_unchecked:
-            self._check_positions(positions, args, kwargs, coords)
-        return positions
-
-    def _check_positions(
-        self, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None
-    ) -> None:
-        """Warns, at the first large batch of training, if the positions look like another quantity or unit."""
-        few = positions.numel() < _LARGE * positions.shape[-1]
-        if few or not torch.is_grad_enabled() or torch.compiler.is_compiling():
-            return
-        self._positions_unchecked = False
-        with outside():
-            flat = unwrapped(positions).detach().reshape(-1, self._d)
-            counts = self.diagram.locate(flat, backend=self.backend).bincount(minlength=self.num_cells)
-            source = first_tensor(args, kwargs)
-            source = None if source is None else unwrapped(source)
-            warning = position_warning(
-                self.coords if coords is None else coords, source, flat, counts, self.diagram.centres
-            )
-        if warning:
-            self._dispatch.warn_once("positions", warning)
-
-    def places(self, positions: Tensor, coords: Tensor | None = None) -> Cells:
+    def places(self, positions: Tensor, method: str | None = None) -> Cells:
         """Returns the cells of samples, with the frozen cells.
 
         Args:
-            positions: Positions [n, 3] in scene units, or Gaussians [n, 6], means and variances.
-            coords: Positions [..., d] that choose the cells, or labels, int32 [..., 1]; None for the positions of the
-                samples.
+            positions: Positions [..., d] in scene units, Gaussians [n, 6], means and variances, or labels,
+                int32 [..., 1].
+            method: The called method, which shares its cells with other methods at the same positions; or None.
         """
         diagram: Any = self._modules["diagram"]
         k, centres, frozen = diagram.num_cells, diagram._buffers["centres"], self._buffers["frozen_cells"]
-        if not torch.compiler.is_compiling() and self._training_checks:
-            self._run_training_checks()
+        self._run_training_checks()
+        if method is not None and self.methods:
+            return Cells(cells=self._group(method, positions).cells, frozen=frozen)
         if k == 1:
             return Cells(frozen=frozen)
-        if coords is not None and not coords.is_floating_point():
-            return Cells(cells=coords.flatten(), frozen=frozen)
+        coords = positions if positions.dim() == 2 else positions.flatten(0, -2)
+        if not coords.is_floating_point():
+            return Cells(cells=coords[:, 0], frozen=frozen)
         d, drawn = centres.shape[1], self.assignment == "stochastic" and self.training
-        if coords is None:
-            coords = positions[:, :d] if positions.shape[1] > d else positions
+        coords = coords[:, :d] if coords.shape[1] > d else coords
         if drawn or d != 3:
             return Cells(cells=self.assign(coords.detach() if drawn else coords), frozen=frozen)
         if diagram.depth == 1:
@@ -649,14 +610,6 @@ class VoronoiRouter(nn.Module):
             return Cells(centres=centres, coords=coords, centre_index=index, frozen=frozen)
         tree = {"child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
         return Cells(centres=centres, coords=coords, frozen=frozen, **tree)
-
-    def _places_of(self, method: str, positions: Tensor) -> Cells:
-        """Returns :meth:`places` for a call of a method; methods with the same positions share their cells."""
-        if self.methods:
-            self._run_training_checks()
-            return Cells(cells=self._group(method, positions).cells, frozen=self.frozen_cells)
-        flat = positions if positions.dim() == 2 else positions.flatten(0, -2)
-        return self.places(flat, flat)
 
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
         """Returns the program of ``forward``, or the reason why it is unknown.
@@ -690,7 +643,7 @@ class VoronoiRouter(nn.Module):
             if trace and self.fuse:
                 cells = None if k == 1 else self.diagram.locate(positions, backend=self.backend)
                 grouping = Grouping(cells, len(positions), k, device, self.backend)
-            call = self._call("forward", positions, arguments, {})
+            call = describe_call(self, "forward", positions, arguments, {})
             program = dispatch.program(call, grouping, device, k, self._options, self.backend)
         if isinstance(program, str) or k == 1:
             return program
@@ -764,21 +717,12 @@ class VoronoiRouter(nn.Module):
         method: str,
         args: tuple[Any, ...],
         kwargs: dict[str, Any],
-        coords: Tensor | Labels | None,
+        coords: Any,
         cells: Tensor | None,
     ) -> Any:
         """Runs one call of a method. A call that is not in the cache causes a graph break in ``torch.compile``."""
         if cells is not None:
-            names = self._argument_names.get(method, ())
-            if coords is not None and "coords" in names:
-                kwargs, coords = {**kwargs, "coords": coords}, None
-            if "cells" in names:
-                kwargs = {**kwargs, "cells": cells}
-            elif coords is not None:
-                raise ValueError("VoronoiRouter: coords must be None where cells are given, got both")
-            else:
-                coords = Labels.of(cells, self.num_cells, self.diagram.centres.device)
-                args = args if self.shared or self.per_ray else coords.widen(args, kwargs)
+            args, kwargs, coords = with_labels(self, method, args, kwargs, coords, cells)
         if self._resized and not torch.compiler.is_compiling():
             self._check_wrapper()
         if method == "forward" and self._field_program is not None:
@@ -789,7 +733,7 @@ class VoronoiRouter(nn.Module):
         if self.fuse:
             module: Any = self._modules["module"]
             key = call_key(method, module.training, args, kwargs, coords)
-            cached = None if key is None else self._dispatch.find(key, self.num_cells)
+            cached = None if key is None else self._dispatch.find(key)
         if cached is not None and (results := cached.run(self, args, kwargs, coords)) is not None:
             return results
         if torch.compiler.is_exporting():
@@ -830,15 +774,15 @@ class VoronoiRouter(nn.Module):
         placed = coords is not None and not isinstance(coords, Labels)
         if placed and "coords" in (accepted_names([function]) or ()):  # coords is an argument of the method
             kwargs, coords, key = {**kwargs, "coords": coords}, None, None
-        positions = self._positions(args, kwargs, coords)
-        call = self._call(method, positions, args, kwargs)
+        positions = find_positions(self, args, kwargs, coords)
+        call = describe_call(self, method, positions, args, kwargs)
         call.key = key
         grouping = self._group(method, positions)
         return self._dispatch.evaluate(call, grouping, self._options, self.frozen_cells).restored(call.layout)
 
     def _run_training_checks(self) -> None:
         """Warns in the first training calls if parameters are not trained; raises if frozen cells change."""
-        if torch.is_grad_enabled():
+        if self._training_checks and torch.is_grad_enabled() and not torch.compiler.is_compiling():
             self._training_checks = [
                 check for check in self._training_checks if not check.is_over(self._dispatch.warn_once)
             ]
@@ -850,22 +794,6 @@ class VoronoiRouter(nn.Module):
     @property
     def _options(self) -> Options:
         return Options(self.fuse, self.way, bool(self.methods), self._names)
-
-    def _call(self, method: str, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
-        """Describes a call of a method, for samples at positions [..., d] or with labels, int32 [..., 1]."""
-        positional = argument_names(getattr(self.module, method))
-        names = [*positional[: len(args)], *map(str, range(len(positional), len(args)))]
-
-        def named(item: str | int) -> str:
-            return item if isinstance(item, str) else names[item] if item < len(names) else str(item)
-
-        layout = Layout(
-            tuple(positions.shape[:-1]),
-            None if self.per_ray is None else frozenset(map(named, self.per_ray)),
-            frozenset(map(named, self.shared)),
-            self.layout == "flat",
-        )
-        return Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
 
     _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)
 
@@ -950,7 +878,7 @@ def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> 
         "way": (options["way"] in ("fused", "grouped", "loop"), "'fused', 'grouped' or 'loop'"),
         "backend": (options["backend"] in ("auto", *BACKENDS), f"auto, {', '.join(BACKENDS)}"),
         "coords": (
-            coords in (None, "first1", "first2", "first3", "first4") or isinstance(coords, slice) or callable(coords),
+            coords in (None, *COLUMNS) or isinstance(coords, slice) or callable(coords),
             "'first1' to 'first4', a slice or a function",
         ),
     }

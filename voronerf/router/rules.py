@@ -18,7 +18,7 @@ from torch import Tensor
 
 from voronerf.ops import grouped_linear
 from voronerf.ops._core.memory import on_huge_pages
-from voronerf.router.axes import Axis, Count
+from voronerf.router.axes import Axis, SampleCount
 from voronerf.router.grouped import GroupedRun, PerCell, find, register, writes_in_place
 from voronerf.router.grouping import cells_of
 from voronerf.router.layout import map_tensors, tensors_of
@@ -284,7 +284,7 @@ for _function in _spellings(_ELEMENTWISE):
 def expand(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
     """Repeats a parameter once per sample, ``p.expand(n, -1)``."""
     sizes = tuple(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes
-    dims = [dim for dim, size in enumerate(sizes) if isinstance(size, Count)]
+    dims = [dim for dim, size in enumerate(sizes) if isinstance(size, SampleCount)]
     if not isinstance(source, PerCell) or len(dims) != 1:
         return NotImplemented
     m = sizes[dims[0]] // run.n
@@ -298,7 +298,7 @@ def expand_as(run: GroupedRun, source: Tensor, other: Tensor) -> Any:
     if not run.is_rows(other):
         return NotImplemented
     dim = run.axis(other).dim
-    return expand(run, source, *other.shape[:dim], Count(other.shape[dim]), *other.shape[dim + 1 :])
+    return expand(run, source, *other.shape[:dim], SampleCount(other.shape[dim]), *other.shape[dim + 1 :])
 
 
 @rule(torch.Tensor.data.__get__)  # type: ignore[attr-defined]
@@ -311,14 +311,14 @@ def data(run: GroupedRun, source: Tensor) -> Any:
 def repeat(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
     """Repeats a parameter once per sample, ``p.repeat(n, 1)``."""
     counts = tuple(sizes[0]) if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes
-    dims = [dim for dim, count in enumerate(counts) if isinstance(count, Count)]
+    dims = [dim for dim, count in enumerate(counts) if isinstance(count, SampleCount)]
     if not isinstance(source, PerCell) or len(dims) != 1:
         return NotImplemented
     m = counts[dims[0]] // run.n
     rows = _spread(run, source, len(counts) - 1 - dims[0], m)
     if rows is None:
         return NotImplemented
-    return run.mark(rows.repeat([1 if isinstance(count, Count) else count for count in counts]), Axis(dims[0], m))
+    return run.mark(rows.repeat([1 if isinstance(count, SampleCount) else count for count in counts]), Axis(dims[0], m))
 
 
 # Norms ----------------------------------------------------------------------------------------------------------------

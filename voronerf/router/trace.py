@@ -19,13 +19,13 @@ from torch import Tensor, fx, nn
 from torch.fx.node import map_aggregate, map_arg
 from torch.overrides import TorchFunctionMode
 
-from voronerf.router.axes import Axis, Count, axis_of
+from voronerf.router.axes import Axis, SampleCount, axis_of
 from voronerf.router.double import Double
 from voronerf.router.grouped import (
     LIKE,
     METADATA,
+    CallAxes,
     Recorder,
-    Step,
     converted,
     find,
     is_random,
@@ -160,7 +160,7 @@ class Trace(TorchFunctionMode):
 
     def _argument(self, value: Any) -> Any:
         """Returns the node of an argument, or the argument itself if it is a constant."""
-        if isinstance(value, Count):
+        if isinstance(value, SampleCount):
             return self._new(int(value), self.graph.call_function(operator.mul, (self.n, value // self.rows)))
         if not isinstance(value, Tensor) or id(value) in self._nodes:
             return self._nodes.get(id(value), value)
@@ -237,7 +237,7 @@ class Trace(TorchFunctionMode):
             if in_c:
                 old_profile.enable()
 
-    def _begin(self, func: Any, args: Any, kwargs: Any, step: Step | None = None) -> _Begun:
+    def _begin(self, func: Any, args: Any, kwargs: Any, step: CallAxes | None = None) -> _Begun:
         """Records a function before its call; returns the node with the function and arguments to call.
 
         A custom function of autograd has no step.
@@ -263,7 +263,7 @@ class Trace(TorchFunctionMode):
         node.meta["line"], node.meta["grad"] = line, torch.is_grad_enabled()
         return _Begun(node, func, args, kwargs, operands)
 
-    def _end(self, begun: _Begun, result: Any, step: Step | None = None) -> None:
+    def _end(self, begun: _Begun, result: Any, step: CallAxes | None = None) -> None:
         """Records the results of a function."""
         node, func, _, kwargs, operands = begun
         inplace, line = node.meta["inplace"], node.meta["line"]

@@ -6,17 +6,16 @@ A trace stores their values. Each call compares the stored values with the curre
 
 from __future__ import annotations
 
-import operator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from numbers import Number
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
-from voronerf.ops._core.unchanged import Values
-from voronerf.router.grouping import parts_of
+from voronerf.ops._core.unchanged import Stale, Values, unchanged
+from voronerf.router.grouping import owned_parameters, parts_of
 
 Source = str | tuple[int, str]
 """An argument by its name, or an attribute by (index of its submodule in ``modules()``, name)."""
@@ -27,8 +26,10 @@ NUMBERS = (torch.float64, torch.float32, torch.int64)
 float64 does not round numbers; float32 promotes other dtypes in the same way as a Python number; int64 can be an index.
 """
 
-_MODULE_ATTRIBUTES = frozenset(vars(nn.Module())) - {"training"}
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+_DICTIONARIES = frozenset({"_modules", *HOOKS})  # of every module; only their contents change
+_UNWATCHED = frozenset(vars(nn.Module())) - {"training", *_DICTIONARIES}
+_OF_CLASSES = (bool, int, float, str, FunctionType)  # a value of the module itself would override them
 _MISSING: Any = object()
 
 
@@ -56,95 +57,107 @@ def lookup(part: nn.Module, name: str) -> Any:
     return members[name] if name in members else part._buffers.get(name, _MISSING)
 
 
-@dataclass
+class _Seen(NamedTuple):
+    """A value that a trace took as a constant.
+
+    Attributes:
+        source: The place of the value in the module.
+        registry: The dictionary that holds the current value under the source's name.
+        value: The value.
+        container: The value if it is a container, or the attributes of a plain object; None for other values.
+        items: The items of the container.
+        tensors: The values of the tensors among the value and its items.
+    """
+
+    source: tuple[int, str]
+    registry: dict[str, Any]
+    value: Any
+    container: Any
+    items: tuple[Any, ...]
+    tensors: list[Values]
+
+    def changed(self) -> bool:
+        """Returns whether the current value differs from the seen value."""
+        items, value = _items(self.container), self.registry.get(self.source[1], _MISSING)
+        is_same = same(value, self.value) and len(items) == len(self.items) and all(map(same, items, self.items))
+        return not is_same or any(tensor.changed() for tensor in self.tensors)
+
+    def note(self, dependencies: Any) -> None:
+        """Adds the value to dependencies (`voronerf.ops._core.unchanged`)."""
+        if self.source[1] not in _DICTIONARIES:
+            dependencies.entries(self.registry, [self.source[1]])
+        for tensor in self.tensors:
+            tensor.note(dependencies)
+        if self.container is not None:
+            dependencies.contents(self.container)
+
+
 class Watch:
-    """Values that a trace took as constants, and the places of their current values."""
+    """The values that a trace read from submodules, without parameters and inputs.
 
-    sources: list[Source] = field(default_factory=list)
-    _values: list[Any] = field(default_factory=list)
-    _dicts: list[tuple[dict[str, Any], str]] = field(default_factory=list)
-    _tensors: list[tuple[Source, Values]] = field(default_factory=list)
-    _holders: list[tuple[Source, Any, tuple[Any, ...]]] = field(default_factory=list)
-    _hooks: list[dict[int, Any]] = field(default_factory=list)
-    _counts: list[int] = field(default_factory=list)
+    Args:
+        module: The traced module.
+        reads: The attributes that were read, as (index of the submodule in ``modules()``, name).
+        inputs: The values that each call looks up.
+    """
 
-    @classmethod
-    def of(cls, module: nn.Module, reads: set[tuple[int, str]], inputs: Inputs) -> Watch:
-        """Makes a watch of the values read from submodules, excluding inputs."""
-        watch, parts = cls(), list(parts_of(module).values())
+    def __init__(self, module: nn.Module, reads: set[tuple[int, str]], inputs: Inputs) -> None:
+        parts, self._seen, self._dependencies = list(parts_of(module).values()), list[_Seen](), cast(Any, Stale())
         for place, name in sorted(reads):
-            part, source = parts[place], (place, name)
-            if source in inputs.sources or name in part._parameters:
+            part = parts[place]
+            if (place, name) in inputs.sources or name in part._parameters or name in _UNWATCHED:
                 continue
-            if name in HOOKS:
-                watch._hooks.append(vars(part)[name])
-                watch._counts.append(len(vars(part)[name]))
-            elif name == "_modules":
-                watch._holders.append((source, part._modules, (*part._modules, *part._modules.values())))
-            elif name not in _MODULE_ATTRIBUTES:
-                watch._add(source, part)
-        return watch
-
-    def _add(self, source: tuple[int, str], part: nn.Module) -> None:
-        name = source[1]
-        registry = next((entries for entries in (vars(part), part._buffers, part._modules) if name in entries), None)
-        if registry is None:
-            if not isinstance(getattr(type(part), name, None), (bool, int, float, str, FunctionType)):
-                return  # a property, or no attribute
-            registry = vars(part)  # a value set here would override the class attribute
-        value = registry.get(name, _MISSING)
-        self.sources.append(source)
-        self._values.append(value)
-        self._dicts.append((registry, name))
-        items = None if value is _MISSING or isinstance(value, Tensor) else _items(value)
-        if items is not None:
-            self._holders.append((source, value, items))
-        for item in (value,) if items is None else items:
-            if isinstance(item, Tensor):
-                self._tensors.append((source, Values(item)))
+            registries = vars(part), part._buffers, part._modules
+            registry = next((entries for entries in registries if name in entries), vars(part))
+            value = registry.get(name, _MISSING)
+            if value is _MISSING and not isinstance(getattr(type(part), name, None), _OF_CLASSES):
+                continue  # a property, or no attribute
+            items = _items(container := _container(value))
+            tensors = [Values(item) for item in (value, *items) if isinstance(item, Tensor)]
+            self._seen.append(_Seen((place, name), registry, value, container, items, tensors))
 
     def value(self, source: Source) -> Any:
         """Returns the value that a trace took as a constant; None if there is none."""
-        return dict(zip(self.sources, self._values, strict=True)).get(source)
+        return next((seen.value for seen in self._seen if seen.source == source), None)
 
-    def note(self, guard: Any) -> None:
-        """Adds the watched values to a guard, which detects their changes (`voronerf.ops._core.unchanged`)."""
-        for registry, name in self._dicts:
-            guard.entries(registry, [name])
-        for _, tensor in self._tensors:
-            tensor.note(guard)
-        for _, value, _ in self._holders:
-            guard.contents(value if isinstance(value, (dict, list, tuple, set, frozenset)) else vars(value))
-        for hooks in self._hooks:
-            guard.contents(hooks)
+    def note(self, dependencies: Any) -> Any:
+        """Adds the values to dependencies, and returns these."""
+        for seen in self._seen:
+            seen.note(dependencies)
+        return dependencies
 
     def changed(self) -> list[Source]:
         """Lists the sources whose values have changed."""
-        changed = list[Source]()
-        values = [registry.get(name, _MISSING) for registry, name in self._dicts]
-        if not all(map(operator.is_, values, self._values)):
-            changed += [s for s, a, b in zip(self.sources, values, self._values, strict=True) if not same(a, b)]
-        changed += [source for source, tensor in self._tensors if tensor.changed()]
-        for source, value, old_items in self._holders:
-            items = _items(value) or ()
-            if len(items) == len(old_items) and all(map(operator.is_, items, old_items)):
-                continue
-            if len(items) != len(old_items) or not all(map(same, items, old_items)):
-                changed.append(source)
-        if [*map(len, self._hooks)] != self._counts:
-            changed.append((0, "hooks"))
+        if self._dependencies.holds():
+            return []
+        changed: list[Source] = [seen.source for seen in self._seen if seen.changed()]
+        if not changed:  # values in new objects are equal
+            self._dependencies = self.note(unchanged())
         return changed
 
 
-def _items(value: Any) -> tuple[Any, ...] | None:
-    """Returns the items of a container or a plain object, one level deep; None for other values."""
-    if isinstance(value, dict):
-        return (*value, *value.values())
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return tuple(value)
-    if isinstance(value, (nn.Module, type)) or callable(value) or not hasattr(value, "__dict__"):
-        return None
-    return tuple(vars(value).values())
+def module_dependencies(module: nn.Module) -> Any:
+    """Returns dependencies on a module's submodules and on the kinds of its parameters."""
+    dependencies = unchanged()
+    for part, name, _ in owned_parameters(module):
+        dependencies.kind(part._parameters, name)
+    for part in parts_of(module).values():
+        if part._modules:
+            dependencies.contents(part._modules)
+    return dependencies
+
+
+def _container(value: Any) -> Any:
+    """Returns a container itself, the attributes of a plain object, or None for other values."""
+    if isinstance(value, (dict, list, tuple, set, frozenset)):
+        return value
+    other = isinstance(value, (Tensor, nn.Module, type)) or callable(value) or not hasattr(value, "__dict__")
+    return None if other else vars(value)
+
+
+def _items(container: Any) -> tuple[Any, ...]:
+    """Returns the items of a container, one level deep."""
+    return (*container, *container.values()) if isinstance(container, dict) else tuple(container or ())
 
 
 def same(a: Any, b: Any) -> bool:
