@@ -783,9 +783,9 @@ class VoronoiRouter(nn.Module):
     def _run_training_checks(self) -> None:
         """Warns in the first training calls if parameters are not trained; raises if frozen cells change."""
         if self._training_checks and torch.is_grad_enabled() and not torch.compiler.is_compiling():
-            self._training_checks = [
-                check for check in self._training_checks if not check.is_over(self._dispatch.warn_once)
-            ]
+            going_on = [check for check in self._training_checks if not check.is_over(self._dispatch.warn_once)]
+            if len(going_on) < len(self._training_checks):  # setting an attribute of a module takes 3 us
+                self._training_checks = going_on
 
     def _drop_frozen_checks(self) -> None:
         """Drops the checks of frozen cells, whose set or values may change after this call."""

@@ -47,7 +47,7 @@ def render_loss(
     (Charbonnier et al. 1994), where e is the squared error of a ray, summed over its channels. It is quadratic for
     small errors and linear beyond s. The native backend computes everything in one pass over each ray.
 
-    The gradient is computed with the loss, for `forward_with_tape`; the results are not differentiable.
+    The gradient is computed with the loss, for `Tape.learn`; the results are not differentiable.
 
     Args:
         raw: colour and density, before their activations unless ``activated``.
