@@ -139,7 +139,7 @@ def test_the_fast_step_is_the_separate_one(name, k, monkeypatch):
     router, field = make(name, k)
     fast, separate = losses(field, monkeypatch)
     compare(router, fast, separate, batch_of())
-    assert (radiance_of(field).networks.density_scale is not None) == (name in RAW)
+    assert ("density_scale" in radiance_of(field).networks.activation) == (name in RAW)
     assert all(p.is_leaf for p in radiance_of(field).cells.parameters)
 
 
@@ -252,7 +252,8 @@ def test_with_cells_that_are_drawn():
     for _ in range(2):
         router.generator = seeded(7)
         known = radiance_of(field, (torch.rand(20, 3), torch.rand(20, 3)))
-        results.append(known.arguments(torch.rand(50, 3, generator=seeded(1)), torch.rand(4, 3), None)["cells"])
+        rows = known.rows(torch.rand(50, 3, generator=seeded(1)), torch.rand(4, 3), None)
+        results.append(rows["cells"].cells)
     router.generator = seeded(7)
     assert torch.equal(results[0], results[1])
     assert torch.equal(results[0], router.assign(torch.rand(50, 3, generator=seeded(1))))
@@ -285,7 +286,7 @@ def test_an_attribute_that_changes_is_followed(monkeypatch):
     for scale in (10.0, 3.0):
         table.module.density_scale = scale
         compare(table, fast, separate, batch_of())
-        assert radiance_of(field).networks.density_scale == scale
+        assert radiance_of(field).networks.activation.get("density_scale") == scale
 
 
 def test_parameters_that_parameters_are_made_of_learn(monkeypatch):
@@ -396,6 +397,8 @@ def test_softplus_is_that_of_the_loss():
         FIELDS["given"] = (Own, {})
         router, field = make("given")
         router.module.activate = lambda raw, density=density: (torch.sigmoid(raw[:, :3]), density(raw[:, 3]))
-        assert radiance_of(field).networks.density_scale == scale
+        assert radiance_of(field).networks.activation.get("density_scale") == scale
         del FIELDS["given"]
-    assert math.isclose(radiance_of(make("softplus")[1], (torch.rand(9, 3),) * 2).networks.density_scale, 4.0)
+    assert math.isclose(
+        radiance_of(make("softplus")[1], (torch.rand(9, 3),) * 2).networks.activation["density_scale"], 4.0
+    )

@@ -327,6 +327,4 @@ def test_errors():
         "biases[0] must have the dtype of weights[0], float32, got float16",
         biases=[torch.zeros(2, 16).half(), *[None] * 6],
     )
-    refuses(
-        "weights[0] must be on the device of offsets, cpu, got meta", weights=[weights[0].to("meta"), *weights[1:]]
-    )
+    refuses("weights[0] must be on the device of offsets, cpu, got meta", weights=[weights[0].to("meta"), *weights[1:]])
