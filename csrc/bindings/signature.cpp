@@ -59,7 +59,7 @@ struct Argument {
 
 // The state of a call while its arguments are checked.
 struct CheckedCall {
-  explicit CheckedCall(Common values) : common(std::move(values)) {}
+  CheckedCall(const py::str& op, const Letters& letters) : common(op, letters) {}
   PyObject* values[kMostArguments] = {};
   TensorView views[kMostArguments];
   Common common;
@@ -309,7 +309,7 @@ class Signature {
   // Checks the arguments, raises the error, and returns the results of a call; NotImplemented if Python has to check
   // the call.
   py::object call(PyObject* args, PyObject* options) {
-    CheckedCall call({op_, letters_});
+    CheckedCall call(op_, letters_);
     const size_t count = arguments_.size() - 1;  // excludes the backend
     bind(args, options, call);
     check(call);

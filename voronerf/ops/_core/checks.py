@@ -63,7 +63,7 @@ def facts(op: str, name: str, tensor: Any) -> tuple[Any, ...]:
 
 
 class TensorRule(NamedTuple):
-    """The rule of a tensor: its dtypes and shape. Its device is that of the first tensor.
+    """The rule of a tensor: its dtypes and shape. All tensors of a call are on one device.
 
     A letter of a shape is bound at its first use, and means the same number in all tensors of a call.
 
