@@ -24,7 +24,7 @@ inline bool is_inference(PyObject* tensor) {
 // Queries of the state of torch and voronerf. The Python objects live as long as the interpreter.
 struct Questions {
   PyObject *own = nullptr, *torch = nullptr, *grad_enabled = nullptr, *tangents = nullptr, *threads = nullptr,
-           *kept = nullptr, *native = nullptr, *choose = nullptr;
+           *kept = nullptr, *native = nullptr, *choose = nullptr, *checks = nullptr;
   std::vector<PyObject*> listeners;
   std::map<unsigned, PyObject*> dtypes;
 

@@ -43,8 +43,9 @@ struct Argument {
   enum class Kind { tensor, integer, flag, number, text, instance, any };
   Kind kind = Kind::any;
   py::str name;
-  bool optional = false, detached = false, small = false, written = false;
+  bool optional = false, detached = false;
   py::object otherwise;  // the default; null: no default
+  py::object check;      // the check in Python of a value that is no tensor; returns the value
   TensorRule rule;
   int condition = -1;  // the shape is the first of two if this argument is not None
   int letter = -1;     // the letter of an integer argument that shapes refer to
@@ -58,6 +59,7 @@ struct Argument {
 
 // The state of a call while its arguments are checked.
 struct CheckedCall {
+  CheckedCall(const py::str& op, const Letters& letters) : common(op, letters) {}
   PyObject* values[kMostArguments] = {};
   TensorView views[kMostArguments];
   Common common;
@@ -273,35 +275,56 @@ class Plan {
 
 class Signature {
  public:
-  // Reads the op's name, a row for each argument, and the dictionary of Declaration._first_call (declare.py).
-  Signature(const py::str& op, const py::sequence& rows, int positional, const py::dict& more)
-      : op_(op), positional_(positional) {
-    for (const auto& row : rows) arguments_.push_back(argument_of(py::cast<py::dict>(row)));
+  // Reads a Declaration (declare.py).
+  explicit Signature(const py::object& declaration) : op_(declaration.attr("name")) {
+    positional_ = py::cast<int>(declaration.attr("_positional"));
+    const py::dict places = declaration.attr("_places"), defaults = declaration.attr("_defaults");
+    for (const auto& argument : declaration.attr("arguments")) {
+      const py::object rule = argument.attr("rule");
+      arguments_.push_back(argument_of(argument, rule, declaration));
+      if (arguments_.back().kind != Argument::Kind::tensor || !places.contains(rule.attr("condition"))) continue;
+      arguments_.back().condition = py::cast<int>(places[rule.attr("condition")]);
+    }
+    arguments_.emplace_back();
+    arguments_.back().name = "backend";
     if (arguments_.size() > kMostArguments) throw std::invalid_argument("too many arguments");
-    for (const auto& letter : more["filled"]) filled_.push_back(letters_.number(py::cast<std::string>(letter)));
-    for (const auto& place : more["compared"]) compared_.push_back(py::cast<size_t>(place));
-    smooth_ = py::cast<bool>(more["smooth"]);
-    inputs_ = more["inputs"];
-    prepare_ = more["prepare"];
-    found_ = more["found"];
-    pack_ = more["pack"];
+    for (Argument& argument : arguments_) {
+      PyObject* name = argument.name.release().ptr();
+      PyUnicode_InternInPlace(&name);
+      argument.name = py::reinterpret_steal<py::str>(name);
+      if (defaults.contains(argument.name)) argument.otherwise = defaults[argument.name];
+    }
+    for (const auto& entry : py::cast<py::dict>(declaration.attr("filled"))) {
+      filled_.push_back({letters_.number(py::cast<std::string>(entry.first)), py::cast<std::string>(entry.second)});
+    }
+    for (const auto& name : declaration.attr("compared")) compared_.push_back(py::cast<size_t>(places[name]));
+    smooth_ = py::len(declaration.attr("smooth")) != 0;
+    inputs_ = declaration.attr("Inputs");
+    prepare_ = declaration.attr("prepare");
+    function_ = declaration.attr("function");
+    found_ = declaration.attr("_implementation");
+    pack_ = declaration.attr("_pack");
   }
 
-  // Returns the results of a call; NotImplemented if an argument breaks a rule, or if the rules cannot be checked here.
+  // Checks the arguments, raises the error, and returns the results of a call; NotImplemented if Python has to check
+  // the call.
   py::object call(PyObject* args, PyObject* options) {
-    CheckedCall call;
+    CheckedCall call(op_, letters_);
     const size_t count = arguments_.size() - 1;  // excludes the backend
-    if (!bind(args, options, call) || !check(call)) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
+    bind(args, options, call);
+    check(call);
     bool learns = false;
     for (size_t i = 0; i < count; ++i) learns = detach(i, call) || learns;
     const bool recorded_gradients = call.common.learns && questions.grad();
     learns = learns && recorded_gradients;
-    if (recorded_gradients && !no_inference_of(call)) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
-    if (!prepare_.is_none()) prepare(call);
+    for (size_t i = 0; recorded_gradients && smooth_ && i < count; ++i) {
+      if (call.views[i].is_there()) refuse_inference(arguments_[i].rule.name, call.values[i], call.common);
+    }
+    if (!prepare_.is_none() && !are_alike(call)) prepare(call);
     const Implementation* const chosen = choose(call);
-    if (chosen == nullptr) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
-    if (chosen->plan && !learns && recording() == nullptr && call.views[0].on_cpu() && questions.compiled_here() &&
-        (!chosen->narrow || call.common.first_float == kFloat32) && !questions.has_listeners()) {
+    if (chosen->plan && !learns && call.common.viewed && recording() == nullptr && call.views[0].on_cpu() &&
+        questions.compiled_here() && (!chosen->narrow || call.common.first_float == kFloat32) &&
+        !questions.has_listeners()) {
       if (py::object result = chosen->plan->run(call, inputs_, count)) return result;
     }
     PyObject* const reference = PyObject_Vectorcall(chosen->run.ptr(), call.values, count, nullptr);
@@ -317,42 +340,37 @@ class Signature {
     bool narrow;
   };
 
-  Argument argument_of(const py::dict& row) {
+  Argument argument_of(const py::handle& row, const py::object& rule, const py::object& declaration) {
     Argument argument;
-    argument.name = row["name"];
-    PyObject* name = argument.name.release().ptr();
-    PyUnicode_InternInPlace(&name);
-    argument.name = py::reinterpret_steal<py::str>(name);
-    argument.optional = py::cast<bool>(row["optional"]);
-    if (row.contains("default")) argument.otherwise = row["default"];
-    const auto kind = py::cast<std::string>(row["kind"]);
-    const py::object rule = row["rule"];
+    argument.name = row.attr("name");
+    argument.optional = py::cast<bool>(row.attr("optional"));
+    argument.check = row.attr("check");
+    const auto text = py::cast<std::string>(row.attr("text"));
+    const py::object type = row.attr("kind");
+    const auto is = [&type](PyTypeObject& each) { return type.ptr() == reinterpret_cast<PyObject*>(&each); };
     using Kind = Argument::Kind;
-    if (kind == "tensor") {
+    if (py::hasattr(rule, "dtypes")) {
       argument.kind = Kind::tensor;
       argument.rule = TensorRule::of(rule, letters_);
-      argument.rule.either = py::cast<bool>(row["either"]);
-      argument.condition = py::cast<int>(row["condition"]);
-      argument.detached = py::cast<bool>(row["detached"]);
-      argument.small = py::cast<bool>(row["small"]);
-      argument.written = py::cast<bool>(row["written"]);
-    } else if (kind == "int") {
+      const bool smooth = declaration.attr("smooth").contains(argument.name);
+      argument.detached = !smooth && py::cast<bool>(row.attr("floating"));
+    } else if (is(PyLong_Type)) {
       argument.kind = Kind::integer;
       std::tie(argument.low, argument.high) = py::cast<std::pair<int64_t, int64_t>>(rule);
-      if (py::cast<bool>(row["bound"])) argument.letter = letters_.number(py::cast<std::string>(row["name"]));
-    } else if (kind == "float") {
+      const bool bound = declaration.attr("_bound").contains(argument.name);
+      if (bound) argument.letter = letters_.number(py::cast<std::string>(argument.name));
+    } else if (is(PyFloat_Type)) {
       argument.kind = Kind::number;
-      const auto text = py::cast<std::string>(rule);
       argument.positive = text == "positive";
       argument.interval = !text.empty() && !argument.positive;
       argument.open = argument.interval && text.back() == ')';
-      std::tie(argument.from, argument.to) = py::cast<std::pair<double, double>>(row["ends"]);
-    } else if (kind == "bool") {
+      if (argument.interval) std::tie(argument.from, argument.to) = py::cast<std::pair<double, double>>(rule);
+    } else if (is(PyBool_Type)) {
       argument.kind = Kind::flag;
-    } else if (kind == "str") {
+    } else if (is(PyUnicode_Type)) {
       argument.kind = Kind::text;
       argument.choices = py::tuple(rule);
-    } else if (kind == "instance") {
+    } else if (PyType_Check(rule.ptr())) {
       argument.kind = Kind::instance;
       argument.kind_of = rule;
       if (py::hasattr(rule, "_fields")) argument.entries = py::len(rule.attr("_fields"));
@@ -360,7 +378,13 @@ class Signature {
     return argument;
   }
 
-  bool bind(PyObject* args, PyObject* options, CheckedCall& call) const {
+  // Puts the arguments in order. If some are missing, unknown or repeated, the empty function of the signature raises
+  // Python's error.
+  void bind(PyObject* args, PyObject* options, CheckedCall& call) const {
+    if (!bound(args, options, call))
+      function_(*py::reinterpret_borrow<py::args>(args), **py::reinterpret_borrow<py::kwargs>(options));
+  }
+  bool bound(PyObject* args, PyObject* options, CheckedCall& call) const {
     const auto positional_count = static_cast<size_t>(PyTuple_GET_SIZE(args));
     if (positional_count > static_cast<size_t>(positional_)) return false;
     for (size_t i = 0; i < positional_count; ++i) call.values[i] = PyTuple_GET_ITEM(args, static_cast<Py_ssize_t>(i));
@@ -381,32 +405,32 @@ class Signature {
     return true;
   }
 
-  bool check(CheckedCall& call) const {
+  void check(CheckedCall& call) const {
     for (size_t i = 0; i < arguments_.size(); ++i) {
       const Argument& argument = arguments_[i];
-      if (argument.optional && call.values[i] == Py_None) continue;
-      if (!check(argument, call.values[i], call.views[i], call)) return false;
-    }
-    for (const int letter : filled_) {
-      if (call.common.letters[letter] < 1) return false;
-    }
-    if (!PyUnicode_CheckExact(call.values[arguments_.size() - 1])) return false;  // the backend
-    if (!compared_.empty()) {
-      const unsigned one = call.views[compared_[0]].dtype(), two = call.views[compared_[1]].dtype();
-      if (one != two || (one & (kFloat32 | kFloat64)) == 0) return false;
-    }
-    return true;
-  }
-  bool check(const Argument& argument, PyObject*& value, TensorView& view, CheckedCall& call) const {
-    switch (argument.kind) {
-      case Argument::Kind::tensor: {
+      PyObject*& value = call.values[i];
+      if (argument.optional && value == Py_None) continue;
+      if (argument.kind == Argument::Kind::tensor) {
         const bool second = argument.condition >= 0 && call.values[argument.condition] == Py_None;
-        if (!view.look(value) || !argument.rule.fits(view, second, call.common)) return false;
-        if (argument.written && (!view.is_contiguous() || is_negative(value))) return false;
-        return !argument.small || view.entries() <= kMostRows;
+        argument.rule.check(value, call.views[i], second, call.common);
+      } else if (!fits(argument, value, call)) {
+        call.own.push_back(argument.check(op_, py::handle(value)));
+        value = call.own.back().ptr();
+        if (argument.letter >= 0) throw ForPython();  // a symbolic number
       }
+    }
+    for (size_t i = 0; i + 1 < arguments_.size(); ++i) {
+      if (call.views[i].is_there()) arguments_[i].rule.check_memory(call.values[i], call.views[i], call.common);
+    }
+    for (const auto& [letter, rule] : filled_) {
+      if (call.common.letters[letter] < 1) throw py::value_error(py::cast<std::string>(op_) + ": " + rule);
+    }
+  }
+  // Returns whether a value that is no tensor fits. If not, the check in Python decides.
+  bool fits(const Argument& argument, PyObject*& value, CheckedCall& call) const {
+    switch (argument.kind) {
       case Argument::Kind::integer: {
-        if (!PyLong_CheckExact(value)) return false;
+        if (!PyLong_Check(value) || PyBool_Check(value)) return false;
         int overflow = 0;
         const int64_t number = PyLong_AsLongLongAndOverflow(value, &overflow);
         if (overflow != 0 || number < argument.low || number > argument.high) return false;
@@ -454,12 +478,11 @@ class Signature {
     call.values[i] = call.own.back().ptr();
     return false;
   }
-  bool no_inference_of(const CheckedCall& call) const {
-    if (!smooth_) return true;
-    for (size_t i = 0; i + 1 < arguments_.size(); ++i) {
-      if (call.views[i].is_there() && is_inference(call.values[i])) return false;
-    }
-    return true;
+  // Returns whether the arguments that are compared have one dtype, so that nothing is to prepare.
+  bool are_alike(const CheckedCall& call) const {
+    if (compared_.empty()) return false;
+    const unsigned one = call.views[compared_[0]].dtype(), two = call.views[compared_[1]].dtype();
+    return one == two && (one & (kFloat32 | kFloat64)) != 0;
   }
   void prepare(CheckedCall& call) const {
     const size_t count = arguments_.size() - 1;
@@ -471,21 +494,23 @@ class Signature {
       if (value == call.values[i]) continue;
       call.values[i] = value;
       call.views[i] = {};
-      if (arguments_[i].kind == Argument::Kind::tensor) call.views[i].look(value);
+      if (arguments_[i].kind == Argument::Kind::tensor && value != Py_None) {
+        call.common.look(arguments_[i].rule.name, value, call.views[i]);
+      }
     }
     call.own.push_back(values);
     call.given = {};
   }
-  // Returns the implementation for the backend and the device and dtype of the first argument; null if the device or
-  // dtype is unknown.
+  // Returns the implementation for the backend and the device and dtype of the first argument.
   const Implementation* choose(const CheckedCall& call) {
     static PyObject *const cpu = PyUnicode_InternFromString("cpu"), *const cuda = PyUnicode_InternFromString("cuda");
     const TensorView& first = call.views[0];
-    const auto dtype = questions.dtypes.find(first.dtype());
-    if ((!first.on_cpu() && !first.on_cuda()) || dtype == questions.dtypes.end()) return nullptr;
     const py::handle backend = call.values[arguments_.size() - 1];
-    const py::object index = first.on_cpu() ? py::object(py::none()) : py::object(py::int_(first.device_index));
-    PyObject* const asked[] = {op_.ptr(), backend.ptr(), first.on_cpu() ? cpu : cuda, index.ptr(), dtype->second};
+    if (!PyUnicode_CheckExact(backend.ptr())) throw ForPython();
+    py::object kind = py::reinterpret_borrow<py::object>(first.on_cpu() ? cpu : cuda);
+    if (!first.on_cpu() && !first.on_cuda()) kind = py::handle(call.values[0]).attr("device").attr("type");
+    const py::object index = first.on_cuda() ? py::object(py::int_(first.device_index)) : py::object(py::none());
+    PyObject* const asked[] = {op_.ptr(), backend.ptr(), kind.ptr(), index.ptr(), questions.dtypes.at(first.dtype())};
     const auto name = py::reinterpret_steal<py::object>(PyObject_Vectorcall(questions.choose, asked, 5, nullptr));
     if (!name) throw py::error_already_set();
     for (const auto& each : implementations_) {
@@ -506,10 +531,10 @@ class Signature {
   int positional_;
   Letters letters_;
   std::vector<Argument> arguments_;
-  std::vector<int> filled_;
+  std::vector<std::pair<int, std::string>> filled_;
   std::vector<size_t> compared_;
   bool smooth_ = false;
-  py::object inputs_, prepare_, found_, pack_;
+  py::object inputs_, prepare_, function_, found_, pack_;
   std::vector<std::unique_ptr<Implementation>> implementations_;
 };
 
@@ -518,6 +543,8 @@ PyObject* call_signature(PyObject* self, PyObject* const* given, Py_ssize_t) {
   auto* const signature = static_cast<Signature*>(PyCapsule_GetPointer(self, nullptr));
   try {
     return signature->call(given[0], given[1]).release().ptr();
+  } catch (const ForPython&) {
+    Py_RETURN_NOTIMPLEMENTED;
   } catch (py::error_already_set& error) {
     error.restore();
   } catch (const py::builtin_exception& error) {
@@ -537,15 +564,13 @@ PyObject* call_signature(PyObject* self, PyObject* const* given, Py_ssize_t) {
 void bind_signatures(py::module_& module) {
   questions.own = module.ptr();
   py::class_<TensorRules>(module, "TensorRules", py::module_local())
-      .def(py::init<const py::sequence&, const std::vector<std::string>&>())
+      .def(py::init<const py::sequence&>())
       .def("__call__", &TensorRules::check);
-  module.def("alike", &alike);
   module.def("way_of", [](const py::tuple& arguments) { return way_of(arguments.ptr()); });
-  module.def("signature", [](const py::str& op, const py::sequence& rows, int positional, const py::dict& more) {
+  module.def("signature", [](const py::object& declaration) {
     static PyMethodDef definition = {
         "call", reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(&call_signature)), METH_FASTCALL, nullptr};
-    const py::capsule owner(new Signature(op, rows, positional, more),
-                            [](void* object) { delete static_cast<Signature*>(object); });
+    const py::capsule owner(new Signature(declaration), [](void* object) { delete static_cast<Signature*>(object); });
     return py::reinterpret_steal<py::object>(PyCFunction_NewEx(&definition, owner.ptr(), nullptr));
   });
   module.def("register_queries", [](const py::dict& objects) {
@@ -557,12 +582,13 @@ void bind_signatures(py::module_& module) {
     questions.kept = held("kept");
     questions.native = held("native");
     questions.choose = held("choose");
+    questions.checks = held("checks");
     questions.listeners.clear();
     for (const auto& listener : objects["listeners"]) {
       questions.listeners.push_back(py::reinterpret_borrow<py::object>(listener).release().ptr());
     }
     for (const auto& entry : py::cast<py::dict>(objects["dtypes"])) {
-      questions.dtypes[dtypes_of(py::make_tuple(entry.first))] =
+      questions.dtypes[mask_of(py::cast<std::string>(entry.first))] =
           py::reinterpret_borrow<py::object>(entry.second).release().ptr();
     }
   });

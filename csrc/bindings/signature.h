@@ -6,7 +6,7 @@
 
 namespace voronerf {
 
-// Adds TensorRules, signature, alike, way_of and register_queries to the module.
+// Adds TensorRules, signature, way_of and register_queries to the module.
 void bind_signatures(pybind11::module_& module);
 
 }  // namespace voronerf

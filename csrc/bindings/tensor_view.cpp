@@ -24,6 +24,7 @@ bool TensorView::look(PyObject* tensor) {
   for (Py_ssize_t i = 0; i < PyTuple_GET_SIZE(plain_classes); ++i) plain |= kind == PyTuple_GET_ITEM(plain_classes, i);
   if (!plain) return false;
   if (exchange->look(tensor, this) != 0) return PyErr_Clear(), false;
+  if (!on_cpu() && !on_cuda()) return *this = {}, false;
   return data != nullptr || entries() == 0;  // false if its memory was freed, for example by storage.resize_
 }
 

@@ -18,15 +18,17 @@ struct TensorView {
   uint16_t lanes = 0;
   const int64_t *shape = nullptr, *strides = nullptr;
   uint64_t byte_offset = 0;
+  unsigned mask = 0;  // the dtype, if it does not come from DLPack
 
-  // Fills the view. Returns false if the tensor is not of a plain class, has no strides or memory, or belongs to a
-  // transform. Then the caller uses the tensor's Python methods.
+  // Fills the view. Returns false if the tensor is not of a plain class, has no strides or memory, belongs to a
+  // transform, or is on another device than a CPU or a GPU. Then the caller uses the tensor's Python methods.
   bool look(_object* tensor);
 
   bool is_there() const { return device_type != 0; }
   bool on_cpu() const { return device_type == 1; }
   bool on_cuda() const { return device_type == 2; }
   unsigned dtype() const {
+    if (mask != 0) return mask;
     switch (code << 8 | bits) {
       case 2 << 8 | 16:
         return kFloat16;

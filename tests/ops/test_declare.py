@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from voronerf.ops import cell_sort, composite
-from voronerf.ops._core.declare import Shaped, declared
+from voronerf.ops._core.declare import declared, tensor_rule
 
 
 def test_the_public_function_has_the_signature_and_the_docstring():
@@ -55,7 +55,7 @@ def test_a_struct_with_other_members_is_refused_at_once():
 
 def test_what_is_no_shape_is_refused():
     with pytest.raises(AssertionError, match="a tensor is written as dtypes and a shape, got 'floating n'"):
-        Shaped.parse("floating n")
+        tensor_rule("points", "floating n")
 
 
 def test_arguments_are_bound_as_python_binds_them():

@@ -5,8 +5,8 @@ values, TypeError for dtypes and types. Validators check shapes, dtypes and devi
 on the CPU. No other element of a tensor is read, so that ``torch.compile`` can trace an operation and a CUDA graph can
 capture it.
 
-Dimension letters in a rule ("n", "k+1") are bound at their first use. If several checks share a ``sizes`` dictionary, a
-letter means the same number in all of them.
+The tensors of a call are checked against rules (`TensorRule`). The compiled module checks them, and raises the error
+(csrc/bindings/tensor_rules.h). `fit` does so while torch's compiler traces, and without the compiled module.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import functools
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ from voronerf.ops._core import backends
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INDEX = (torch.int32,)
 LIKE_FIRST: tuple[torch.dtype, ...] = ()
-"""A placeholder in `Checked.tensor` for the dtype of the first floating-point tensor."""
+"""A placeholder in `TensorRule.dtypes` for the dtype of the first floating-point tensor."""
 MAX_COUNT = 2**31 - 1
 """The largest number of rows in one call, because index tensors are int32."""
 MAX_GROUPS = 2**27
@@ -52,155 +52,33 @@ def to_common_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
     return points.detach().to(dtype), centres.detach().to(dtype)
 
 
-def check_shape(
-    op: str, name: str, tensor: Tensor, shape: Sequence[int | str], sizes: dict[str, int] | None = None
-) -> None:
-    """Checks a tensor against a shape such as ``("n", 3)`` or ``("k+1",)``.
+def facts(op: str, name: str, tensor: Any) -> tuple[Any, ...]:
+    """Returns the shape, strides and dtype of a dense tensor, and the type and index of its device.
 
-    Args:
-        op: the operation's name, for the error.
-        name: the argument's name, for the error.
-        tensor: the tensor to check.
-        shape: for every dimension a number, a letter, or a letter plus one.
-        sizes: the numbers that letters are bound to; unbound letters are added.
-
-    Raises:
-        TypeError: ``tensor`` is not a tensor.
-        ValueError: ``tensor`` has another shape, or more rows than an int32 can number.
+    The compiled module checks these facts if torch gives no view of the tensor, such as a subclass.
     """
     check_tensor(op, name, tensor)
-    bound = {} if sizes is None else sizes
-    bound_before, actual = len(bound), tensor.shape
-    fits = len(actual) == len(shape)
-    if fits:
-        # Each size is read once: a few dozen checks take as long as a small network.
-        for entry, size in zip(shape, actual):
-            if isinstance(entry, int):
-                fits = size == entry
-            elif entry in bound:
-                fits = size == bound[entry]
-            elif entry[-2:] == "+1":
-                fits = size >= 1 and size - 1 == bound.setdefault(entry[:-2], size - 1)
-                if size > MAX_GROUPS + 1:
-                    raise ValueError(f"{op}: {name} must have at most {MAX_GROUPS + 1} entries, got {size}")
-            else:
-                bound[entry] = size
-            if not fits:
-                break
-    if not fits:
-        # The text is built only after a failed check, because torch.compile cannot format a symbolic size.
-        entries = [str(entry) for entry in shape]
-        letters = dict.fromkeys(entry.removesuffix("+1") for entry in entries)
-        values = ", ".join(f"{letter} = {bound[letter]}" for letter in letters if letter in list(bound)[:bound_before])
-        rule = f"[{', '.join(entries)}]" + (f" with {values}" if values else "")
-        raise ValueError(f"{op}: {name} must have shape {rule}, got {list(tensor.shape)}")
-    if actual and actual[0] > MAX_COUNT:
-        check_count(op, name, actual[0])
-
-
-def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype] = FLOATING) -> None:
-    """Raises TypeError unless the tensor's dtype is one of ``dtypes``."""
-    if not isinstance(tensor, Tensor) or tensor.dtype not in dtypes:
-        check_tensor(op, name, tensor)
-        names = [_short(dtype) for dtype in dtypes]
-        rule = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
-        raise TypeError(f"{op}: {name} must have dtype {rule}, got {_short(tensor.dtype)}")
-
-
-def check_same_dtype(op: str, **tensors: Tensor | None) -> None:
-    """Raises TypeError unless all named tensors share the dtype of the first; None is skipped."""
-    first: tuple[str, torch.dtype] | None = None
-    for name, tensor in tensors.items():
-        if tensor is None:
-            continue
-        if first is None:
-            first = (name, tensor.dtype)
-        elif tensor.dtype != first[1]:
-            raise TypeError(
-                f"{op}: {name} must have the dtype of {first[0]}, {_short(first[1])}, got {_short(tensor.dtype)}"
-            )
-
-
-def check_same_device(op: str, **tensors: Tensor | None) -> None:
-    """Raises ValueError unless all named tensors are on the device of the first; None is skipped."""
-    first: tuple[str, torch.device] | None = None
-    for name, tensor in tensors.items():
-        if tensor is None:
-            continue
-        if first is None:
-            first = (name, tensor.device)
-        elif tensor.device != first[1]:
-            raise ValueError(f"{op}: {name} must be on the device of {first[0]}, {first[1]}, got {tensor.device}")
-
-
-class Checked:
-    """The tensors of one call, checked one after another.
-
-    Args:
-        op: the operation's name, for errors.
-
-    Attributes:
-        sizes: the numbers that the letters of the shapes are bound to.
-        tensors: the checked tensors, by name.
-    """
-
-    def __init__(self, op: str) -> None:
-        self.op = op
-        self.sizes: dict[str, int] = {}
-        self.tensors: dict[str, Tensor] = {}
-        self._device: torch.device | None = None
-        self._float: tuple[str, Tensor] | None = None
-
-    def tensor(self, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype], *shape: int | str) -> None:
-        """Checks a tensor's shape and dtype, its device (the first tensor's), and that an int32 can number its rows.
-
-        Args:
-            name: the argument's name.
-            tensor: the argument's value.
-            dtypes: the allowed dtypes; `LIKE_FIRST` for the dtype of the first floating-point tensor.
-            shape: the shape's entries, see `check_shape`.
-
-        Raises:
-            TypeError: ``tensor`` is not a tensor, or has another dtype.
-            ValueError: ``tensor`` has another shape or device, or too many rows.
-        """
-        check_shape(self.op, name, tensor, shape, self.sizes)
-        dtype = tensor.dtype
-        if not dtypes and self._float is not None:
-            if dtype != self._float[1].dtype:
-                check_same_dtype(self.op, **{self._float[0]: self._float[1], name: tensor})
-        elif dtype not in dtypes:
-            check_dtype(self.op, name, tensor, dtypes)
-        if self._float is None and dtype in FLOATING:
-            self._float = name, tensor
-        if self._device is None:
-            self._device = tensor.device
-        elif tensor.device != self._device:
-            check_same_device(self.op, **self.tensors, **{name: tensor})
-        self.tensors[name] = tensor
-
-    def first_float(self) -> Tensor:
-        """Returns the first floating-point tensor."""
-        assert self._float is not None
-        return self._float[1]
-
-    def no_inference(self) -> None:
-        """Runs `check_no_inference` on all tensors."""
-        if torch.is_grad_enabled() and not torch.compiler.is_compiling():
-            for tensor in self.tensors.values():
-                if tensor.is_inference():
-                    check_no_inference(self.op, **self.tensors)
+    device = tensor.device
+    return tensor.shape, tensor.stride(), tensor.dtype, device.type, device.index or 0
 
 
 class TensorRule(NamedTuple):
-    """The rule of a tensor: the arguments of `Checked.tensor`.
+    """The rule of a tensor: its dtypes and shape. All tensors of a call are on one device.
+
+    A letter of a shape is bound at its first use, and means the same number in all tensors of a call.
 
     Attributes:
         name: the tensor's name, for errors.
-        dtypes: the allowed dtypes.
-        shape: the numbers and letters of the shape; "1|k" is 1 or the letter.
+        dtypes: the allowed dtypes; `LIKE_FIRST` for the dtype of the first floating-point tensor.
+        shape: the numbers and letters of the shape; "k+1" is a letter plus one, "1|k" is 1 or the letter.
         like: the name of a tensor with the same dtype, if the error should name it; else "".
         empty: the rule that the error states if the tensor has no rows; "" if the tensor may be empty.
+        wide: whether the dtype of the first floating-point tensor is promoted to at least float32.
+        otherwise: the second of two possible shapes, or ().
+        condition: the argument that is None if the tensor has the second shape. "" if either shape fits; the two shapes
+            then differ in the number of dimensions.
+        small: whether the number of elements must fit an int32; else only the number of rows must.
+        written: whether an op writes into the tensor's memory, which must then be contiguous and not negated.
     """
 
     name: str
@@ -208,6 +86,16 @@ class TensorRule(NamedTuple):
     shape: tuple[int | str, ...]
     like: str = ""
     empty: str = ""
+    wide: bool = False
+    otherwise: tuple[int | str, ...] = ()
+    condition: str = ""
+    small: bool = False
+    written: bool = False
+
+    @property
+    def either(self) -> bool:
+        """Returns whether the tensor may have either of two shapes."""
+        return bool(self.otherwise) and not self.condition
 
 
 class Default(NamedTuple):
@@ -227,8 +115,7 @@ def check_rules(
 ) -> dict[str, int]:
     """Checks each tensor against one row of a table; the number of rows depends on the network.
 
-    The compiled module reads the rows once and then checks all tensors of the network. If a tensor breaks a rule,
-    Python repeats the check and raises the error.
+    The compiled module reads the rows once and then checks all tensors of the network.
 
     Args:
         op: the operation's name, for errors.
@@ -238,96 +125,86 @@ def check_rules(
         smooth: whether autograd saves the tensors; if so, inference tensors are refused.
 
     Returns:
-        The number of each letter; 0 for an unbound letter.
+        The number of each letter.
 
     Raises:
         TypeError: an argument is not a tensor, or has another dtype.
         ValueError: a tensor has another shape or device, or too many rows.
     """
-    if not torch.compiler.is_dynamo_compiling():
-        letters, compiled = _compiled(make, *arguments)
-        numbers = compiled(tensors)
-        if numbers is not None:
-            return dict(zip(letters, numbers))
-    checked, by_name, remaining, rows = Checked(op), {}, iter(tensors), make(*arguments)
-    for row in rows:
+    if not torch.compiler.is_dynamo_compiling() and backends.compiled() is not None:
+        found: dict[str, int] | None = _compiled(make, *arguments)(op, tensors, smooth)
+        if found is not None:
+            return found
+    remaining = iter(tensors)
+    sizes: dict[str, int] = {}
+    others: list[Tensor] = []
+    for row in make(*arguments):
         if isinstance(row, Default):
-            checked.sizes.setdefault(row.letter, row.number)
-            continue
-        tensor = by_name[row.name] = next(remaining)
-        shape = row.shape
-        if shape and isinstance(shape[0], str) and shape[0].startswith("1|"):
-            check_tensor(op, row.name, tensor)
-            shape = (1 if tensor.shape[:1] == (1,) else shape[0].removeprefix("1|"), *shape[1:])
-        if row.like:
-            check_shape(op, row.name, tensor, shape, checked.sizes)
-            check_same_dtype(op, **{row.like: by_name[row.like], row.name: tensor})
-        checked.tensor(row.name, tensor, row.dtypes, *shape)
-        if row.empty and tensor.shape[0] < 1 + str(shape[0]).endswith("+1"):
-            raise ValueError(f"{op}: {row.name} {row.empty}, got {list(tensor.shape)}")
-    if smooth:
-        checked.no_inference()
-    return {**dict.fromkeys(_letters(rows), 0), **checked.sizes}
+            sizes.setdefault(row.letter, row.number)
+        else:
+            fit(op, row, next(remaining), sizes, others)
+    return sizes
 
 
 @functools.lru_cache(maxsize=4096)
-def _compiled(make: Callable[..., TensorRules], *arguments: Any) -> tuple[list[str], Callable[[list[Any]], Any]]:
-    """Returns the letters of the rows, and a compiled function.
+def _compiled(make: Callable[..., TensorRules], *arguments: Any) -> Any:
+    """Returns a compiled function from the op's name, tensors and ``smooth`` to the letters' sizes."""
+    return backends.compiled().TensorRules(make(*arguments))
 
-    The function returns the sizes of the letters for tensors, or None if a tensor breaks a rule.
+
+def fit(
+    op: str, rule: TensorRule, tensor: Any, sizes: dict[str, int], others: list[Tensor], second: bool = False
+) -> None:
+    """Checks a tensor in Python. Unlike the compiled module, it does not tell which part of the rule is broken.
+
+    Args:
+        op: the operation's name, for the error.
+        rule: the rule.
+        tensor: the tensor.
+        sizes: the numbers that letters are bound to; unbound letters are added.
+        others: the tensors of the call that have been checked; the tensor is added.
+        second: whether the tensor has the rule's second shape.
     """
-    rows = make(*arguments)
-    letters = _letters(rows)
-    native = backends.compiled()
-    if native is None:
-        return letters, lambda tensors: None
-    rules: list[Any] = []
-    for row in rows:
-        rules.append(
-            row
-            if isinstance(row, Default)
-            else ([_short(dtype) for dtype in row.dtypes], "filled" if row.empty else "", row.shape, None)
-        )
-    return letters, native.TensorRules([tuple(row) for row in rules], letters)
+    check_tensor(op, rule.name, tensor)
+    shape, dtypes = rule.shape, rule.dtypes
+    if (second and rule.otherwise) or (rule.either and tensor.dim() != len(shape)):
+        shape = rule.otherwise
+    if not dtypes:
+        first = [other.dtype for other in others if other.dtype in FLOATING][0]  # noqa: RUF015  # next cannot be traced
+        dtypes = (torch.promote_types(first, torch.float32) if rule.wide else first,)
+    right_dtype = tensor.dtype in dtypes
+    fits = right_dtype and len(tensor.shape) == len(shape) and all(t.device == tensor.device for t in others[:1])
+    for entry, size in zip(shape, tensor.shape):
+        if not fits:
+            break
+        if isinstance(entry, int):
+            fits = size == entry
+        elif entry[:2] != "1|" or size != 1:
+            letter, less = entry.removeprefix("1|").removesuffix("+1"), int(entry[-2:] == "+1")
+            fits = less <= size and size - less == sizes.setdefault(letter, size - less)
+            fits = fits and (not less or size <= MAX_GROUPS + 1)
+    if fits and shape:
+        fits = (tensor.numel() if rule.small else tensor.shape[0]) <= MAX_COUNT
+        fits = fits and (not rule.empty or tensor.shape[0] > int(str(shape[0]).endswith("+1")))
+    if not fits or (rule.written and not tensor.is_contiguous()):
+        text = f"{'|'.join(map(short, dtypes))} [{', '.join(map(str, shape))}]"
+        text += f" on {others[0].device}" if others else ""
+        actual = f"{short(tensor.dtype)} {list(tensor.shape)} on {tensor.device}"
+        raise (ValueError if right_dtype else TypeError)(f"{op}: {rule.name} must be {text}, got {actual}")
+    others.append(tensor)
 
 
-def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool:
-    """Returns whether several lists of tensors match, so that the compiled module can work on them.
-
-    The tensors at one index of the lists must have one shape. All tensors, and ``scalars`` of shape [], must be float32
-    and on one device, and tensors of the ``written`` lists must be contiguous. The result is also False if only
-    Python can check the tensors.
-    """
-    native = None if torch.compiler.is_dynamo_compiling() else backends.compiled()
-    return native is not None and native.alike(lists, written, scalars)
+def check_shape(
+    op: str, name: str, tensor: Any, shape: Sequence[int | str], sizes: Mapping[str, int] | None = None
+) -> None:
+    """Runs `check_rules` on the shape of one tensor; ``sizes`` are the numbers of letters."""
+    check_tensor(op, name, tensor)
+    rule = TensorRule(name, (tensor.dtype,), tuple(shape))
+    check_rules(op, _one_rule, [tensor], rule, tuple((sizes or {}).items()))
 
 
-def _letters(rows: TensorRules) -> list[str]:
-    shapes = [[row.letter] if isinstance(row, Default) else row.shape for row in rows]
-    entries = [entry for shape in shapes for entry in shape if isinstance(entry, str)]
-    return [*dict.fromkeys(entry.removesuffix("+1").removeprefix("1|") for entry in entries)]
-
-
-def check_writable(op: str, name: str, tensor: Tensor) -> None:
-    """Raises ValueError unless an op can write into a tensor's memory: a contiguous tensor without the negative bit.
-
-    The memory of a tensor with the negative bit, such as ``x.conj().imag``, holds negated values.
-    """
-    if not tensor.is_contiguous():
-        raise ValueError(f"{op}: {name} must be contiguous, got strides {tensor.stride()}")
-    if not torch.compiler.is_compiling() and tensor.is_neg():  # is_neg cannot be traced
-        raise ValueError(f"{op}: {name} must not be a negative view: clone it")
-
-
-def check_no_inference(op: str, **tensors: Tensor | None) -> None:
-    """Raises TypeError if autograd records and a named tensor is an inference tensor, which autograd cannot save."""
-    if not torch.is_grad_enabled() or torch.compiler.is_compiling():
-        return
-    present = [(name, tensor) for name, tensor in tensors.items() if tensor is not None]
-    if any(tensor.requires_grad for _, tensor in present):
-        for name, tensor in present:
-            if tensor.is_inference():
-                raise TypeError(f"{op}: {name} must not be an inference tensor while gradients are recorded: clone it")
+def _one_rule(rule: TensorRule, sizes: Sequence[tuple[str, int]]) -> TensorRules:
+    return [*(Default(*size) for size in sizes), rule]
 
 
 def check_count(op: str, name: str, count: int) -> None:
@@ -359,25 +236,18 @@ def check_integer(op: str, name: str, value: int, minimum: int, maximum: int = M
         raise ValueError(f"{op}: {name} must be at most {maximum}, got {value}")
 
 
-def check_number(op: str, name: str, value: float) -> None:
-    """Raises TypeError unless ``value`` is a number, ValueError for an integer that overflows a float."""
+def check_number(op: str, name: str, value: float, rule: str = "", ends: Sequence[float] = ()) -> None:
+    """Raises TypeError unless ``value`` is a number, ValueError if it overflows a float or breaks a rule.
+
+    The rule is "positive", "" or an interval such as "[0, 1)" or "0 to 1", whose ends are ``ends``.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, float, torch.SymFloat, torch.SymInt)):
         raise TypeError(f"{op}: {name} must be a number, got {type(value).__name__}")
     if isinstance(value, int) and abs(value) > sys.float_info.max:
         raise ValueError(f"{op}: {name} must be at most {sys.float_info.max:.2g}, got a larger integer")
-
-
-def check_positive(op: str, name: str, value: float) -> None:
-    """Runs `check_number`, and raises ValueError unless ``value`` is above 0."""
-    check_number(op, name, value)
-    if not value > 0:
+    if rule == "positive" and not value > 0:
         raise ValueError(f"{op}: {name} must be positive, got {value}")
-
-
-def check_interval(op: str, name: str, value: float, low: float, high: float, rule: str) -> None:
-    """Runs `check_number`, and raises ValueError for a value outside an interval; ``rule`` is "[0, 1)" or "0 to 1"."""
-    check_number(op, name, value)
-    if not (low <= value < high or (value == high and not rule.endswith(")"))):
+    if ends and not (ends[0] <= value < ends[1] or (value == ends[1] and not rule.endswith(")"))):
         raise ValueError(f"{op}: {name} must lie in {rule}, got {value}")
 
 
@@ -408,7 +278,8 @@ def check_choice(op: str, name: str, value: object, choices: Sequence[str]) -> N
         raise ValueError(f"{op}: {name} must be one of {', '.join(choices)}, got {value!r:.60}")
 
 
-def _short(dtype: torch.dtype) -> str:
+def short(dtype: torch.dtype) -> str:
+    """Returns the name of a dtype without its module."""
     return str(dtype).removeprefix("torch.")
 
 

@@ -12,10 +12,10 @@
         \"\"\"The docstring; the function has no body.\"\"\"
 
 The decorator makes the public function, which checks the arguments, chooses a backend, and calls the backend's
-implementation with positional arguments. The compiled module handles the call if it can
-(csrc/bindings/signature.cpp); Python handles invalid arguments and tensors that are not plain. The signature also gives
-the schema of custom ops, the allocation of their results (also used as the fake), their gradients
-(`Declaration.backward_op`), and the members of compiled structs (`Declaration.inputs` and `Declaration.outputs`).
+implementation with positional arguments. The compiled module does all this (csrc/bindings/signature.cpp); Python does
+it without the compiled module and while torch's compiler traces. The signature also gives the schema of custom ops, the
+allocation of their results (also used as the fake), their gradients (`Declaration.backward_op`), and the members of
+compiled structs (`Declaration.inputs` and `Declaration.outputs`).
 
 A tensor's annotation has dtypes and a shape. The dtypes are ``floating``, a list of names (``float32|float64``),
 ``same`` for the dtype of the first floating-point tensor, or ``wide`` for this dtype promoted to at least float32. An
@@ -47,7 +47,7 @@ from torch import Tensor
 
 from voronerf.ops._core import backends, checks
 from voronerf.ops._core.backends import Implementation
-from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, MAX_COUNT
+from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, MAX_COUNT, TensorRule
 from voronerf.ops._core.custom_op import Op, custom_op
 from voronerf.ops._core.derivatives import register_derivatives
 from voronerf.ops._core.rows import new_empty, rows_of
@@ -72,38 +72,16 @@ def declared(name: str) -> Declaration:
     return _DECLARED[name]
 
 
-class Shaped(NamedTuple):
-    """The dtypes and shape of a tensor in a signature."""
-
-    dtypes: tuple[torch.dtype, ...]
-    shape: tuple[int | str, ...]
-    wide: bool = False
-    condition: str = ""
-    otherwise: tuple[int | str, ...] = ()
-    text: str = ""
-
-    @property
-    def either(self) -> bool:
-        """Returns whether the tensor may have either of two shapes."""
-        return bool(self.otherwise) and not self.condition
-
-    @property
-    def row(self) -> tuple[Any, ...]:
-        """Returns the description of the tensor for the compiled module."""
-        names = [str(dtype).removeprefix("torch.") for dtype in self.dtypes]
-        kind = "wide" if self.wide else "" if names else "same"
-        return names, kind, self.shape, self.otherwise or None
-
-    @staticmethod
-    def parse(text: str) -> Shaped:
-        """Parses a tensor's annotation."""
-        match = re.fullmatch(r"([\w|]+) \[(.*?)\](?: (?:if (\w+) else|or) \[(.*)\])?", text)
-        assert match is not None, f"a tensor is written as dtypes and a shape, got {text!r}"
-        dtypes, shape, condition, otherwise = match.groups()
-        known_dtypes = _DTYPES.get(dtypes)
-        if known_dtypes is None:
-            known_dtypes = tuple(getattr(torch, name) for name in dtypes.split("|"))
-        return Shaped(known_dtypes, _entries(shape), dtypes == "wide", condition or "", _entries(otherwise or ""), text)
+def tensor_rule(name: str, text: str) -> TensorRule:
+    """Returns the rule of a tensor from its annotation."""
+    match = re.fullmatch(r"([\w|]+) \[(.*?)\](?: (?:if (\w+) else|or) \[(.*)\])?", text)
+    assert match is not None, f"a tensor is written as dtypes and a shape, got {text!r}"
+    dtypes, shape, condition, otherwise = match.groups()
+    known_dtypes = _DTYPES.get(dtypes)
+    if known_dtypes is None:
+        known_dtypes = tuple(getattr(torch, name) for name in dtypes.split("|"))
+    rule = TensorRule(name, known_dtypes, _entries(shape), wide=dtypes == "wide", condition=condition or "")
+    return rule._replace(otherwise=_entries(otherwise or ""))
 
 
 def _entries(text: str) -> tuple[int | str, ...]:
@@ -125,31 +103,21 @@ class Argument(NamedTuple):
         """Returns whether the argument is a tensor that may have a floating-point dtype."""
         return self.kind is Tensor and (not self.rule.dtypes or bool({*self.rule.dtypes} & {*FLOATING}))
 
-    def check(self, checked: checks.Checked, values: dict[str, Any]) -> None:
-        """Checks the argument's entry in ``values``, and converts it to a float if the argument is a float."""
-        name, kind, rule, value = self.name, self.kind, self.rule, values[self.name]
-        if kind is Tensor:
-            self._check_tensor(checked, values)
-        elif kind is int:
-            checks.check_integer(checked.op, name, value, *rule)
+    def check(self, op: str, value: Any) -> Any:
+        """Checks the value of an argument that is no tensor, and returns it; a number as a float if it must be one."""
+        name, kind, rule = self.name, self.kind, self.rule
+        if kind is int:
+            checks.check_integer(op, name, value, *rule)
         elif kind is float:
-            rule(checked.op, name, value)
-            values[name] = float(value)
+            checks.check_number(op, name, value, self.text, rule)
+            return float(value)
         elif kind is bool:
-            checks.check_flag(checked.op, name, value)
+            checks.check_flag(op, name, value)
         elif kind is str:
-            checks.check_choice(checked.op, name, value, rule)
+            checks.check_choice(op, name, value, rule)
         elif isinstance(rule, type):
-            checks.check_kind(checked.op, name, value, rule)
-
-    def _check_tensor(self, checked: checks.Checked, values: dict[str, Any]) -> None:
-        rule, tensor = self.rule, values[self.name]
-        second_shape = bool(rule.condition) and values[rule.condition] is None
-        if rule.either:
-            checks.check_tensor(checked.op, self.name, tensor)
-            second_shape = tensor.dim() != len(rule.shape)
-        dtypes = [torch.promote_types(checked.first_float().dtype, torch.float32)] if rule.wide else rule.dtypes
-        checked.tensor(self.name, tensor, dtypes, *(rule.otherwise if second_shape else rule.shape))
+            checks.check_kind(op, name, value, rule)
+        return value
 
 
 class Binding(NamedTuple):
@@ -194,9 +162,9 @@ class Declaration:
         writes: the arguments that the op writes into.
         sizes: functions of the arguments, for letters that occur only in results.
         filled: letters that must be at least 1, and the text of the error.
-        compared: two arguments that are compared, so they are promoted to one dtype (`checks.to_common_dtype`).
         prepare: a function from the checked arguments, as a named tuple, to the implementations' arguments. It checks
             rules that the signature cannot express.
+        compared: two arguments; `prepare` is left out if both are float32 or both are float64.
         composed: whether the reference passes ``backend`` to other ops that it calls (`resolve_composed`).
 
     Attributes:
@@ -216,8 +184,8 @@ class Declaration:
     writes: Sequence[str] = ()
     sizes: Mapping[str, Callable[[Any], int]] = field(default_factory=dict)
     filled: Mapping[str, str] = field(default_factory=dict)
-    compared: Sequence[str] = ()
     prepare: Callable[[Any], Any] | None = None
+    compared: Sequence[str] = ()
     composed: bool = False
 
     def __post_init__(self) -> None:
@@ -226,7 +194,9 @@ class Declaration:
         hints = typing.get_type_hints(self.function, include_extras=True)
         of_result = hints.pop("return")
         hints.pop("backend")
-        self.arguments = [_argument(name, hint) for name, hint in hints.items()]
+        self.arguments = [
+            _argument(name, hint, name in self.small, name in self.writes) for name, hint in hints.items()
+        ]
         kinds = {arg.name: arg.kind | None if arg.optional else arg.kind for arg in self.arguments}
         self._places = {name: place for place, name in enumerate(kinds)}
         self.Inputs = _named(f"{self.name}_inputs", kinds)
@@ -290,8 +260,8 @@ class Declaration:
     def public(self) -> Any:
         """Returns the public function: it checks its arguments, chooses a backend and calls the implementation.
 
-        The compiled module handles the call if it can (csrc/bindings/signature.cpp). `_call` is the fallback without
-        the module, for an invalid argument, and for a tensor that is not plain.
+        The compiled module handles the call (csrc/bindings/signature.cpp), or `_call` without the module, and while
+        torch's compiler traces.
         """
         function, self._calls, traces = self.function, self._first_call, torch.compiler.is_dynamo_compiling
 
@@ -313,35 +283,31 @@ class Declaration:
         return public
 
     def _call(self, args: tuple[Any, ...], options: dict[str, Any]) -> Any:
-        """Handles a call in Python, and raises the errors of invalid arguments."""
+        """Checks and makes a call in Python: while torch's compiler traces, and without the compiled module."""
         named = {**dict(zip(self._ordered, args)), **options}
         values, repeated = {**self._defaults, **named}, len(named) < len(args) + len(options)
         if repeated or len(args) > self._positional or values.keys() != self._ordered.keys():
             self.function(*args, **options)  # the empty function raises Python's TypeError
-        checked = checks.Checked(self.name)
+        sizes: dict[str, int] = {}
+        tensors: list[Tensor] = []
         for argument in self.arguments:
-            if argument.optional and values[argument.name] is None:
+            name, rule, value = argument.name, argument.rule, values[argument.name]
+            if argument.optional and value is None:
                 continue
-            argument.check(checked, values)
-            if argument.kind is not Tensor and argument.name in self._bound:
-                checked.sizes[argument.name] = values[argument.name]
-            if argument.floating and argument.name not in self.smooth and values[argument.name].requires_grad:
-                values[argument.name] = values[argument.name].detach()
-        if self.smooth:
-            checked.no_inference()
-        for name in self.writes:
-            checks.check_writable(self.name, name, values[name])
-        for name in self.small:
-            checks.check_count(self.name, name, values[name].numel())
-        for letter, rule in self.filled.items():
-            if checked.sizes[letter] < 1:
-                raise ValueError(f"{self.name}: {rule}")
-        if self.compared:
-            first, second = self.compared
-            values[first], values[second] = checks.to_common_dtype(values[first], values[second])
-        flat = [values[name] for name in self._places]
-        if self.prepare is not None:
-            flat = self.prepare(self.Inputs(*flat))
+            if argument.kind is Tensor:
+                second_shape = bool(rule.condition) and values[rule.condition] is None
+                checks.fit(self.name, rule, value, sizes, tensors, second_shape)
+                if argument.floating and name not in self.smooth and value.requires_grad:
+                    values[name] = value.detach()
+                continue
+            values[name] = argument.check(self.name, value)
+            if name in self._bound:
+                sizes[name] = values[name]
+        for letter, text in self.filled.items():
+            if sizes[letter] < 1:
+                raise ValueError(f"{self.name}: {text}")
+        given = self.Inputs(*[values[name] for name in self._places])
+        flat = given if self.prepare is None else self.prepare(given)
         resolve = backends.resolve_composed if self.composed else backends.resolve
         run = resolve(self.name, backend=values["backend"], device=flat[0].device, dtype=flat[0].dtype)
         return run(*flat) if self._pack is None else self._pack(run(*flat))
@@ -351,44 +317,8 @@ class Declaration:
         native = backends.compiled()
         if native is None:
             return NotImplemented
-        rows = [{**self._row(arg), **self._default(arg.name)} for arg in self.arguments]
-        rows.append({"name": "backend", "kind": "any", "optional": False, "rule": None, **self._default("backend")})
-        more = {
-            "filled": list(self.filled),
-            "compared": [self._places[name] for name in self.compared],
-            "smooth": bool(self.smooth),
-            "inputs": self.Inputs,
-            "prepare": self.prepare,
-            "found": self._implementation,
-            "pack": self._pack,
-        }
-        self._calls = native.signature(self.name, rows, self._positional, more)
+        self._calls = native.signature(self)
         return self._calls(args, options)
-
-    def _default(self, name: str) -> dict[str, Any]:
-        return {"default": self._defaults[name]} if name in self._defaults else {}
-
-    def _row(self, argument: Argument) -> dict[str, Any]:
-        """Returns the description of an argument for the compiled module."""
-        name, kind, optional, rule, text = argument
-        row = {"name": name, "optional": optional, "bound": name in self._bound, "rule": rule, "kind": "any"}
-        if kind is Tensor:
-            return {
-                **row,
-                "kind": "tensor",
-                "rule": rule.row,
-                "either": rule.either,
-                "condition": self._places.get(rule.condition, -1),
-                "detached": name not in self.smooth and argument.floating,
-                "small": name in self.small,
-                "written": name in self.writes,
-            }
-        if kind is float:
-            ends = [float(end) for end in re.findall(r"[\d.]+", text)] or [0.0, 0.0]
-            return {**row, "kind": "float", "rule": text, "ends": tuple(ends)}
-        if kind in (int, bool, str):
-            return {**row, "kind": kind.__name__}
-        return {**row, "kind": "instance"} if isinstance(rule, type) else row
 
     def _implementation(self, name: str, backend: str) -> tuple[Any, Any, bool]:
         """Returns an implementation, its `Op.plan` or None, and whether it is wrapped by `in_float32`."""
@@ -399,8 +329,8 @@ class Declaration:
     def _docstring(self) -> str:
         """Returns the docstring, with each tensor's dtypes and shape from the signature, and with the backends."""
         text = self.function.__doc__ or ""
-        for name, _, optional, rule, _ in self._tensors():
-            form = f"{rule.text} or None" if optional else rule.text
+        for name, _, optional, _, rule in self._tensors():
+            form = f"{rule} or None" if optional else rule
             text = re.sub(rf"^( +{name}: )", rf"\g<1>{form}, ", text, count=1, flags=re.MULTILINE)
         backends = {"auto": True, "reference": True, "native": self.native, "warp": self.warp}
         *others, last = [f'"{name}"' for name, exists in backends.items() if exists]
@@ -626,7 +556,7 @@ def _named(name: str, hints: dict[str, Any]) -> Any:
     return kind
 
 
-def _argument(name: str, hint: Any) -> Argument:
+def _argument(name: str, hint: Any, small: bool, written: bool) -> Argument:
     rule = ""
     if typing.get_origin(hint) is typing.Annotated:
         hint, rule = typing.get_args(hint)
@@ -634,40 +564,32 @@ def _argument(name: str, hint: Any) -> Argument:
     (kind,) = (kind for kind in options if kind is not type(None))
     parsed: Any = kind
     if kind is Tensor:
-        parsed = Shaped.parse(rule)
+        parsed = tensor_rule(name, rule)._replace(small=small, written=written)
     elif kind is int:
         low, _, high = rule.partition("..")
         parsed = int(low), int(high or MAX_COUNT)
     elif kind is float:
-        parsed = _float_check(rule)
+        parsed = tuple(float(end) for end in re.findall(r"[\d.]+", rule))
     elif kind is str:
         parsed = rule.split("|")
     return Argument(name, kind, hint is not kind, parsed, rule)
 
 
-def _float_check(rule: str) -> Callable[[str, str, float], None]:
-    if rule == "positive":
-        return checks.check_positive
-    if not rule:
-        return checks.check_number
-    low, high = (float(end) for end in re.findall(r"[\d.]+", rule))
-    return lambda op, name, value: checks.check_interval(op, name, value, low, high, rule)
-
-
-def _results(hint: Any) -> tuple[Callable[[Any], Any] | None, dict[str, Shaped]]:
+def _results(hint: Any, name: str = "result") -> tuple[Callable[[Any], Any] | None, dict[str, TensorRule]]:
     """Returns the function that packs the results for the caller (or None), and the result tensors by name."""
     if hint is type(None):
         return None, {}
     if typing.get_origin(hint) is typing.Annotated:
-        return None, {"result": Shaped.parse(typing.get_args(hint)[1])}
+        return None, {name: tensor_rule(name, typing.get_args(hint)[1])}
     if hasattr(hint, "_fields"):
         fields = typing.get_type_hints(hint, include_extras=True)
-        return hint._make, {name: _results(field)[1]["result"] for name, field in fields.items()}
+        return hint._make, {name: _results(field, name)[1][name] for name, field in fields.items()}
     first, *others = typing.get_args(hint)
     if hasattr(first, "_fields"):  # a named tuple of results, then a gradient
         count = len(first._fields)
         return lambda results: (first(*results[:count]), *results[count:]), {
             **_results(first)[1],
-            "gradient": _results(*others)[1]["result"],
+            **_results(others[0], "gradient")[1],
         }
-    return None, {f"result{place}": _results(part)[1]["result"] for place, part in enumerate((first, *others))}
+    names = {f"result{place}": part for place, part in enumerate((first, *others))}
+    return None, {name: _results(part, name)[1][name] for name, part in names.items()}

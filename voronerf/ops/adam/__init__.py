@@ -10,21 +10,11 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
-from voronerf.ops._core.checks import (
-    alike,
-    check_dtype,
-    check_flag,
-    check_interval,
-    check_kind,
-    check_number,
-    check_same_device,
-    check_shape,
-    check_tensor,
-    check_writable,
-)
+from voronerf.ops._core.checks import TensorRule, check_flag, check_kind, check_number, check_rules
 from voronerf.ops.adam.reference import Guard, UpdateRule
 
 _OP = backends.declare("adam", native=Implementation(EVERYWHERE, (torch.float32,)), warp=PLAIN)
+_DTYPES = (torch.float32,)
 _AVERAGE = backends.declare(
     "average",
     native=Implementation(EVERYWHERE, (torch.float32,), file="adam"),
@@ -84,7 +74,8 @@ def adam(
         >>> (table[0] != 0).tolist()
         [False, True, False]
     """
-    _check_all(rules, parameters, gradients, means, squares, guard, loss)
+    lists = {"parameters": parameters, "gradients": gradients, "means": means, "squares": squares}
+    _check_all(rules, lists, guard, loss)
     if not rules:
         return
     loss = None if loss is None else loss.detach()
@@ -119,46 +110,35 @@ def average(
     lists = {"averages": averages} if parameters is None else {"averages": averages, "parameters": parameters}
     if not _are_lists(_AVERAGE, lists, "averages", averages):
         return
-    _check_lists(_AVERAGE, lists, read="")
-    if isinstance(share, Tensor):
-        _check_scalar(_AVERAGE, "share", share, averages[0])
-    else:
-        check_interval(_AVERAGE, "share", share, 0, 1, "0 to 1")
+    if not isinstance(share, Tensor):
+        check_number(_AVERAGE, "share", share, "0 to 1", (0, 1))
+    _check_lists(_AVERAGE, lists, "", [("share", share)] if isinstance(share, Tensor) else [])
     run = backends.resolve(_AVERAGE, backend=backend, device=averages[0].device, dtype=torch.float32)
     run(averages, parameters, share)
 
 
 def _check_all(
-    rules: Sequence[UpdateRule],
-    parameters: Sequence[Tensor],
-    gradients: Sequence[Tensor],
-    means: Sequence[Tensor],
-    squares: Sequence[Tensor],
-    guard: Guard | None,
-    loss: Tensor | None,
+    rules: Sequence[UpdateRule], lists: dict[str, Sequence[Tensor]], guard: Guard | None, loss: Tensor | None
 ) -> None:
-    lists = {"parameters": parameters, "gradients": gradients, "means": means, "squares": squares}
     if not _are_lists(_OP, lists, "rules", rules):
         return
-    checked: Any = None
+    checked, scalars = None, list[tuple[str, Any]]()
     for index, rule in enumerate(rules):
         check_kind(_OP, f"rules[{index}]", rule, UpdateRule)
+        scalars.append(("step", rule.step))
         if checked is None or any(part is not previous for part, previous in zip(rule[1:], checked[1:])):
-            _check_rule(rule, parameters[0])  # equal rules in a row are checked once
+            _check_rule(rule, scalars)  # equal rules in a row are checked once
         checked = rule
     if guard is not None:
         check_kind(_OP, "guard", guard, Guard)
         check_number(_OP, "limit", guard.limit)
-    if loss is not None and guard is None:
-        raise ValueError(f"{_OP}: loss must come with a guard, got none")
-    scalars: list[tuple[str, Any]] = [("step", rule.step) for rule in rules]
-    if guard is not None:
-        scalars += [
-            (name, value) for name, value in zip(guard._fields, guard[:4]) if value is not None or name != "scale"
-        ]
+        members = zip(guard._fields, guard[:4])
+        scalars += [(name, value) for name, value in members if value is not None or name != "scale"]
     if loss is not None:
+        if guard is None:
+            raise ValueError(f"{_OP}: loss must come with a guard, got none")
         scalars.append(("loss", loss))
-    _check_lists(_OP, lists, read="gradient", scalars=scalars)
+    _check_lists(_OP, lists, "gradients", scalars)
 
 
 def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Sequence[Any]) -> bool:
@@ -175,49 +155,28 @@ def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Se
     return bool(first)
 
 
-def _check_lists(
-    op: str, lists: dict[str, Sequence[Tensor]], read: str, scalars: Sequence[tuple[str, Any]] = ()
-) -> None:
-    """Checks dtype, shape and device of the tensors of each parameter, and that each scalar has shape [].
-
-    All tensors must be contiguous, except in one list: ``read`` is the name of this list without its plural s, or empty
-    if there is no such list.
-    """
-    if alike([*lists.values()], [name[:-1] != read for name in lists], [value for _, value in scalars]):
-        return
-    for tensors in zip(*lists.values(), strict=True):
-        _check(op, {name[:-1]: tensor for name, tensor in zip(lists, tensors, strict=True)}, read)
-    name, first = next(iter(lists.items()))
-    check_same_device(op, **{f"{name}[{index}]": tensor for index, tensor in enumerate(first)})
-    for key, scalar in scalars:
-        _check_scalar(op, key, scalar, first[0])
+def _check_lists(op: str, lists: dict[str, Sequence[Tensor]], read: str, scalars: list[tuple[str, Any]]) -> None:
+    """Checks lists of tensors, and tensors [] with their names. Tensors of the list ``read`` need not be contiguous."""
+    tensors = [tensor for tensors in zip(*lists.values()) for tensor in tensors]
+    shapes = tuple([getattr(tensor, "shape", ()) for tensor in next(iter(lists.values()))])
+    names = tuple([name for name, _ in scalars])
+    tensors += [tensor for _, tensor in scalars]
+    check_rules(op, _rules, tensors, tuple(lists), read, shapes, names, smooth=False)
 
 
-def _check(op: str, tensors: dict[str, Tensor], read: str) -> None:
-    """Checks the tensors of one parameter; the tensor named ``read`` need not be contiguous."""
-    first, *_ = tensors.values()
-    for name, tensor in tensors.items():
-        check_tensor(op, name, tensor)
-        check_dtype(op, name, tensor, (torch.float32,))
-        if tensor.shape != first.shape:
-            raise ValueError(f"{op}: {name} must have shape {list(first.shape)}, got {list(tensor.shape)}")
-        if name != read:
-            check_writable(op, name, tensor)
-    check_same_device(op, **tensors)
+def _rules(lists: Sequence[str], read: str, shapes: Sequence[Any], scalars: Sequence[str]) -> list[TensorRule]:
+    """Returns the rules for the tensors of each parameter, one of each list, and for the tensors []."""
+    rows = [TensorRule(name[:-1], _DTYPES, tuple(shape), written=name != read) for shape in shapes for name in lists]
+    return [*rows, *(TensorRule(name, _DTYPES, ()) for name in scalars)]
 
 
-def _check_scalar(op: str, name: str, tensor: Any, parameter: Tensor) -> None:
-    check_shape(op, name, tensor, ())
-    check_dtype(op, name, tensor, (torch.float32,))
-    check_same_device(op, **{"parameters[0]": parameter, name: tensor})
-
-
-def _check_rule(rule: UpdateRule, parameter: Tensor) -> None:
+def _check_rule(rule: UpdateRule, scalars: list[tuple[str, Any]]) -> None:
+    """Checks the numbers of a rule; adds a learning rate that is a tensor to ``scalars``."""
     if isinstance(rule.learning_rate, Tensor):
-        _check_scalar(_OP, "learning_rate", rule.learning_rate, parameter)
+        scalars.append(("learning_rate", rule.learning_rate))
     else:
         check_number(_OP, "learning_rate", rule.learning_rate)
-    check_number(_OP, "epsilon", rule.epsilon)
+    check_number(_OP, "epsilon", rule.epsilon, "positive")
     check_flag(_OP, "dense", rule.dense)
     betas = rule.betas
     if not isinstance(betas, (tuple, list)) or len(betas) != 2:
@@ -226,5 +185,3 @@ def _check_rule(rule: UpdateRule, parameter: Tensor) -> None:
         check_number(_OP, "betas", beta)
         if not 0 <= beta < 1:
             raise ValueError(f"{_OP}: betas must lie in [0, 1), got {betas}")
-    if not rule.epsilon > 0:
-        raise ValueError(f"{_OP}: epsilon must be positive, got {rule.epsilon}")

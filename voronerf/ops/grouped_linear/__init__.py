@@ -8,16 +8,22 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import check_same_dtype
+from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, TensorRule, check_rules
 from voronerf.ops._core.declare import declare
 from voronerf.ops._core.layers import ACTIVATIONS
+
+
+def _like_x(count: int) -> list[TensorRule]:
+    shapes = {"x": ("n", "i"), "weight": ("k", "o", "i"), "bias": ("k", "o")}
+    return [TensorRule(name, FLOATING if name == "x" else LIKE_FIRST, shapes[name]) for name in [*shapes][:count]]
 
 
 def _prepare(arguments: Any) -> Any:
     if 0 in arguments.weight.shape:
         raise ValueError(f"grouped_linear: weight must have no empty dimension, got {list(arguments.weight.shape)}")
     if not torch.is_autocast_enabled(arguments.x.device.type):
-        check_same_dtype("grouped_linear", x=arguments.x, weight=arguments.weight, bias=arguments.bias)
+        tensors = [arguments.x, arguments.weight, *([] if arguments.bias is None else [arguments.bias])]
+        check_rules("grouped_linear", _like_x, tensors, len(tensors))
     return arguments
 
 

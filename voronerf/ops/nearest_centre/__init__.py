@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -10,14 +10,19 @@ from torch.utils._python_dispatch import _disable_current_modes
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
-from voronerf.ops._core.checks import FLOATING, Checked
+from voronerf.ops._core.checks import FLOATING, TensorRule, check_rules, to_common_dtype
 from voronerf.ops._core.declare import declare
+
+
+def _prepare(arguments: Any) -> Any:
+    return (*to_common_dtype(arguments.points, arguments.centres), arguments.index)
 
 
 @declare(
     native=Implementation(EVERYWHERE, COORDINATES),
     warp=Implementation(EVERYWHERE, COORDINATES),
     filled={"k": "centres must hold at least one centre, got none"},
+    prepare=_prepare,
     compared=["points", "centres"],
 )
 def nearest_centre(
@@ -81,8 +86,7 @@ def index_centres(centres: Tensor) -> Tensor | None:
         >>> bool((nearest_centre(points, centres, index=index) == nearest_centre(points, centres)).all())
         True
     """
-    arguments = Checked("index_centres")
-    arguments.tensor("centres", centres, FLOATING, "k", "d")
+    check_rules("index_centres", _rules, [centres])
     check_sizes("index_centres", centres)
     native = backends.compiled()
     if native is None or centres.is_meta:
@@ -93,6 +97,10 @@ def index_centres(centres: Tensor) -> Tensor | None:
         index = torch.empty(native.compiled.centre_index_words(k, d, rows.itemsize), dtype=torch.int32)
         native.compiled.index_centres(rows, index, k, d, native.cpu().threads)
         return index.to(centres.device)
+
+
+def _rules() -> list[TensorRule]:
+    return [TensorRule("centres", FLOATING, ("k", "d"))]
 
 
 def check_sizes(op: str, centres: Tensor) -> None:

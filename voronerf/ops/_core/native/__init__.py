@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from voronerf.ops._core import backends
+from voronerf.ops._core import backends, checks
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.ops._core.custom_op import LISTENERS, Op
 
@@ -95,7 +95,7 @@ def register_torch(module: Any) -> None:
 
 register_torch(compiled)
 
-signature, TensorRules, alike = compiled.signature, compiled.TensorRules, compiled.alike
+signature, TensorRules = compiled.signature, compiled.TensorRules
 """The functions that check arguments and make calls (csrc/bindings/signature.h); kept when tests replace `compiled`."""
 
 ISAS = compiled.Isa
@@ -198,6 +198,7 @@ compiled.register_queries(
         "kept": backends._override,
         "native": globals(),
         "choose": backends._choose_once,
+        "checks": checks,
         "dtypes": DTYPES,
     }
 )
