@@ -72,13 +72,14 @@ class ProgramCall {
   // Runs the program on `tensors`: inputs, parameters, offsets, order, ray_index and the look-ups (the features from
   // hash grids) that an earlier call kept. `gradients` is the index of the first input that is a gradient, or -1.
   // `caller` and `ray_name` are the names of the op and of its argument for errors. Returns the outputs, the sums over
-  // rows and, if `keep`, the look-ups. Returns None if Python has to make the call: during a recording, and for
-  // unsupported tensors.
-  py::object call(const py::tuple& tensors, bool keep, int64_t gradients, const char* caller,
-                  const char* ray_name) const {
+  // rows and, if `keep`, the look-ups. Returns None if Python has to make the call: during a recording, for unsupported
+  // tensors and, if `asked`, while torch has to see the call (Questions::has_listeners).
+  py::object call(const py::tuple& tensors, bool keep, int64_t gradients, const char* caller, const char* ray_name,
+                  bool asked) const {
     if (recording() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
       return py::none();
     }
+    if (asked && questions.has_listeners()) return py::none();
     TensorView offsets;
     if (!offsets.look(PyTuple_GET_ITEM(tensors.ptr(), 2)) || !offsets.on_cpu()) return py::none();
     Loaded loaded{function_, bound_, {}, {}};

@@ -9,7 +9,6 @@ Letters: n samples, k cells, d coordinates.
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -26,7 +25,7 @@ from voronerf.router.labels import Labels
 from voronerf.router.layout import SAMPLE, Call, rebuild, tensors_of
 from voronerf.router.watch import Watch, module_dependencies
 
-_NAMES = Names("VoronoiRouter")
+_NAMES, _NOTHING = Names("VoronoiRouter"), contextlib.nullcontext()
 _VALUES = {type(None), bool, int, float, str}
 
 
@@ -88,8 +87,7 @@ class CachedCall:
         self._dtypes = None if {*dtypes} == {torch.float32} else dtypes
         self._parameters, self._program, self._is_compilable = fused.parameters, program, not fused.computes
         fused.parameters(grouping.k, device, grouping.backend)  # fills a cached property, which torch.compile cannot
-        in_half = functools.partial(torch.autocast, device.type, enabled=False)  # results are rounded at the end
-        self._precision: Any = in_half if torch.is_autocast_enabled(device.type) else contextlib.nullcontext
+        self._autocast = torch.is_autocast_enabled(device.type)
 
     @staticmethod
     def of(fused: Fused, watch: Watch, most: int, call: Call, grouping: Grouping) -> CachedCall | None:
@@ -117,7 +115,7 @@ class CachedCall:
             return None
         rows = [self._rows(arguments[i], n) for i in self._reads]
         network = Network(self._program, self._parameters(k, rows[0].device, router.backend), names=_NAMES)
-        with self._precision():
+        with torch.autocast(rows[0].device.type, enabled=False) if self._autocast else _NOTHING:
             results, _ = network.run(rows, router.places(positions, self._method), backend="native")
         if self._tails is not None:
             results = [out.reshape(*lead, *tail) for out, tail in zip(results, self._tails)]

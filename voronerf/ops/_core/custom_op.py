@@ -209,7 +209,7 @@ class Op:
     def _with_node(self, flat: Sequence[Any], arguments: Sequence[Any]) -> Any:
         """Calls the op with its autograd node."""
         entries = self._tensors_of(flat) if self._lists else flat
-        return self._as_declared(_apply_directly(*entries, None, self, arguments))
+        return self._as_declared(_apply_node(*entries, self, arguments))
 
     def _tensors_of(self, flat: Sequence[Any]) -> list[Any]:
         """Returns the entries of the custom op's lists, then its arguments that are tensors or None."""
@@ -224,16 +224,10 @@ class Op:
         if self._backward is None:
             return self._op(*flat)
         entries, lengths = _flattened(flat)
-        return self._as_declared(_Differentiable.apply(*entries, lengths, self, None))
+        return self._as_declared(_Transformed.apply(*entries, lengths, self))
 
     def _as_declared(self, results: Any) -> Any:
         return list(results) if self._listed else results  # autograd.Function cannot return lists
-
-    def refuse_batches(self, of_results: Sequence[Any]) -> None:
-        """Raises NotImplementedError for batched gradients."""
-        for gradient in of_results:
-            if gradient is not None and torch._C._functorch.is_legacy_batchedtensor(gradient):
-                raise self.no_batches
 
     @property
     def no_batches(self) -> NotImplementedError:
@@ -271,6 +265,13 @@ class Op:
         gradients = self._backward(ctx, *of_results)
         return tuple(self._fields.flat(gradients if isinstance(gradients, tuple) else (gradients,)))
 
+    def flat_gradients(self, ctx: Any, of_results: Sequence[Any]) -> tuple[Any, ...]:
+        """Returns the gradients of the custom op's arguments; raises NotImplementedError for batched gradients."""
+        for gradient in of_results:
+            if gradient is not None and torch._C._functorch.is_legacy_batchedtensor(gradient):
+                raise self.no_batches
+        return self.gradients(ctx, of_results) if self._listed else self.gradients(ctx, *of_results)
+
     def results(self, arguments: Sequence[Any]) -> Any:
         """Returns the results in the form of ``torch.autograd.Function``: a tensor or a tuple."""
         results = self._run(arguments)
@@ -281,46 +282,55 @@ class Op:
         return self._fields.packed(_nested(entries, lengths))
 
 
-class _Differentiable(torch.autograd.Function):
-    """An op with gradients for PyTorch's autograd and ``torch.func``.
+class _Node(torch.autograd.Function):
+    """The autograd node of an op.
 
-    ``forward`` takes flat arguments, then the lengths of lists, the op, and the op's own arguments.
+    ``forward`` takes the op's tensors (`Op._tensors_of`), which only tell autograd what the op takes, then the op and
+    its arguments.
+    """
 
-    Under ``torch.func``, the flat arguments are the custom op's arguments with flattened lists. ``torch.func`` replaces
-    the tensors among them, so the op's own arguments are None, and are rebuilt from the flat arguments and the lengths.
+    @staticmethod
+    def forward(ctx: Any, *flat: Any) -> Any:
+        op, arguments = flat[-2:]
+        ctx.op, results = op, op.results(arguments)
+        op.set_up(ctx, arguments, results)
+        return results
 
-    Otherwise, the lengths are None, and the op's own arguments are given. The flat arguments only tell autograd which
-    tensors the op takes: they are the result of `Op._tensors_of` if the op has lists, else the custom op's arguments.
+    @staticmethod
+    def backward(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
+        gradients = ctx.op.flat_gradients(ctx, of_results)
+        return *(ctx.op._tensors_of(gradients) if ctx.op._lists else gradients), None, None
+
+
+#: ``apply`` without the checks of ``torch.func`` and of ``forward``'s signature, which take 20 us.
+_apply_node = super(torch.autograd.Function, _Node).apply
+
+
+class _Transformed(torch.autograd.Function):
+    """An op with gradients for ``torch.func``, which replaces the tensors among the arguments of ``forward``.
+
+    ``forward`` takes the custom op's arguments with flattened lists, the lengths of the lists, and the op.
     """
 
     @staticmethod
     def forward(*flat: Any) -> Any:
-        *entries, lengths, op, arguments = flat
-        return op.results(arguments or op.arguments(entries, lengths))
+        *entries, lengths, op = flat
+        return op.results(op.arguments(entries, lengths))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        *entries, ctx.lengths, ctx.op, arguments = inputs
-        ctx.op.set_up(ctx, arguments or ctx.op.arguments(entries, ctx.lengths), output)
+        *entries, ctx.lengths, ctx.op = inputs
+        ctx.op.set_up(ctx, ctx.op.arguments(entries, ctx.lengths), output)
 
     @staticmethod
     def backward(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
-        op: Op = ctx.op
-        op.refuse_batches(of_results)
-        gradients = op.gradients(ctx, of_results) if op._listed else op.gradients(ctx, *of_results)
-        if ctx.lengths is None:
-            return *(op._tensors_of(gradients) if op._lists else gradients), None, None, None
-        lists = zip(gradients, ctx.lengths, strict=True)
+        lists = zip(ctx.op.flat_gradients(ctx, of_results), ctx.lengths, strict=True)
         flat_gradients = _flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0]
-        return *flat_gradients, None, None, None
+        return *flat_gradients, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, *flat: Any) -> Any:
-        raise flat[-2].no_batches
-
-
-#: `_Differentiable.apply` without the checks of ``torch.func`` and of ``forward``'s signature, which take 20 us.
-_apply_directly = super(torch.autograd.Function, _Differentiable).apply
+        raise flat[-1].no_batches
 
 
 def _flattened(arguments: Sequence[Any]) -> tuple[list[Any], list[int]]:

@@ -86,6 +86,10 @@ class Run(NamedTuple):
 
     def results(self) -> list[Tensor]:
         """Returns the outputs and sums, with gradients of every order."""
+        if not (torch.is_grad_enabled() or torch.compiler.is_dynamo_compiling()):
+            direct = _direct(self, asked=True)
+            if direct is not None:
+                return direct
         keep = torch.is_grad_enabled() and bool(_tables(self.text))
         keep = keep and any(t.requires_grad for t in (*self.inputs, *self.parameters))
         results: list[Tensor] = run(*(self._replace(keep=True) if keep else self))
@@ -228,19 +232,22 @@ def _memory(call: Run) -> list[Tensor]:
     return results
 
 
-def _direct(call: Run) -> list[Tensor] | None:
-    """Returns the results of a CPU call, for which the compiled module allocates them; None if Python has to do it."""
+def _direct(call: Run, asked: bool) -> list[Tensor] | None:
+    """Returns the results of a CPU call, for which the compiled module allocates them; None if Python has to do it.
+
+    ``asked`` refuses calls that modes, transforms or profilers of torch observe.
+    """
     if not compiled_runs(call.text) or native.on_cuda(call.offsets):
         return None
     lowered = lower(call.text, _layout(call.products, call.offsets), False)
-    results: list[Tensor] | None = lowered.call(call[:6], call.keep, call.gradients, call.op, call.index_name)
+    results: list[Tensor] | None = lowered.call(call[:6], call.keep, call.gradients, call.op, call.index_name, asked)
     return results
 
 
 @custom_op("network", _memory, counted=True)
 def run(call: Run) -> list[Tensor]:
     """Runs a program: returns its outputs, its sums and, if ``keep``, the features looked up in hash grids."""
-    results = _direct(call)
+    results = _direct(call, False)
     if results is not None:
         return results
     program, results = Program.parse(call.text), _memory(call)
