@@ -279,12 +279,7 @@ class Signature {
   explicit Signature(const py::object& declaration) : op_(declaration.attr("name")) {
     positional_ = py::cast<int>(declaration.attr("_positional"));
     const py::dict places = declaration.attr("_places"), defaults = declaration.attr("_defaults");
-    for (const auto& argument : declaration.attr("arguments")) {
-      const py::object rule = argument.attr("rule");
-      arguments_.push_back(argument_of(argument, rule, declaration));
-      if (arguments_.back().kind != Argument::Kind::tensor || !places.contains(rule.attr("condition"))) continue;
-      arguments_.back().condition = py::cast<int>(places[rule.attr("condition")]);
-    }
+    for (const auto& row : declaration.attr("arguments")) arguments_.push_back(argument_of(row, declaration, places));
     arguments_.emplace_back();
     arguments_.back().name = "backend";
     if (arguments_.size() > kMostArguments) throw std::invalid_argument("too many arguments");
@@ -340,18 +335,20 @@ class Signature {
     bool narrow;
   };
 
-  Argument argument_of(const py::handle& row, const py::object& rule, const py::object& declaration) {
+  Argument argument_of(const py::handle& row, const py::object& declaration, const py::dict& places) {
     Argument argument;
     argument.name = row.attr("name");
     argument.optional = py::cast<bool>(row.attr("optional"));
     argument.check = row.attr("check");
     const auto text = py::cast<std::string>(row.attr("text"));
-    const py::object type = row.attr("kind");
+    const py::object type = row.attr("kind"), rule = row.attr("rule");
     const auto is = [&type](PyTypeObject& each) { return type.ptr() == reinterpret_cast<PyObject*>(&each); };
     using Kind = Argument::Kind;
     if (py::hasattr(rule, "dtypes")) {
       argument.kind = Kind::tensor;
       argument.rule = TensorRule::of(rule, letters_);
+      const py::object condition = rule.attr("condition");
+      if (places.contains(condition)) argument.condition = py::cast<int>(places[condition]);
       const bool smooth = declaration.attr("smooth").contains(argument.name);
       argument.detached = !smooth && py::cast<bool>(row.attr("floating"));
     } else if (is(PyLong_Type)) {

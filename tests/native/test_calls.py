@@ -64,7 +64,7 @@ def without_the_exchange():
 @pytest.mark.parametrize("learns", [False, True])
 @pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, case in CASES.items() for kind in case.kinds])
 def test_the_same_bits_as_by_the_methods_of_tensors(name, kind, learns):
-    """Without torch's tensor exchange API, Python checks and runs every call, with bitwise equal results."""
+    """Without torch's tensor exchange API, Python reads the tensors and runs every call, with bitwise equal results."""
     case = CASES[name]
     for n, dtype in ((0, torch.float32), (1, torch.float32), (33, torch.float32), (33, torch.bfloat16)):
         if (learns and not case.differentiable) or dtype in refused_dtypes(name):

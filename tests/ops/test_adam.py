@@ -66,10 +66,7 @@ def test_what_was_found_before_leaves_out_a_step(device, backend):
 
 
 def test_refuses_what_would_be_read_out_of_bounds():
-    """Each call has a single wrong argument, so that every part of the compiled module's fast check is tested.
-
-    The tensors are checked one by one only if the fast check fails.
-    """
+    """Each call has a single wrong argument."""
 
     def call(rules=None, **changed):
         arguments = {name: [torch.ones(())] for name in ("parameters", "gradients", "means", "squares")}

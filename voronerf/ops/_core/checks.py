@@ -166,7 +166,7 @@ def fit(
         second: whether the tensor has the rule's second shape.
     """
     check_tensor(op, rule.name, tensor)
-    shape, dtypes = rule.shape, rule.dtypes
+    shape, dtypes, known = rule.shape, rule.dtypes, dict(sizes)
     if (second and rule.otherwise) or (rule.either and tensor.dim() != len(shape)):
         shape = rule.otherwise
     if not dtypes:
@@ -187,7 +187,8 @@ def fit(
         fits = (tensor.numel() if rule.small else tensor.shape[0]) <= MAX_COUNT
         fits = fits and (not rule.empty or tensor.shape[0] > int(str(shape[0]).endswith("+1")))
     if not fits or (rule.written and not tensor.is_contiguous()):
-        text = f"{'|'.join(map(short, dtypes))} [{', '.join(map(str, shape))}]"
+        values = ", ".join(f"{letter} = {number}" for letter, number in known.items())
+        text = f"{'|'.join(map(short, dtypes))} [{', '.join(map(str, shape))}]" + (f" with {values}" if values else "")
         text += f" on {others[0].device}" if others else ""
         actual = f"{short(tensor.dtype)} {list(tensor.shape)} on {tensor.device}"
         raise (ValueError if right_dtype else TypeError)(f"{op}: {rule.name} must be {text}, got {actual}")
