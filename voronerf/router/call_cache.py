@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -87,7 +88,7 @@ class CachedCall:
         self._dtypes = None if {*dtypes} == {torch.float32} else dtypes
         self._parameters, self._program, self._is_compilable = fused.parameters, program, not fused.computes
         fused.parameters(grouping.k, device, grouping.backend)  # fills a cached property, which torch.compile cannot
-        self._autocast = torch.is_autocast_enabled(device.type)
+        self._autocast, self._network = torch.is_autocast_enabled(device.type), cast("Network | None", None)
 
     @staticmethod
     def of(fused: Fused, watch: Watch, most: int, call: Call, grouping: Grouping) -> CachedCall | None:
@@ -114,7 +115,7 @@ class CachedCall:
         if not self._fits(router, arguments, lead, n):
             return None
         rows = [self._rows(arguments[i], n) for i in self._reads]
-        network = Network(self._program, self._parameters(k, rows[0].device, router.backend), names=_NAMES)
+        network = self._network_of(self._parameters(k, rows[0].device, router.backend))
         with torch.autocast(rows[0].device.type, enabled=False) if self._autocast else _NOTHING:
             results, _ = network.run(rows, router.places(positions, self._method), backend="native")
         if self._tails is not None:
@@ -122,6 +123,15 @@ class CachedCall:
         if self._dtypes is not None:
             results = [out.to(dtype) for out, dtype in zip(results, self._dtypes)]
         return rebuild(self._result, results)
+
+    def _network_of(self, parameters: list[Tensor]) -> Network:
+        """Returns the network of parameters, which is made again only for other parameters than in the last call."""
+        network = self._network
+        if network is None or torch.compiler.is_compiling() or not all(map(operator.is_, parameters, network.given)):
+            network = Network(self._program, parameters, names=_NAMES)
+            if not torch.compiler.is_compiling():
+                self._network = network
+        return network
 
     def _fits(self, router: Any, arguments: tuple[Any, ...], lead: torch.Size, n: int) -> bool:
         """Returns whether a call with leading dimensions ``lead`` of n samples can run in the cached form."""

@@ -76,6 +76,9 @@ class Network:
             all of one dtype, except the table [k, e, f], [1, e, f] or [e, f] of a hash grid.
         names: the names in error messages.
 
+    Attributes:
+        given: the parameters, as the caller gave them.
+
     Raises:
         TypeError: ``program`` is no Program, or ``parameters`` are no list.
         ValueError: there are not as many parameters as in the program.
@@ -100,7 +103,7 @@ class Network:
         if not isinstance(program, Program):
             raise TypeError(f"{names.op}: program must be a Program, got {type(program).__name__}")
         _check_list(names.op, "parameters", parameters, len(program.parameters))
-        self.program, self.names, self._parameters = program, names, parameters
+        self.program, self.names, self.given = program, names, parameters
         shapes = zip(parameters, program.parameters)
         self.shared = tuple([isinstance(p, Tensor) and p.dim() == len(shape) for p, shape in shapes])
         self.parameters = parameters
@@ -143,7 +146,7 @@ class Network:
         """
         self.check(inputs, cells, ray_index)
         learns = torch.is_grad_enabled()
-        leaves = [*inputs, *self._parameters]
+        leaves = [*inputs, *self.given]
         wanted, arguments = [learns and tensor.requires_grad for tensor in leaves], self.arguments(inputs, ray_index)
         place: dict[str, Any] = {"device": inputs[0].device, "dtype": arguments.dtype}
         plain = arguments.dtype is torch.float32 and all(leaf.dtype is torch.float32 for leaf in leaves)
@@ -190,7 +193,7 @@ class Network:
 
     def check(self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None) -> None:
         """Raises the errors of a call with these arguments; reads values on the CPU alone."""
-        op, program, parameters, names = self.names.op, self.program, self._parameters, self.names
+        op, program, parameters, names = self.names.op, self.program, self.given, self.names
         if not program.inputs:
             raise ValueError(f"{op}: program must have at least one input, got none")
         _check_list(op, "inputs", inputs, len(program.inputs))
@@ -201,9 +204,10 @@ class Network:
         rules, tensors = cells.to_check(op)
         check_tensor(op, names.of("inputs", 0), inputs[0])
         dtype = None
-        if (layer := program.first_layer) >= 0:
-            check_tensor(op, names.of("parameters", layer), parameters[layer])
-            dtype = parameters[layer].dtype
+        for i, parameter in enumerate(parameters):
+            if i == program.first_layer:  # torch.compile may make this number symbolic
+                check_tensor(op, names.of("parameters", i), parameter)
+                dtype = parameter.dtype
         first = 1 if cells.offsets is not None else 0  # offsets tell the number of cells
         all_tensors = [*tensors[:first], *inputs, *parameters, *tensors[first:]]
         if ray_index is not None:

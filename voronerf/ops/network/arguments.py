@@ -46,14 +46,13 @@ class Arguments(NamedTuple):
         index_name: str,
     ) -> Arguments:
         """Returns the arguments of a program; float64 inputs are encoded here if the results have another dtype."""
-        dtype, kind = inputs[0].dtype, inputs[0].device.type
-        if program.first_layer >= 0:
-            dtype = parameters[program.first_layer].dtype
-            if dtype is not torch.float64 and torch.is_autocast_enabled(kind):
-                dtype = torch.get_autocast_dtype(kind)
+        first, kind = program.first_layer, inputs[0].device.type
+        dtype = inputs[0].dtype if first < 0 else parameters[first].dtype
         if dtype is not torch.float64:
+            if first >= 0 and torch.is_autocast_enabled(kind):
+                dtype = torch.get_autocast_dtype(kind)
             wide = tuple([x.dtype is torch.float64 for x in inputs])
-            if any(wide):
+            if True in wide:
                 program, ahead = _encoded_ahead(program.text, wide)
                 further = []
                 for i, start, width, name, size in ahead:

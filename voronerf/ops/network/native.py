@@ -359,14 +359,14 @@ def _multiplies_halves(products: str, device: torch.device) -> bool:
 
 
 def _save(ctx: Any, inputs: Sequence[Any], output: Sequence[Tensor]) -> None:
-    call, count = Run._make(inputs), _results(inputs[6])
-    kept, constant = output[count:], _constant_results(call.text)
+    rows, parameters, offsets, order, ray_index, earlier, *ctx.options = inputs
+    text = ctx.options[0]
+    kept, constant = output[_results(text) :], _constant_results(text)
     ctx.set_materialize_grads(False)
     if kept or constant:
         ctx.mark_non_differentiable(*kept, *[output[i] for i in constant])
-    ctx.counts = len(call.inputs), len(call.parameters), len(call.kept)
-    ctx.options = call[6:]
-    ctx.save_for_backward(*call.inputs, *call.parameters, *call[2:5], *kept)
+    ctx.counts = len(rows), len(parameters), len(earlier)
+    ctx.save_for_backward(*rows, *parameters, offsets, order, ray_index, *kept)
 
 
 def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> Sequence[Any]:
