@@ -63,8 +63,8 @@ struct Type {
   std::vector<std::string> values;  // value names of an enumeration
   std::vector<Member> members;      // members of a struct
   void (*construct)(void*) = nullptr;
-  void (*destroy)(void*) = nullptr;          // for an opaque object: deletes it
-  void* (*resize)(void*, size_t) = nullptr;  // for a std::vector: returns its data
+  void (*destroy)(void*) = nullptr;                      // for an opaque object: deletes it
+  void* (*resize)(void*, size_t) = nullptr;              // for a std::vector: returns its data
   bool (*load)(void* frame, _object*, void*) = nullptr;  // for a type with a loader of its own
   mutable _object* known_dtype = nullptr;
   mutable _typeobject* known_class = nullptr;  // cached class of a struct's last argument
@@ -109,11 +109,11 @@ std::vector<Member> members_of(const void* object, const char* names, const M&..
 // Declares a struct that a function of its own loads from a Python object (frame.h).
 template <typename T>
 struct Loader;
-#define VN_LOADER(T)                                               \
-  template <>                                                      \
-  struct Loader<T> {                                               \
-    static constexpr const char* vn_type = #T;                     \
-    static bool load(void* frame, _object* object, void* place);   \
+#define VN_LOADER(T)                                             \
+  template <>                                                    \
+  struct Loader<T> {                                             \
+    static constexpr const char* vn_type = #T;                   \
+    static bool load(void* frame, _object* object, void* place); \
   }
 
 // Declares a class whose objects Python gets from the module and only passes back.

@@ -293,6 +293,18 @@ class Tape:
         leaves: the inputs, then the parameters, as the caller gave them.
         wanted: for each leaf, whether it has a gradient.
         run: the evaluation, whose ``backward`` computes the gradients.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import MLP, Layer
+        >>> from voronerf.ops import Cells, Network
+        >>> weight = torch.tensor([[[2.0]]], requires_grad=True)
+        >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))
+        >>> network = Network(table.program(1, 0, None, (False,)), [weight])
+        >>> (out,), tape = network.fwd([torch.ones(4, 1)], Cells())
+        >>> loss = tape.learn(out.square().mean(), [out * (2 / 4)])
+        >>> float(loss), float(weight.grad)
+        (4.0, 4.0)
     """
 
     outputs: Sequence[Tensor]
@@ -334,18 +346,6 @@ class Tape:
 
         Raises:
             ValueError: ``loss`` or a gradient has another shape.
-
-        Examples:
-            >>> import torch
-            >>> from voronerf import MLP, Layer
-            >>> from voronerf.ops import Cells, Network
-            >>> weight = torch.tensor([[[2.0]]], requires_grad=True)
-            >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))
-            >>> network = Network(table.program(1, 0, None, (False,)), [weight])
-            >>> (out,), tape = network.fwd([torch.ones(4, 1)], Cells())
-            >>> loss = tape.learn(out.square().mean(), [out * (2 / 4)])
-            >>> float(loss), float(weight.grad)
-            (4.0, 4.0)
         """
         check_shape("learn", "loss", loss, ())
         check_flag("learn", "defer", defer)
