@@ -148,9 +148,8 @@ class Pool {
     const SeeOutputs& out = call_.out;
     add_wave(
         call_.isa,
-        {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(),
-         front_.data(), out.heaviest == nullptr ? nullptr : most_.data(), out.colour, out.opacity, out.depth, out.light,
-         out.heaviest},
+        {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(), front_.data(),
+         out.heaviest == nullptr ? nullptr : most_.data(), out.colour, out.opacity, out.depth, out.light, out.heaviest},
         count_);
     return true;
   }

@@ -33,9 +33,9 @@ struct SeeOutputs {
   float* heaviest;                 // [r], depth of the heaviest sample, far without samples; or null
 };
 
-// The march must have no uniforms, seed or start. The program has one output with 4 columns, colour and density. Its inputs are positions,
-// whose values in `network` are not read, and optionally directions [r,q], one per ray. Returns false if a position is
-// not at a leaf after `depth` levels.
+// The march must have no uniforms, seed or start. The program has one output with 4 columns, colour and density. Its
+// inputs are positions, whose values in `network` are not read, and optionally directions [r,q], one per ray. Returns
+// false if a position is not at a leaf after `depth` levels.
 bool render_opaque_cpu(const Program& program, const ProgramInputs& network, const MarchInputs& march,
                        const SeeCells& cells, const SeeOptions& options, const SeeOutputs& out, Isa isa, int threads);
 

@@ -9,9 +9,9 @@ namespace voronerf {
 
 // The samples of a wave, and the numbers [r] of their rays in the image.
 struct SeenWave {
-  const float* raw;                 // [m,4], colour and density
-  const float *depths, *deltas;     // [m]
-  const int32_t *offsets, *number;  // [r+1], [r]
+  const float* raw;                        // [m,4], colour and density
+  const float *depths, *deltas;            // [m]
+  const int32_t *offsets, *number;         // [r+1], [r]
   static constexpr bool activated = true;  // as render_tile.h reads `raw`
   static constexpr float density_scale = 1.0f;
   double* front;                   // [r], the optical depth so far
