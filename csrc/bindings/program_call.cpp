@@ -6,7 +6,6 @@
 
 #include "bindings/program.h"
 #include "bindings/questions.h"
-#include "bindings/tensor_rules.h"
 
 namespace voronerf {
 
@@ -15,6 +14,30 @@ namespace {
 TableType table_type(unsigned dtype) {
   return dtype == kBfloat16 ? TableType::bfloat16 : dtype == kFloat16 ? TableType::float16 : TableType::float32;
 }
+
+// The view of a tensor. If torch gives none (tensor_view.h), its shape, strides and dtype come from Python attributes.
+struct Look : TensorView {
+  bool is_viewed = false;
+  std::vector<int64_t> sizes;
+
+  bool look(PyObject* tensor) {
+    is_viewed = TensorView::look(tensor);
+    if (is_viewed) return true;
+    const py::handle object(tensor);
+    if (!py::hasattr(object, "stride") || !py::hasattr(object, "dtype")) return false;
+    sizes = py::cast<std::vector<int64_t>>(object.attr("shape"));
+    dimensions = static_cast<int32_t>(sizes.size());
+    const auto steps = py::cast<std::vector<int64_t>>(object.attr("stride")());
+    sizes.insert(sizes.end(), steps.begin(), steps.end());
+    shape = sizes.data();
+    strides = shape + dimensions;
+    const py::object dtype = object.attr("dtype");
+    const auto is = [&dtype](const char* name) { return dtype.ptr() == dtypes().at(name); };
+    code = is("bfloat16") ? 4 : is("float16") || is("float32") ? 2 : UINT8_MAX;
+    bits = is("float32") ? 32 : 16;
+    return true;
+  }
+};
 
 // A program with the facts that its calls need: the shapes and types of the results, and the sizes of parameters.
 class ProgramCall {
@@ -112,20 +135,12 @@ class ProgramCall {
     PyObject *const offsets = PyTuple_GET_ITEM(tuple, first + 2), *const ray_index = PyTuple_GET_ITEM(tuple, first + 4);
     const size_t count = size(inputs), parameter_count = size(parameters);
     if (parameter_count != sizes_.size() || count == 0) return false;
-    static const py::handle op = py::str("network").release();
-    static const Letters letters;
-    Common common(op, letters);  // holds the shapes of tensors without a view
-    const auto look = [&common, viewed](PyObject* tensor, TensorView& view) {
-      if (viewed) return view.look(tensor);
-      common.look("tensor", tensor, view);
-      return true;
-    };
-    std::vector<TensorView> views(count);
+    std::vector<Look> views(count);
     for (size_t i = 0; i < count; ++i) {
-      if (!look(at(inputs, i), views[i]) || views[i].dimensions != 2) return false;
+      if (!views[i].look(at(inputs, i)) || views[i].dimensions != 2 || (viewed && !views[i].is_viewed)) return false;
     }
-    TensorView cells, index;
-    if (!look(offsets, cells) || (ray_index != Py_None && !look(ray_index, index))) return false;
+    Look cells, index;
+    if (!cells.look(offsets) || (ray_index != Py_None && !index.look(ray_index))) return false;
     in.n = ray_index == Py_None ? views[0].shape[0] : index.shape[0];
     in.r = rays_ < 0 ? 0 : views[static_cast<size_t>(rays_)].shape[0];
     in.k = cells.shape[0] - 1;
@@ -149,8 +164,8 @@ class ProgramCall {
       }
     }
     for (size_t i = 0; i < parameter_count; ++i) {
-      TensorView view;
-      if (!look(at(parameters, i), view) || view.dimensions < 1) return false;
+      Look view;
+      if (!view.look(at(parameters, i)) || view.dimensions < 1 || (viewed && !view.is_viewed)) return false;
       const bool table = std::find(tables_.begin(), tables_.end(), i) != tables_.end();
       if (!table && view.dtype() != kFloat32) return false;
       in.parameter_types.push_back(table_type(view.dtype()));
@@ -175,9 +190,8 @@ class ProgramCall {
     void* target = &address;
     return frame.load(any(), tensor, target);
   }
-  static bool load_any(Frame& frame, PyObject* tensor, const TensorView& view, void*& address) {
-    const bool is_viewed = view.mask == 0;
-    return is_viewed ? frame.load_view(any(), tensor, view, address) : load_any(frame, tensor, address);
+  static bool load_any(Frame& frame, PyObject* tensor, const Look& view, void*& address) {
+    return view.is_viewed ? frame.load_view(any(), tensor, view, address) : load_any(frame, tensor, address);
   }
   static py::object fast(PyObject* sequence) {
     return py::reinterpret_steal<py::object>(PySequence_Fast(sequence, "a program takes lists"));
