@@ -41,6 +41,8 @@ class Recorder:
 
     def __getattr__(self, name: str) -> Any:
         entry = getattr(self._compiled, name)
+        if name == "ProgramCall":
+            return self._make_program_call
         if isinstance(entry, type) or not callable(entry) or not hasattr(self._kernels, name):
             return entry
 
@@ -58,17 +60,24 @@ class Recorder:
 
         return call
 
+    def _make_program_call(self, *arguments: Any) -> Any:
+        packed = [as_data(argument, {}, self.plans) for argument in arguments[:-1]]
+        made = self._compiled.ProgramCall(*arguments)
+        self.plans[id(made)] = made, ("plan", "ProgramCall", (), [*packed, None])  # results are never on huge pages
+        return made
+
 
 def as_data(value: Any, tensors: dict[int, tuple[int, Tensor]], plans: dict[int, tuple[Any, Any]]) -> Any:
     if id(value) in plans:
         return plans[id(value)][1]
     if isinstance(value, Tensor):
-        return "array", tensors.setdefault(id(value), (len(tensors), value))[0]
+        return "array", tensors.setdefault(id(value), (len(tensors), value))[0], str(value.dtype).removeprefix("torch.")
     if hasattr(value, "_fields"):
         fields = [as_data(part, tensors, plans) for part in value]
         return "struct", type(value).__name__, value._fields, fields
     if isinstance(value, (list, tuple)):
-        return [as_data(part, tensors, plans) for part in value]
+        parts = [as_data(part, tensors, plans) for part in value]
+        return parts if isinstance(value, list) else ("tuple", parts)
     assert value is None or isinstance(value, (bool, int, float, str)), value
     return value
 

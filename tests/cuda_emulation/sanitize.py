@@ -15,7 +15,7 @@ import numpy as np
 from emulation_build import load
 
 RANDOM = np.random.default_rng(0)
-DTYPES = {name: name for name in ("float32", "float64", "int32", "int64", "uint8", "bool")}
+DTYPES = {name: name for name in ("float16", "bfloat16", "float32", "float64", "int32", "int64", "uint8", "bool")}
 LEAST, MOST = -(2**31), 2**31 - 1
 
 
@@ -24,6 +24,13 @@ class Memory:
 
     def __init__(self, array):
         self.array, self.dtype = array.copy(), DTYPES.get(array.dtype.name)
+
+    @property
+    def shape(self):
+        return list(self.array.shape)
+
+    def stride(self):
+        return [step // self.array.itemsize for step in self.array.strides]
 
     def contiguous(self):
         return self
@@ -45,7 +52,11 @@ def argument(module, value, memory):
     if not isinstance(value, tuple):
         return value
     if value[0] == "array":
-        return memory[value[1]]
+        tensor = memory[value[1]]
+        tensor.dtype = DTYPES.get(value[2], tensor.dtype)
+        return tensor
+    if value[0] == "tuple":
+        return tuple(argument(module, part, memory) for part in value[1])
     return getattr(module, value[1])(*(argument(module, part, memory) for part in value[3]))
 
 

@@ -5,7 +5,7 @@ n samples, k cells, m centres of all diagrams together, g diagrams.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -149,18 +149,45 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
         if cells is None:
             assert self.centres is not None
             coords = positions[:, :3] if self.coords is None else self.coords
-            if self.child_offsets is not None and self.child is not None:
-                tree = self.child_offsets, self.child
-                cells = locate_cell(coords, self.centres, *tree, depth=self.depth, backend=backend)
+            coords, centres = to_common_dtype(coords, self.centres)
+            index = self.centre_index if centres is self.centres else None
+            tree = self.child_offsets, self.child, self.depth
+            if self.rows is not None and _on_cuda(coords, backend):
+                cells = _find_valid(coords, centres, tree, self.rows, index)
+                return Sorted(cells, *cell_sort(cells, k, backend=backend))
+            if tree[0] is not None and tree[1] is not None:
+                cells = locate_cell(coords, centres, tree[0], tree[1], depth=self.depth, backend=backend)
             else:
-                coords, centres = to_common_dtype(coords, self.centres)
-                index = self.centre_index if centres is self.centres else None
                 cells = nearest_centre(coords, centres, index=index, backend=backend)
         if self.rows is None:
             return Sorted(cells, *cell_sort(cells, k, backend=backend))
         valid = torch.arange(cells.shape[0], device=cells.device) < self.rows
         order, offsets = cell_sort(torch.where(valid, cells, k), k + 1, backend=backend)
         return Sorted(torch.where(valid, cells, -1), order, offsets[:-1])
+
+
+def _on_cuda(coords: Tensor, backend: str) -> bool:
+    """Returns whether compiled CUDA kernels find the cells."""
+    native = backends.compiled()
+    if native is None or not native.on_cuda(coords):
+        return False
+    return backends.chosen("nearest_centre", coords.device, coords.dtype, backend=backend) == "native"
+
+
+def _find_valid(coords: Tensor, centres: Tensor, tree: Any, rows: Tensor, index: Tensor | None) -> Tensor:
+    """Returns the cells on CUDA, without further launches for invalid rows: -1 for the rows after the first ``rows``.
+
+    ``cell_sort`` on CUDA leaves rows of cell -1 outside all cells.
+    """
+    from voronerf.ops.locate_cell import native as trees
+    from voronerf.ops.nearest_centre import native as diagrams
+
+    cells = coords.new_empty(coords.shape[0], dtype=torch.int32)
+    if tree[0] is None:
+        diagrams.find(cells, coords, centres, rows, index)
+    else:
+        trees.find(cells, coords, centres, tree, "locate_cell", rows)
+    return cells
 
 
 def _one_cell(positions: Tensor, rows: Tensor | None) -> Sorted:
