@@ -48,7 +48,7 @@ from voronerf.ops._core.derivatives import register_derivatives
 from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.program import FUNCTIONS, HASH, PARAMETER, VALUE, Columns, Program, Step, pruned
 from voronerf.ops.grouped_linear.activation import one_layer
-from voronerf.ops.network.arguments import Arguments
+from voronerf.ops.network import Names, Network
 from voronerf.ops.network.reference import Run, cells_of
 from voronerf.ops.network.reference import network as in_torch
 
@@ -489,9 +489,9 @@ def _padded(x: Tensor, start: int = 0) -> Tensor:
     return F.pad(x, (start % WIDTH, -(start + x.shape[-1]) % WIDTH))
 
 
-def network(arguments: Arguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
-    """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``."""
-    return in_torch(arguments, offsets, order, _run)
+def network(*arguments: Any) -> list[Tensor]:
+    """Runs a network on the rows of each cell; see ``voronerf.ops.network.Network``."""
+    return in_torch(*arguments, run=_run)
 
 
 def grouped_linear(
@@ -502,4 +502,5 @@ def grouped_linear(
     if torch.is_autocast_enabled(kind) and dtype != torch.float64:
         dtype = torch.get_autocast_dtype(kind)
     parameters, program = [weight] if bias is None else [weight, bias], one_layer(weight, bias, activation)
-    return network(Arguments(program, [x], parameters, None, dtype, "grouped_linear", ""), offsets, None)[0]
+    layer = Network(program, parameters, names=Names("grouped_linear"))
+    return network(layer, [x], None, offsets, None, dtype)[0]

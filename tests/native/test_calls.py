@@ -44,10 +44,7 @@ def results(name, arguments):
     """Returns an op's results, its arguments (the op may write into them), and the gradients of the arguments."""
     result = getattr(ops, CASES[name].call or name)(**arguments, backend="native")
     leaves = [leaf for leaf in tree_leaves((result, arguments)) if isinstance(leaf, Tensor)]
-    if hasattr(result, "raw"):
-        result.backward(result.raw.sum(), torch.ones_like(result.raw))
-        leaves.append(result.raw)
-    elif smooth := [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor) and leaf.requires_grad]:
+    if smooth := [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor) and leaf.requires_grad]:
         torch.autograd.backward([leaf.sum() for leaf in smooth])
     gradients = [leaf.grad for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.grad is not None]
     return [leaf.detach().clone() for leaf in (*leaves, *gradients)]

@@ -25,9 +25,10 @@ from voronerf.ops._core.checks import (
     check_shape,
     check_tensor,
 )
+from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.derivatives import add_gradients
-from voronerf.ops._core.program import Program
-from voronerf.ops.network.arguments import Arguments, among
+from voronerf.ops._core.encodings import ENCODINGS
+from voronerf.ops._core.program import Ahead, Program, encoded_ahead
 from voronerf.ops.network.cells import Cells
 
 OP = backends.declare(
@@ -46,7 +47,7 @@ class Names(NamedTuple):
         op: the name of the op.
         inputs: the name of each input.
         parameters: the name of each parameter.
-        index: the name of the ray index.
+        ray_index: the name of the ray index.
     """
 
     op: str = "Network"
@@ -78,6 +79,8 @@ class Network:
 
     Attributes:
         given: the parameters, as the caller gave them.
+        parameters: [k, ...] each, or [1, ...] for a parameter that all cells share.
+        shared: for each parameter, whether the caller gave it without the dimension of cells.
 
     Raises:
         TypeError: ``program`` is no Program, or ``parameters`` are no list.
@@ -147,15 +150,14 @@ class Network:
         self.check(inputs, cells, ray_index)
         learns = torch.is_grad_enabled()
         leaves = [*inputs, *self.given]
-        wanted, arguments = [learns and tensor.requires_grad for tensor in leaves], self.arguments(inputs, ray_index)
-        place: dict[str, Any] = {"device": inputs[0].device, "dtype": arguments.dtype}
-        plain = arguments.dtype is torch.float32 and all(leaf.dtype is torch.float32 for leaf in leaves)
-        if plain and backends.chosen(OP, backend=backend, **place) == "native":
+        wanted, dtype = [learns and tensor.requires_grad for tensor in leaves], self.dtype(inputs)
+        plain = dtype is torch.float32 and all(leaf.dtype is torch.float32 for leaf in leaves)
+        if plain and backends.chosen(OP, inputs[0].device, dtype, backend=backend) == "native":
             from voronerf.ops.network.native import Run
 
             with torch.no_grad():
                 rows = cells.sort(inputs[0], self.count(cells), backend)
-                results, run = Run.of(arguments, rows.offsets, rows.order).forward(any(wanted))
+                results, run = Run.of(self, inputs, ray_index, rows.offsets, rows.order, dtype).forward(any(wanted))
             return results, Tape(results, rows.cells, cells.frozen, leaves, wanted, run)
         own = [leaf.detach().requires_grad_(want) for leaf, want in zip(leaves, wanted)]  # leaves without hooks
         network = Network(self.program, own[len(inputs) :], names=self.names)
@@ -168,19 +170,42 @@ class Network:
         self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None = None, backend: str = "auto"
     ) -> tuple[list[Tensor], Tensor | None]:
         """Evaluates tensors that have been checked; see :meth:`__call__`."""
-        arguments = self.arguments(inputs, ray_index)
-        place: dict[str, Any] = {"device": inputs[0].device, "dtype": arguments.dtype}
-        run = backends.resolve(OP, backend=backend, **place)
+        dtype = self.dtype(inputs)
+        run = backends.resolve(OP, backend=backend, device=inputs[0].device, dtype=dtype)
         rows = cells.sort(inputs[0], self.count(cells), backend)
-        results: list[Tensor] = run(arguments, rows.offsets, rows.order)
+        network, tensors = self.encoded(inputs, dtype)
+        results: list[Tensor] = run(network, tensors, ray_index, rows.offsets, rows.order, dtype)
         if cells.frozen is not None and rows.cells is not None:
             held = frozen_rows(cells.frozen, rows.cells)
             results = [stop_gradients(out, held) for out in results]
         return results, rows.cells
 
-    def arguments(self, inputs: Sequence[Tensor], ray_index: Tensor | None) -> Arguments:
-        """Returns the arguments of the implementations."""
-        return Arguments.of(self.program, inputs, self.parameters, ray_index, self.names.op, self.names.ray_index)
+    def dtype(self, inputs: Sequence[Tensor]) -> torch.dtype:
+        """Returns the dtype of the results: the layers' dtype, or autocast's; without layers, the first input's.
+
+        With float16 and bfloat16, operands of products may be rounded; all other values are float32 at least.
+        """
+        first, kind = self.program.first_layer, inputs[0].device.type
+        if first < 0:
+            return inputs[0].dtype
+        dtype = self.parameters[first].dtype
+        if dtype is not torch.float64 and torch.is_autocast_enabled(kind):
+            return torch.get_autocast_dtype(kind)
+        return dtype
+
+    def encoded(self, inputs: Sequence[Tensor], dtype: torch.dtype) -> tuple[Network, Sequence[Tensor]]:
+        """Encodes float64 inputs in float64, for results of another dtype.
+
+        Returns the network that reads the encodings, and its inputs.
+        """
+        wide = tuple([x.dtype is torch.float64 for x in inputs])
+        if True not in wide or dtype is torch.float64:
+            return self, inputs
+        program, ahead = _encoded_ahead(self.program.text, wide)
+        further = []
+        for i, start, width, name, size in ahead:
+            further.append(ENCODINGS[name].formula(inputs[i][:, start : start + width], size))
+        return Network(program, self.parameters, names=self.names), [*inputs, *further]
 
     def count(self, cells: Cells) -> int:
         """Returns the number of cells k."""
@@ -221,6 +246,16 @@ class Network:
         if cells.offsets is None and (program.sums or program.by_ray or among(0, program.rays)):
             raise ValueError(f"{op}: program must have outputs [n, w], and inputs[0] with one row for each sample")
         cells.check(op, inputs[0], sizes)
+
+
+@constant_result
+def _encoded_ahead(text: str, wide: tuple[bool, ...]) -> tuple[Program, tuple[Ahead, ...]]:
+    return encoded_ahead(Program.parse(text), wide)
+
+
+def among(i: int, numbers: Sequence[int]) -> bool:
+    """Returns whether a number is in a list; ``in`` fails if torch.compile makes the list's numbers symbolic."""
+    return any(i == number for number in numbers)
 
 
 def _check_list(op: str, name: str, tensors: Any, count: int) -> None:

@@ -21,7 +21,7 @@ from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import needed_gradients
 from voronerf.ops._core.program import Program, gradient, gradient_reaches
 from voronerf.ops._core.rows import new_empty, rows_of
-from voronerf.ops.network.arguments import Arguments, among
+from voronerf.ops.network import Network, among
 from voronerf.ops.network.lowering import Lowered, compiled_runs, lower
 from voronerf.ops.network.reference import evaluate
 
@@ -63,16 +63,22 @@ class Run(NamedTuple):
     gradients: int = -1
 
     @staticmethod
-    def of(arguments: Arguments, offsets: Tensor, order: Tensor | None) -> Run:
-        """Returns the run of a program on rows with offsets [k + 1], and perhaps an order; casts the tensors.
+    def of(
+        network: Network,
+        inputs: Sequence[Tensor],
+        ray_index: Tensor | None,
+        offsets: Tensor,
+        order: Tensor | None,
+        dtype: torch.dtype,
+    ) -> Run:
+        """Returns the run of a network on rows with offsets [k + 1], and perhaps an order; casts the tensors.
 
         If all inputs and the results are bfloat16, they are read and written without casts. Otherwise inputs are cast
         to float32. Parameters are always cast to float32; a cell has few of them. If the results are bfloat16, products
         take bfloat16 operands on processors that multiply them faster (AVX512-BF16, AMX), and float32 operands
         elsewhere. Sums are always float32.
         """
-        program, inputs, parameters, ray_index, dtype, op, index_name = arguments
-        products = "float32"
+        program, parameters, names, products = network.program, network.parameters, network.names, "float32"
         if dtype is not torch.float32 or program.tables:
             products = PRODUCTS.get(dtype, "float32")
             parameters = [
@@ -82,7 +88,8 @@ class Run(NamedTuple):
         stored = dtype is torch.bfloat16 and not program.tables and all(x.dtype is dtype for x in inputs)
         if not stored:  # hash grids take positions in float32
             inputs = [x if x.dtype is torch.float32 else x.float() for x in inputs]
-        return Run(inputs, parameters, offsets, order, ray_index, (), program.text, op, index_name, products)
+        text, op, index_name = program.text, names.op, names.ray_index
+        return Run(inputs, parameters, offsets, order, ray_index, (), text, op, index_name, products)
 
     def results(self) -> list[Tensor]:
         """Returns the outputs and sums, with gradients of every order."""
@@ -142,10 +149,17 @@ class Run(NamedTuple):
         return results
 
 
-def network(arguments: Arguments, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
-    """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``."""
-    dtype = arguments.dtype
-    return [out if out.dtype is dtype else out.to(dtype) for out in Run.of(arguments, offsets, order).results()]
+def network(
+    network: Network,
+    inputs: Sequence[Tensor],
+    ray_index: Tensor | None,
+    offsets: Tensor,
+    order: Tensor | None,
+    dtype: torch.dtype,
+) -> list[Tensor]:
+    """Runs a network on the rows of each cell; see ``voronerf.ops.network.Network``."""
+    results = Run.of(network, inputs, ray_index, offsets, order, dtype).results()
+    return [out if out.dtype is dtype else out.to(dtype) for out in results]
 
 
 class _Gradient(NamedTuple):

@@ -16,22 +16,27 @@ from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.program import BINARY, FUNCTIONS, PARAMETER, VALUE, Columns, Program, Step
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
 from voronerf.ops.hash_encode.reference import interpolate
-from voronerf.ops.network.arguments import Arguments
+from voronerf.ops.network import Network
 
 
 def network(
-    arguments: Arguments, offsets: Tensor, order: Tensor | None, run: Callable[..., Run] | None = None
+    network: Network,
+    inputs: Sequence[Tensor],
+    ray_index: Tensor | None,
+    offsets: Tensor,
+    order: Tensor | None,
+    dtype: torch.dtype,
+    run: Callable[..., Run] | None = None,
 ) -> list[Tensor]:
-    """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``.
+    """Runs a network on the rows of each cell; see ``voronerf.ops.network.Network``.
 
     With half types, the operands and results of products are rounded. ``run`` replaces the class `Run`.
     """
-    check_rows(arguments, offsets, order)
-    program, inputs, parameters, ray_index, dtype, *_ = arguments
+    _check_rows(network, inputs, ray_index, offsets, order)
     wide = torch.promote_types(dtype, torch.float32)
     with torch.autocast(offsets.device.type, enabled=False):
-        cast = [x.to(wide) for x in inputs], [p.to(wide) for p in parameters]
-        results = evaluate(*cast, offsets, order, ray_index, program, dtype, run)
+        cast = [x.to(wide) for x in inputs], [p.to(wide) for p in network.parameters]
+        results = evaluate(*cast, offsets, order, ray_index, network.program, dtype, run)
     return [result.to(dtype) for result in results]
 
 
@@ -77,20 +82,22 @@ def _grid(text: str) -> HashGrid:
     return grid
 
 
-def check_rows(arguments: Arguments, offsets: Tensor, order: Tensor | None) -> None:
+def _check_rows(
+    network: Network, inputs: Sequence[Tensor], index: Tensor | None, offsets: Tensor, order: Tensor | None
+) -> None:
     """Raises ValueError if offsets, an order or a ray index on the CPU are out of range."""
     if offsets.device.type != "cpu" or torch.compiler.is_compiling():
         return
-    index, n = arguments.ray_index, len(arguments.inputs[0] if arguments.ray_index is None else arguments.ray_index)
-    check_offsets(arguments.op, offsets, n)
+    n, names = len(inputs[0] if index is None else index), network.names
+    check_offsets(names.op, offsets, n)
     if order is not None:
-        check_range(arguments.op, "order", order, n)
+        check_range(names.op, "order", order, n)
     if index is not None and len(index):
-        last = len(arguments.inputs[arguments.program.rays[0]]) - 1
+        last = len(inputs[network.program.rays[0]]) - 1
         low, high = (int(bound) for bound in index.aminmax())
         if low < 0 or high > last:
             wrong = low if low < 0 else high
-            raise ValueError(f"{arguments.op}: {arguments.index_name} must be 0 to {last}, got {wrong}")
+            raise ValueError(f"{names.op}: {names.ray_index} must be 0 to {last}, got {wrong}")
 
 
 class Run:

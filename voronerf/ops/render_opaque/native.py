@@ -45,7 +45,7 @@ def render_opaque(*flat: Any) -> RenderedRays:
         composed: RenderedRays = partial(reference.render_opaque, backend="native")(*arguments)
         return composed
     offsets = torch.zeros(k + 1, dtype=torch.int32)
-    run = Run.of(network.arguments(inputs, none if rays else None), offsets, None)
+    run = Run.of(network, inputs, none if rays else None, offsets, None, torch.float32)
     lowered = lower(run.text)
     if k == 1:
         cells, centres, index = Cells(), None, None
