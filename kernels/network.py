@@ -42,13 +42,14 @@ from voronerf.kernels.frequency_encode import frequency_encode
 from voronerf.kernels.hash_encode import hash_encode
 from voronerf.kernels.render_loss import sigmoid, softplus
 from voronerf.kernels.spherical_harmonics import spherical_harmonics
+from voronerf.ops._core.checks import dtype_under_autocast
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import register_derivatives
 from voronerf.ops._core.encodings import ENCODINGS
-from voronerf.ops._core.program import FUNCTIONS, HASH, PARAMETER, VALUE, Columns, Program, Step, pruned
+from voronerf.ops._core.program import FUNCTIONS, HASH, PARAMETER, VALUE, Columns, Names, Program, Step, pruned
 from voronerf.ops.grouped_linear.activation import one_layer
-from voronerf.ops.network import Names, Network
+from voronerf.ops.network.cells import Sorted
 from voronerf.ops.network.reference import Run, cells_of
 from voronerf.ops.network.reference import network as in_torch
 
@@ -490,7 +491,7 @@ def _padded(x: Tensor, start: int = 0) -> Tensor:
 
 
 def network(*arguments: Any) -> list[Tensor]:
-    """Runs a network on the rows of each cell; see ``voronerf.ops.network.Network``."""
+    """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``."""
     return in_torch(*arguments, run=_run)
 
 
@@ -498,9 +499,7 @@ def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
     """Runs a program of one layer; see ``voronerf.ops.grouped_linear``."""
-    kind, dtype = x.device.type, x.dtype
-    if torch.is_autocast_enabled(kind) and dtype != torch.float64:
-        dtype = torch.get_autocast_dtype(kind)
+    dtype = dtype_under_autocast(x.dtype, x)
     parameters, program = [weight] if bias is None else [weight, bias], one_layer(weight, bias, activation)
-    layer = Network(program, parameters, names=Names("grouped_linear"))
-    return network(layer, [x], None, offsets, None, dtype)[0]
+    rows = Sorted(None, None, offsets)
+    return network(program, parameters, Names("grouped_linear"), [x], None, rows, dtype)[0]

@@ -69,50 +69,53 @@ class ProgramCall {
     function_ = &function;
   }
 
-  // Runs the program on `tensors`: inputs, parameters, offsets, order, ray_index and the look-ups (the features from
-  // hash grids) that an earlier call kept. `gradients` is the index of the first input that is a gradient, or -1.
-  // `caller` and `ray_name` are the names of the op and of its argument for errors. Returns the outputs, the sums over
-  // rows and, if `keep`, the look-ups. Returns None if Python has to make the call: during a recording, for unsupported
-  // tensors and, if `asked`, while torch has to see the call (Questions::has_listeners).
-  py::object call(const py::tuple& tensors, bool keep, int64_t gradients, const char* caller, const char* ray_name,
-                  bool asked) const {
-    if (recording() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
+  // Runs the program on a Run (voronerf/ops/network/native.py). Returns the outputs, the sums over rows and, if the run
+  // keeps them, the look-ups (the features from hash grids). Returns None if Python has to make the call: during a
+  // recording, for unsupported tensors and, if `asked`, while torch has to see the call (Questions::has_listeners).
+  py::object call(const py::tuple& given, bool asked) const {
+    PyObject* const tuple = given.ptr();
+    if (recording() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here() ||
+        !has_entries(tuple, 12)) {
       return py::none();
     }
+    const bool keep = PyTuple_GET_ITEM(tuple, 10) == Py_True;
     if (asked && questions.has_listeners()) return py::none();
     TensorView offsets;
-    if (!offsets.look(PyTuple_GET_ITEM(tensors.ptr(), 2)) || !offsets.on_cpu()) return py::none();
+    if (!offsets.look(PyTuple_GET_ITEM(tuple, 2)) || !offsets.on_cpu()) return py::none();
     Loaded loaded{function_, bound_, {}, {}};
     Frame& frame = loaded.frame;
     loaded.values.place(type_of<Program>()) = PyCapsule_GetPointer(program_.ptr(), "Program");
     auto& in = *static_cast<ProgramInputs*>(loaded.values.place(type_of<ProgramInputs>()));
     auto& out = *static_cast<ProgramResults*>(loaded.values.place(type_of<ProgramResults>()));
     *static_cast<Cpu*>(loaded.values.place(type_of<Cpu>())) = questions.cpu();
-    if (!load(frame, tensors.ptr(), 0, in, true)) return py::none();
-    const py::object kept = fast(PyTuple_GET_ITEM(tensors.ptr(), 5));
-    in.gradients = keep && !kept_.empty() ? -1 : gradients;  // look-ups are kept for all rows
-    in.caller = caller;
-    in.ray_name = ray_name;
+    if (!load(frame, tuple, 0, in, true)) return py::none();
+    const py::object inputs = fast(PyTuple_GET_ITEM(tuple, 0)), kept = fast(PyTuple_GET_ITEM(tuple, 5));
+    in.gradients = keep && !kept_.empty() ? -1 : PyLong_AsLong(PyTuple_GET_ITEM(tuple, 11));  // all rows are kept
+    in.caller = PyUnicode_AsUTF8(PyTuple_GET_ITEM(tuple, 7));
+    in.ray_name = PyUnicode_AsUTF8(PyTuple_GET_ITEM(tuple, 8));
 
     py::list results;
     const TableType type = in.input_types[0];
+    const auto memory = [&](TableType of, const std::vector<int64_t>& shape) {
+      return address(results, of, shape, of == type ? at(inputs, 0) : nullptr);
+    };
     void** const addresses = frame.array(widths_.size() + sums_.size());
     void** next = addresses;
     for (const auto& [width, by_ray] : widths_) {
       if (by_ray && type != TableType::float32) return py::none();  // per-ray outputs are float32
       out.output_types.push_back(type);
-      *next++ = memory(results, type, {by_ray ? in.r : in.n, width});
+      *next++ = memory(type, {by_ray ? in.r : in.n, width});
     }
     for (const auto& [table, shape] : sums_) {
       const bool shared = table >= 0 && in.strides[static_cast<size_t>(table)] == 0;
       std::vector<int64_t> sizes = {shared ? 1 : in.k};
       sizes.insert(sizes.end(), shape.begin(), shape.end());
-      *next++ = memory(results, TableType::float32, sizes);
+      *next++ = memory(TableType::float32, sizes);
     }
     in.ready = !keep || kept_.empty();
     void** const looked_up = frame.array(kept_.size());
     if (keep) {
-      for (size_t i = 0; i < kept_.size(); ++i) looked_up[i] = memory(results, TableType::float32, {in.n, kept_[i]});
+      for (size_t i = 0; i < kept_.size(); ++i) looked_up[i] = memory(TableType::float32, {in.n, kept_[i]});
     } else {
       for (size_t i = 0; i < size(kept); ++i) {
         TensorView view;
@@ -207,9 +210,10 @@ class ProgramCall {
       return false;
     return view.strides[0] == 1 && (view.shape[1] == 1 || view.strides[1] == view.shape[0]);
   }
-  void* memory(py::list& results, TableType type, const std::vector<int64_t>& shape) const {
+  // Adds a new tensor to the results and returns its address; `like` is null or a tensor of the same type.
+  void* address(py::list& results, TableType type, const std::vector<int64_t>& shape, PyObject* like) const {
     const bool narrow = type == TableType::bfloat16;
-    const auto tensor = questions.new_memory(shape, questions.dtypes.at(narrow ? kBfloat16 : kFloat32));
+    const auto tensor = questions.new_memory(shape, questions.dtypes.at(narrow ? kBfloat16 : kFloat32), like);
     int64_t bytes = narrow ? 2 : 4;
     for (const int64_t length : shape) bytes *= length;
     if (bytes >= large_) on_large_(tensor);

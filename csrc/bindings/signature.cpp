@@ -197,9 +197,9 @@ class Plan {
       shape.push_back(size.function ? py::cast<int64_t>(size.function(given(call, inputs, count)))
                                     : call.common.size(size.size));
     }
-    const py::object& dtype = result.dtype;
-    return questions.new_memory(shape,
-                                dtype.is_none() ? questions.dtypes.at(call.views[result.like].dtype()) : dtype.ptr());
+    PyObject* const of_like = questions.dtypes.at(call.views[result.like].dtype());
+    PyObject* const dtype = result.dtype.is_none() ? of_like : result.dtype.ptr();
+    return questions.new_memory(shape, dtype, dtype == of_like ? call.values[result.like] : nullptr);
   }
 
   // Loads the parameters of the function from their sources.

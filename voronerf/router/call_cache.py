@@ -8,9 +8,7 @@ Letters: n samples, k cells, d coordinates.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import operator
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -18,7 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.ops._core import backends
-from voronerf.ops.network import Names, Network
+from voronerf.ops._core.checks import dtype_under_autocast
+from voronerf.ops._core.program import Names
+from voronerf.ops._core.unchanged import Stale
+from voronerf.ops.network import Network
 from voronerf.router.arrange import find_positions
 from voronerf.router.fused import HALF, Fused, WholeProgram
 from voronerf.router.grouping import Grouping
@@ -26,7 +27,7 @@ from voronerf.router.labels import Labels
 from voronerf.router.layout import SAMPLE, Call, rebuild, tensors_of
 from voronerf.router.watch import Watch, module_dependencies
 
-_NAMES, _NOTHING = Names("VoronoiRouter"), contextlib.nullcontext()
+_NAMES = Names("VoronoiRouter")
 _VALUES = {type(None), bool, int, float, str}
 
 
@@ -37,24 +38,20 @@ def call_key(method: str, training: bool, args: Sequence[Any], kwargs: dict[str,
     or an argument that is neither a plain tensor nor a number, text, bool or None.
     """
     key: list[Any] = [method, training, torch.is_grad_enabled(), coords is None, *kwargs]
-    device, values = None, (*args, *kwargs.values()) if kwargs else args
+    tensor, values = None, (*args, *kwargs.values()) if kwargs else args
     if coords is not None:
         values = (*values, coords.cells if type(coords) is Labels else coords)
     for value in values:
         value_type = type(value)
         plain = value_type is Tensor or value_type is nn.Parameter
         if plain or (isinstance(value, Tensor) and torch.compiler.is_exporting()):
-            device = value.device
-            key += (value.shape[1:], value.dtype, device, value.layout, value.requires_grad)
+            tensor = value
+            key += (value.shape[1:], value.dtype, value.device, value.layout, value.requires_grad)
         elif value_type in _VALUES:
             key += (value_type, value)
         else:
             return None
-    if device is None:
-        return None
-    if torch.is_autocast_enabled(device.type):
-        key.append(torch.get_autocast_dtype(device.type))
-    return tuple(key)
+    return None if tensor is None else (*key, dtype_under_autocast(torch.float32, tensor))
 
 
 class CachedCall:
@@ -86,9 +83,9 @@ class CachedCall:
         self._tails = None if is_flat else [shape[ones:] for shape, _ in results]
         dtypes = [dtype if half and dtype in HALF else torch.float32 for _, dtype in results]
         self._dtypes = None if {*dtypes} == {torch.float32} else dtypes
-        self._parameters, self._program, self._is_compilable = fused.parameters, program, not fused.computes
+        self._fused, self._program, self._is_compilable = fused, program, not fused.computes
         fused.parameters(grouping.k, device, grouping.backend)  # fills a cached property, which torch.compile cannot
-        self._autocast, self._network = torch.is_autocast_enabled(device.type), cast("Network | None", None)
+        self._made = cast("tuple[Any, Network | None]", (Stale(), None))  # the last network, and its dependencies
 
     @staticmethod
     def of(fused: Fused, watch: Watch, most: int, call: Call, grouping: Grouping) -> CachedCall | None:
@@ -106,40 +103,46 @@ class CachedCall:
             return None
         return CachedCall(fused, program, most, call, grouping, watch.note(module_dependencies(call.module)))
 
-    def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None) -> Any:
-        """Returns the results of a call of a router; None if this call cannot run in the cached form."""
+    def run(
+        self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None, compiles: bool
+    ) -> Any:
+        """Returns the results of a call of a router; None if this call cannot run in the cached form.
+
+        ``compiles`` tells whether torch's compiler traces the call.
+        """
         arguments = (*args, *kwargs.values()) if kwargs else args
-        positions, k = find_positions(router, args, kwargs, coords), router.num_cells
+        positions = find_positions(router, args, kwargs, coords)
         lead = positions.shape[:-1]
         n = lead[0] if len(lead) == 1 else math.prod(lead)
-        if not self._fits(router, arguments, lead, n):
+        if not self._fits(router, arguments, lead, n, compiles):
             return None
         rows = [self._rows(arguments[i], n) for i in self._reads]
-        network = self._network_of(self._parameters(k, rows[0].device, router.backend))
-        with torch.autocast(rows[0].device.type, enabled=False) if self._autocast else _NOTHING:
-            results, _ = network.run(rows, router.places(positions, self._method), backend="native")
+        network = self._network(router, rows[0].device, compiles)
+        places = router.places(positions, self._method)
+        results, _ = network.run(rows, places, backend="native", dtype=torch.float32)  # rounded below under autocast
         if self._tails is not None:
             results = [out.reshape(*lead, *tail) for out, tail in zip(results, self._tails)]
         if self._dtypes is not None:
             results = [out.to(dtype) for out, dtype in zip(results, self._dtypes)]
         return rebuild(self._result, results)
 
-    def _network_of(self, parameters: list[Tensor]) -> Network:
-        """Returns the network of parameters, which is made again only for other parameters than in the last call."""
-        network = self._network
-        if network is None or torch.compiler.is_compiling() or not all(map(operator.is_, parameters, network.given)):
+    def _network(self, router: Any, device: torch.device, compiles: bool) -> Network:
+        """Returns the network, which is made again only for other parameters than in the last call."""
+        same, network = self._made
+        if compiles or network is None or not same.holds():
+            parameters = self._fused.parameters(router.num_cells, device, router.backend)
             network = Network(self._program, parameters, names=_NAMES)
-            if not torch.compiler.is_compiling():
-                self._network = network
+            if not compiles:
+                self._made = self._fused.same_parameters(), network
         return network
 
-    def _fits(self, router: Any, arguments: tuple[Any, ...], lead: torch.Size, n: int) -> bool:
+    def _fits(self, router: Any, arguments: tuple[Any, ...], lead: torch.Size, n: int, compiles: bool) -> bool:
         """Returns whether a call with leading dimensions ``lead`` of n samples can run in the cached form."""
         if len(lead) != self._leading or not 0 < n <= self._most:
             return False
         if self._learns and router.frozen_cells is not None:  # samples of frozen cells need no backward pass
             return False
-        if compiles := torch.compiler.is_compiling():
+        if compiles:
             drawn = router.assignment == "stochastic" and router.training
             if drawn or router.methods or not self._is_compilable:
                 return False

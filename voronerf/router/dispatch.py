@@ -209,10 +209,10 @@ class Dispatch:
             self._subclasses.add(key)
         return plain
 
-    def find(self, key: Any) -> CachedCall | None:
+    def find(self, key: Any, compiles: bool) -> CachedCall | None:
         """Returns the cached call of a key; None if its dependencies have changed (not asked during compilation)."""
         cached = self.cached.get(key)
-        if cached is None or torch.compiler.is_compiling():
+        if cached is None or compiles:
             return cached
         return cached if not is_intercepted() and cached.dependencies.holds() else None
 

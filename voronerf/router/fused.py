@@ -21,6 +21,7 @@ from torch import Tensor, fx
 from torch.fx.node import map_arg
 
 from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step
+from voronerf.ops._core.unchanged import Stale, unchanged
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.router.axes import SampleCount
 from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable, name_of
@@ -374,6 +375,15 @@ class Fused:
             as_it_is = parameter.dtype is torch.float32 and entries.resolve({entries.of: parameter}) is parameter
             sources.append((owner._parameters, name, None if as_it_is else entries))
         return sources
+
+    def same_parameters(self) -> Any:
+        """Returns dependencies (`voronerf.ops._core.unchanged`): the tensors that :meth:`parameters` returns now."""
+        if self.computes or any(entries is not None for _, _, entries in self._sources):
+            return Stale()
+        same = unchanged()
+        for registry, name, _ in self._sources:
+            same.entries(registry, [name])
+        return same
 
     def parameters(self, k: int, device: torch.device, backend: str) -> list[Tensor]:
         """Returns the float32 parameters of :attr:`whole_program`: the module's own, or computed from them."""

@@ -16,11 +16,11 @@ from torch import Tensor, nn
 
 from voronerf.ops._core.checks import check_shape
 from voronerf.ops._core.layers import MLP
-from voronerf.ops._core.program import Builder, Program
+from voronerf.ops._core.program import Builder, Names, Program
 from voronerf.ops._core.tolerances import agree
 from voronerf.ops._core.unchanged import Stale, unchanged
 from voronerf.ops.grouped_program import grouped_program
-from voronerf.ops.network import Names, Network
+from voronerf.ops.network import Network
 from voronerf.router.arrange import find_positions
 from voronerf.router.axes import Axis
 from voronerf.router.double import Double

@@ -723,7 +723,8 @@ class VoronoiRouter(nn.Module):
         """Runs one call of a method. A call that is not in the cache causes a graph break in ``torch.compile``."""
         if cells is not None:
             args, kwargs, coords = with_labels(self, method, args, kwargs, coords, cells)
-        if self._resized and not torch.compiler.is_compiling():
+        compiles = torch.compiler.is_compiling()
+        if self._resized and not compiles:
             self._check_wrapper()
         if method == "forward" and self._field_program is not None:
             results = self._field_program.run(self, args, kwargs, coords)
@@ -733,16 +734,16 @@ class VoronoiRouter(nn.Module):
         if self.fuse:
             module: Any = self._modules["module"]
             key = call_key(method, module.training, args, kwargs, coords)
-            cached = None if key is None else self._dispatch.find(key)
-        if cached is not None and (results := cached.run(self, args, kwargs, coords)) is not None:
+            cached = None if key is None else self._dispatch.find(key, compiles)
+        if cached is not None and (results := cached.run(self, args, kwargs, coords, compiles)) is not None:
             return results
         if torch.compiler.is_exporting():
             raise RuntimeError(
                 f"VoronoiRouter: torch.export needs a {method} that is fused whole and has run once; make the router "
                 f"with fuse=True, and call it beforehand, with gradients on or off as in the export; {self.explain()}"
             )
-        compiling = torch.compiler.is_compiling() or "torch._dynamo" in sys.modules
-        run = self._route_uncompiled if compiling else self._route_as_it_is
+        uncompiled = compiles or "torch._dynamo" in sys.modules
+        run = self._route_uncompiled if uncompiled else self._route_as_it_is
         return run(method, args, kwargs, coords)
 
     def _check_wrapper(self) -> None:

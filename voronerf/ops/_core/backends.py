@@ -134,7 +134,7 @@ def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) 
         ValueError: unknown op or backend.
         BackendUnavailable: the named backend is not available, or does not support this device or dtype.
     """
-    return _FUNCTIONS[op, _choose(op, backend, device.type, device.index, dtype)]
+    return _FUNCTIONS[op, _choose(op, backend, device, dtype)]
 
 
 def resolve_composed(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
@@ -143,7 +143,7 @@ def resolve_composed(op: str, *, backend: str, device: torch.device, dtype: torc
     The reference receives "auto" if "auto" falls back to the reference, so that the choice is made for each inner op.
     It receives the named backend if that backend's implementation is ``PLAIN``, so that the inner ops run there.
     """
-    return function(op, _choose(op, backend, device.type, device.index, dtype), backend, composed=True)
+    return function(op, _choose(op, backend, device, dtype), backend, composed=True)
 
 
 def function(op: str, name: str, backend: str, composed: bool) -> Callable[..., Any]:
@@ -167,7 +167,7 @@ def folder(op: str) -> str:
 
 def chosen(op: str, device: torch.device, dtype: torch.dtype, *, backend: str = "auto") -> str:
     """Returns the name of the implementation that :func:`resolve` returns, with the same arguments and errors."""
-    return _choose(op, backend, device.type, device.index, dtype)
+    return _choose(op, backend, device, dtype)
 
 
 def why_not(op: str, backend: str, device: torch.device, dtype: torch.dtype | None = None) -> str | None:
@@ -343,10 +343,15 @@ def _describe(module: str) -> dict[str, Any]:
 
 # torch.compile calls this while tracing and treats the result as a constant. The look-up in _FUNCTIONS can be traced.
 @constant_result
-def _choose(op: str, backend: str, device: str, index: int | None, dtype: torch.dtype) -> str:
+def _choose(op: str, backend: str, device: torch.device, dtype: torch.dtype) -> str:
     if not isinstance(backend, str):  # an unhashable backend, such as a list, cannot be a cache key
         raise ValueError(f"{op}: backend must be one of {_choices(('auto', *BACKENDS))}, got {backend!r:.60}")
-    return _choose_once(op, backend, device, index, dtype)
+    return _choose_once(op, backend, *_kind(device), dtype)
+
+
+@functools.cache  # reading the type makes a new text, which takes longer than all the rest of a choice
+def _kind(device: torch.device) -> tuple[str, int | None]:
+    return device.type, device.index
 
 
 @functools.cache

@@ -52,6 +52,14 @@ def to_common_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
     return points.detach().to(dtype), centres.detach().to(dtype)
 
 
+def dtype_under_autocast(dtype: torch.dtype, tensor: Tensor) -> torch.dtype:
+    """Returns the dtype in which layers of a dtype run: autocast's on the device of a tensor, except for float64."""
+    kind = "cpu" if tensor.is_cpu else tensor.device.type  # `type` makes a new text, which takes longer than the rest
+    if torch.is_autocast_enabled(kind) and dtype is not torch.float64:
+        return torch.get_autocast_dtype(kind)
+    return dtype
+
+
 def facts(op: str, name: str, tensor: Any) -> tuple[Any, ...]:
     """Returns the shape, strides and dtype of a dense tensor, and the type and index of its device.
 

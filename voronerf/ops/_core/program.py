@@ -181,6 +181,7 @@ class Program:
     orders: int = field(init=False, compare=False)  # the highest order of derivative of a step; see _order
     tables: tuple[int, ...] = field(init=False, compare=False)  # the parameters that are tables of grids
     first_layer: int = field(init=False, compare=False)  # the first parameter that is no table, or -1
+    encodes: bool = field(init=False, compare=False)  # whether a step is an encoding without parameters
     sum_tables: tuple[int | None, ...] = field(init=False, compare=False)  # the table whose gradient each sum is
 
     def __post_init__(self) -> None:
@@ -192,6 +193,8 @@ class Program:
         object.__setattr__(self, "tables", tuple(sorted(read)))
         first = next((i for i in range(len(self.parameters)) if i not in read), -1)
         object.__setattr__(self, "first_layer", first)
+        encodes = any(step.op == "encode" and step.name != HASH for step in self.steps)
+        object.__setattr__(self, "encodes", encodes)
         tables_of_sums = {step.out: int(step.numbers[1]) for step in self.steps if step.op == "scatter"}
         object.__setattr__(self, "sum_tables", tuple(tables_of_sums.get(index) for index in range(len(self.sums))))
 
@@ -214,6 +217,32 @@ class Program:
     def cells_of_sums(self, parameters: Sequence[Tensor], k: int) -> list[int]:
         """Returns the number of cells of each sum: 1 if it is the gradient of a shared table [1, e, f], else k."""
         return [k if table is None else parameters[table].shape[0] for table in self.sum_tables]
+
+
+class Names(NamedTuple):
+    """The names of an op and of its tensors in error messages; by default ``inputs[0]``, ``parameters[0]`` and so on.
+
+    Attributes:
+        op: the name of the op.
+        inputs: the name of each input.
+        parameters: the name of each parameter.
+        ray_index: the name of the ray index.
+    """
+
+    op: str = "Network"
+    inputs: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+    ray_index: str = "ray_index"
+
+    def of(self, kind: str, i: int) -> str:
+        """Returns the name of input or parameter ``i``; ``kind`` is "inputs" or "parameters"."""
+        names: tuple[str, ...] = getattr(self, kind)
+        return names[i] if names else f"{kind}[{i}]"
+
+
+def among(i: int, numbers: Sequence[int]) -> bool:
+    """Returns whether a number is in a list; ``in`` fails if torch.compile makes the list's numbers symbolic."""
+    return any(i == number for number in numbers)
 
 
 _WIDEST = 1 << 20  # the largest number of columns

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from voronerf.ops._core.checks import dtype_under_autocast
 from voronerf.ops.grouped_linear.activation import one_layer
 from voronerf.ops.network.native import PRODUCTS, Run
 
@@ -17,9 +18,7 @@ def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
     """Applies the layer of each sample's cell; see ``voronerf.ops.grouped_linear``."""
-    dtype = x.dtype
-    if torch.is_autocast_enabled(x.device.type) and dtype != torch.float64:
-        dtype = torch.get_autocast_dtype(x.device.type)
+    dtype = dtype_under_autocast(x.dtype, x)
     stored = dtype if dtype == torch.bfloat16 else torch.float32
     rounded = [p.to(dtype).float() for p in (weight, bias) if p is not None]
     text, products = one_layer(weight, bias, activation).text, PRODUCTS.get(dtype, "float32")

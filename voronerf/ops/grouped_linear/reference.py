@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf.ops._core.checks import dtype_under_autocast
 from voronerf.ops.grouped_linear.activation import activate
 
 _PIECE = 1024
@@ -26,9 +27,7 @@ def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
     """Applies the layer of each sample's cell; see ``voronerf.ops.grouped_linear``."""
-    dtype = x.dtype
-    if torch.is_autocast_enabled(x.device.type) and dtype != torch.float64:
-        dtype = torch.get_autocast_dtype(x.device.type)
+    dtype = dtype_under_autocast(x.dtype, x)
     # Operands are rounded to half types but multiplied in float32: torch's float16 products take a minute on a CPU.
     wide = torch.promote_types(dtype, torch.float32)
     x, weight = x.to(dtype).to(wide), weight.to(dtype).to(wide)

@@ -13,8 +13,8 @@ from voronerf.ops._core.checks import check_shape, check_tensor
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
-from voronerf.ops._core.program import Program
-from voronerf.ops.network import OP, Cells, Names, Network
+from voronerf.ops._core.program import Names, Program
+from voronerf.ops.network import OP, Cells, Network
 
 _OP = backends.declare("grouped_mlp", runs=OP)
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from voronerf.ops._core.program import Program
-from voronerf.ops.network import OP, Cells, Names, Network
+from voronerf.ops._core.program import Names, Program
+from voronerf.ops.network import OP, Cells, Network
 
 _NAMES = Names(OP)
 

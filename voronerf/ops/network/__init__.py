@@ -24,11 +24,12 @@ from voronerf.ops._core.checks import (
     check_rules,
     check_shape,
     check_tensor,
+    dtype_under_autocast,
 )
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.derivatives import add_gradients
 from voronerf.ops._core.encodings import ENCODINGS
-from voronerf.ops._core.program import Ahead, Program, encoded_ahead
+from voronerf.ops._core.program import Ahead, Names, Program, among, encoded_ahead
 from voronerf.ops.network.cells import Cells
 
 OP = backends.declare(
@@ -38,27 +39,6 @@ OP = backends.declare(
     reference=Implementation(function="network"),
 )
 """The op whose row in the table of backends all networks share."""
-
-
-class Names(NamedTuple):
-    """The names of an op and of its tensors in error messages; by default ``inputs[0]``, ``parameters[0]`` and so on.
-
-    Attributes:
-        op: the name of the op.
-        inputs: the name of each input.
-        parameters: the name of each parameter.
-        ray_index: the name of the ray index.
-    """
-
-    op: str = "Network"
-    inputs: tuple[str, ...] = ()
-    parameters: tuple[str, ...] = ()
-    ray_index: str = "ray_index"
-
-    def of(self, kind: str, i: int) -> str:
-        """Returns the name of input or parameter ``i``; ``kind`` is "inputs" or "parameters"."""
-        names: tuple[str, ...] = getattr(self, kind)
-        return names[i] if names else f"{kind}[{i}]"
 
 
 _NAMES = Names()
@@ -81,9 +61,11 @@ class Network:
         given: the parameters, as the caller gave them.
         parameters: [k, ...] each, or [1, ...] for a parameter that all cells share.
         shared: for each parameter, whether the caller gave it without the dimension of cells.
+        k: the number of cells, which is 1 if all cells share all parameters.
+        dtype_of_layers: the dtype of all parameters except tables; None without such parameters.
 
     Raises:
-        TypeError: ``program`` is no Program, or ``parameters`` are no list.
+        TypeError: ``program`` is no Program, or ``parameters`` are no list of tensors.
         ValueError: there are not as many parameters as in the program.
 
     Examples:
@@ -107,11 +89,15 @@ class Network:
             raise TypeError(f"{names.op}: program must be a Program, got {type(program).__name__}")
         _check_list(names.op, "parameters", parameters, len(program.parameters))
         self.program, self.names, self.given = program, names, parameters
-        shapes = zip(parameters, program.parameters)
-        self.shared = tuple([isinstance(p, Tensor) and p.dim() == len(shape) for p, shape in shapes])
+        for i in [i for i, p in enumerate(parameters) if not isinstance(p, Tensor)]:
+            check_tensor(names.op, names.of("parameters", i), parameters[i])
+        self.shared = tuple([p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)])
         self.parameters = parameters
         if True in self.shared:
             self.parameters = [p.unsqueeze(0) if alone else p for p, alone in zip(parameters, self.shared)]
+        counts = [p.shape[0] for p in self.parameters if p.dim() and p.shape[0] != 1]
+        self.k, first = counts[0] if counts else 1, program.first_layer
+        self.dtype_of_layers = None if first < 0 else parameters[first].dtype
 
     def __call__(
         self, inputs: Sequence[Tensor], cells: Cells, *, ray_index: Tensor | None = None, backend: str = "auto"
@@ -156,8 +142,9 @@ class Network:
             from voronerf.ops.network.native import Run
 
             with torch.no_grad():
-                rows = cells.sort(inputs[0], self.count(cells), backend)
-                results, run = Run.of(self, inputs, ray_index, rows.offsets, rows.order, dtype).forward(any(wanted))
+                rows = cells.sort(inputs[0], self.k, backend)
+                run = Run.of(self.program, self.parameters, self.names, inputs, ray_index, rows, dtype)
+                results, run = run.forward(any(wanted))
             return results, Tape(results, rows.cells, cells.frozen, leaves, wanted, run)
         own = [leaf.detach().requires_grad_(want) for leaf, want in zip(leaves, wanted)]  # leaves without hooks
         network = Network(self.program, own[len(inputs) :], names=self.names)
@@ -167,14 +154,19 @@ class Network:
         )
 
     def run(
-        self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None = None, backend: str = "auto"
+        self,
+        inputs: Sequence[Tensor],
+        cells: Cells,
+        ray_index: Tensor | None = None,
+        backend: str = "auto",
+        dtype: torch.dtype | None = None,
     ) -> tuple[list[Tensor], Tensor | None]:
-        """Evaluates tensors that have been checked; see :meth:`__call__`."""
-        dtype = self.dtype(inputs)
+        """Evaluates tensors that have been checked; see :meth:`__call__`. By default, :meth:`dtype` is the dtype."""
+        dtype = dtype or self.dtype(inputs)
         run = backends.resolve(OP, backend=backend, device=inputs[0].device, dtype=dtype)
-        rows = cells.sort(inputs[0], self.count(cells), backend)
-        network, tensors = self.encoded(inputs, dtype)
-        results: list[Tensor] = run(network, tensors, ray_index, rows.offsets, rows.order, dtype)
+        rows = cells.sort(inputs[0], self.k, backend)
+        program, tensors = self.encoded(inputs, dtype) if self.program.encodes else (self.program, inputs)
+        results: list[Tensor] = run(program, self.parameters, self.names, tensors, ray_index, rows, dtype)
         if cells.frozen is not None and rows.cells is not None:
             held = frozen_rows(cells.frozen, rows.cells)
             results = [stop_gradients(out, held) for out in results]
@@ -185,36 +177,22 @@ class Network:
 
         With float16 and bfloat16, operands of products may be rounded; all other values are float32 at least.
         """
-        first, kind = self.program.first_layer, inputs[0].device.type
-        if first < 0:
-            return inputs[0].dtype
-        dtype = self.parameters[first].dtype
-        if dtype is not torch.float64 and torch.is_autocast_enabled(kind):
-            return torch.get_autocast_dtype(kind)
-        return dtype
+        dtype, first = self.dtype_of_layers, inputs[0]
+        return first.dtype if dtype is None else dtype_under_autocast(dtype, first)
 
-    def encoded(self, inputs: Sequence[Tensor], dtype: torch.dtype) -> tuple[Network, Sequence[Tensor]]:
+    def encoded(self, inputs: Sequence[Tensor], dtype: torch.dtype) -> tuple[Program, Sequence[Tensor]]:
         """Encodes float64 inputs in float64, for results of another dtype.
 
-        Returns the network that reads the encodings, and its inputs.
+        Returns the program that reads the encodings, and its inputs.
         """
         wide = tuple([x.dtype is torch.float64 for x in inputs])
         if True not in wide or dtype is torch.float64:
-            return self, inputs
+            return self.program, inputs
         program, ahead = _encoded_ahead(self.program.text, wide)
         further = []
         for i, start, width, name, size in ahead:
             further.append(ENCODINGS[name].formula(inputs[i][:, start : start + width], size))
-        return Network(program, self.parameters, names=self.names), [*inputs, *further]
-
-    def count(self, cells: Cells) -> int:
-        """Returns the number of cells k."""
-        if cells.offsets is not None:
-            return cells.offsets.shape[0] - 1
-        for p in self.parameters:
-            if p.shape[0] != 1:
-                return p.shape[0]
-        return 1
+        return program, [*inputs, *further]
 
     def check(self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None) -> None:
         """Raises the errors of a call with these arguments; reads values on the CPU alone."""
@@ -228,17 +206,12 @@ class Network:
             raise ValueError(f"{op}: {names.ray_index} must be {rule} inputs of rays, got {came}")
         rules, tensors = cells.to_check(op)
         check_tensor(op, names.of("inputs", 0), inputs[0])
-        dtype = None
-        for i, parameter in enumerate(parameters):
-            if i == program.first_layer:  # torch.compile may make this number symbolic
-                check_tensor(op, names.of("parameters", i), parameter)
-                dtype = parameter.dtype
         first = 1 if cells.offsets is not None else 0  # offsets tell the number of cells
         all_tensors = [*tensors[:first], *inputs, *parameters, *tensors[first:]]
         if ray_index is not None:
             all_tensors.append(ray_index)
         others = tuple(rules[:first]), tuple(rules[first:])
-        sizes = check_rules(op, _rules, all_tensors, program, names, dtype, self.shared, *others)
+        sizes = check_rules(op, _rules, all_tensors, program, names, self.dtype_of_layers, self.shared, *others)
         if ray_index is not None and not sizes["r"] and sizes["n"]:
             at = next(i for i in range(len(inputs)) if among(i, program.rays))
             shape = list(inputs[at].shape)
@@ -251,11 +224,6 @@ class Network:
 @constant_result
 def _encoded_ahead(text: str, wide: tuple[bool, ...]) -> tuple[Program, tuple[Ahead, ...]]:
     return encoded_ahead(Program.parse(text), wide)
-
-
-def among(i: int, numbers: Sequence[int]) -> bool:
-    """Returns whether a number is in a list; ``in`` fails if torch.compile makes the list's numbers symbolic."""
-    return any(i == number for number in numbers)
 
 
 def _check_list(op: str, name: str, tensors: Any, count: int) -> None:

@@ -5,7 +5,7 @@ n samples, k cells, m centres of all diagrams together, g diagrams.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -144,23 +144,22 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
         if self.offsets is not None:
             return Sorted(None, self.order, self.offsets)
         cells = self.cells
-        if cells is None and k == 1:
-            return _one_cell(positions, self.rows)
         if cells is None:
-            assert self.centres is not None
-            coords = positions[:, :3] if self.coords is None else self.coords
-            coords, centres = to_common_dtype(coords, self.centres)
+            if k == 1:
+                return _one_cell(positions, self.rows)
+            coords, centres = positions[:, :3] if self.coords is None else self.coords, cast(Tensor, self.centres)
+            coords, centres = to_common_dtype(coords, centres)
             index = self.centre_index if centres is self.centres else None
-            tree = self.child_offsets, self.child, self.depth
             if self.rows is not None and _on_cuda(coords, backend):
-                cells = _find_valid(coords, centres, tree, self.rows, index)
+                cells = _find_valid(coords, centres, (self.child_offsets, self.child, self.depth), self.rows, index)
                 return Sorted(cells, *cell_sort(cells, k, backend=backend))
-            if tree[0] is not None and tree[1] is not None:
-                cells = locate_cell(coords, centres, tree[0], tree[1], depth=self.depth, backend=backend)
-            else:
+            if self.child_offsets is None or self.child is None:
                 cells = nearest_centre(coords, centres, index=index, backend=backend)
+            else:
+                cells = locate_cell(coords, centres, self.child_offsets, self.child, depth=self.depth, backend=backend)
         if self.rows is None:
-            return Sorted(cells, *cell_sort(cells, k, backend=backend))
+            order, offsets = cell_sort(cells, k, backend=backend)
+            return Sorted(cells, order, offsets)
         valid = torch.arange(cells.shape[0], device=cells.device) < self.rows
         order, offsets = cell_sort(torch.where(valid, cells, k), k + 1, backend=backend)
         return Sorted(torch.where(valid, cells, -1), order, offsets[:-1])

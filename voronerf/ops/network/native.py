@@ -19,9 +19,9 @@ from voronerf.ops._core import backends, native
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import needed_gradients
-from voronerf.ops._core.program import Program, gradient, gradient_reaches
+from voronerf.ops._core.program import Names, Program, among, gradient, gradient_reaches
 from voronerf.ops._core.rows import new_empty, rows_of
-from voronerf.ops.network import Network, among
+from voronerf.ops.network.cells import Sorted
 from voronerf.ops.network.lowering import Lowered, compiled_runs, lower
 from voronerf.ops.network.reference import evaluate
 
@@ -64,21 +64,22 @@ class Run(NamedTuple):
 
     @staticmethod
     def of(
-        network: Network,
+        program: Program,
+        parameters: Sequence[Tensor],
+        names: Names,
         inputs: Sequence[Tensor],
         ray_index: Tensor | None,
-        offsets: Tensor,
-        order: Tensor | None,
+        rows: Sorted,
         dtype: torch.dtype,
     ) -> Run:
-        """Returns the run of a network on rows with offsets [k + 1], and perhaps an order; casts the tensors.
+        """Returns the run of a program on sorted rows; casts the tensors.
 
         If all inputs and the results are bfloat16, they are read and written without casts. Otherwise inputs are cast
         to float32. Parameters are always cast to float32; a cell has few of them. If the results are bfloat16, products
         take bfloat16 operands on processors that multiply them faster (AVX512-BF16, AMX), and float32 operands
         elsewhere. Sums are always float32.
         """
-        program, parameters, names, products = network.program, network.parameters, network.names, "float32"
+        products = "float32"
         if dtype is not torch.float32 or program.tables:
             products = PRODUCTS.get(dtype, "float32")
             parameters = [
@@ -89,7 +90,7 @@ class Run(NamedTuple):
         if not stored:  # hash grids take positions in float32
             inputs = [x if x.dtype is torch.float32 else x.float() for x in inputs]
         text, op, index_name = program.text, names.op, names.ray_index
-        return Run(inputs, parameters, offsets, order, ray_index, (), text, op, index_name, products)
+        return Run(inputs, parameters, rows.offsets, rows.order, ray_index, (), text, op, index_name, products)
 
     def results(self) -> list[Tensor]:
         """Returns the outputs and sums, with gradients of every order."""
@@ -150,16 +151,17 @@ class Run(NamedTuple):
 
 
 def network(
-    network: Network,
+    program: Program,
+    parameters: Sequence[Tensor],
+    names: Names,
     inputs: Sequence[Tensor],
     ray_index: Tensor | None,
-    offsets: Tensor,
-    order: Tensor | None,
+    rows: Sorted,
     dtype: torch.dtype,
 ) -> list[Tensor]:
-    """Runs a network on the rows of each cell; see ``voronerf.ops.network.Network``."""
-    results = Run.of(network, inputs, ray_index, offsets, order, dtype).results()
-    return [out if out.dtype is dtype else out.to(dtype) for out in results]
+    """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``."""
+    results = Run.of(program, parameters, names, inputs, ray_index, rows, dtype).results()
+    return results if dtype is torch.float32 else [out.to(dtype) for out in results]
 
 
 class _Gradient(NamedTuple):
@@ -253,8 +255,7 @@ def _direct(call: Run, asked: bool) -> list[Tensor] | None:
     """
     if not compiled_runs(call.text) or native.on_cuda(call.offsets):
         return None
-    lowered = lower(call.text, _layout(call.products, call.offsets), False)
-    results: list[Tensor] | None = lowered.call(call[:6], call.keep, call.gradients, call.op, call.index_name, asked)
+    results: list[Tensor] | None = lower(call.text, _cpu_layout(call.products)).call(call, asked)
     return results
 
 
@@ -267,7 +268,8 @@ def run(call: Run) -> list[Tensor]:
     program, results = Program.parse(call.text), _memory(call)
     if not compiled_runs(program.text):
         inputs = [x.float() for x in call.inputs]
-        values = evaluate(inputs, call.parameters, call.offsets, call.order, call.ray_index, program)
+        with torch.autocast(call.offsets.device.type, enabled=False):
+            values = evaluate(inputs, call.parameters, call.offsets, call.order, call.ray_index, program)
         for to, result in zip(results, values, strict=True):
             to.copy_(result)
         return results
@@ -359,6 +361,10 @@ def _layout(products: str, tensor: Tensor) -> str:
     """
     if native.on_cuda(tensor):
         return "tiles" if products != "float32" and _multiplies_halves(products, tensor.device) else "floats"
+    return _cpu_layout(products)
+
+
+def _cpu_layout(products: str) -> str:
     layouts = _LAYOUTS.get(native.isa())
     if layouts is None:
         return "floats"

@@ -13,30 +13,31 @@ from voronerf.ops._core.checks import check_range
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.grids import HashGrid
-from voronerf.ops._core.program import BINARY, FUNCTIONS, PARAMETER, VALUE, Columns, Program, Step
+from voronerf.ops._core.program import BINARY, FUNCTIONS, PARAMETER, VALUE, Columns, Names, Program, Step
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
 from voronerf.ops.hash_encode.reference import interpolate
-from voronerf.ops.network import Network
+from voronerf.ops.network.cells import Sorted
 
 
 def network(
-    network: Network,
+    program: Program,
+    parameters: Sequence[Tensor],
+    names: Names,
     inputs: Sequence[Tensor],
     ray_index: Tensor | None,
-    offsets: Tensor,
-    order: Tensor | None,
+    rows: Sorted,
     dtype: torch.dtype,
     run: Callable[..., Run] | None = None,
 ) -> list[Tensor]:
-    """Runs a network on the rows of each cell; see ``voronerf.ops.network.Network``.
+    """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``.
 
     With half types, the operands and results of products are rounded. ``run`` replaces the class `Run`.
     """
-    _check_rows(network, inputs, ray_index, offsets, order)
+    _check_rows(program, names, inputs, ray_index, rows)
     wide = torch.promote_types(dtype, torch.float32)
-    with torch.autocast(offsets.device.type, enabled=False):
-        cast = [x.to(wide) for x in inputs], [p.to(wide) for p in network.parameters]
-        results = evaluate(*cast, offsets, order, ray_index, network.program, dtype, run)
+    with torch.autocast(rows.offsets.device.type, enabled=False):
+        cast = [x.to(wide) for x in inputs], [p.to(wide) for p in parameters]
+        results = evaluate(*cast, rows.offsets, rows.order, ray_index, program, dtype, run)
     return [result.to(dtype) for result in results]
 
 
@@ -82,18 +83,16 @@ def _grid(text: str) -> HashGrid:
     return grid
 
 
-def _check_rows(
-    network: Network, inputs: Sequence[Tensor], index: Tensor | None, offsets: Tensor, order: Tensor | None
-) -> None:
+def _check_rows(program: Program, names: Names, inputs: Sequence[Tensor], index: Tensor | None, rows: Sorted) -> None:
     """Raises ValueError if offsets, an order or a ray index on the CPU are out of range."""
-    if offsets.device.type != "cpu" or torch.compiler.is_compiling():
+    if rows.offsets.device.type != "cpu" or torch.compiler.is_compiling():
         return
-    n, names = len(inputs[0] if index is None else index), network.names
-    check_offsets(names.op, offsets, n)
-    if order is not None:
-        check_range(names.op, "order", order, n)
+    n = len(inputs[0] if index is None else index)
+    check_offsets(names.op, rows.offsets, n)
+    if rows.order is not None:
+        check_range(names.op, "order", rows.order, n)
     if index is not None and len(index):
-        last = len(inputs[network.program.rays[0]]) - 1
+        last = len(inputs[program.rays[0]]) - 1
         low, high = (int(bound) for bound in index.aminmax())
         if low < 0 or high > last:
             wrong = low if low < 0 else high

@@ -10,8 +10,9 @@ from torch import Tensor
 from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
+from voronerf.ops._core.program import Names
 from voronerf.ops.formulas import RenderedRays
-from voronerf.ops.network import Cells, Names, Network
+from voronerf.ops.network import Cells, Network
 
 _NAMES = Names("render_opaque")
 

@@ -18,7 +18,7 @@ from voronerf.ops.formulas import RenderedRays
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.nearest_centre.native import check_index
-from voronerf.ops.network import Cells
+from voronerf.ops.network.cells import Cells, Sorted
 from voronerf.ops.network.lowering import lower
 from voronerf.ops.network.native import Run, inputs_of
 from voronerf.ops.render_opaque import reference
@@ -36,16 +36,16 @@ def render_opaque(*flat: Any) -> RenderedRays:
     """Renders every ray until it is opaque, in float32; see ``voronerf.ops.render_opaque``."""
     arguments = _OP.Inputs._make(flat)
     network, cells, none = arguments.network, arguments.cells, torch.empty(0, dtype=torch.int32)
-    centres, index, k = cells.centres, cells.centre_index, network.count(cells)
-    inputs, rays = [arguments.origins, arguments.directions], bool(network.program.rays)
-    inputs = inputs[: len(network.program.inputs)]
+    centres, index, k = cells.centres, cells.centre_index, network.k
+    inputs = [arguments.origins, arguments.directions][: len(network.program.inputs)]
     tensors = (*inputs, *network.parameters, centres)
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in tensors)
     if not plain or torch.is_autocast_enabled("cpu"):
         composed: RenderedRays = partial(reference.render_opaque, backend="native")(*arguments)
         return composed
-    offsets = torch.zeros(k + 1, dtype=torch.int32)
-    run = Run.of(network, inputs, none if rays else None, offsets, None, torch.float32)
+    program, parameters, names = network.program, network.parameters, network.names
+    rows, ray_index = Sorted(None, None, torch.zeros(k + 1, dtype=torch.int32)), none if network.program.rays else None
+    run = Run.of(program, parameters, names, inputs, ray_index, rows, torch.float32)
     lowered = lower(run.text)
     if k == 1:
         cells, centres, index = Cells(), None, None

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from voronerf.ops._core import backends
-from voronerf.ops._core.program import Program
-from voronerf.ops.network import OP, Cells, Names, Network
+from voronerf.ops._core.program import Names, Program
+from voronerf.ops.network import OP, Cells, Network
 
 _NAMES = Names(backends.declare("routed_program", runs=OP))
 
