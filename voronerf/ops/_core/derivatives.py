@@ -28,7 +28,7 @@ def needed_gradients(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
     # count as needed, without a query. A query for a leaf that is an input of torch.autograd.grad raises RuntimeError:
     # the leaf's gradient is needed. Such a query takes 10 us.
     for node in reversed(nodes):
-        leaf = type(node).__name__ == "AccumulateGrad"
+        leaf = type(node) is _LEAF
         if node is None or (sure and leaf):
             answers.append(node is not None)
             continue
@@ -40,8 +40,9 @@ def needed_gradients(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
     return answers[::-1]
 
 
-# torch has no public name for this function; without it every gradient is computed.
+# torch has no public names for these; without the function every gradient is computed.
 _ask = getattr(torch._C, "_will_engine_execute_node", None)
+_LEAF = getattr(torch._C._functions, "AccumulateGrad", None)
 
 
 def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:

@@ -95,8 +95,8 @@ class Network:
         self.parameters = parameters
         if True in self.shared:
             self.parameters = [p.unsqueeze(0) if alone else p for p, alone in zip(parameters, self.shared)]
-        counts = [p.shape[0] for p in self.parameters if p.dim() and p.shape[0] != 1]
-        self.k, first = counts[0] if counts else 1, program.first_layer
+        self.k = next((p.shape[0] for p in self.parameters if p.dim() and p.shape[0] != 1), 1)
+        first = program.first_layer
         self.dtype_of_layers = None if first < 0 else parameters[first].dtype
 
     def __call__(

@@ -5,7 +5,7 @@ n samples, k cells, m centres of all diagrams together, g diagrams.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -147,8 +147,8 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
         if cells is None:
             if k == 1:
                 return _one_cell(positions, self.rows)
-            coords, centres = positions[:, :3] if self.coords is None else self.coords, cast(Tensor, self.centres)
-            coords, centres = to_common_dtype(coords, centres)
+            assert self.centres is not None
+            coords, centres = to_common_dtype(positions[:, :3] if self.coords is None else self.coords, self.centres)
             index = self.centre_index if centres is self.centres else None
             if self.rows is not None and _on_cuda(coords, backend):
                 cells = _find_valid(coords, centres, (self.child_offsets, self.child, self.depth), self.rows, index)

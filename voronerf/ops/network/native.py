@@ -130,22 +130,19 @@ class Run(NamedTuple):
         if not derived.places:
             return results
         of_outputs = sum(present[:split])
-        second = self._replace(
-            inputs=[*self.inputs, *tensors[:of_outputs]],
-            parameters=[*self.parameters, *tensors[of_outputs:]],
-            kept=self.kept if derived.keeps else (),
-            text=derived.text,
-            keep=False,
-            gradients=count if derived.sifts else -1,
+        inputs, parameters = [*self.inputs, *tensors[:of_outputs]], [*self.parameters, *tensors[of_outputs:]]
+        kept, first = self.kept if derived.keeps else (), count if derived.sifts else -1
+        _, _, offsets, order, ray_index, _, _, op, index_name, products, _, _ = self
+        second = Run(  # `_replace` takes three times as long
+            inputs, parameters, offsets, order, ray_index, kept, derived.text, op, index_name, products, False, first
         )
-        # `Run.results` keeps the looked-up features again, for a pass that is differentiated further.
-        values = second.results() if torch.is_grad_enabled() else run(*second)
+        values = second.results()
         for place, total in zip(derived.places, values, strict=True):
             if place >= count:
                 p = self.parameters[place - count]
-                if p.shape[0] == 1 and total.shape[0] > 1:
+                if total.numel() != p.numel():  # all cells share the parameter
                     total = total.sum(0, keepdim=True)
-                total = total if p.dtype is total.dtype else total.to(p.dtype)
+                total = total.to(p.dtype) if program.tables else total  # all other parameters are float32
             results[place] = total
         return results
 
