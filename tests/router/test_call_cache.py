@@ -322,6 +322,7 @@ CHANGES: dict[str, Callable[[VoronoiRouter], Any]] = {
     "the module": lambda r: setattr(r, "module", doubled(r.module)),
     "a part": lambda r: setattr(r.module, "layer", doubled(r.module.layer)),
     "values": lambda r: r.module.layer.weight.data.mul_(2),
+    "the memory": lambda r: setattr(r.module.layer.weight, "data", r.module.layer.weight.data * 2),
     "the dtype": lambda r: r.double(),
     "the backend": lambda r: setattr(r, "backend", "reference"),
     "the cells": lambda r: r.subdivide(*r.diagram.refine({1: rows(3, seed=9)})),
@@ -329,9 +330,10 @@ CHANGES: dict[str, Callable[[VoronoiRouter], Any]] = {
 }
 
 
+@pytest.mark.parametrize("share", [(), ("layer.weight",)])
 @pytest.mark.parametrize("change", CHANGES)
-def test_changes_are_followed(change: str, ordinary: Callable[..., list[Tensor]]) -> None:
-    router, x, d = routed(Named()), rows(64), rows(64, seed=1)
+def test_changes_are_followed(change: str, share: tuple[str, ...], ordinary: Callable[..., list[Tensor]]) -> None:
+    router, x, d = routed(Named(), share=share), rows(64), rows(64, seed=1)
     for _ in range(2):
         before = router(x, d)["colour"]
     CHANGES[change](router)

@@ -130,10 +130,11 @@ class CachedCall:
         """Returns the network, which is made again only for other parameters than in the last call."""
         same, network = self._made
         if compiles or network is None or not same.holds():
+            same = None if compiles else self._fused.same_parameters()  # noted first: another thread may assign some
             parameters = self._fused.parameters(router.num_cells, device, router.backend)
             network = Network(self._program, parameters, names=_NAMES)
             if not compiles:
-                self._made = self._fused.same_parameters(), network
+                self._made = same, network
         return network
 
     def _fits(self, router: Any, arguments: tuple[Any, ...], lead: torch.Size, n: int, compiles: bool) -> bool:

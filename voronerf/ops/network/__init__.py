@@ -59,7 +59,6 @@ class Network:
 
     Attributes:
         given: the parameters, as the caller gave them.
-        parameters: [k, ...] each, or [1, ...] for a parameter that all cells share.
         shared: for each parameter, whether the caller gave it without the dimension of cells.
         k: the number of cells, which is 1 if all cells share all parameters.
         dtype_of_layers: the dtype of all parameters except tables; None without such parameters.
@@ -92,12 +91,17 @@ class Network:
         for i in [i for i, p in enumerate(parameters) if not isinstance(p, Tensor)]:
             check_tensor(names.op, names.of("parameters", i), parameters[i])
         self.shared = tuple([p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)])
-        self.parameters = parameters
-        if True in self.shared:
-            self.parameters = [p.unsqueeze(0) if alone else p for p, alone in zip(parameters, self.shared)]
         self.k = next((p.shape[0] for p in self.parameters if p.dim() and p.shape[0] != 1), 1)
         first = program.first_layer
         self.dtype_of_layers = None if first < 0 else parameters[first].dtype
+
+    @property
+    def parameters(self) -> Sequence[Tensor]:
+        """The parameters, [k, ...] each, or [1, ...] for a parameter that all cells share."""
+        if True not in self.shared:
+            return self.given
+        # New views for each call: an old view keeps the memory that `p.data = values` replaces.
+        return [p.unsqueeze(0) if alone else p for p, alone in zip(self.given, self.shared)]
 
     def __call__(
         self, inputs: Sequence[Tensor], cells: Cells, *, ray_index: Tensor | None = None, backend: str = "auto"
