@@ -108,8 +108,8 @@ def test_pairs(stopped, resumed, content):
 
 #: Changes of the database by SQL, and the error messages. Without checks, some of them end COLMAP by a signal.
 CHANGES = {
-    "DELETE FROM two_view_geometries; UPDATE matches SET data = randomblob(8 * rows)": "matches must be of features of",
-    "UPDATE two_view_geometries SET data = randomblob(8 * rows)": "matches must be of features of two images",
+    "DELETE FROM two_view_geometries; UPDATE matches SET data = randomblob(8 * rows) WHERE rows": "matches must be of",
+    "UPDATE two_view_geometries SET data = randomblob(8 * rows) WHERE rows": "matches must be of features of two",
     "UPDATE two_view_geometries SET pair_id = pair_id + 777777777777": "matches must be of features of two images",
     "UPDATE two_view_geometries SET rows = -5": "two_view_geometries must have whole matrices, got (-5, 2) rows and",
     "UPDATE matches SET rows = -9223372036854775808": "matches must have whole matrices, got (-9223372036854775808, 2)",
