@@ -214,6 +214,11 @@ def test_a_tape_gives_the_gradients_that_autograd_gives(device, backend):
         actual = tape.backward([arriving], [i == index for i in range(len(leaves))])
         assert [g is None for g in actual] == [i != index for i in range(len(leaves))]
         torch.testing.assert_close(actual[index], expected[index], rtol=1e-4, atol=1e-4)
+    again = tape.backward([arriving])
+    assert [g is None for g in again] == [False] * len(leaves), "a tape may be used again"
+    arguments["positions"].requires_grad_(False)
+    _, tape = forward(arguments, backend)
+    assert tape.backward([arriving], [True] * len(leaves))[0] is None, "without a gradient in the forward pass"
 
 
 def test_refuses_what_makes_no_sense(device, backend):
@@ -232,6 +237,16 @@ def test_refuses_what_makes_no_sense(device, backend):
         "parameters[1] must have shape [k, 3, 10] with k = 3, got [2, 3, 10]": lambda: Network(
             PROGRAM, [k[0], torch.ones(2, 3, 10, device=device), *k[2:]]
         ).fwd(inputs, cells, ray_index=index),
+        "parameters[0] must be a tensor, got str": lambda: Network(PROGRAM, ["x", *k[1:]]),
+        "order must come with offsets, got no offsets": lambda: Network(PROGRAM, k).fwd(
+            inputs, Cells(order=index), ray_index=index
+        ),
+        **{
+            f"{name} must be None where offsets are given, got both": lambda name=name: Network(PROGRAM, k).fwd(
+                inputs, Cells(**{"offsets": index, name: index}), ray_index=index
+            )
+            for name in ("cells", "centres", "rows", "frozen")
+        },
         "program must have outputs [n, w], and inputs[0] with one row for each sample": lambda: Network(
             sums, parameters
         ).fwd(inputs, cells, ray_index=index),

@@ -346,6 +346,52 @@ def test_changes_are_followed(change: str, share: tuple[str, ...], ordinary: Cal
     assert torch.allclose(router(x, d)["colour"].float(), before, atol=1e-6) == (same or change == "the dtype")
 
 
+class Partly(nn.Module):
+    """A module whose ``forward`` reads only the layer ``a``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b = nn.Linear(3, 4), nn.Linear(4, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.a(x).relu()
+
+
+@pytest.mark.parametrize("frozen", [(), (0,), (1, 2, 3, 4, 5)])
+@pytest.mark.parametrize("where", ["first2", "first3", "labels"])
+def test_networks_may_share_all_that_a_call_reads(
+    where: str, frozen: tuple[int, ...], ordinary: Callable[..., list[Tensor]]
+) -> None:
+    d, rule = (2, where) if where == "first2" else (3, None if where == "labels" else where)
+    router, x = routed(Partly(), d, coords=rule, share=["a.*"]), rows(64)
+    labels = {"cells": torch.arange(64) % 6} if where == "labels" else {}
+    router.freeze(frozen)
+    found = [outcome(router, lambda r: r(x, **labels)) for _ in range(3)]
+    expected = ordinary(router, lambda r: r(x, **labels))
+    for each in found:
+        for actual, wanted in zip(each, expected, strict=True):
+            torch.testing.assert_close(actual, wanted)
+
+
+def test_cached_calls_release_computed_parameters() -> None:
+    """``swap_tensors`` refuses parameters that a graph holds."""
+
+    class Sliced(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight = nn.Parameter(rows(6, 2))
+
+        def forward(self, x: Tensor) -> Tensor:
+            return x @ self.weight[:3]
+
+    router, x = routed(Sliced()), rows(64)
+    for _ in range(3):
+        router(x).sum().backward()
+    router.zero_grad()
+    torch.utils.swap_tensors(router.module.weight, nn.Parameter(torch.zeros_like(router.module.weight)))
+    assert not router(x).any()
+
+
 def test_arguments_unlike_those_of_before(calls: list[str]) -> None:
     router, x = routed(Named()), rows(64)
     router(x, rows(64, seed=1))

@@ -85,7 +85,7 @@ class CachedCall:
         self._dtypes = None if {*dtypes} == {torch.float32} else dtypes
         self._fused, self._program, self._is_compilable = fused, program, not fused.computes
         fused.parameters(grouping.k, device, grouping.backend)  # fills a cached property, which torch.compile cannot
-        self._made = cast("tuple[Any, Network | None]", (Stale(), None))  # the last network, and its dependencies
+        self._made = cast("tuple[Any, Network | None]", (Stale(), None))  # dependencies and the network made with them
 
     @staticmethod
     def of(fused: Fused, watch: Watch, most: int, call: Call, grouping: Grouping) -> CachedCall | None:
@@ -133,7 +133,7 @@ class CachedCall:
             same = None if compiles else self._fused.same_parameters()  # noted first: another thread may assign some
             parameters = self._fused.parameters(router.num_cells, device, router.backend)
             network = Network(self._program, parameters, names=_NAMES)
-            if not compiles:
+            if not compiles and not isinstance(same, Stale):
                 self._made = same, network
         return network
 

@@ -377,8 +377,11 @@ class Fused:
         return sources
 
     def same_parameters(self) -> Any:
-        """Returns dependencies (`voronerf.ops._core.unchanged`): the tensors that :meth:`parameters` returns now."""
-        if self.computes or any(entries is not None for _, _, entries in self._sources):
+        """Returns dependencies (`voronerf.ops._core.unchanged`): the tensors that :meth:`parameters` returns now.
+
+        Returns `Stale` if the tensors are computed, in this module or by the caller of ``torch.func.functional_call``.
+        """
+        if self.computes or any(entries or not owner[name].is_leaf for owner, name, entries in self._sources):
             return Stale()
         same = unchanged()
         for registry, name, _ in self._sources:

@@ -241,12 +241,9 @@ class FieldProgram:
             check_shape(_OP, "directions", directions, ("n", 3), {"n": positions.shape[0]})
         else:
             program = cast(Program, looked.ray_program)
-        k, parameters = router.num_cells, layers.parameters
-        if all(p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)):  # cells share all parameters
-            parameters = [parameters[0].expand(k, *parameters[0].shape), *parameters[1:]]
         rows = [(positions, directions)[number] for number in layers.reads]
         places = router.places(find_positions(router, args, kwargs, coords))
-        network = Network(program, parameters, names=Names(_OP))
+        network = Network(program, layers.parameters, names=Names(_OP))
         results, _ = network(rows, places, ray_index=ray_index, backend=router.backend)
         if layers.activate is not None:
             return layers.activate(*results)

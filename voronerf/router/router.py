@@ -595,21 +595,21 @@ class VoronoiRouter(nn.Module):
         k, centres, frozen = diagram.num_cells, diagram._buffers["centres"], self._buffers["frozen_cells"]
         self._run_training_checks()
         if method is not None and self.methods:
-            return Cells(cells=self._group(method, positions).cells, frozen=frozen)
+            return Cells(cells=self._group(method, positions).cells, frozen=frozen, k=k)
         if k == 1:
-            return Cells(frozen=frozen)
+            return Cells(frozen=frozen, k=k)
         coords = positions if positions.dim() == 2 else positions.flatten(0, -2)
         if not coords.is_floating_point():
-            return Cells(cells=coords[:, 0], frozen=frozen)
+            return Cells(cells=coords[:, 0], frozen=frozen, k=k)
         d, drawn = centres.shape[1], self.assignment == "stochastic" and self.training
         coords = coords[:, :d] if coords.shape[1] > d else coords
         if drawn or d != 3:
-            return Cells(cells=self.assign(coords.detach() if drawn else coords), frozen=frozen)
+            return Cells(cells=self.assign(coords.detach() if drawn else coords), frozen=frozen, k=k)
         if diagram.depth == 1:
             index = diagram.index() if k >= MANY_CELLS else None
-            return Cells(centres=centres, coords=coords, centre_index=index, frozen=frozen)
+            return Cells(centres=centres, coords=coords, centre_index=index, frozen=frozen, k=k)
         tree = {"child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
-        return Cells(centres=centres, coords=coords, frozen=frozen, **tree)
+        return Cells(centres=centres, coords=coords, frozen=frozen, k=k, **tree)
 
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
         """Returns the program of ``forward``, or the reason why it is unknown.

@@ -60,7 +60,6 @@ class Network:
     Attributes:
         given: the parameters, as the caller gave them.
         shared: for each parameter, whether the caller gave it without the dimension of cells.
-        k: the number of cells, which is 1 if all cells share all parameters.
         dtype_of_layers: the dtype of all parameters except tables; None without such parameters.
 
     Raises:
@@ -86,13 +85,9 @@ class Network:
     def __init__(self, program: Program, parameters: Sequence[Tensor], *, names: Names = _NAMES) -> None:
         if not isinstance(program, Program):
             raise TypeError(f"{names.op}: program must be a Program, got {type(program).__name__}")
-        _check_list(names.op, "parameters", parameters, len(program.parameters))
-        self.program, self.names, self.given = program, names, parameters
-        for i in [i for i, p in enumerate(parameters) if not isinstance(p, Tensor)]:
-            check_tensor(names.op, names.of("parameters", i), parameters[i])
+        _check_list(names, "parameters", parameters, len(program.parameters))
+        self.program, self.names, self.given, first = program, names, tuple(parameters), program.first_layer
         self.shared = tuple([p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)])
-        self.k = next((p.shape[0] for p in self.parameters if p.dim() and p.shape[0] != 1), 1)
-        first = program.first_layer
         self.dtype_of_layers = None if first < 0 else parameters[first].dtype
 
     @property
@@ -146,7 +141,7 @@ class Network:
             from voronerf.ops.network.native import Run
 
             with torch.no_grad():
-                rows = cells.sort(inputs[0], self.k, backend)
+                rows = cells.sort(inputs[0], self.count(cells), backend)
                 run = Run.of(self.program, self.parameters, self.names, inputs, ray_index, rows, dtype)
                 results, run = run.forward(any(wanted))
             return results, Tape(results, rows.cells, cells.frozen, leaves, wanted, run)
@@ -168,7 +163,7 @@ class Network:
         """Evaluates tensors that have been checked; see :meth:`__call__`. By default, :meth:`dtype` is the dtype."""
         dtype = dtype or self.dtype(inputs)
         run = backends.resolve(OP, backend=backend, device=inputs[0].device, dtype=dtype)
-        rows = cells.sort(inputs[0], self.k, backend)
+        rows = cells.sort(inputs[0], self.count(cells), backend)
         program, tensors = self.encoded(inputs, dtype) if self.program.encodes else (self.program, inputs)
         results: list[Tensor] = run(program, self.parameters, self.names, tensors, ray_index, rows, dtype)
         if cells.frozen is not None and rows.cells is not None:
@@ -198,24 +193,30 @@ class Network:
             further.append(ENCODINGS[name].formula(inputs[i][:, start : start + width], size))
         return program, [*inputs, *further]
 
+    def count(self, cells: Cells) -> int:
+        """Returns the number of cells."""
+        if cells.k is not None:
+            return cells.k
+        return next((p.shape[0] for p in self.parameters if p.shape[0] != 1), 1)
+
     def check(self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None) -> None:
         """Raises the errors of a call with these arguments; reads values on the CPU alone."""
         op, program, parameters, names = self.names.op, self.program, self.given, self.names
         if not program.inputs:
             raise ValueError(f"{op}: program must have at least one input, got none")
-        _check_list(op, "inputs", inputs, len(program.inputs))
+        _check_list(names, "inputs", inputs, len(program.inputs))
         if (ray_index is not None) != (len(program.rays) > 0):
             rule = "given for a program with" if program.rays else "None for a program without"
             came = "None" if ray_index is None else "an index"
             raise ValueError(f"{op}: {names.ray_index} must be {rule} inputs of rays, got {came}")
         rules, tensors = cells.to_check(op)
-        check_tensor(op, names.of("inputs", 0), inputs[0])
         first = 1 if cells.offsets is not None else 0  # offsets tell the number of cells
         all_tensors = [*tensors[:first], *inputs, *parameters, *tensors[first:]]
         if ray_index is not None:
             all_tensors.append(ray_index)
         others = tuple(rules[:first]), tuple(rules[first:])
-        sizes = check_rules(op, _rules, all_tensors, program, names, self.dtype_of_layers, self.shared, *others)
+        facts = program, names, self.dtype_of_layers, self.shared, cells.k
+        sizes = check_rules(op, _rules, all_tensors, *facts, *others)
         if ray_index is not None and not sizes["r"] and sizes["n"]:
             at = next(i for i in range(len(inputs)) if among(i, program.rays))
             shape = list(inputs[at].shape)
@@ -230,11 +231,14 @@ def _encoded_ahead(text: str, wide: tuple[bool, ...]) -> tuple[Program, tuple[Ah
     return encoded_ahead(Program.parse(text), wide)
 
 
-def _check_list(op: str, name: str, tensors: Any, count: int) -> None:
+def _check_list(names: Names, kind: str, tensors: Any, count: int) -> None:
     if not isinstance(tensors, Sequence):
-        raise TypeError(f"{op}: {name} must be a list, got {type(tensors).__name__}")
+        raise TypeError(f"{names.op}: {kind} must be a list, got {type(tensors).__name__}")
     if len(tensors) != count:
-        raise ValueError(f"{op}: {name} must have {count} tensors, got {len(tensors)}")
+        raise ValueError(f"{names.op}: {kind} must have {count} tensors, got {len(tensors)}")
+    for i, tensor in enumerate(tensors):
+        if not isinstance(tensor, Tensor):
+            check_tensor(names.op, names.of(kind, i), tensor)
 
 
 def _rules(
@@ -242,15 +246,16 @@ def _rules(
     names: Names,
     dtype: torch.dtype | None,
     shared: Sequence[bool],
+    k: int | None,
     first: Sequence[TensorRule],
     last: Sequence[TensorRule],
 ) -> TensorRules:
     """Returns the rules for the tensors of a network: ``first``, inputs, parameters, ``last`` and the ray index.
 
     ``dtype`` is the dtype of all parameters except tables, or None without such parameters. ``shared`` tells for each
-    parameter whether it lacks the dimension of cells.
+    parameter whether it lacks the dimension of cells; ``k`` is the number of cells, or None if the tensors tell it.
     """
-    rules: list[TensorRule | Default] = [*first]
+    rules: list[TensorRule | Default] = [*first, *([] if k is None else [Default("k", k)])]
     for i, width in enumerate(program.inputs):
         rules.append(TensorRule(names.of("inputs", i), FLOATING, ("r" if among(i, program.rays) else "n", width)))
     like = ""
@@ -285,7 +290,7 @@ class _Graph(NamedTuple):
         if not pairs or not chosen:
             return [None] * len(wanted)
         outputs, arriving = zip(*pairs)
-        slopes = iter(torch.autograd.grad(outputs, chosen, arriving, allow_unused=True))
+        slopes = iter(torch.autograd.grad(outputs, chosen, arriving, retain_graph=True, allow_unused=True))
         return [next(slopes) if want else None for want in wanted]
 
 
@@ -326,17 +331,17 @@ class Tape:
 
         Args:
             gradients: the gradient of a loss with respect to each result, or None.
-            wanted: for each input, then for each parameter, whether to return its gradient; by default if it requires a
-                gradient.
+            wanted: for each input, then for each parameter, whether to return its gradient; by default True.
 
         Returns:
-            The gradients; None if it is unwanted, or if no result depends on the tensor.
+            The gradients; None if it is unwanted, if the tensor requires no gradient or if no result depends on it.
         """
         if self.frozen is not None and self.cells is not None:  # the backward pass drops rows with a zero gradient
             held = frozen_rows(self.frozen, self.cells)
             gradients = [None if g is None else g.masked_fill(held, 0) for g in gradients]
+        chosen = self.wanted if wanted is None else [a and b for a, b in zip(wanted, self.wanted, strict=True)]
         with torch.no_grad():
-            slopes = self.run.backward(gradients, self.wanted if wanted is None else wanted)
+            slopes = self.run.backward(gradients, chosen)
             pairs = zip(slopes, self.leaves, strict=True)
             return [g if g is None or g.dim() == leaf.dim() else g.view_as(leaf) for g, leaf in pairs]
 

@@ -65,6 +65,7 @@ class Cells(NamedTuple):
         rows: int32 [1], the number of valid leading rows, for example from `march_rays` with a capacity; None for all.
             Later rows have outputs 0, no gradients, and cell -1. The host does not wait for this number.
         frozen: bool [k], the frozen cells, whose rows have no gradients; or None.
+        k: the number of cells; None for as many as the parameters have.
 
     Examples:
         >>> import torch
@@ -86,9 +87,16 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
     centre_index: Tensor | None = None
     rows: Tensor | None = None
     frozen: Tensor | None = None
+    k: int | None = None
 
     def to_check(self, op: str) -> Others:
         """Checks the combination of arguments; returns the rules for the tensors, and the tensors."""
+        if self.offsets is None and self.order is not None:
+            raise ValueError(f"{op}: order must come with offsets, got no offsets")
+        if self.offsets is not None:
+            others = {"cells": self.cells, "centres": self.centres, "rows": self.rows, "frozen": self.frozen}
+            if given := [name for name, value in others.items() if value is not None]:
+                raise ValueError(f"{op}: {given[0]} must be None where offsets are given, got both")
         if self.centres is None:
             for name, tensor in (("child_offsets", self.child_offsets), ("child", self.child)):
                 if tensor is not None:
@@ -109,8 +117,9 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
             if self.child is None and self.depth != 1:
                 raise ValueError(f"{op}: depth must be 1 for a flat diagram, got {self.depth}")
         rules: dict[str, TensorRule] = _RULES if self.child is None else _RULES_OF_A_TREE
-        given = [(rules[name], value) for name, value in zip(self._fields, self) if value is not None and name in rules]
-        return [rule for rule, _ in given], [value for _, value in given]
+        values: dict[str, Any] = {name: value for name, value in zip(self._fields, self) if value is not None}
+        given = [name for name in values if name in rules]
+        return [rules[name] for name in given], [values[name] for name in given]
 
     def check(self, op: str, positions: Tensor, sizes: dict[str, int]) -> None:
         """Checks the rules that depend on the sizes of the letters in the checked shapes.
@@ -149,7 +158,7 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
                 return _one_cell(positions, self.rows)
             assert self.centres is not None
             coords, centres = to_common_dtype(positions[:, :3] if self.coords is None else self.coords, self.centres)
-            index = self.centre_index if centres is self.centres else None
+            index = self.centre_index if centres.dtype is self.centres.dtype else None
             if self.rows is not None and _on_cuda(coords, backend):
                 cells = _find_valid(coords, centres, (self.child_offsets, self.child, self.depth), self.rows, index)
                 return Sorted(cells, *cell_sort(cells, k, backend=backend))

@@ -36,7 +36,7 @@ def render_opaque(*flat: Any) -> RenderedRays:
     """Renders every ray until it is opaque, in float32; see ``voronerf.ops.render_opaque``."""
     arguments = _OP.Inputs._make(flat)
     network, cells, none = arguments.network, arguments.cells, torch.empty(0, dtype=torch.int32)
-    centres, index, k = cells.centres, cells.centre_index, network.k
+    centres, index, k = cells.centres, cells.centre_index, network.count(cells)
     inputs = [arguments.origins, arguments.directions][: len(network.program.inputs)]
     tensors = (*inputs, *network.parameters, centres)
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in tensors)
