@@ -238,6 +238,7 @@ def test_refuses_what_makes_no_sense(device, backend):
             PROGRAM, [k[0], torch.ones(2, 3, 10, device=device), *k[2:]]
         ).fwd(inputs, cells, ray_index=index),
         "parameters[0] must be a tensor, got str": lambda: Network(PROGRAM, ["x", *k[1:]]),
+        "k must be at least 1, got 0": lambda: Network(PROGRAM, k).fwd(inputs, Cells(k=0), ray_index=index),
         "order must come with offsets, got no offsets": lambda: Network(PROGRAM, k).fwd(
             inputs, Cells(order=index), ray_index=index
         ),
@@ -245,14 +246,14 @@ def test_refuses_what_makes_no_sense(device, backend):
             f"{name} must be None where offsets are given, got both": lambda name=name: Network(PROGRAM, k).fwd(
                 inputs, Cells(**{"offsets": index, name: index}), ray_index=index
             )
-            for name in ("cells", "centres", "rows", "frozen")
+            for name in ("cells", "centres", "rows", "frozen", "k")
         },
         "program must have outputs [n, w], and inputs[0] with one row for each sample": lambda: Network(
             sums, parameters
         ).fwd(inputs, cells, ray_index=index),
     }
     for message, call in wrong.items():
-        with refused(TypeError if "must be a" in message else ValueError, f"Network: {message}"):
+        with refused(TypeError if "must be a " in message else ValueError, f"Network: {message}"):
             call()
     raw, tape = forward(arguments, backend)
     loss, gradient = squares(raw)

@@ -53,7 +53,8 @@ class Cells(NamedTuple):
     """The cell of each row: by ``offsets``, by labels ``cells``, or by the centres of a diagram; else one cell.
 
     Attributes:
-        offsets: int32 [k + 1], ascending; cell c owns the sorted rows ``offsets[c]`` to ``offsets[c + 1]``.
+        offsets: int32 [k + 1], ascending; cell c owns the sorted rows ``offsets[c]`` to ``offsets[c + 1]``. All other
+            attributes but ``order`` must then be None.
         order: int32 [n], the sorted row i is row ``order[i]``; None if the rows are sorted.
         cells: int32 [n], the cell of each row, 0 to k - 1.
         centres: [k, 3], the centres of a flat diagram; or [m, 3], the centres of a tree as in `locate_cell`.
@@ -94,9 +95,11 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
         if self.offsets is None and self.order is not None:
             raise ValueError(f"{op}: order must come with offsets, got no offsets")
         if self.offsets is not None:
-            others = {"cells": self.cells, "centres": self.centres, "rows": self.rows, "frozen": self.frozen}
-            if given := [name for name, value in others.items() if value is not None]:
-                raise ValueError(f"{op}: {given[0]} must be None where offsets are given, got both")
+            for name in ("cells", "centres", "rows", "frozen", "k"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{op}: {name} must be None where offsets are given, got both")
+        if self.k is not None:
+            check_integer(op, "k", self.k, 1)
         if self.centres is None:
             for name, tensor in (("child_offsets", self.child_offsets), ("child", self.child)):
                 if tensor is not None:
