@@ -676,7 +676,7 @@ FAULTS = (
     _python(
         "float64 positions are compared with the index of float32 centres",
         "ops/network/cells.py",
-        "index = self.centre_index if centres is self.centres else None",
+        "index = self.centre_index if centres.dtype is self.centres.dtype else None",
         "index = self.centre_index",
         "tests/router/test_call_cache.py",
     ),
