@@ -164,7 +164,7 @@ class Network:
         dtype = dtype or self.dtype(inputs)
         run = backends.resolve(OP, backend=backend, device=inputs[0].device, dtype=dtype)
         rows = cells.sort(inputs[0], self.count(cells), backend)
-        program, tensors = self.encoded(inputs, dtype) if self.program.encodes else (self.program, inputs)
+        program, tensors = self.encoded(inputs, dtype)
         results: list[Tensor] = run(program, self.parameters, self.names, tensors, ray_index, rows, dtype)
         if cells.frozen is not None and rows.cells is not None:
             held = frozen_rows(cells.frozen, rows.cells)
@@ -184,8 +184,10 @@ class Network:
 
         Returns the program that reads the encodings, and its inputs.
         """
+        if not self.program.encodes or dtype is torch.float64:
+            return self.program, inputs
         wide = tuple([x.dtype is torch.float64 for x in inputs])
-        if True not in wide or dtype is torch.float64:
+        if True not in wide:
             return self.program, inputs
         program, ahead = _encoded_ahead(self.program.text, wide)
         further = []

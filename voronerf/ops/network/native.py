@@ -147,17 +147,9 @@ class Run(NamedTuple):
         return results
 
 
-def network(
-    program: Program,
-    parameters: Sequence[Tensor],
-    names: Names,
-    inputs: Sequence[Tensor],
-    ray_index: Tensor | None,
-    rows: Sorted,
-    dtype: torch.dtype,
-) -> list[Tensor]:
+def network(*arguments: Any) -> list[Tensor]:
     """Runs a program on the rows of each cell; see ``voronerf.ops.network.Network``."""
-    results = Run.of(program, parameters, names, inputs, ray_index, rows, dtype).results()
+    results, dtype = Run.of(*arguments).results(), arguments[-1]
     return results if dtype is torch.float32 else [out.to(dtype) for out in results]
 
 
