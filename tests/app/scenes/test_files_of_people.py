@@ -5,16 +5,19 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from helpers import refuses
+from PIL import Image
 from scene_files import DATA
 
 from voronerf.app.render.paths import read_camera_path
 from voronerf.app.scenes import SceneError, load_scene
 from voronerf.app.scenes.colmap import read_model
 from voronerf.app.scenes.folders import listed_images
-from voronerf.app.scenes.gather import emptied, gather
+from voronerf.app.scenes.gather import _take_frames as gather_frames
+from voronerf.app.scenes.gather import cameras_of, emptied, gather
 
 CASES = DATA.parent / "cases"
 
@@ -150,3 +153,73 @@ def test_camera_paths(name):
     frames = json.loads((case("camera_path_nerfstudio") / f"{name}.json").read_text())["camera_path"]
     rows = torch.tensor([frame["camera_to_world"] for frame in frames]).view(-1, 4, 4)
     torch.testing.assert_close(path.frames.poses, rows, atol=1e-5, rtol=0)
+
+
+def first_frame(path, out):
+    """Returns (the first of two frames of a video, float [h, w, 3]; the lines about the video)."""
+    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed")
+    said = []
+    gather_frames(path, out, 2, said.append)
+    with Image.open(out / "00001.jpg") as image:
+        return torch.from_numpy(np.array(image.convert("RGB"))).float(), " ".join(said)
+
+
+def test_colours_of_hd_video(tmp_path):
+    image, _ = first_frame(case("bt709_colours") / "clip.mp4", tmp_path / "frames")
+    assert (image[90, 60] - torch.tensor([30.0, 200, 40])).abs().max() <= 3
+
+
+@pytest.mark.parametrize(("name", "kind", "psnr"), [("hlg", "HLG", 19.5), ("pq", "PQ", 24.5)])
+def test_hdr_video(tmp_path, name, kind, psnr):
+    """The videos have no tag of their transfer function, and colours beyond those of the chart."""
+    chart, _ = first_frame(case("bt709_colours") / "clip.mp4", tmp_path / "chart")
+    image, said = first_frame(case("hdr_video") / f"{name}.mp4", tmp_path / "frames")
+    assert f"is HDR ({kind}) and is tone-mapped to sRGB" in said
+    assert 10 * (255**2 / (image - chart).square().mean()).log10() > psnr
+
+
+def test_videos_that_cannot_be_read(tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed")
+    for name, line in (
+        ("no_moov.mp4", "moov atom not found, so the recording or the download was cut off"),
+        ("sound.m4a", "it has no moving pictures"),
+    ):
+        path = case("unreadable_videos") / name
+        refuses(line, gather_frames, path, tmp_path, 5, print, error=SceneError)
+
+
+def test_raw_folders_of_polycam(tmp_path):
+    images, _ = gathered(case("polycam_raw"), tmp_path)
+    assert [path.name for path in images] == [f"keyframes_corrected_images_{n}.jpg" for n in range(5)]
+    images, _ = gathered(case("polycam_raw") / "keyframes", tmp_path)
+    assert len(images) == 5
+
+
+def test_masks_of_instant_ngp_in_process(tmp_path):
+    images, said = gathered(case("dynamic_masks") / "images", tmp_path)
+    assert [path.name for path in images] == [f"00{n}.jpg" for n in range(6)] and "6 of 6 images have a mask" in said
+    for path in images:
+        left_out = case("dynamic_masks") / f"images/dynamic_mask_{path.stem}.png"
+        masks = [np.asarray(Image.open(file).convert("L")) for file in (tmp_path / f"masks/{path.name}.png", left_out)]
+        assert ((masks[0] > 0) == (masks[1] == 0)).all() and masks[1].any()
+
+
+def test_names_that_begin_like_comments(tmp_path):
+    images, _ = gathered(case("hash_names"), tmp_path)
+    assert [path.name for path in images] == [f"_{n}.jpg" for n in range(8)]
+
+
+def test_images_of_16_bits():
+    folder = case("png_16_bit")
+    scene = load_scene(folder)
+    with Image.open(folder / "images/001.png") as image:
+        assert torch.equal(scene.train.images[0], torch.from_numpy(np.array(image.convert("RGB"))))
+
+
+def test_two_lenses_with_one_size(tmp_path):
+    source = case("two_lenses_one_size")
+    images = emptied(tmp_path / "images")
+    places = gather(source, images, tmp_path / "masks", 150, say=print, progress=lambda *_: None)
+    labels = cameras_of(listed_images(images), places)
+    assert len(set(labels.values())) == 2
+    assert all(("26 mm" in label) == name.startswith("wide") for name, label in labels.items())

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import refuses
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 from scene_files import write_images, write_walls
 
 from voronerf.app.cli import main
@@ -487,7 +487,7 @@ def gathered(tmp_path, monkeypatch, files):
         else:
             (picture(content) if isinstance(content, int) else content).save(folder / name)
     refuses("no model", process.process, folder, out, say=said.append, error=SceneError)
-    before = itertools.takewhile(lambda line: "with one camera" not in line, said)
+    before = itertools.takewhile(lambda line: "keeps COLMAP's results" not in line, said)
     return sorted(path.name for path in (out / "images").iterdir()), list(before)
 
 
@@ -541,6 +541,12 @@ def numbered(*patterns, first=0, count=3):
             ["a_0.jpg", "a_1.jpg", "a_2.jpg"],
             [],
         ),
+        (
+            numbered("k/images/{}.jpg", "k/corrected_images/{}.jpg", "k/confidence/{}.png", "k/depth/{}.png"),
+            [f"k_corrected_images_{i}.jpg" for i in range(3)],
+            [],
+        ),
+        (numbered("#{}.jpg", "a #{}.jfif"), [*(f"_{i}.jpg" for i in range(3)), *(f"a_#{i}.jpg" for i in range(3))], []),
     ],
 )
 def test_the_images_of_a_folder_are_taken_once_and_what_is_left_out_is_said(tmp_path, monkeypatch, files, names, lines):
@@ -770,11 +776,39 @@ def test_images_of_one_size_share_a_camera(tmp_path, pictures, monkeypatch):
     with pytest.raises(SceneError, match="finds no model"):
         process.process(tmp_path / "mixed", tmp_path / "out", max_features=100, say=said.append)
     sizes = f"4 of {WIDTH} x {HEIGHT}, 2 of {HEIGHT} x {WIDTH}"
-    assert said[0].startswith(f"6 images with 2 cameras, one for each size: {sizes}; ")
+    assert said[0].startswith(f"6 images with 2 cameras: {sizes}; ")
     with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
         cameras = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
         taken = [cameras[opened.read_image_with_name(f"{number}.png").camera_id] for number in range(6)]
     assert len(cameras) == 2 and taken == 2 * [(HEIGHT, WIDTH), (WIDTH, HEIGHT), (WIDTH, HEIGHT)]
+
+
+def with_lens(image, path, focal):
+    """Saves a JPEG with EXIF tags of a phone and, unless ``focal`` is None, of a focal length in 35 mm film."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Model] = "Phone"
+    if focal:
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.convert("RGB").save(path, exif=exif)
+
+
+def test_each_lens_has_a_camera(tmp_path, pictures, monkeypatch):
+    """Phones write images of 1x and 2x in one size; without tags, each folder counts as a lens."""
+    folders = [("all/1x_{}.jpg", 26), ("all/2x_{}.jpg", 52), ("a/{}.jpg", None), ("b/{}.jpg", None)]
+    for number, path in enumerate(sorted(pictures.iterdir())[:8]):
+        name, focal = folders[number % 4]
+        with Image.open(path) as image:
+            with_lens(image, tmp_path / "in" / name.format(number), focal)
+    monkeypatch.setattr(process, "_map", lambda *_: None)
+    said = []
+    with pytest.raises(SceneError, match="finds no model"):
+        process.process(tmp_path / "in", tmp_path / "out", max_features=100, say=said.append)
+    line = next(line for line in said if "8 images with 4 cameras" in line)
+    assert all(f"2 of {WIDTH} x {HEIGHT}, {lens}" in line for lens in ("Phone 26 mm", "Phone 52 mm", "in a", "in b"))
+    with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
+        taken = {image.name[:-5]: image.camera_id for image in opened.read_all_images()}
+    assert len(taken) == len(set(taken.values())) == 4
 
 
 def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch):

@@ -99,7 +99,7 @@ def test_sound_with_a_cover_is_no_video(tmp_path):
     Image.new("RGB", (64, 64)).save(tmp_path / "cover.jpg")
     options = ("-f", "lavfi", "-i", "anullsrc=d=1", "-c:v", "copy", "-disposition:v:0", "attached_pic")
     convert(tmp_path / "cover.jpg", path := tmp_path / "a.mp4", *options)
-    refuses("must be a video in a supported container", gather._take_frames, path, tmp_path, 5, print, error=SceneError)
+    refuses("it has no moving pictures", gather._take_frames, path, tmp_path / "out", 5, print, error=SceneError)
 
 
 def test_times_that_go_back_do_not_matter(tmp_path):
@@ -123,3 +123,116 @@ def test_a_video_becomes_upright_images(tmp_path):
     gather.gather(tmp_path / "turned.mp4", out, tmp_path / "masks", 5, say=print, progress=lambda *_: None)
     sizes = [Image.open(path).size for path in sorted(out.iterdir())]
     assert sizes == [(64, 80)] * 5
+
+
+COLOURS = ((220, 30, 30), (30, 200, 40), (40, 60, 220), (230, 220, 40), (128, 128, 128), (235, 235, 235))
+TAGGED = "format=yuv444p,setparams=colorspace=bt709:color_primaries=bt709:color_trc={}"
+HD = f"scale=out_color_matrix=bt709,{TAGGED.format('bt709')},format=yuv420p"
+LINEAR = f"scale=out_color_matrix=bt709,{TAGGED.format('iec61966-2-1')},zscale=t=linear:npl=203,format=gbrpf32le"
+
+
+def chart(width=240, height=80):
+    """Returns stripes of `COLOURS`, [height, width, 3]."""
+    return np.repeat(np.array(COLOURS, dtype=np.uint8), width // len(COLOURS), 0)[None].repeat(height, 0)
+
+
+def encoded(folder, filters, *options, codec="libx264", picture=None, frames=2):
+    """Writes a video of a picture, by default the chart, after ffmpeg's filters; returns its path."""
+    Image.fromarray(chart() if picture is None else picture).save(folder / "chart.png")
+    options = ("-vf", filters, "-frames:v", str(frames), "-c:v", codec, "-crf", "8", *options)
+    convert(folder / "chart.png", path := folder / "a.mkv", *options, before=("-loop", "1"))
+    return path
+
+
+def taken_from(path, **options):
+    """Returns (the first frame of a video, the lines about it)."""
+    said = []
+    gather._take_frames(path, path.parent / "frames", 1, said.append)
+    with Image.open(next((path.parent / "frames").iterdir())) as image:
+        return np.asarray(image.convert("RGB")), " ".join(said)
+
+
+@pytest.mark.parametrize(
+    ("filters", "line"),
+    [
+        ("scale=out_color_matrix=bt601,format=yuv420p", ""),
+        (HD, ""),
+        ("scale=out_color_matrix=bt709:out_range=full,format=yuvj420p,setparams=colorspace=bt709:range=full", ""),
+        ("scale=out_color_matrix=bt601:out_range=full,format=yuvj420p,setparams=range=full", ""),
+        (f"{HD},zscale=p=2020:m=2020_ncl,format=yuv420p10le", "bt2020, which are converted to sRGB"),
+        (f"{HD},zscale=p=smpte432,format=yuv420p10le", "smpte432, which are converted to sRGB"),
+        (f"{LINEAR},zscale=p=2020,zscale=t=arib-std-b67:m=2020_ncl:npl=203,format=yuv420p10le", "is HDR (HLG) and is"),
+        (f"{LINEAR},zscale=p=2020,zscale=t=smpte2084:m=2020_ncl:npl=203,format=yuv420p10le", "is HDR (PQ) and is tone"),
+        (f"{HD},setfield=tff,setparams=field_mode=tff", "is interlaced: one of two lines is interpolated"),
+    ],
+)
+def test_frames_have_the_colours_of_the_video(tmp_path, filters, line):
+    interlaced = ("-flags", "+ilme+ildct", "-x264-params", "tff=1") if "tff" in filters else ()
+    image, said = taken_from(encoded(tmp_path, filters, *interlaced))
+    middles = image[40, 20::40].astype(int)
+    assert np.abs(middles - COLOURS).max() <= 8, middles.tolist()
+    assert line in said and bool(line) == ("a.mkv: " in said.replace("all 2 frames", ""))
+
+
+def test_large_videos_without_tags_have_the_colours_of_hd(tmp_path):
+    filters = "scale=1280:720:flags=neighbor:out_color_matrix=bt709,format=yuv420p,setparams=colorspace=unknown"
+    image, said = taken_from(encoded(tmp_path, filters))
+    assert np.abs(image[360, 107::213].astype(int)[:6] - COLOURS).max() <= 5
+    assert "has no colour tags: those of HD video (bt709) are assumed" in said
+
+
+@pytest.mark.parametrize(("aspect", "size"), [("4/3", (320, 80)), ("1/2", (240, 160)), ("1/1", (240, 80))])
+def test_pixels_become_square(tmp_path, aspect, size):
+    path = encoded(tmp_path, f"format=yuv420p,setsar={aspect}")
+    for turned in (False, True):
+        image, said = taken_from(path)
+        assert image.shape[1::-1] == (size[::-1] if turned else size)
+        assert (f"its frames become {image.shape[1]} x {image.shape[0]}" in said) == (aspect != "1/1")
+        convert(path, path := tmp_path / "turned.mp4", "-c", "copy", before=("-display_rotation", "90"))
+
+
+def test_videos_that_are_written_have_the_colours_of_hd(tmp_path):
+    pictures = torch.from_numpy(chart(1284, 720))
+    write_video(tmp_path / "a.mp4", [pictures] * 2, 24)
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-i", str(tmp_path / "a.mp4")]
+    assert "yuv420p(tv, bt709, " in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+    convert(tmp_path / "a.mp4", tmp_path / "a.png", "-vf", "scale=in_color_matrix=bt709", "-frames:v", "1")
+    shown = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
+    assert np.abs(shown[360, 107::214] - COLOURS).max() <= 4
+
+
+def test_several_videos_share_the_frames_by_their_lengths(tmp_path):
+    (tmp_path / "in").mkdir()
+    paths = [write_clip(tmp_path / "in/GX02.MP4", 20), write_clip(tmp_path / "in/GX01.MP4", 5, "-vf", "hflip")]
+    said = []
+    out, options = tmp_path / "frames", {"say": said.append, "progress": lambda *_: None}
+    places = gather.gather(paths, out.with_name("a"), tmp_path / "masks", 5, **options)
+    assert places == {**{f"1_0000{n}.jpg": "GX02.MP4" for n in range(1, 5)}, "2_00001.jpg": "GX01.MP4"}
+    assert steps_of(out.with_name("a")) == [2, 7, 12, 17, 46] and not said
+    (tmp_path / "in/GX01.THM").write_bytes(b"")
+    assert len(gather.gather(tmp_path / "in", out, tmp_path / "masks", 150, **options)) == 25
+    assert steps_of(out) == [*range(48, 43, -1), *range(20)]  # in the order of names
+    assert said == [
+        f"{tmp_path}/in: has no images; frames are taken from GX01.MP4, GX02.MP4",
+        f"{tmp_path}/in/GX01.MP4, {tmp_path}/in/GX02.MP4: all 25 frames are taken, fewer than --frames 150",
+    ]
+
+
+def test_a_folder_may_have_a_percent_sign(tmp_path):
+    gather._take_frames(write_clip(tmp_path / "a 50%.mp4", 20), tmp_path / "100%d", 5, print)
+    assert steps_of(tmp_path / "100%d") == [1, 5, 9, 13, 17]
+
+
+def test_the_cause_is_told_if_frames_cannot_be_written(tmp_path, monkeypatch):
+    path, ran = write_clip(tmp_path / "a.mp4", 5), gather._run_ffmpeg
+
+    def run(video, options):
+        done = ran(video, options)
+        if "-filter_complex" in options:
+            errors = "[out#1/image2 @ 0x1] Error writing: No space left on device\nConversion failed!\n"
+            return subprocess.CompletedProcess(done.args, 228, done.stdout, errors)
+        return done
+
+    monkeypatch.setattr(gather, "_run_ffmpeg", run)
+    line = "ffmpeg cannot write its frames to {}: Error writing: No space left on device".format(tmp_path / "out")
+    refuses(line, gather._take_frames, path, tmp_path / "out", 5, print, error=SceneError)

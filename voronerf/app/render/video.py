@@ -10,6 +10,11 @@ from pathlib import Path
 from torch import Tensor
 from torch.nn.functional import pad
 
+#: The filters from RGB to HD video. By default, ffmpeg uses the matrix of BT.601 and stores no tags, so that players
+#: assume BT.709 for large videos.
+TAGS = "colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=limited"
+TO_BT709 = f"scale=out_color_matrix=bt709:out_range=limited,setparams={TAGS}"
+
 
 def check_video(path: Path) -> None:
     """Checks, before any frame is rendered, that :func:`write_video` can write the file; makes its folder."""
@@ -61,6 +66,7 @@ def write_video(path: Path, frames: Iterable[Tensor], fps: float) -> None:
             macro_block_size=2,
             quality=8,
             ffmpeg_log_level="quiet",
+            output_params=["-vf", TO_BT709],
         )
         writer.send(None)
         count = 0

@@ -1,4 +1,4 @@
-"""Gathers images of a folder or frames of a video for COLMAP, as PNG and JPEG files without duplicates."""
+"""Gathers images of a folder or frames of videos for COLMAP, as PNG and JPEG files without duplicates."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import re
 import shutil
 import subprocess
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,33 @@ from PIL import ExifTags, Image, ImageOps
 
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import CONVERTED, HEIF, SUFFIXES, listed_images
-from voronerf.app.scenes.images import UNREADABLE, Header, drawn, read_header, read_image
+from voronerf.app.scenes.images import (
+    COLOURS,
+    DYNAMIC_MASK,
+    UNREADABLE,
+    Header,
+    check_grey,
+    drawn,
+    is_deep,
+    read_header,
+    read_image,
+)
 from voronerf.app.scenes.soundness import some_of
 
 #: Container formats of videos. Playlists are excluded, since they name other files.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
+VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".mpg", ".3gp")
+#: The transfer functions of HDR video, by ffmpeg's names. In a frame of a video that states none, a ninth decile of the
+#: brightness above `BRIGHT` speaks for HLG, whose white is at 75 %; the white of PQ is at 58 % (ITU-R BT.2408).
+HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
+BRIGHT = 0.63
+#: The filters from HDR to sRGB: white is at 203 cd/m2 (BT.2408); up to 0.8 of it, colours are kept.
+TONE_MAPPING = (
+    "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,"
+    "tonemap=mobius:param=0.8:peak=5:desat=0,zscale=t=iec61966-2-1"
+)
+#: Primaries, by ffmpeg's names, with more colours than sRGB has.
+WIDE = ("bt2020", "smpte431", "smpte432")
 #: Image formats, recognised by the content of a file, and the formats that are copied unchanged. MPO is JPEG with two
 #: pictures.
 FORMATS = ("PNG", "JPEG", "WebP", "TIFF", "BMP")
@@ -36,36 +59,59 @@ KINDS = (*reversed(SUFFIXES), *CONVERTED)
 #: Files and folders of operating systems, which are ignored like hidden ones.
 IGNORED = ("thumbs.db", "desktop.ini", "__macosx", "@eadir")
 #: Folders of masks, depths and smaller copies that programs keep beside photographs.
-BESIDE = re.compile(r"(?i)masks?|depths?|images_\d+")
+BESIDE = re.compile(r"(?i)masks?|depths?|confidences?|images_\d+")
+#: The folder of Polycam's images without distortion, beside the distorted ones in `images`.
+POLYCAM = "corrected_images"
 LEAST_IMAGES = 3
 
 Progress = Callable[[str, int, int], None]
 
 
 def gather(
-    source: Path, images: Path, masks: Path, frames: int, *, say: Callable[[str], None], progress: Progress
-) -> None:
-    """Copies the images of a folder and their masks, or extracts frames of a video.
+    source: Path | Sequence[Path],
+    images: Path,
+    masks: Path,
+    frames: int,
+    *,
+    say: Callable[[str], None],
+    progress: Progress,
+) -> dict[str, str]:
+    """Copies the images of a folder and their masks, or extracts frames of videos.
 
     Args:
-        source: a video, or a folder, as in :func:`voronerf.app.scenes.process.process`.
+        source: a folder or videos, as in :func:`voronerf.app.scenes.process.process`.
         images: the empty folder for the images.
         masks: the folder for the masks, which is made only if there are masks.
-        frames: the number of frames to extract from a video.
+        frames: the number of frames to extract from the videos.
         say: called with a line for the user, such as about files that are left out.
         progress: called with the name "images", the number of copied images, and the number of all images.
+
+    Returns:
+        The place of each image by its name: its folder inside ``source``, or its video.
     """
-    folder, files = _list_images(source, say) if source.is_dir() else (source, [])
-    progress("images", 0, len(files))
-    copied = _copy_images(folder, files, images, say, progress)
-    if not source.is_dir():
-        _take_frames(source, images, frames, say)
+    clips = [source] if isinstance(source, Path) else list(source)
+    folder, places, copied = clips[0], dict[str, str](), dict[Path, Path]()
+    if folder.is_dir():
+        files = sorted(_files(folder))
+        if any(path.suffix.lower() in KINDS for path in files):
+            clips = []
+            folder, files = _list_images(folder, say)
+            progress("images", 0, len(files))
+            copied = _copy_images(folder, files, images, say, progress)
+            places = {copy.name: path.parent.relative_to(folder).as_posix() for copy, path in copied.items()}
+        else:
+            clips = [path for path in files if path.suffix.lower() in VIDEOS]
+            say(f"{folder}: has no images; frames are taken from {some_of([path.name for path in clips])}")
+    if clips:
+        progress("images", 0, 0)
+        places = _take_clips(clips, images, frames, say)
     if repeats := _remove_repeats(images):
         say(f"{folder}: {len(repeats)} byte-identical copies of images are left out: {some_of(repeats)}")
-    count = len(listed_images(images))
-    if count < LEAST_IMAGES:
-        raise SceneError(f"{folder}: must have at least {LEAST_IMAGES} images, got {count}")
+    names = [path.name for path in listed_images(images)]
+    if len(names) < LEAST_IMAGES:
+        raise SceneError(f"{folder}: must have at least {LEAST_IMAGES} images, got {len(names)}")
     _copy_masks(folder, {copy: path for copy, path in copied.items() if copy.exists()}, masks, say)
+    return {name: places[name] for name in names}
 
 
 def emptied(folder: Path) -> Path:
@@ -78,16 +124,18 @@ def emptied(folder: Path) -> Path:
 def _files(folder: Path) -> Iterator[Path]:
     """Yields the files of a folder and its subfolders.
 
-    It skips hidden files, system files, folders of masks, depths and smaller copies, and scenes made by
-    :func:`process`.
+    It skips hidden files, system files, masks, folders of masks, depths and smaller copies, and scenes made by
+    :func:`process`. Of Polycam's raw folders, it takes only the images without distortion.
     """
 
     def counts(path: Path) -> bool:
-        return not path.name.startswith(".") and path.name.lower() not in IGNORED
+        return not path.name.startswith((".", DYNAMIC_MASK)) and path.name.lower() not in IGNORED
 
     for place, folders, files in os.walk(folder):
         inside = [path for name in folders if counts(path := Path(place, name)) and not BESIDE.fullmatch(name)]
         folders[:] = [path.name for path in inside if not (path / "colmap" / "settings.json").is_file()]
+        if POLYCAM in folders and "images" in folders:
+            folders.remove("images")
         yield from (path for name in files if counts(path := Path(place, name)))
 
 
@@ -130,14 +178,16 @@ def _copy_images(
 ) -> dict[Path, Path]:
     """Copies images to a folder, and returns the original of each copy.
 
-    In the copies' names, `_` replaces `/` and spaces, since COLMAP's lists of pairs separate names by spaces.
+    In the copies' names, `_` replaces `/`, spaces and a first `#`: in COLMAP's lists of pairs, spaces separate names,
+    and lines that begin with `#` are comments.
     """
     copied: dict[Path, Path] = {}
     deep = []
     for path in files:
-        copy, reduced = _copy_image(path, part / "_".join("_".join(path.relative_to(folder).parts).split()))
+        name = "_".join("_".join(path.relative_to(folder).parts).split())
+        copy, reduced = _copy_image(path, part / re.sub("^#", "_", name))
         if copy in copied:
-            raise SceneError(f"{path}: {copied[copy]} has the same name, once _ replaces spaces and /")
+            raise SceneError(f"{path}: {copied[copy]} has the same name, once _ replaces spaces, # and /")
         copied[copy] = path
         deep += [path.name] * reduced
         progress("images", len(copied), len(files))
@@ -166,27 +216,29 @@ def _copy_image(path: Path, copy: Path) -> tuple[Path, bool]:
     """
     try:
         with _opened(path) as image:
-            deep = re.search(r";16[BLN]", str(getattr(image, "tile", ""))) is not None
+            deep = is_deep(image)
             if image.format in COPIED and not deep:
                 read_image(path, min(8, *read_header(path).size))  # refuses truncated files, which COLMAP accepts
+                copy = copy.with_suffix(".jpg") if copy.suffix.lower() == ".jfif" else copy
                 shutil.copyfile(path, copy)
                 return copy, deep
-            if image.mode[0] in "IF":
-                raise SceneError(f"{path}: has grey values of more than 8 bits; write it with 8 bits a channel")
+            check_grey(image, path)
             lossy = image.format is None or (image.format == "WEBP" and b"VP8L" not in path.read_bytes())
             copy = copy.with_suffix(".jpg" if lossy and not image.has_transparency_data else ".png")
             exif = image.getexif()
             lens, written = exif.get_ifd(ExifTags.IFD.Exif), Image.Exif()
             written[ExifTags.IFD.Exif] = {tag: lens[tag] for tag in LENS if tag in lens}
             written.update({tag: exif[tag] for tag in CAMERA if tag in exif})
-            upright = ImageOps.exif_transpose(image).convert("RGBA" if image.has_transparency_data else "RGB")
-            upright.save(copy, quality=95, compress_level=1, exif=written)
+            mode = "RGBA" if image.has_transparency_data else "RGB"
+            profile = image.info.get("icc_profile") if image.mode in COLOURS else None
+            upright = ImageOps.exif_transpose(image).convert(mode)
+            upright.save(copy, quality=95, compress_level=1, exif=written, icc_profile=profile)
     except SceneError:
         raise
     except Image.UnidentifiedImageError:
         raise SceneError(f"{path}: is not an image in {', '.join(FORMATS)} format") from None
     except (*UNREADABLE, RuntimeError) as error:
-        raise SceneError(f"{path}: cannot be read: {error}") from None
+        raise SceneError(f"{path}: cannot be copied: {error}") from None
     return copy, deep
 
 
@@ -220,7 +272,8 @@ def read_mask(path: Path, name: str, header: Header) -> NDArray[np.bool_]:
             if image.size not in (header.size, upright):
                 size, actual = (" x ".join(map(str, sides)) for sides in (header.size, image.size))
                 raise SceneError(f"{path}: is {actual} pixels, {name} is {size}")
-            return drawn(image, header.size, header.turns)
+            kept = drawn(image, header.size, header.turns)
+            return kept ^ path.name.startswith(DYNAMIC_MASK)
     except SceneError:
         raise
     except UNREADABLE as error:
@@ -230,7 +283,8 @@ def read_mask(path: Path, name: str, header: Header) -> NDArray[np.bool_]:
 def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callable[[str], None]) -> None:
     """Writes the masks of copied images to ``masks``, under the names that COLMAP expects: `0.jpg.png` for `0.jpg`.
 
-    The masks lie in a folder `masks`, in or beside the folder of the images, or beside an image in a subfolder.
+    The masks lie in a folder `masks`, in or beside the folder of the images, or beside an image in a subfolder. The
+    masks of instant-ngp, `dynamic_mask_0.png` for `0.jpg`, lie beside the images.
 
     Args:
         folder: the folder of the images.
@@ -244,6 +298,7 @@ def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callab
         name, header = path.relative_to(folder), read_header(copy)
         named = [place / end for place in places for end in (f"{name}.png", name.with_suffix(".png"))]
         named += [path.parent / "masks" / end for end in (f"{path.name}.png", f"{path.stem}.png")]
+        named.append(path.with_name(f"{DYNAMIC_MASK}{path.stem}.png"))
         mask = next((file for file in named if file.is_file()), None)
         if mask is None:
             continue
@@ -257,46 +312,184 @@ def _copy_masks(folder: Path, copied: dict[Path, Path], masks: Path, say: Callab
         say(f"{places[0]}: has no mask of any image; the mask of 0.jpg must be 0.jpg.png or 0.png")
 
 
-def _take_frames(video: Path, folder: Path, count: int, say: Callable[[str], None]) -> None:
-    """Writes evenly spaced frames of a video as JPEG, none of them twice; ffmpeg turns frames of phones upright.
+class Video(NamedTuple):
+    """The first video stream of a file.
 
-    The number of frames is estimated by the number of packets: counting packets is fast, and the duration in the file
-    may be missing or wrong. A video that was cut without re-encoding has more packets than frames, and is read a second
-    time.
+    Attributes:
+        path: the file.
+        packets: the number of packets, an estimate of the number of frames: counting packets is fast, and the duration
+            in the file may be missing or wrong.
+        interlaced: whether the frames are interlaced.
+        filters: ffmpeg's filters that give a frame square pixels and JPEG's colours.
+        notes: phrases about the filters for the user.
     """
+
+    path: Path
+    packets: int
+    interlaced: bool
+    filters: list[str]
+    notes: list[str]
+
+
+def _run_ffmpeg(video: Path, options: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Runs ffmpeg on a video, whose frames it turns upright."""
     import imageio_ffmpeg
 
     # Without -reinit_filter 0, ffmpeg would restart the filters, and their frame count, where the frame size changes.
     read = ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS, "-reinit_filter", "0"]
-    read += ["-i", f"file:{video}"]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", *read]
-    passed = ["-fps_mode", "passthrough"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", *read, "-i", f"file:{video}"]
+    return subprocess.run([*command, *options], capture_output=True, text=True, errors="replace")
 
-    def run(options: Sequence[str]) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([*command, *options], capture_output=True, text=True, errors="replace")
+
+def _reason(errors: str) -> str:
+    """Returns the first line of ffmpeg's errors, the cause of the others, without the name of a part of ffmpeg."""
+    return re.sub(r"^\[.*?\] ", "", (errors.strip().splitlines() or ["no reason"])[0])[:200]
+
+
+def _open_video(path: Path) -> Video:
+    """Counts the packets of a video, and chooses filters by the properties of its first frame."""
+    stream = ["-map", "0:V:0"]
+    copied = _run_ffmpeg(path, ["-v", "error", *stream, "-c", "copy", "-f", "framecrc", "-"])
+    packets = sum(not line.startswith("#") for line in copied.stdout.splitlines())
+    if not packets:
+        reason = _reason(copied.stderr)
+        if "matches no streams" in copied.stderr:
+            reason = "it has no moving pictures"
+        elif "moov atom not found" in copied.stderr:
+            reason += ", so the recording or the download was cut off"
+        raise SceneError(f"{path}: must be a video in a supported container ({CONTAINERS}): {reason}")
+    printed = ["-vf", "showinfo,signalstats,metadata=print", "-frames:v", "1", "-f", "null", "-"]
+    output = _run_ffmpeg(path, [*stream, *printed]).stderr
+    shown = " ".join(re.findall(r"^\[Parsed_showinfo.*?\] (.*)", output, re.MULTILINE)[:8])
+    frame = dict(reversed(re.findall(r"(\w+):\s*([^\s\[]+)", shown)))
+    if not {"s", "sar", "i", "fmt"} <= frame.keys():
+        raise SceneError(f"{path}: ffmpeg cannot decode its first frame")
+    high = re.search(r"signalstats.YHIGH=(\d+)", output)
+    depth = re.search(r"p(1\d)", frame["fmt"])
+    bright = int(high[1]) / 2 ** int(depth[1] if depth else 8) if high else 0.0
+    interlaced = frame["i"] in "TB"
+    filters, notes = _colour_filters(frame, bright)
+    return Video(
+        path, packets, interlaced, filters, ["is interlaced: one of two lines is interpolated"] * interlaced + notes
+    )
+
+
+def _colour_filters(frame: Mapping[str, str], bright: float) -> tuple[list[str], list[str]]:
+    """Returns filters that give a frame square pixels and JPEG's colours, and phrases about them for the user.
+
+    JPEG's colours are sRGB, stored by the matrix of BT.601.
+
+    Args:
+        frame: properties of the frame by the names of ffmpeg's filter showinfo.
+        bright: the ninth decile of the frame's brightness, from 0 to 1.
+    """
+    matrix, primaries, transfer = (frame.get(f"color_{name}", "unknown") for name in ("space", "primaries", "trc"))
+    width, height = (int(side) for side in frame["s"].split("x"))
+    filters, notes = [], []
+    if matrix.startswith("bt2020") and transfer == "unknown":
+        transfer = "arib-std-b67" if bright > BRIGHT else "smpte2084"
+        notes.append(f"has no tag of its transfer function: {HDR[transfer]} is assumed, by its brightness")
+    if matrix == "unknown" and transfer in HDR:
+        matrix = "bt2020nc"
+    elif matrix == "unknown" and (width >= 1280 or height > 576):  # the rule of players
+        matrix = "bt709"
+        notes.append("has no colour tags: those of HD video (bt709) are assumed")
+    if matrix.startswith("bt2020") and primaries == "unknown":
+        primaries = "bt2020"
+    if transfer in HDR or primaries in WIDE:
+        tags = f"color_primaries={primaries}:color_trc={transfer.replace('unknown', 'bt709')}"
+        filters += [f"setparams=colorspace={matrix}:{tags}", TONE_MAPPING if transfer in HDR else "zscale=p=bt709"]
+        filters += ["zscale=m=bt709:r=limited", "format=yuv444p"]
+        mapped = (
+            f"is HDR ({HDR[transfer]}) and is tone-mapped"
+            if transfer in HDR
+            else f"has colours of {primaries}, which are converted"
+        )
+        notes.append(f"{mapped} to sRGB")
+    elif matrix != "unknown":
+        filters.append(f"setparams=colorspace={matrix}")
+    scale = ["out_color_matrix=bt601"] * (matrix != "unknown")
+    across, down = (int(side) for side in frame["sar"].split("/"))
+    if across and down and across != down:
+        width, height = (width * across // down, height) if across > down else (width, height * down // across)
+        scale.append(f"w={width}:h={height}")
+        notes.append(f"has pixels of {across} to {down}: its frames become {width} x {height}")
+    return [*filters, "=".join(("scale", ":".join(scale))).rstrip("=")], notes
+
+
+def _take_frames(video: Path, folder: Path, count: int, say: Callable[[str], None]) -> None:
+    """Writes evenly spaced frames of a video as JPEG to a folder, none of them twice."""
+    _take_clips([video], folder, count, say)
+
+
+def _take_clips(paths: Sequence[Path], folder: Path, count: int, say: Callable[[str], None]) -> dict[str, str]:
+    """Writes evenly spaced frames of videos as JPEG to a folder, and returns the video's name for each frame's name.
+
+    Each video has its share of ``count`` frames by its length, but at least one. If there are several videos, the
+    frames' names begin with a video's number.
+    """
+    videos = [_open_video(path) for path in paths]
+    ends = np.cumsum([0, *(video.packets for video in videos)])
+    shares = np.diff(np.rint(count * ends / ends[-1])).astype(int).clip(1).tolist()
+    emptied(folder)
+    taken = 0
+    for number, (video, share) in enumerate(zip(videos, shares), 1):
+        prefix = f"{number:0{len(str(len(videos)))}}_" * (len(videos) > 1)
+        if video.notes:
+            say(f"{video.path}: {'; '.join(video.notes)}")
+        taken += _write_frames(video, folder, share, prefix)
+    if taken < count:
+        say(f"{some_of(list(map(str, paths)))}: all {taken} frames are taken, fewer than --frames {count}")
+    return {path.name: paths[int(path.stem.rpartition("_")[0] or 1) - 1].name for path in listed_images(folder)}
+
+
+def _write_frames(video: Video, folder: Path, count: int, prefix: str) -> int:
+    """Writes evenly spaced frames of a video, and returns their number.
+
+    A video that was cut without re-encoding has more packets than frames, and is read a second time.
+    """
+    passed = ["-fps_mode", "passthrough"]
+    deinterlaced = "bwdif=send_frame:deint=interlaced," * video.interlaced
+    pattern = str(folder / prefix).replace("%", "%%") + ("" if prefix else os.sep) + "%05d.jpg"
 
     def take(total: int) -> int:
         """Writes frames, assuming that the video has `total` frames, and returns the actual number."""
         rate = f"{min(count, total)}/{total}"
         chosen = f"select='gt(floor((n+1)*{rate}+0.5),floor(n*{rate}+0.5))'"
         # Frame numbers replace time stamps, since ffmpeg stops at repeated or decreasing ones.
-        graph = f"[0:V:0]settb=1,setpts=N,split[all][each];[each]{chosen},scale[chosen]"
+        graph = f"[0:V:0]{deinterlaced}settb=1,setpts=N,split[all][each];"
+        graph += f"[each]{','.join([chosen, *video.filters])}[chosen]"
         counted = ["-map", "[all]", *passed, "-progress", "-", "-f", "null", "-"]
-        written = ["-map", "[chosen]", *passed, "-enc_time_base", "1", "-q:v", "2", str(emptied(folder) / "%05d.jpg")]
-        done = run(["-filter_complex", graph, *counted, *written])
+        written = ["-map", "[chosen]", *passed, "-enc_time_base", "1", "-q:v", "2", pattern]
+        done = _run_ffmpeg(video.path, ["-v", "error", "-filter_complex", graph, *counted, *written])
         frames = re.findall(r"^frame=(\d+)$", done.stdout, re.MULTILINE)
         if done.returncode or not frames:
-            reason = (done.stderr.strip().splitlines() or ["no reason"])[-1]
-            raise SceneError(f"{video}: ffmpeg cannot read it: {reason:.200}")
+            raise SceneError(f"{video.path}: ffmpeg cannot write its frames to {folder}: {_reason(done.stderr)}")
         return int(frames[-1])
 
-    copied = run(["-map", "0:V:0", "-c", "copy", "-f", "framecrc", "-"])
-    packets = sum(not line.startswith("#") for line in copied.stdout.splitlines())
-    if not packets:
-        reason = (copied.stderr.strip().splitlines() or ["no reason"])[-1]
-        raise SceneError(f"{video}: must be a video in a supported container ({CONTAINERS}): {reason:.200}")
-    frames = take(packets)
-    if len(listed_images(folder)) != min(count, frames):
+    frames = take(video.packets)
+    written = sorted(folder.glob(f"{prefix}*.jpg"))
+    if len(written) != min(count, frames):
+        for path in written:
+            path.unlink()
         take(frames)
-    if frames < count:
-        say(f"{video}: all {frames} frames are taken, fewer than --frames {count}")
+    return min(count, frames)
+
+
+def cameras_of(images: Sequence[Path], places: Mapping[str, str]) -> dict[str, str]:
+    """Returns a label of the camera of each image by its name: images with the same label share a camera.
+
+    A label has the size of the image and the make, model and focal lengths in its EXIF tags or, if these tell no focal
+    length, its place in ``places``, see :func:`gather`.
+    """
+    labels = {}
+    for path in images:
+        with Image.open(path, formats=COPIED) as image:
+            exif = image.getexif()
+            lens = exif.get_ifd(ExifTags.IFD.Exif)
+            told = [str(exif[tag]).strip("\0 ") for tag in CAMERA if tag in exif]
+            focal = [f"{lens[tag]} mm" for tag in LENS if tag in lens]
+            place = places.get(path.name, ".")
+            where = [" ".join(told + focal)] if focal else [f"in {place}"] * (place != ".")
+            labels[path.name] = ", ".join(["{} x {}".format(*image.size), *where])
+    return labels

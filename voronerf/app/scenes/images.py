@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import io
 import itertools
 import math
+import re
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
@@ -15,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageCms
 from PIL.JpegImagePlugin import JpegImageFile
 from torch import Tensor
 
@@ -27,10 +30,14 @@ from voronerf.ops._core.checks import available_memory
 #: another program.
 FORMATS = ("PNG", "JPEG")
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+#: Pillow's modes of images to which a colour profile applies.
+COLOURS = ("RGB", "RGBA", "P")
 #: Quarter turns anticlockwise that make an image upright, by its orientation tag. Mirrored images stay mirrored.
 TURNS = {3: 2, 6: 3, 8: 1}
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_DEPTH = 24  # byte offset of the number of bits per channel
+#: The first part of the names of instant-ngp's masks, whose pixels are left out where they are not black.
+DYNAMIC_MASK = "dynamic_mask_"
+#: The largest difference of colours in a profile that counts as sRGB.
+ROUNDED = 2
 #: If alpha is used as a mask, pixels with an alpha below this are masked, since their colour is partly background.
 OPAQUE = 250
 #: The largest fraction of the free memory for a scene; the rest is for the networks.
@@ -52,6 +59,7 @@ class Header(NamedTuple):
         depth: bytes of a decoded pixel in memory.
         jpeg: whether the file is JPEG.
         turns: quarter turns anticlockwise that make the image upright, by the orientation tag.
+        deep: whether the image has 16 bits a channel, of which the upper 8 are read.
     """
 
     size: tuple[int, int]
@@ -59,6 +67,7 @@ class Header(NamedTuple):
     depth: int
     jpeg: bool
     turns: int
+    deep: bool
 
     def decoded(self, factor: int) -> int:
         """Returns the memory for decoding the image, in bytes."""
@@ -99,7 +108,8 @@ def read_header(path: Path) -> Header:
             with contextlib.suppress(*UNREADABLE):  # a broken tag counts as missing
                 turns = TURNS.get(file.getexif().get(ExifTags.Base.Orientation, 1), 0)
         # Pillow keeps colours in four bytes a pixel.
-        return Header(file.size, _has_alpha(file), 1 if len(file.getbands()) == 1 else 4, jpeg, turns)
+        depth = 1 if len(file.getbands()) == 1 else 4
+        return Header(file.size, _has_alpha(file), depth, jpeg, turns, is_deep(file))
 
 
 def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
@@ -107,6 +117,7 @@ def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
 
     The orientation tag is ignored, since poses and intrinsics refer to the image as stored. JPEG files are reduced by
     up to 8 during decoding, from the low frequencies of each block of 8 x 8 pixels, which saves time and memory.
+    Colours are converted to sRGB by the colour profile of the file.
 
     Returns:
         [h, w, 3], or [h, w, 4] with an alpha channel.
@@ -121,7 +132,36 @@ def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
             bottom = min(top + rows, height)
             band = file.crop((0, top * rest, width * rest, bottom * rest)).convert(mode)
             pixels[top:bottom] = area_average(np.asarray(band), rest)
-        return pixels
+        transform = _to_srgb(file.info.get("icc_profile"), mode) if file.mode in COLOURS else None
+        return pixels if transform is None else np.array(ImageCms.applyTransform(Image.fromarray(pixels), transform))
+
+
+def is_deep(file: Image.Image) -> bool:
+    """Returns whether an opened file, whose pixels are not decoded yet, has 16 bits a channel."""
+    return re.search(r";16[BLN]", str(getattr(file, "tile", ""))) is not None
+
+
+def check_grey(image: Image.Image, path: Path) -> None:
+    """Raises SceneError for grey values of more than 8 bits, whose range is unknown."""
+    if image.mode[0] in "IF":
+        raise SceneError(f"{path}: has grey values of more than 8 bits; write it with 8 bits a channel")
+
+
+@functools.lru_cache(maxsize=8)
+def _to_srgb(profile: bytes | None, mode: str) -> ImageCms.ImageCmsTransform | None:
+    """Returns the transform from a colour profile, such as Display P3, to sRGB; None if there is nothing to convert."""
+    if not profile:
+        return None
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, mode)
+    except (ImageCms.PyCMSError, OSError):  # a broken profile counts as missing
+        return None
+    levels = np.linspace(0, 255, 9).astype(np.uint8)
+    colours = np.stack(np.meshgrid(*[levels] * 3), -1).reshape(1, -1, 3)
+    colours = np.concatenate((colours, np.full_like(colours[..., :1], 255)), -1)[..., : len(mode)]
+    shown = np.asarray(ImageCms.applyTransform(Image.fromarray(colours), transform))
+    return transform if np.abs(shown.astype(int) - colours).max() > ROUNDED else None
 
 
 class Decoded(NamedTuple):
@@ -294,14 +334,9 @@ def drawn(mask: Image.Image, size: Sequence[int], turns: int) -> NDArray[np.bool
 def _opened(path: Path) -> Iterator[Image.Image]:
     """Opens an image file without decoding its pixels."""
     try:
-        with open(path, "rb") as stream:
-            start = stream.read(PNG_DEPTH + 1)
-            stream.seek(0)
-            # Pillow rounds most 16-bit images to 8 bits without a warning.
-            if start.startswith(PNG_SIGNATURE) and start[PNG_DEPTH:] == b"\x10":
-                raise SceneError(f"{path}: has more than 8 bits a channel, which is not supported")
-            with Image.open(stream, formats=FORMATS) as file:
-                yield file
+        with open(path, "rb") as stream, Image.open(stream, formats=FORMATS) as file:
+            check_grey(file, path)
+            yield file
     except SceneError:
         raise
     except UNREADABLE as error:

@@ -1,4 +1,4 @@
-"""Makes a scene from a video or a folder of images; COLMAP (through pycolmap) finds the cameras.
+"""Makes a scene from videos or a folder of images; COLMAP (through pycolmap) finds the cameras.
 
 The stages keep their results in `OUT/colmap`. A stopped process continues from these results, and COLMAP's own program
 can open them:
@@ -50,7 +50,7 @@ from voronerf.app.scenes.folds import (
     trusted_pairs,
     wide_pairs,
 )
-from voronerf.app.scenes.gather import Progress, emptied, gather, read_mask
+from voronerf.app.scenes.gather import Progress, cameras_of, emptied, gather, read_mask
 from voronerf.app.scenes.images import read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
 from voronerf.app.scenes.results import (
@@ -98,6 +98,8 @@ LARGEST_ERROR, ERROR_SHARE = 2.0, 1 / 800
 TRACKS = 200
 #: The name of the mapper's thread, which cannot be interrupted.
 MAPPER = "mapper"
+#: The file with the folder or the video of each image.
+PLACES = "places.json"
 #: The temporary name of the stages' folder, until its settings are written.
 BEGUN = ".colmap"
 #: Reduced images are written only if their longer side has at least this number of pixels.
@@ -150,7 +152,7 @@ class Model:
 
 
 def process(
-    source: Path,
+    source: Path | Sequence[Path],
     out: Path,
     *,
     frames: int = 150,
@@ -165,17 +167,19 @@ def process(
 ) -> None:
     """Makes a scene: `out/images`, reduced copies, a COLMAP model in `out/sparse/0` and `out/transforms.json`.
 
-    Images of one size share a camera. `out/colmap` keeps the results of each stage, from which a process with the same
-    settings continues. `out/sparse/0` is written last.
+    Images share a camera if they have the same size and, by their EXIF tags, the same make, model and focal length. If
+    the tags tell no focal length, they must also come from the same folder or video. `out/colmap` keeps the results of
+    each stage, from which a process with the same settings continues. `out/sparse/0` is written last.
 
     Args:
-        source: a video, or a folder of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC images. If the folder
-            itself has no images, its subfolder `images` or else all its subfolders are read. Pixels that are
+        source: a video or several videos, or a folder of PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif, HEIC images.
+            If the folder itself has no images, its subfolder `images` or else all its subfolders are read; if it has
+            none anywhere, its videos are read. Colours of videos are converted to sRGB. Pixels that are
             transparent, or black in a mask, have no features. The mask of `0.jpg` is `0.jpg.png` or `0.png` in a folder
             `masks`, in or beside the images' folder, and is copied to `out/masks`. The static surroundings of an object
             on a turntable must be transparent or masked.
         out: the folder to make; an existing folder must be empty or belong to a stopped process.
-        frames: the number of evenly spaced frames to take from a video; all frames if it has fewer.
+        frames: the number of evenly spaced frames to take from the videos; all frames if they have fewer.
         matching: selection of image pairs: "exhaustive", all pairs; "sequential", neighbours by name; "auto", images
             whose largest features match, and the next two images by name.
         camera_model: COLMAP's name of the lens model.
@@ -202,12 +206,18 @@ def process(
         raise ValueError(f"process: max_features must be at least 100, got {max_features}")
     if size < 64:
         raise ValueError(f"process: size must be at least 64, got {size}")
-    if not source.exists():
-        raise SceneError(f"{source}: there is no such video or folder")
-    settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features, size)
+    sources = [source] if isinstance(source, Path) else list(source)
+    for path in sources:
+        if not path.exists():
+            raise SceneError(f"{path}: there is no such video or folder")
+        if len(sources) > 1 and not path.is_file():
+            raise SceneError(f"{path}: several sources must be videos, got a folder; put all pictures into one folder")
+    resolved = os.pathsep.join(str(path.resolve()) for path in sources)
+    settings = Settings(resolved, frames, matching, camera_model, max_features, size)
     work = _begin(out, settings)
+    places = work / PLACES
     if not (images := out / "images").is_dir():
-        _begin_images(source, out, frames, say, progress)
+        _begin_images(sources, out, frames, say, progress)
     os.environ.setdefault("GLOG_logbuflevel", "-1")  # read when COLMAP is loaded: turns off log buffering
     stopping = signal.getsignal(signal.SIGTERM)
     try:
@@ -224,14 +234,15 @@ def process(
         log.set_log_destination(other, "")
     files, masks = listed_images(images), out / "masks"
     sizes = {path.name: read_header(path).size for path in files}
-    counts = [f"{count} of {width} x {height}" for (width, height), count in Counter(sizes.values()).most_common()]
-    shared = "one camera" if len(counts) == 1 else f"{len(counts)} cameras, one for each size: {some_of(counts)}"
+    cameras = cameras_of(files, read_result(places, dict) if places.is_file() else {})
+    counts = [f"{count} of {label}" for label, count in Counter(cameras.values()).most_common()]
+    shared = "one camera" if len(counts) == 1 else f"{len(counts)} cameras: {some_of(counts)}"
     say(f"{len(files)} images with {shared}; {work} keeps COLMAP's results")
     stages = Stages(pycolmap, work, images, progress)
     if masks.is_dir() or any(read_header(path).alpha for path in files):
         _write_masks(files, masks, work / "masks")
     with named_errors("pycolmap: matches"):
-        _match(stages, sizes, settings)
+        _match(stages, sizes, cameras, settings)
         matches = _read_matches(stages)
     still, pairs = still_pairs(matches)
     if still > STILL * pairs:
@@ -241,14 +252,15 @@ def process(
         )
     models = _find_models(stages, matches, mapper, len(files), say)
     if not models:
-        raise SceneError(f"{source}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
+        raise SceneError(f"{sources[0]}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
     best = _best(models, len(files))
     few = len(best.images) < LEAST_SHARE * len(files)
     faults = best.faults or ["less than half of the images have a camera"] * few
     if faults:
         raise SceneError(
             f"{out}: no sound model of {len(files)} images: {'; '.join(faults)}. Try --matching exhaustive, "
-            f"--max-features 8192, another --camera-model, or more images; {work} has COLMAP's results"
+            f"--max-features 8192, another --camera-model, more images, or a folder for each lens and zoom: images "
+            f"with {shared.partition(':')[0]}; {work} has COLMAP's results"
         )
     for factor in (2, 4):
         _write_reduced(files, out / f"images_{factor}", factor)
@@ -295,11 +307,14 @@ def _begin(out: Path, settings: Settings) -> Path:
     return work
 
 
-def _begin_images(source: Path, out: Path, frames: int, say: Callable[[str], None], progress: Progress) -> None:
+def _begin_images(
+    sources: Sequence[Path], out: Path, frames: int, say: Callable[[str], None], progress: Progress
+) -> None:
     """Makes `out/images` and, if there are masks, `out/masks`; removes both and the stages' folder on failure."""
     part, masks = emptied(out / ".images"), out / "masks"
     try:
-        gather(source, part, masks, frames, say=say, progress=progress)
+        places = gather(sources, part, masks, frames, say=say, progress=progress)
+        write_text(out / "colmap" / PLACES, json.dumps(places, indent=1))
     except BaseException:
         for folder in (part, masks):
             shutil.rmtree(folder, ignore_errors=True)
@@ -329,8 +344,8 @@ class Stages:
         self.progress(name, len(items), len(items))
 
 
-def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
-    """Finds and matches the features of images; ``sizes`` maps the images' names to their sizes."""
+def _match(stages: Stages, sizes: dict[str, Size], labels: dict[str, str], settings: Settings) -> None:
+    """Finds and matches the features of images; the dictionaries have the images' sizes and cameras by their names."""
     colmap, database, names = stages.colmap, stages.work / "database.db", list(sizes)
     extraction = colmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = settings.max_features
@@ -343,9 +358,9 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
 
     def extract(some: Sequence[str], where: Path = database) -> None:
         with colmap.Database.open(where) as opened:
-            cameras = {(each.width, each.height): each.camera_id for each in opened.read_all_cameras()}
-        for size, alike in itertools.groupby(sorted(some, key=sizes.__getitem__), sizes.__getitem__):
-            reader.existing_camera_id = cameras.get(size, -1)
+            cameras = {labels[image.name]: image.camera_id for image in opened.read_all_images()}
+        for label, alike in itertools.groupby(sorted(some, key=labels.__getitem__), labels.__getitem__):
+            reader.existing_camera_id = cameras.get(label, -1)
             colmap.extract_features(
                 where,
                 stages.images,
@@ -637,6 +652,7 @@ def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
     for path in files:
         with Image.open(path) as image:
             kept = {} if path.suffix.lower() == ".png" else {"quality": 95, "exif": image.getexif()}
+            kept["icc_profile"] = image.info.get("icc_profile")
             indexed = image.mode in ("P", "1")
             shown = image.convert("RGBA" if read_header(path).alpha else "RGB") if indexed else image
             shown.reduce(factor).save(part / path.name, **kept)
