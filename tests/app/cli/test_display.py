@@ -55,7 +55,7 @@ def test_stages_of_a_process_fit_80_columns_and_say_the_time_left(monkeypatch):
     monkeypatch.setattr(console, "_width", 80)
     monkeypatch.setattr(console, "_height", 25)
     display, now = StageDisplay(), [0.0]
-    display.progress.get_time = lambda: now[0]
+    display.progress.get_time = display.progress.tasks[0]._get_time = lambda: now[0]
     display.show("features", 0, 500)
     now[0] = 40.0  # after two batches of four large images
     display.show("features", 8, 500)
@@ -69,9 +69,9 @@ def test_stages_of_a_process_fit_80_columns_and_say_the_time_left(monkeypatch):
     assert line.rstrip().endswith("8 of 500 0:41:00 left")
     for stage in ("matches", "global mapping: retriangulation and refinement"):
         display.show(stage, 0, 0)
-    lines = shown()
-    assert len(lines) == 3 and max(map(len, lines)) <= 80
-    assert lines[2].startswith("global mapping: retriangulation and refinement") and "left" not in lines[2]
+    (line,) = shown()
+    assert len(line) <= 80
+    assert line.startswith("global mapping: retriangulation and refinement") and "left" not in line
 
 
 def test_without_a_terminal_lines_tell_how_far_it_is(monkeypatch, capsys):

@@ -307,7 +307,7 @@ def test_a_step_takes_more_rays_where_space_is_empty(scene, monkeypatch):
 
 def test_a_run_directory_has_one_run(tmp_path, scene, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = [str(choose_directory(small(), scene).out) for _ in range(3)]
+    names = [str(choose_directory(small(), scene.name).out) for _ in range(3)]
     assert names == [f"runs/{scene.name}{end}" for end in ("", "-2", "-3")]
     other = Path("runs/other")
     with held(other):

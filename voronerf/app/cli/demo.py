@@ -44,7 +44,7 @@ def demo(out: Path | None = None, budget: float = 35.0) -> int:
     config = TrainConfig(data=f"builtin:{SIZE}", out=out, budget=budget, evaluations=1, eval_views=8)
     say(f"computing the built-in scene: 125 views of {SIZE} x {SIZE} pixels")
     scene = replace(load_scene(config.data), name="demo")
-    config = choose_directory(config, scene)
+    config = choose_directory(config, scene.name)
     run = config.out
     assert run is not None
     check_video(run / "turn.mp4")

@@ -106,11 +106,15 @@ def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
         )
     if not is_dataclass(info.type):
         return None
-    texts, hints, specs = field_docs(info.type), get_type_hints(info.type), []
-    for field in fields(info.type):
+    kind, prefix = info.type, getattr(info.type, "prefix", "")
+    texts, hints, specs = field_docs(kind), get_type_hints(kind), []
+    for field in fields(kind):
         default = getattr(info.default, field.name, field.default)
-        specs.append(StructFieldSpec(field.name, _argument(hints[field.name], default), default, texts[field.name]))
-    return StructConstructorSpec(info.type, tuple(specs))
+        name = f"{prefix}{field.name}"
+        specs.append(StructFieldSpec(name, _argument(hints[field.name], default), default, texts[field.name]))
+    return StructConstructorSpec(
+        lambda **parts: kind(**{name.removeprefix(prefix): value for name, value in parts.items()}), tuple(specs)
+    )
 
 
 @RULES.primitive_rule
@@ -177,11 +181,12 @@ def group_name(kind: type) -> str:
 
 
 def field_docs(kind: type) -> dict[str, str]:
-    """Returns the docstrings below the fields of a dataclass, each as one line."""
-    (tree,) = ast.parse(inspect.getsource(kind)).body
-    assert isinstance(tree, ast.ClassDef)
+    """Returns the docstrings below the fields of a dataclass and of its bases, each as one line."""
+    classes = [ast.parse(inspect.getsource(base)).body[0] for base in reversed(kind.__mro__) if is_dataclass(base)]
     return {
         before.target.id: " ".join(str(after.value.value).split())
+        for tree in classes
+        if isinstance(tree, ast.ClassDef)
         for before, after in itertools.pairwise(tree.body)
         if isinstance(before, ast.AnnAssign) and isinstance(before.target, ast.Name)
         if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)

@@ -1,15 +1,17 @@
-"""``voronerf process``: makes a scene from a video or photographs."""
+"""``voronerf process``: makes a scene from videos or photographs."""
 
 from __future__ import annotations
 
 import os
 import sys
 import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import Literal
 
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Column
 from rich.text import Text
 
@@ -19,53 +21,63 @@ from voronerf.app.scenes.process import MAPPER
 from voronerf.app.scenes.process import process as make_scene
 
 
+@dataclass(frozen=True)
+class ProcessSettings:
+    """The search for the cameras of images."""
+
+    frames: int = 150
+    """Number of evenly spaced frames to take from the videos; all frames if they have fewer."""
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """The pairs of images that are compared: all pairs (exhaustive), neighbours by name (sequential), or images that
+    share their largest features (auto)."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE."""
+    mapper: Literal["auto", "global", "incremental"] = "auto"
+    """COLMAP's mapper; auto is global, and also incremental if the global model has faults or loses cameras. A model
+    that contradicts pairs of images is made again without the doubtful pairs."""
+    max_features: int = 4096
+    """Greatest number of features of an image."""
+    size: int = 1600
+    """Pixels along the longer side to which images are reduced for the search of features."""
+    verbose: bool = False
+    """Show the output of COLMAP."""
+
+
+@dataclass(frozen=True)
+class CaptureSettings(ProcessSettings):
+    """The search for cameras if --data is a video or a folder of pictures without cameras, as in voronerf process."""
+
+    prefix = "process_"  # of the options
+
+
+AS_IN_PROCESS = CaptureSettings()
+
+
 def process(
-    source: Path,
-    out: Path,
-    /,
-    frames: int = 150,
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto",
-    camera_model: str = "SIMPLE_RADIAL",
-    mapper: Literal["auto", "global", "incremental"] = "auto",
-    max_features: int = 4096,
-    size: int = 1600,
-    verbose: bool = False,
+    source: Path, out: Path, more: tuple[Path, ...] = (), /, settings: ProcessSettings = ProcessSettings()
 ) -> int:
-    """Make a scene from a video or images: COLMAP finds the cameras. The same command continues after a stop.
+    """Make a scene from videos or images: COLMAP finds the cameras. The same command continues after a stop.
 
     Args:
         source: A video, or a folder of images, also in subfolders: PNG, JPEG, WebP, TIFF, BMP or, with pillow-heif,
-            HEIC. A folder named masks, in or beside the folder of the images, may hold a mask for each image; pixels
-            that are black in the mask are ignored.
+            HEIC, or of videos. A folder named masks, in or beside the folder of the images, may hold a mask for each
+            image; pixels that are black in the mask are ignored.
         out: The folder to make; it gets images, masks if there are any, sparse/0, transforms.json, and colmap, which
             holds the results of each stage so that the command can continue.
-        frames: Number of evenly spaced frames to take from a video; all frames if it has fewer.
-        matching: The pairs of images that are compared: all pairs (exhaustive), neighbours by name (sequential), or
-            images that share their largest features (auto).
-        camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
-        mapper: COLMAP's mapper; auto is global, and also incremental if the global model has faults or loses cameras. A
-            model that contradicts pairs of images is made again without the doubtful pairs.
-        max_features: Greatest number of features of an image.
-        size: Pixels along the longer side to which images are reduced for the search of features.
-        verbose: Show the output of COLMAP.
+        more: With several videos, as in `process a.mp4 b.mp4 DIR`, the last path is the folder to make.
+        settings: The settings of COLMAP.
     """
-    check_counts(frames=frames, max_features=max_features, size=size)
+    paths = [source, out, *more]
+    return find_cameras(paths[:-1], paths[-1], settings)
+
+
+def find_cameras(sources: Sequence[Path], out: Path, settings: ProcessSettings) -> int:
+    """Makes a scene with a progress line; returns 0, or the exit status after Ctrl-C or SIGTERM."""
+    check_counts(frames=settings.frames, max_features=settings.max_features, size=settings.size)
     display = StageDisplay()
     try:
         with display.progress:
-            make_scene(
-                source,
-                out,
-                frames=frames,
-                matching=matching,
-                camera_model=camera_model,
-                mapper=mapper,
-                max_features=max_features,
-                size=size,
-                verbose=verbose,
-                say=say,
-                progress=display.show,
-            )
+            make_scene(sources, out, **vars(settings), say=say, progress=display.show)
     except (KeyboardInterrupt, SystemExit) as stop:  # Ctrl-C, SIGTERM
         say("stopped; continue with the same command")
         status = stop.code if isinstance(stop, SystemExit) and isinstance(stop.code, int) else 130
@@ -97,9 +109,9 @@ class TimeLeft(ProgressColumn):
 
 
 class StageDisplay:
-    """A display of the stages of a long command: bars with the remaining time on a terminal, plain lines elsewhere.
+    """A display of the stages of a long command: a line with the remaining time on a terminal, a line each elsewhere.
 
-    Its ``progress`` is the context manager that shows the bars.
+    Its ``progress`` is the context manager that shows the line.
     """
 
     def __init__(self) -> None:
@@ -112,16 +124,13 @@ class StageDisplay:
             disable=not console.is_terminal,
             refresh_per_second=4,
         )
-        self.tasks: dict[str, TaskID] = {}
+        self.task = self.progress.add_task("", total=None, count="", visible=False)
 
     def show(self, stage: str, done: int, total: int) -> None:
         """Shows the progress of a stage; a total of 0 means unknown."""
-        if stage not in self.tasks:
-            for task in self.progress.tasks:
-                if task.total is None:  # a finished stage of unknown length
-                    self.progress.update(task.id, completed=1, total=1)
-            self.tasks[stage] = self.progress.add_task(stage, total=None, count="")
+        if stage != self.progress.tasks[0].description:
+            self.progress.reset(self.task, description=stage, visible=True)
             if not console.is_terminal:
                 say(stage)
         count = f"{done} of {total}" if total else str(done or "")
-        self.progress.update(self.tasks[stage], completed=done, total=total or None, count=count)
+        self.progress.update(self.task, completed=done, total=total or None, count=count)

@@ -13,7 +13,7 @@ import sys
 import threading
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import torch
 from rich.console import Console
@@ -23,7 +23,7 @@ from rich.table import Table
 from voronerf import __version__
 from voronerf.app.cli.compare import compare
 from voronerf.app.cli.demo import demo
-from voronerf.app.cli.display import console, one_line, say
+from voronerf.app.cli.display import console, exit_on_sigterm, one_line, say
 from voronerf.app.cli.editing import cut, join, place
 from voronerf.app.cli.eval import evaluate_run
 from voronerf.app.cli.export import export
@@ -87,7 +87,7 @@ def run(args: list[str] | None = None) -> int:
             signal.signal(signal.SIGINT, signal.default_int_handler)
     warnings.showwarning = _show_warning
     threading.excepthook = _show_thread_error
-    with contextlib.nullcontext() if args[:1] == ["train"] else _exit_on_sigterm():  # a training ends by a checkpoint
+    with contextlib.nullcontext() if args[:1] == ["train"] else exit_on_sigterm():  # a training ends by a checkpoint
         try:
             status = _run(args)
         except SystemExit:
@@ -109,20 +109,6 @@ def _nobody_reads() -> bool:
         return bool(poll.poll(0))  # reports errors only
     except (AttributeError, OSError, ValueError):  # Windows, no stdout, or a stdout without a file descriptor
         return False
-
-
-@contextlib.contextmanager
-def _exit_on_sigterm() -> Iterator[None]:
-    """A context in which SIGTERM unwinds the stack, so that a command removes its incomplete files."""
-    is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _run(args: list[str]) -> int:

@@ -48,7 +48,8 @@ def argument_names(command: Callable[..., int]) -> tuple[list[str], list[str], l
         if parameter.kind is parameter.POSITIONAL_ONLY:
             arguments.append(name)
         elif is_dataclass(hints[name]):
-            options |= get_type_hints(hints[name])
+            prefix = getattr(hints[name], "prefix", "")
+            options |= {f"{prefix}{name}": hint for name, hint in get_type_hints(hints[name]).items()}
         else:
             options[next((note.name for note in notes if getattr(note, "name", "")), name)] = hints[name]
     options |= {f"no-{name}": hint for name, hint in options.items() if hint is bool}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import glob
 import importlib
 import inspect
 import itertools
@@ -21,12 +22,16 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from voronerf.app.cli.display import TrainingDisplay, busy, say, tracked
+from voronerf.app.cli.display import TrainingDisplay, busy, exit_on_sigterm, say, tracked
+from voronerf.app.cli.export import export
+from voronerf.app.cli.process import AS_IN_PROCESS, CaptureSettings, find_cameras
+from voronerf.app.cli.render import render
 from voronerf.app.cli.view import import_viewer
 from voronerf.app.evaluate.lpips import find_lpips
 from voronerf.app.evaluate.panels import write_panels
+from voronerf.app.files import read_json
 from voronerf.app.run import open_run
-from voronerf.app.scenes import Scene, SceneError, load_scene
+from voronerf.app.scenes import Scene, SceneError, load_scene, needs_cameras
 from voronerf.app.train.build import build, present_device
 from voronerf.app.train.callbacks import (
     CHECKPOINT_EVERY,
@@ -59,12 +64,15 @@ from voronerf.ops._core import backends
 LONGEST_NAME = 255 - len(".png")
 #: Default number of panels.
 PANELS = 4
+#: The folder of a run with the scene that was made of a video or of pictures.
+CAPTURE = "capture"
 #: Signals that end a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
 
 #: Printed before a training without any options.
 WHAT_TO_TRY = """This trains the built-in scene for 480 s, into runs/. Ctrl-C stops it. Other things to try:
   voronerf train --budget 60                the same for a minute
+  voronerf train --data walk.mp4            your video or your pictures: finds the cameras first
   voronerf train --data DIR --downscale 4   your scene: Blender, transforms.json, COLMAP or LLFF
   voronerf train --view                     watch it in a browser
   voronerf demo                             a picture and a video of the built-in scene in two minutes
@@ -83,10 +91,13 @@ def train(
     host: str = "127.0.0.1",
     port: int = 8080,
     explain: bool = False,
+    capture: CaptureSettings = AS_IN_PROCESS,
 ) -> int:
     """Train a scene: first one coarse network, then a network for each Voronoi cell.
 
-    With --resume, omitted options keep their value from the run in --out.
+    With --resume, omitted options keep their value from the run in --out. If --data is a video, or a folder of pictures
+    or videos without cameras, COLMAP finds the cameras first, see voronerf process. Then the folder capture of the run
+    is the scene, and the trained run gets a video and a page for browsers.
 
     Args:
         config: The settings.
@@ -100,6 +111,7 @@ def train(
         host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
         port: Port that --view listens at; 0 is any free port.
         explain: Only print how a training step is computed, and what prevents a faster implementation.
+        capture: The settings of COLMAP.
     """
     present_device(config.device)  # fails before the scene is read
     if panels is not None and panels < 0:
@@ -110,6 +122,11 @@ def train(
         import_viewer().check_address(host, port)
     if tensorboard:
         tensorboard_writer()
+    if not resume and needs_cameras(config.data):
+        config, status = with_cameras(config, capture)
+        if status:
+            return status
+    is_capture = Path(config.data).name == CAPTURE
     try:
         with busy(f"reading {config.data}"):
             scene = load_scene(config.data, **config.reading)
@@ -118,12 +135,14 @@ def train(
             raise
         again = shlex.join(["voronerf", "train", "--resume", "--out", config.data])
         raise ConfigError(f"--data must be a scene, got the run {config.data}; {again} continues it") from None
+    if is_capture:
+        scene = replace(scene, name=Path(config.data).resolve().parent.name)
     if explain:
         state = build(config, scene)
         for line in (*state.ray_loss.explain().splitlines(), state.training_step.explain()):
             say(line)
         return 0
-    chosen = choose_directory(config, scene, resume=resume)
+    chosen = choose_directory(config, scene.name, resume=resume)
     assert chosen.out is not None
     for path in (config.data, config.lpips):
         if path is not None and is_outside(chosen.out, path):
@@ -142,6 +161,8 @@ def train(
 
         options: dict[str, Any] = {"checkpoint_every": checkpoint_every, "panels": panels, "tensorboard": tensorboard}
         summary = run_training(chosen, scene, resume=resume, watch=watch if view else None, **options)
+        if is_capture and summary["complete"]:
+            finish(chosen.out)
         for viewer in viewers:
             if summary["complete"]:
                 say(f"{viewer.address} shows the run until Ctrl-C")
@@ -150,6 +171,49 @@ def train(
                 with contextlib.suppress(KeyboardInterrupt):
                     viewer.serve()
     return 0 if summary["complete"] else 130
+
+
+def with_cameras(config: TrainConfig, settings: CaptureSettings) -> tuple[TrainConfig, int]:
+    """Makes a scene of a video or a folder of pictures, in the folder `CAPTURE` of a run.
+
+    Without --out, the run is one that has begun with the same data and settings, or else a new one.
+
+    Returns:
+        (the settings with this scene and run, 0 or the exit status after a stop).
+    """
+    source = Path(config.data)
+    resolved = source.resolve()
+    name = resolved.stem if source.is_file() else resolved.name
+    begun = _begun(name, {"source": str(resolved), **vars(settings)}) if config.out is None else None
+    chosen = choose_directory(replace(config, out=begun or config.out), name)
+    assert chosen.out is not None
+    capture = chosen.out / CAPTURE
+    with contextlib.ExitStack() as stack:
+        if config.out is None:
+            stack.callback(_remove_empty, chosen.out)
+        stack.enter_context(held(chosen.out))
+        stack.enter_context(exit_on_sigterm())
+        is_made = (capture / "sparse" / "0").is_dir()
+        status = 0 if is_made else find_cameras([source], capture, settings)
+    return replace(chosen, data=str(capture)), status
+
+
+def _begun(name: str, settings: dict[str, Any]) -> Path | None:
+    """Returns the last run of this name that was stopped, with these settings, before its training; or None."""
+    for record in sorted(Path("runs").glob(f"{glob.escape(name)}*/{CAPTURE}/colmap/settings.json"), reverse=True):
+        run = record.parents[2]
+        if not checkpoint_paths(run) and read_json(record, dict).items() <= settings.items():
+            return run
+    return None
+
+
+def finish(run: Path) -> None:
+    """Makes a video and a page of a trained run."""
+    render(run)
+    try:
+        export(run, web=run / "scene.html")
+    except ValueError as error:  # a page has no code for some fields
+        say(f"no page: {error}")
 
 
 def continuation(config: TrainConfig) -> str:

@@ -14,6 +14,7 @@ from voronerf.app.scenes.builtin.city import city_of
 from voronerf.app.scenes.colmap import find_models, load_colmap
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import CONVERTED, SUFFIXES
+from voronerf.app.scenes.gather import VIDEOS
 from voronerf.app.scenes.llff import FILE, load_llff
 from voronerf.app.scenes.photographs import Reading
 from voronerf.app.scenes.scene import KINDS, Scene, Split
@@ -26,10 +27,6 @@ BUILTIN_SIZE = 100
 BUILTIN, CITY = "builtin", "builtin-city"  # optional suffix: builtin:SIZE, builtin-city:BLOCKS
 CACHED = 100  # least side, in pixels, of a built-in scene that is cached
 MOST_PIXELS = 1600  # largest side of the built-in scene
-
-
-#: Suffixes of videos that `voronerf process` may read.
-VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".mpg")
 
 
 class Format(NamedTuple):
@@ -71,6 +68,17 @@ def is_builtin(source: str | Path | None) -> bool:
 def has_images(folder: Path) -> bool:
     """Returns whether a folder has images, with or without cameras."""
     return any(path.suffix.lower() in (*SUFFIXES, *CONVERTED) for path in folder.iterdir())
+
+
+def needs_cameras(source: str | Path) -> bool:
+    """Returns whether a source is a video or a folder of pictures or videos without cameras, for `voronerf process`."""
+    path = Path(source)
+    if path.is_file():
+        return path.suffix.lower() in VIDEOS
+    if is_builtin(source) or not path.is_dir() or any(item.is_used_by(path) for item in FORMATS.values()):
+        return False
+    suffixes = (*SUFFIXES, *CONVERTED, *VIDEOS)
+    return any(file.suffix.lower() in suffixes for file in path.rglob("*") if not file.name.startswith("."))
 
 
 def load_scene(

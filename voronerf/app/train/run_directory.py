@@ -22,7 +22,7 @@ from voronerf.app.files import (
     read_json_lines,
     remove_partial,
 )
-from voronerf.app.scenes import Scene, is_builtin
+from voronerf.app.scenes import is_builtin
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
 
@@ -72,14 +72,17 @@ def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None
             )
 
 
-def choose_directory(config: TrainConfig, scene: Scene, *, resume: bool = False) -> TrainConfig:
-    """Returns the configuration with ``out`` filled in and checked; makes a new folder if ``out`` is None."""
+def choose_directory(config: TrainConfig, name: str, *, resume: bool = False) -> TrainConfig:
+    """Returns the configuration with ``out`` filled in and checked; makes a new folder if ``out`` is None.
+
+    The new folder is `runs/NAME`, or the first free `runs/NAME-N`.
+    """
     out = config.out
     if out is None:
         if resume:
             raise ConfigError("--resume needs --out, the run directory to continue")
-        names = (scene.name, *(f"{scene.name}-{i}" for i in range(2, 10_000)))
-        out = next(folder for name in names if _make_folder(folder := Path("runs") / name))
+        names = (name, *(f"{name}-{i}" for i in range(2, 10_000)))
+        out = next(folder for each in names if _make_folder(folder := Path("runs") / each))
     elif out.is_file():
         raise ConfigError(f"--out must be a folder, got the file {out}")
     elif not resume and checkpoint_paths(out):
