@@ -70,6 +70,8 @@ def test_downscale(tmp_path):
     [
         ("{", "is not JSON"),
         (b"\xff\xfe\x00", "is not JSON"),
+        ("\ufeff{}".encode("utf-16-le"), "transforms.json: is not JSON in UTF-8 but UTF-16 text; save it as UTF-8"),
+        ("{}".encode("utf-16-be"), "transforms.json: is not JSON in UTF-8 but UTF-16 text; save it as UTF-8"),
         ("", "is not JSON"),
         ("[]", "has no frames"),
         ("{}", "has no frames"),
@@ -110,24 +112,50 @@ def edited(row, column, value):
         (edited(0, 0, 2.0), "is not a rotation"),
         (edited(0, 0, -1.0), "determinant -1"),
         (edited(0, 1, 0.1), "is not a rotation"),
-        (edited(1, 3, math.nan), "not finite"),
-        (edited(1, 1, math.inf), "not finite"),
         (edited(3, 3, 2.0), "last row must be 0 0 0 1"),
         (edited(0, 0, "one"), "not a matrix of numbers"),
         (POSE[:2], "must be 4 x 4, got shape [2, 4]"),
         ([[1, 2], [3]], "not a matrix of numbers"),
-        (None, "not a matrix of numbers"),
         *[(edited(0, 0, value), "not a matrix of numbers") for value in ("1.0", True)],
         (edited(2, 3, 1e30), "are not finite, or above 1e+09"),
         *[(edited(*at, 10**400), "is not a matrix of numbers") for at in ((0, 0), (1, 3))],
         *[(edited(*at, 1e300), "are not finite") for at in ((0, 0), (1, 3))],
     ],
-    ids=range(17),
+    ids=range(14),
 )
 def test_pose(tmp_path, matrix, reason):
     write_noise(tmp_path)
     rewrite(tmp_path, lambda contents: contents["frames"][1].update(transform_matrix=matrix))
     fails(tmp_path, "transforms.json: frame 1 (1.png)", reason)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "reason"),
+    [
+        (None, "not a matrix of numbers"),
+        ("absent", "not a matrix of numbers"),
+        (edited(1, 3, math.nan), "not finite"),
+        (edited(1, 1, math.inf), "not finite"),
+        (edited(1, 3, None), "not a matrix of numbers"),
+    ],
+)
+def test_a_frame_without_a_pose_is_left_out_but_not_all_frames(tmp_path, matrix, reason):
+    """A few frames without a pose are left out with a note; if no frame has a pose, the first one is refused."""
+    write_noise(tmp_path, count=4)
+
+    def change(contents, count):
+        for frame in contents["frames"][:count]:
+            frame["transform_matrix"] = matrix
+            if matrix == "absent":
+                del frame["transform_matrix"]
+
+    rewrite(tmp_path, lambda contents: change(contents, 2))
+    (tmp_path / "0.png").unlink()
+    scene = load_scene(tmp_path)
+    assert (scene.test.names, scene.train.names) == (("2",), ("3",))
+    assert "2 of 4 frames have no pose and are left out: 0.png, 1.png" in scene.notes
+    rewrite(tmp_path, lambda contents: change(contents, 4))
+    fails(tmp_path, "transforms.json: frame 0 (0.png): transform_matrix", reason)
 
 
 def test_what_is_sound_loads(tmp_path):
@@ -158,6 +186,8 @@ def test_images(tmp_path):
     for index in range(3):
         (tmp_path / f"{index}.png").unlink()
     fails(tmp_path, "transforms.json: none of its 3 images exists, the first is", "0.png")
+    Image.fromarray(NOISE).save(tmp_path / "1.webp")
+    fails(tmp_path, f"0.png; mogrify -format png {tmp_path}/*.webp writes PNG files, which are found")
     write_noise(tmp_path, count=1)
     fails(tmp_path, "needs at least two images")
 
@@ -173,7 +203,7 @@ def test_images(tmp_path):
         ({"fl_x": None, "camera_angle_x": 3.5}, "camera_angle_x must be an angle between 0 and pi, got 3.5"),
         ({"w": 16}, "says w = 16"),
         ({"w": 6, "h": 8}, "is 8 x 6 pixels, but"),
-        ({"w": 1920, "h": 1080}, "says w = 1920 and h = 1080"),
+        ({"w": 1920, "h": 1080}, "says w = 1920 and h = 1080: it was cropped or has another aspect ratio; use the"),
         ({"h": 8}, "says h = 8"),
         ({"k4": 0.1}, "lens distortion k4 is not supported, only k1, k2, k3, p1, p2"),
         ({"is_fisheye": True, "p1": 0.1}, "lens distortion p1 is not supported, only k1, k2, k3, k4 of a fisheye"),
@@ -238,6 +268,26 @@ def test_blender(tmp_path):
         for name in ("train", "test"):
             (tmp_path / f"transforms_{name}.json").write_text(json.dumps(contents | entries))
         fails(tmp_path, reason)
+
+
+@pytest.mark.parametrize("suffix", ["webp", "tif", "BMP"])
+def test_images_in_other_formats_have_a_remedy_that_works(tmp_path, suffix):
+    """The error for a format that is not read names the command that converts the images, which are found then."""
+    folder = tmp_path / "a scene"
+    write_noise(folder)
+    for index in range(3):
+        Image.fromarray(NOISE).save(folder / f"{index}.{suffix}")
+        (folder / f"{index}.png").unlink()
+
+    def change(contents):
+        for frame in contents["frames"]:
+            frame["file_path"] = frame["file_path"].replace("png", suffix)
+
+    rewrite(folder, change)
+    fails(folder, f".{suffix}: is not an image in PNG or JPEG format; mogrify -format png '{folder}'/*.{suffix} writes")
+    for index in range(3):
+        Image.fromarray(NOISE).save(folder / f"{index}.png")
+    assert load_scene(folder).train.names == ("1", "2")
 
 
 @pytest.mark.parametrize("kind", ["above", "absolute", "link", "linked folder", "suffix", "backslash"])

@@ -104,6 +104,9 @@ def write_named(folder, name, file, pictures="images", size=SIZE):
         ("C:\\a\\{}.jpg", "b/{}.png", False),
         ("IMG_{}.JPG", "image{:03d}.png", True),
         ("/home/someone/gone/{}.jpg", "{:03d}.png", True),
+        ("Mu\u0308ller_{}.jpg", "M\u00fcller_{}.jpg", False),  # as macOS writes names
+        ("M\u00dcLLER_{}.jpg", "mu\u0308ller_{}.png", False),
+        ("E:\\scan\\left\\{}.jpg", "left/{}.jfif", False),
         pytest.param("9" * 5000 + "{}.jpg", "{:03d}.png", True, id="more digits than int takes"),
     ],
 )
@@ -223,6 +226,19 @@ def test_names_of_files_elsewhere_are_those_in_the_folder(tmp_path):
         assert int(scene.train.images[scene.train.names.index("1")].max()) == grey
 
 
+def test_paths_of_another_machine_with_equal_names(tmp_path, caplog):
+    """Images of two cameras with the same base names are told apart by their folders; a missing one stays missing."""
+    names = [f"{'left' if index % 2 else 'right'}/{index // 2:02d}.jpg" for index in range(COUNT)]
+    write_named(tmp_path, lambda index: f"/home/me/scan/{names[index]}", names.__getitem__)
+    scene = load_scene(tmp_path, normalise=False)
+    for split in (scene.train, scene.test):
+        for image, pose in zip(split.images, split.cameras.poses):
+            torch.testing.assert_close(pose, POSES[int(image[0, 0, 0])], atol=1e-5, rtol=0)
+    (tmp_path / "images/left/01.jpg").unlink()
+    scene = load_scene(tmp_path)
+    assert len(scene.train) + len(scene.test) == 8 and "1 of 9 listed images are missing" in caplog.text
+
+
 @pytest.mark.parametrize("again", ["03.jpg", "./03.jpg", "../images/03.jpg", "link.jpg"])
 def test_an_image_that_is_listed_twice_is_not_also_held_out(tmp_path, again):
     write_named(tmp_path, lambda index: again if index == 8 else f"{index:02d}.jpg", "{:02d}.jpg".format)
@@ -230,6 +246,130 @@ def test_an_image_that_is_listed_twice_is_not_also_held_out(tmp_path, again):
     scene = load_scene(tmp_path)
     assert f"images are listed twice; only the first entry counts: {again.rpartition('/')[2]}" in scene.notes
     assert sorted((*scene.train.names, *scene.test.names)) == [f"{index:02d}" for index in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [
+        *[
+            (place, name)
+            for place in ("rgb", "My 100% Frames")
+            for name in ("{:02d}.jpg", "{:02d}", "C:\\a\\{:02d}.JPG")
+        ],
+        ("rgb", "rgb/{:02d}.jpg"),
+        (".", "{:02d}.jpg"),
+    ],
+)
+@pytest.mark.parametrize("data", [".", "sparse/0"])
+def test_a_folder_of_images_with_another_name(tmp_path, place, name, data):
+    write_named(tmp_path, name.format, "{:02d}.jpg".format, "made")
+    half_black(tmp_path / "masks/03.jpg.png", SIZE)
+    half_black(tmp_path / "depth/03.jpg", SIZE)
+    (tmp_path / place).mkdir(exist_ok=True)
+    for path in (tmp_path / "made").iterdir():
+        path.rename(tmp_path / place / path.name)
+    scene = load_scene(tmp_path / data)
+    # Names with the folder are paths in the scene's folder.
+    where = tmp_path.name if place == "." or "rgb/" in name else place
+    assert f"images are read from {where}, since there is no folder images" in scene.notes
+    assert scene.name == tmp_path.name and len(scene.train) + len(scene.test) == 9
+    assert "1 of 9 images have a mask in masks, whose black pixels do not count" in scene.notes
+
+
+def test_two_folders_of_images_with_other_names_are_refused(tmp_path):
+    write_named(tmp_path, "{:02d}.jpg".format, "{:02d}.jpg".format, "rgb")
+    shutil.copytree(tmp_path / "rgb", tmp_path / "small")
+    line = "has no folder images, and rgb as well as small has images of the model; rename the folder of the images to"
+    refuses(line, load_scene, tmp_path, error=SceneError)
+    shutil.rmtree(tmp_path / "rgb")
+    for path in (tmp_path / "small").iterdir():
+        path.rename(path.with_name(f"x{path.name}"))
+    refuses("images_4, ...; rename the folder of the images to images", load_scene, tmp_path, error=SceneError)
+
+
+def test_places_of_automatic_reconstruction_and_of_glomap(tmp_path):
+    """A place with images comes before a place without, and `transforms.json` before both."""
+    folder = tmp_path / "automatic"
+    write_models(folder, {"dense/0/sparse": 9, "sparse/0": 5}, "dense/0/images")
+    (folder / "dense/1").mkdir()
+    for data in (folder, folder / "dense/0", folder / "dense/0/sparse"):
+        assert len(load_scene(data).train) == 7
+    line = f"the first of the folders in dense is read (--data {folder / 'dense/1'} reads another one)"
+    assert line in load_scene(folder).notes
+    folder = tmp_path / "glomap"
+    write_models(folder, {"output/0": 9})
+    for data in (folder, folder / "output", folder / "output/0"):
+        scene = load_scene(data)
+        assert len(scene.train) == 7 and scene.name == "glomap"
+    (folder / "transforms.json").write_text("{}")
+    refuses("transforms.json: has no frames", load_scene, folder, error=SceneError)
+
+
+def write_list(path, *lines, end="\n"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"\xef\xbb\xbf" + end.join(("# names", "", *lines, "")).encode())
+
+
+@pytest.mark.parametrize(
+    ("model", "lists", "train", "test", "notes"),
+    [
+        ("{:02d}.jpg", {"test": ["03.jpg", "05.jpg"]}, (0, 1, 2, 4, 6, 7, 8), (3, 5), ()),
+        ("{:02d}.jpg", {"test": ["images/03", "images/05.JPG"]}, (0, 1, 2, 4, 6, 7, 8), (3, 5), ()),
+        ("{:02d}.jpg", {"test": ["03", "77", "# 05"]}, (0, 1, 2, 4, 5, 6, 7, 8), (3,), ("1 of 2 names in",)),
+        ("{:02d}.jpg", {"test": ["images\\03.png", "./images/05.png"]}, (0, 1, 2, 4, 6, 7, 8), (3, 5), ()),
+        ("a/{:02d}.jpg", {"test": ["03.jpg", "05.jpg", "77.jpg"]}, (0, 1, 2, 4, 6, 7, 8), (3, 5), ("1 of 3 names in",)),
+        ("{:02d}.jpg", {"test": ["77"]}, range(1, 8), (0, 8), ("1 of 1 names in", "every 8th image is held out")),
+        ("{:02d}.jpg", {"test": []}, range(1, 8), (0, 8), ()),
+        ("{:02d}.jpg", {"train_list": ["01", "02"], "test_list": ["03"]}, (1, 2), (3,), ("6 images are in no list",)),
+        ("{:02d}.jpg", {"train_list": ["01", "02"]}, (1, 2), (0, 3, 4, 5, 6, 7, 8), ()),
+        ("{:02d}.jpg", {"test_list": ["03"], "test": ["04"]}, (0, 1, 2, 4, 5, 6, 7, 8), (3,), ()),
+    ],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_lists_of_test_images(tmp_path, model, lists, train, test, notes, end):
+    """Lists beside a model or in the scene's folder choose the test images, by names with or without folder."""
+    write_named(tmp_path, model.format, model.format)
+    for name, lines in lists.items():
+        write_list(tmp_path / ("sparse/0/test.txt" if name == "test" else f"{name}.txt"), *lines, end=end)
+    scene = load_scene(tmp_path)
+    for split, numbers in ((scene.train, train), (scene.test, test)):
+        assert [int(name[-2:]) for name in split.names] == list(numbers)
+    for line in notes:
+        assert line in " ".join(scene.notes)
+    said = "test images are those of" in " ".join(scene.notes)
+    assert said == (len(test) + len(train) < 9 or tuple(test) != (0, 8))
+
+
+@pytest.mark.parametrize(
+    ("lists", "reason"),
+    [
+        ({"train_list": ["01", "03"], "test_list": ["03"]}, "train_list.txt and the images for testing must differ"),
+        ({"train_list": [f"{index:02d}" for index in range(COUNT)]}, "train_list.txt leave no image for testing"),
+    ],
+)
+def test_lists_that_do_not_fit_together_are_refused(tmp_path, lists, reason):
+    write_both(tmp_path)
+    for name, lines in lists.items():
+        write_list(tmp_path / f"{name}.txt", *lines)
+    for format in ("colmap", "llff"):
+        refuses(reason, load_scene, tmp_path, format=format, error=SceneError)
+
+
+def test_lists_of_llff_and_lists_that_are_broken(tmp_path):
+    write_both(tmp_path)
+    write_list(tmp_path / "test_list.txt", "03.jpg")
+    assert load_scene(tmp_path, format="llff").test.names == ("03",)
+    (tmp_path / "test_list.txt").write_text("03.jpg", encoding="utf-16")
+    refuses("test_list.txt: is UTF-16 text; save it as UTF-8", load_scene, tmp_path, error=SceneError)
+    (tmp_path / "test_list.txt").unlink()
+    (tmp_path / "test_list.txt").symlink_to("/etc/passwd")
+    refuses("test_list.txt: must lie in the folder of the scene", load_scene, tmp_path, error=SceneError)
+    names = [f"{'left' if index % 2 else 'right'}/{index // 2:02d}.jpg" for index in range(COUNT)]
+    write_named(tmp_path / "two", names.__getitem__, names.__getitem__)
+    write_list(tmp_path / "two/sparse/0/test.txt", "03.jpg")
+    refuses("03.jpg may be left/03.jpg or right/03.jpg: the list", load_scene, tmp_path / "two", error=SceneError)
+    write_list(tmp_path / "two/sparse/0/test.txt", "left/03.jpg", "right/03")
+    assert load_scene(tmp_path / "two").test.names == ("images_right_03", "images_left_03")[::-1]
 
 
 def half_black(path, size):
@@ -317,7 +457,7 @@ def test_masks_of_reduced_images(tmp_path):
         (lambda model: (model.parents[1] / "images/03.jpg").write_bytes(b"no"), "03.jpg: is not an image"),
         (
             lambda model: Image.new("RGB", (10, 12)).save(model.parents[1] / "images/03.jpg"),
-            "is 10 x 12 pixels as stored",
+            "images.bin says 12 x 10: it was cropped or has another aspect ratio; use the images for which the cameras",
         ),
     ],
 )
@@ -351,6 +491,17 @@ def test_numbers_of_points_that_are_none_are_passed_over(tmp_path):
         ("cameras", "1 PINHOLE 12 ten 20 20 6 5", "cameras.txt: line 1 does not describe a camera"),
         ("cameras", f"1 PINHOLE {10**400} 10 20 20 6 5", "camera 1 must have a size, finite parameters"),
         ("cameras", "1 PINHOLE 12 10 20 20 6", "camera 1: PINHOLE must have 4 parameters, got 3"),
+        (
+            "cameras",
+            "1 PINHOLE 12 10 20,5 20 6 5",
+            "cameras.txt: line 1 does not describe a camera, since it has decimal commas: write 20.5 instead of 20,5",
+        ),
+        ("images", "1 0,5 0 0 0 0 0 0 1 a b.jpg", "does not describe an image, since it has decimal commas: write 0.5"),
+        (
+            "points3D",
+            "7 1,5e-3 2 3 9 9 9 1 1 0",
+            "does not describe a point, since it has decimal commas: write 1.5e-3",
+        ),
         ("images", "1 1 0 0 0 0 0", "images.txt: line 1 does not describe an image"),
         ("points3D", "7 one 2 3", "points3D.txt: line 1 does not describe a point"),
     ],
@@ -359,3 +510,22 @@ def test_broken_text_is_one_line(tmp_path, file, text, reason):
     write_both(tmp_path, binary=False)
     (tmp_path / f"sparse/0/{file}.txt").write_text(text + "\n")
     refuses(reason, load_scene, tmp_path, error=SceneError)
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
+def test_text_of_utf_16_is_one_line(tmp_path, file):
+    write_both(tmp_path, binary=False)
+    path = tmp_path / f"sparse/0/{file}.txt"
+    path.write_text(path.read_text(), encoding="utf-16")
+    refuses(f"{file}.txt: is UTF-16 text; save it as UTF-8", load_scene, tmp_path, error=SceneError)
+
+
+def test_images_in_other_formats_have_a_remedy(tmp_path):
+    write_named(tmp_path, "{}.webp".format, "{}.webp".format)
+    line = (
+        f"0.webp: is not an image in PNG or JPEG format; mogrify -format png {tmp_path}/images/*.webp writes PNG files"
+    )
+    refuses(line[1:], load_scene, tmp_path, error=SceneError)
+    for index in range(COUNT):
+        Image.new("RGB", SIZE).save(tmp_path / f"images/{index}.png")
+    assert len(load_scene(tmp_path).train) == 7

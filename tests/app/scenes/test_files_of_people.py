@@ -112,6 +112,67 @@ def test_names_of_pictures(name, downscale):
         assert torch.equal(scene.train.cameras.poses, full.train.cameras.poses)
 
 
+@pytest.mark.parametrize(
+    ("name", "test", "files"),
+    [
+        ("gaussian", ("003", "005"), "sparse/0/test.txt"),
+        ("lists", ("007", "008"), "train_list.txt and test_list.txt"),
+    ],
+)
+def test_lists_of_test_images(name, test, files):
+    scene = load_scene(case("test_lists") / name)
+    assert scene.test.names == test and len(scene.train) == 7
+    assert f"test images are those of {files}: 2 of 9" in scene.notes
+
+
+def test_masks_of_instant_ngp():
+    folder = case("dynamic_masks")
+    scene = load_scene(folder)
+    assert len(scene.train) == 5 and scene.test.names == ("000",)
+    assert (
+        "6 of 6 images have a mask dynamic_mask_NAME.png, whose pixels that are not black do not count" in scene.notes
+    )
+    for split in (scene.train, scene.test):
+        for index, label in enumerate(split.names):
+            white = np.asarray(Image.open(folder / f"images/dynamic_mask_{label}.png").convert("L")) > 0
+            assert white.any() and torch.equal(split.mask(index), torch.from_numpy(~white))
+    assert len(listed_images(folder / "images")) == 6
+
+
+def test_times_are_not_used():
+    scene = load_scene(case("time_of_frames"))
+    assert "its times are not used: the scene is taken as still" in scene.notes
+
+
+@pytest.mark.parametrize("name", ["case", "dexnerf", "nfd", "parent", "posix", "suffix", "windows"])
+def test_paths_of_another_machine(name):
+    scene = load_scene(folder := case("transforms_paths") / name, normalise=False)
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    for split in (scene.train, scene.test):
+        for label, pose in zip(split.names, split.cameras.poses):
+            expected = torch.tensor(frames[int(label[-1])]["transform_matrix"])
+            torch.testing.assert_close(pose, expected, atol=1e-5, rtol=0)
+    assert len(scene.train) + len(scene.test) == 6
+
+
+@pytest.mark.parametrize(
+    ("data", "name"),
+    [
+        ("dense0", "dense0"),
+        ("dense0/dense/0", "0"),
+        ("glomap", "glomap"),
+        ("glomap/output/0", "glomap"),
+        ("rgb", "rgb"),
+        ("rgb/sparse/0", "rgb"),
+    ],
+)
+def test_layouts_of_folders(data, name):
+    scene = load_scene(case("layouts") / data)
+    assert scene.name == name and len(scene.train) + len(scene.test) == 6
+    line = "images are read from rgb, since there is no folder images"
+    assert (line in scene.notes) == data.startswith("rgb")
+
+
 def test_models_of_colmap_4():
     folder = case("colmap4_models")
     scene = load_scene(folder / "equirectangular")

@@ -1,5 +1,6 @@
 """Tests of the masks of valid pixels: from mask files, from alpha, and from the image circle of a lens."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 from helpers import refuses, trained
 from PIL import Image
-from scene_files import rewrite, write_capture
+from scene_files import COUNT, POINTS, POSES, SIZE, rewrite, write_capture, write_colmap, write_images, write_llff
 
 from voronerf.app.scenes import SceneError, load_scene
 from voronerf.app.train import TrainConfig
@@ -137,6 +138,45 @@ def test_a_mask_lies_as_its_image_is_stored_or_as_it_is_seen(tmp_path, tag, upri
 
     rewrite(tmp_path, change)
     assert torch.equal(load_scene(tmp_path).train.mask(0), seen)
+
+
+@pytest.mark.parametrize("format", ["transforms", "colmap", "llff"])
+@pytest.mark.parametrize("tag", [1, 6])
+def test_masks_of_instant_ngp_leave_out_what_is_not_black(tmp_path, format, tag):
+    """The masks lie beside the images in every format, as stored or as seen, and are no images themselves."""
+    exif, turns = Image.Exif(), {1: 0, 6: 3}[tag]
+    exif[0x0112] = tag
+    write_images(tmp_path, [SIZE] * COUNT, exif=exif)
+    white = torch.rand(SIZE[::-1], generator=torch.Generator().manual_seed(0)) > 0.7
+    for index in range(5):
+        lies = torch.rot90(white, turns) if index % 2 else white
+        Image.fromarray(lies.numpy()).save(tmp_path / f"images/dynamic_mask_{index:02d}.png")
+    if format == "colmap":
+        write_colmap(tmp_path, POSES, [SIZE] * COUNT, POINTS)
+    elif format == "llff":
+        write_llff(tmp_path, POSES, SIZE, 20.0, (2.5, 5.5))
+    else:
+        frames = [
+            {"file_path": f"images/{index:02d}", "transform_matrix": pose.tolist()} for index, pose in enumerate(POSES)
+        ]
+        (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "frames": frames}))
+    for downscale in (1, 2):
+        scene = load_scene(tmp_path, downscale=downscale)
+        line = "5 of 9 images have a mask dynamic_mask_NAME.png, whose pixels that are not black do not count"
+        assert line in scene.notes and len(scene.train) + len(scene.test) == 9
+        blocks = white.view(10 // downscale, downscale, 12 // downscale, downscale).any(3).any(1)
+        for split in (scene.train, scene.test):
+            for index, name in enumerate(split.names):
+                kept = ~blocks if int(name) < 5 else torch.ones_like(blocks)
+                assert torch.equal(split.mask(index), torch.rot90(kept, turns))
+    if format == "colmap":
+        (tmp_path / "masks").mkdir()
+        Image.new("L", SIZE, 255).save(tmp_path / "masks/01.png")
+        notes = load_scene(tmp_path).notes
+        assert "1 masks dynamic_mask_NAME.png are not used, since their images have other masks" in notes
+    (tmp_path / "images/dynamic_mask_00.png").unlink()
+    (tmp_path / "images/dynamic_mask_00.png").symlink_to("/etc/passwd")
+    refuses("dynamic_mask_00.png: must lie in the folder of the scene", load_scene, tmp_path, error=SceneError)
 
 
 def test_a_jpeg_may_be_a_mask(tmp_path):

@@ -2,7 +2,9 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -360,6 +362,233 @@ def test_a_picture_that_is_listed_twice_counts_once(tmp_path):
     scene = load_scene(tmp_path)
     assert sorted(scene.train.names + scene.test.names) == [f"{index:02d}" for index in range(9)]
     assert "images are listed twice; only the first entry counts: 07.png, 99.png, 99.png" in scene.notes
+
+
+def write_listed(folder, names, files):
+    """Writes a capture whose frame i is called ``names[i]``; its image ``files[i]`` has grey value i."""
+    frames = []
+    for index, (name, file) in enumerate(zip(names, files)):
+        if file is not None:
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", SIZE, 3 * (index,)).save(folder / file)
+        frames.append({"file_path": name, "transform_matrix": POSES[index].tolist()})
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 20, "frames": frames}))
+
+
+def check_listed(folder, count):
+    """Checks that each of ``count`` images has the pose of its frame."""
+    scene = load_scene(folder, normalise=False)
+    assert len(scene.train) + len(scene.test) == count
+    for split in (scene.train, scene.test):
+        for image, pose in zip(split.images, split.cameras.poses):
+            torch.testing.assert_close(pose, POSES[int(image[0, 0, 0])], atol=1e-5, rtol=0)
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("E:\\tmp\\scan\\images\\{}.jpg", "images/{}.png"),
+        ("/home/me/scan/images/{}.JPG", "images/{}.jpg"),
+        ("./scan/images/{}.jpg", "images/{}.jpg"),
+        ("./..\\data\\scan\\rgb/{}.png", "rgb/{}.jpg"),
+        ("../images/{}.png", "images/{}.png"),
+        ("Images/{}.JPG", "images/{}.jfif"),
+        ("images/{}", "Images/{}.jfif"),
+        ("images/M\u00fc {}%20.jpg", "images/Mu\u0308 {}%20.jpg"),
+        ("images/mu\u0308_{}.jpg", "images/M\u00dc_{}.png"),
+        ("/home/me/{}.jpg", "some pictures/{}.jpg"),
+    ],
+)
+def test_images_of_transforms_are_found_where_they_are(tmp_path, name, file):
+    """Names of another machine, suffix, case or spelling are found; copies, masks and depths beside them are not."""
+    write_listed(
+        tmp_path,
+        [name.format(f"{index:02d}") for index in range(9)],
+        [file.format(f"{index:02d}") for index in range(9)],
+    )
+    for index in range(9):
+        other = Path(file.format(f"{index:02d}")).with_suffix(".png").name
+        for folder in ("masks", "depth", "images_2", "old/images"):
+            (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+            if folder != "old/images" or "mages" in file:
+                Image.new("RGB", SIZE, (99, 99, 99)).save(tmp_path / folder / other)
+    check_listed(tmp_path, 9)
+    (tmp_path / file.format("03")).unlink()
+    contents = rewrite(tmp_path, lambda contents: contents["frames"].append({**contents["frames"][0]}))
+    lists = {"test_filenames": [contents["frames"][index]["file_path"] for index in (1, 3, 5)]}
+    rewrite(tmp_path, lambda contents: contents.update(lists))
+    for folder in ("masks", "depth", "images_2", "old"):
+        shutil.rmtree(tmp_path / folder)
+    assert [int(image[0, 0, 0]) for image in check_listed(tmp_path, 8).test.images] == [1, 5]
+
+
+@pytest.mark.parametrize("start", ["/home/me/scan/", "E:\\scan\\"])
+def test_images_of_two_cameras_on_another_machine(tmp_path, start):
+    """Images with equal base names are told apart by their folders; a missing image is not taken from the other one."""
+    names = [f"{'left' if index % 2 else 'right'}/{index // 2:02d}.png" for index in range(9)]
+    write_listed(tmp_path, [start + name.replace("/", "\\" if "E" in start else "/") for name in names], names)
+    check_listed(tmp_path, 9)
+    (tmp_path / "left/01.png").unlink()
+    check_listed(tmp_path, 8)
+    rewrite(tmp_path, lambda contents: contents.update(frames=contents["frames"][1::2]))  # those of the left camera
+    check_listed(tmp_path, 3)
+
+
+def test_images_that_may_be_several_are_refused(tmp_path):
+    names = [f"/home/me/{index:02d}.jpg" for index in range(9)]
+    write_listed(tmp_path, names, [f"a/{index:02d}.jpg" for index in range(9)])
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    refuses("00.jpg may be a/00.jpg or b/00.jpg in", load_scene, tmp_path, error=SceneError)
+    (tmp_path / "b").rename(tmp_path / "images_4")
+    assert "no image exists as it is named: /home/me/00.jpg is a/00.jpg, and so on" in check_listed(tmp_path, 9).notes
+    shutil.rmtree(tmp_path / "a")
+    (tmp_path / "images_4").rename(tmp_path / "masks")
+    refuses("none of its 9 images exists, the first is /home/me/00.jpg", load_scene, tmp_path, error=SceneError)
+
+
+def test_a_path_of_this_machine_that_leads_outside_is_refused(tmp_path):
+    scene, elsewhere = tmp_path / "scene", tmp_path / "elsewhere/images"
+    names = [f"{elsewhere}/{index:02d}.png" for index in range(9)]
+    write_listed(scene, names, [f"images/{index:02d}.png" for index in range(9)])
+    check_listed(scene, 9)
+    shutil.copytree(scene / "images", elsewhere)
+    refuses("file_path: must lie in the folder of the scene", load_scene, scene, error=SceneError)
+
+
+def test_masks_of_another_machine(tmp_path):
+    write_listed(
+        tmp_path,
+        [f"C:\\scan\\images\\{index}.jpg" for index in range(9)],
+        [f"images/{index}.jpg" for index in range(9)],
+    )
+    for index in range(9):
+        pixels = np.full((10, 12), 255, np.uint8)
+        pixels[0, index] = 0
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        Image.fromarray(pixels).save(tmp_path / f"masks/{index}.png")
+
+    def change(contents, start):
+        for index, frame in enumerate(contents["frames"]):
+            frame["mask_path"] = f"{start}{index}.jpg"
+
+    for start in ("C:\\scan\\masks\\", "/home/me/", "Masks/"):
+        rewrite(tmp_path, lambda contents, start=start: change(contents, start))
+        scene = check_listed(tmp_path, 9)
+        for index, name in enumerate(scene.train.names):
+            assert torch.nonzero(~scene.train.mask(index)).tolist() == [[0, int(name)]]
+    (tmp_path / "masks/3.png").unlink()
+    refuses("frame 3 (C:\\scan\\images\\3.jpg): its mask", load_scene, tmp_path, error=SceneError)
+
+
+@pytest.mark.parametrize("scale", [[2.0], [0.01, 0.01, 3.0]])
+def test_scaled_poses_are_normalised(tmp_path, scale):
+    """Axes of one length other than 1, as of a scaled camera in Blender, are normalised; positions stay."""
+    write_capture(tmp_path / "plain", Cameras(POSES, torch.full((9, 4), 12.0), 12, 10))
+    write_capture(tmp_path / "scaled", Cameras(POSES, torch.full((9, 4), 12.0), 12, 10))
+
+    def change(contents, factors):
+        for index, frame in enumerate(contents["frames"]):
+            rows = torch.tensor(frame["transform_matrix"], dtype=torch.float64)
+            rows[:3, :3] *= torch.tensor(factors[index % len(factors)], dtype=torch.float64)
+            frame["transform_matrix"] = rows.tolist()
+
+    rewrite(tmp_path / "scaled", lambda contents: change(contents, scale))
+    plain, scaled = (load_scene(tmp_path / name, normalise=False) for name in ("plain", "scaled"))
+    torch.testing.assert_close(plain.train.cameras.poses, scaled.train.cameras.poses, atol=1e-6, rtol=0)
+    length = "2" if len(scale) == 1 else "0.01 to 3"
+    assert f"the axes of 9 of 9 poses have length {length}, and are scaled to 1" in scaled.notes
+    for factors in ([1.0, 1.0, 1.1], [-1.0, 1.0, 1.0], [-2.0, -2.0, -2.0]):
+        write_capture(tmp_path / "bad", Cameras(POSES, torch.full((9, 4), 12.0), 12, 10))
+        rewrite(tmp_path / "bad", lambda contents, factors=factors: change(contents, [factors]))
+        refuses("is not a rotation", load_scene, tmp_path / "bad", error=SceneError)
+
+
+@pytest.mark.parametrize(("times", "said"), [((0.0, 0.5, 1), True), ((0.5, 0.5, None), False), ((0, 0.0, "a"), False)])
+def test_times_that_differ_are_said(tmp_path, times, said):
+    write_capture(tmp_path, orbit_cameras(3, radius=2, elevation=5, width=12, height=10, focal=12))
+    rewrite(tmp_path, lambda contents: [frame.update(time=time) for frame, time in zip(contents["frames"], times)])
+    assert ("its times are not used: the scene is taken as still" in load_scene(tmp_path).notes) == said
+
+
+@pytest.mark.parametrize("tag", [6, 8])
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [
+        ("OPENCV", (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02)),
+        ("THIN_PRISM_FISHEYE", (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02, 0.01, 0.002, 0.04, 0.03)),
+        ("FOV", (21, 19, 5, 6, 0.3)),
+    ],
+)
+@pytest.mark.parametrize("scale", [1, 2])
+def test_cameras_of_upright_pictures(tmp_path, tag, model, lens, scale):
+    """Cameras of the pictures as an orientation tag turns them give the same rays as the upright pictures without a
+    tag, which the model may have seen larger."""
+    exif, generator = Image.Exif(), np.random.default_rng(1)
+    exif[0x0112] = tag
+    turns = {6: -1, 8: 1}[tag]
+    large = (model, tuple(value * scale if place < 4 else value for place, value in enumerate(lens)))
+    for folder in ("plain", "tagged"):
+        write_colmap(
+            tmp_path / folder, POSES.numpy(), [(10 * scale, 13 * scale)] * COUNT, POINTS, lenses=[large] * COUNT
+        )
+        (tmp_path / folder / "images").mkdir()
+    for index in range(COUNT):
+        stored = generator.integers(0, 255, (10, 13, 3), np.uint8)
+        Image.fromarray(stored).save(tmp_path / f"tagged/images/{index:02}.jpg", exif=exif, quality=100, subsampling=0)
+        stored = np.asarray(Image.open(tmp_path / f"tagged/images/{index:02}.jpg"))
+        Image.fromarray(np.rot90(stored, turns)).save(tmp_path / f"plain/images/{index:02}.png")
+    plain, tagged = (load_scene(tmp_path / folder, downscale=1) for folder in ("plain", "tagged"))
+    names = ", ".join([f"{index:02}.jpg" for index in range(8)])
+    line = f"cameras are those of pictures turned upright by their orientation tags: {names}, 1 more"
+    assert line in tagged.notes
+    assert plain.test.names == tagged.test.names and torch.equal(plain.train.images, tagged.train.images)
+    torch.testing.assert_close(plain.transform, tagged.transform, atol=1e-6, rtol=1e-6)
+    for one, other in ((plain.train, tagged.train), (plain.test, tagged.test)):
+        for index in range(len(one)):
+            rays = [split.cameras.image_rays(index) for split in (one, other)]
+            torch.testing.assert_close(rays[0].directions, rays[1].directions, atol=2e-6, rtol=0)
+            torch.testing.assert_close(rays[0].origins, rays[1].origins, atol=1e-6, rtol=0)
+    assert torch.equal(plain.train.sparse_depth.pixels, tagged.train.sparse_depth.pixels)
+    tagged = load_scene(tmp_path / "tagged", downscale=3).train.cameras  # drops a column of the stored pictures
+    full = plain.train.cameras
+    assert (tagged.width, tagged.height) == (3, 4)
+    x, y = torch.tensor([0.5, 2.5]), torch.tensor([0.5, 3.5])
+    left, top = (1, 0) if tag == 6 else (0, 1)  # the dropped row or column of the stored picture lies there
+    down = full.rays(0, 3 * x + left, 3 * y + top)
+    torch.testing.assert_close(tagged.rays(0, x, y).directions, down.directions, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("scale", [1, 3])
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"fl_x": 21.0, "fl_y": 19.0, "cx": 5.0, "cy": 6.0, "k1": 0.02, "p1": 0.01, "p2": 0.03, "w": 10, "h": 13},
+        {"fl_x": 21.0, "w": 10, "h": 13, "is_fisheye": True, "k1": 0.02, "fisheye_crop_radius": 6},
+        {"camera_angle_x": 0.7, "w": 10},
+    ],
+)
+def test_transforms_of_upright_pictures(tmp_path, lens, scale):
+    if "h" not in lens and scale > 1:
+        pytest.skip("w alone tells no scaled size")
+    lens = {
+        key: value * scale if key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "fisheye_crop_radius") else value
+        for key, value in lens.items()
+    }
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for folder in ("plain", "tagged"):
+        write_capture(tmp_path / folder, Cameras(POSES, torch.full((9, 4), 12.0), 10, 13), **{"fl_x": None, **lens})
+    for index in range(9):
+        Image.new("RGB", (13, 10), 3 * (index,)).save(tmp_path / f"tagged/{index:02}.jpg", exif=exif)
+        (tmp_path / f"tagged/{index:02}.png").unlink()
+    plain, tagged = (load_scene(tmp_path / folder) for folder in ("plain", "tagged"))
+    for index in range(len(plain.train)):
+        rays = [split.cameras.image_rays(index).directions for split in (plain.train, tagged.train)]
+        torch.testing.assert_close(*rays, atol=2e-6, rtol=0)
+        masks = [split.mask(index) for split in (plain.train, tagged.train)]
+        assert masks[0] is None or torch.equal(*masks)
+    assert ("their lenses are scaled" in " ".join(tagged.notes)) == (scale > 1)
 
 
 @pytest.mark.parametrize("tag", [3, 6, 8])

@@ -125,6 +125,27 @@ def test_without_pictures_for_testing_every_eighth_is_held_out(tmp_path, test, l
     assert len(scene.train) == (7 if held else 9)
 
 
+@pytest.mark.parametrize("start", ["./", "/home/me/lego/", "E:\\lego\\", ""])
+def test_a_picture_of_another_split_is_not_taken(tmp_path, start):
+    """A missing test image never becomes a training image of the same name, on whatever machine they were listed."""
+    blender_nerf(tmp_path, "not rendered", lens=False)
+
+    def change(contents):
+        for frame in contents["frames"]:
+            frame["file_path"] = frame["file_path"].replace("./", start)
+
+    for name in ("transforms_train", "transforms_test"):
+        rewrite(tmp_path, change, name)
+    scene = load_scene(tmp_path)
+    assert scene.test.names == ("r_0", "r_8") and len(scene.train) == 7
+    rewrite(tmp_path, lambda contents: [frame.update(time=0.25) for frame in contents["frames"]], "transforms_train")
+    assert not any("times" in note for note in load_scene(tmp_path).notes)
+    rewrite(tmp_path, lambda contents: contents["frames"][3].update(time=0.5), "transforms_train")
+    assert "its times are not used: the scene is taken as still" in load_scene(tmp_path).notes
+    (tmp_path / "train").rename(tmp_path / "test")
+    refuses("transforms_train.json: none of its 9 images exists", load_scene, tmp_path, error=SceneError)
+
+
 def test_flags_that_are_off_make_no_capture(tmp_path):
     write_blender(tmp_path, builtin_scene(8, train_views=4, test_views=2), 0.69)
     for name in ("transforms_train", "transforms_test"):

@@ -159,7 +159,8 @@ def load_scene(
         raise SceneError(f"{folder}: is not a folder{hint}")
     formats = [name for name, item in FORMATS.items() if item.is_used_by(folder)]
     models = find_models(folder)
-    if "transforms" in formats and models and models.paths[0].relative_to(models.folder).parts[1:2] == ("sparse",):
+    place = models.paths[0].relative_to(models.folder).parts if models else ()
+    if "transforms" in formats and place[:1] in (("colmap",), ("distorted",), ("dense",), ("output",)):
         formats.remove("colmap")  # nerfstudio makes transforms.json, with further entries, from colmap/sparse/0
         formats.append("colmap")
     if not formats:

@@ -16,7 +16,15 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_images
 from voronerf.app.scenes.photographs import HOLD_OUT, Reading, distinct_names
 from voronerf.app.scenes.scene import Scene, Split
-from voronerf.app.scenes.transforms import ListedImage, capture_scene, focal_length, has_lens, number, read_transforms
+from voronerf.app.scenes.transforms import (
+    ListedImage,
+    capture_scene,
+    focal_length,
+    has_lens,
+    number,
+    read_transforms,
+    time_notes,
+)
 from voronerf.nerf.cameras import Cameras
 
 log = logging.getLogger(__name__)
@@ -37,12 +45,12 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
         training views; without alpha the box is None. For a capture see `load_transforms`.
     """
     train_file = folder / "transforms_train.json"
-    entries, train_frames = read_transforms(train_file, reading.allow_outside)
+    entries, train_frames, notes = read_transforms(train_file, reading.allow_outside)
     train_frames = list({frame.path.resolve(): frame for frame in train_frames}.values())
-    test_frames = _test_frames(folder, train_frames, reading)
-    note: tuple[str, ...] = ()
+    test_frames, more = _test_frames(folder, train_frames, reading)
+    notes += more
     if not test_frames:
-        note = ("no test images, as in BlenderNeRF's exports: every 8th image is held out",)
+        notes += ("no test images, as in BlenderNeRF's exports: every 8th image is held out",)
         train_frames.sort(key=lambda frame: frame.path.as_posix())
         test_frames = train_frames[::HOLD_OUT]
         train_frames = [frame for number, frame in enumerate(train_frames) if number % HOLD_OUT]
@@ -53,7 +61,7 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
         if "near" in entries or "far" in entries:
             log.warning("%s: near and far are not used, since the scene of a capture is moved and scaled", train_file)
         frames = [*train_frames, *test_frames]
-        return capture_scene(folder, entries, frames, torch.arange(len(frames)) >= len(train_frames), reading, note)
+        return capture_scene(folder, entries, frames, torch.arange(len(frames)) >= len(train_frames), reading, notes)
 
     if reading.kind not in ("auto", "object"):
         raise SceneError(f"{train_file}: --kind must be auto or object for a Blender scene, got {reading.kind}")
@@ -69,25 +77,28 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     train = _split(train_frames, images[:count], sizes[:count], downscale, on_disk)
     test = _split(test_frames, images[count:], sizes[count:], downscale, on_disk)
     box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
-    name, notes = folder.resolve().name, ("Blender scene, an object on white", *note)
+    notes = ("Blender scene, an object on white", *notes, *time_notes((*train_frames, *test_frames)))
+    name = folder.resolve().name
     return Scene(name=name, train=train, test=test, near=near, far=far, box=box, background="white", notes=notes)
 
 
-def _test_frames(folder: Path, train_frames: Sequence[ListedImage], reading: Reading) -> list[ListedImage]:
-    """Returns the test images of `transforms_test.json` or, if it has none, of `transforms_val.json`.
+def _test_frames(
+    folder: Path, train_frames: Sequence[ListedImage], reading: Reading
+) -> tuple[list[ListedImage], tuple[str, ...]]:
+    """Returns the test images of `transforms_test.json` or, if it has none, of `transforms_val.json`, and notes.
 
     Training images in these files are left out, with a warning. The list is empty if neither file has test images.
     """
     training = {frame.path.resolve() for frame in train_frames}
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():
-            frames = read_transforms(folder / name, reading.allow_outside, all_may_miss=True)[1]
+            _, frames, notes = read_transforms(folder / name, reading.allow_outside, all_may_miss=True)
             others = [frame for frame in frames if frame.path.resolve() not in training]
             if shared := len(frames) - len(others):
                 log.warning("%s: %d of its images are for training, and are not tested", folder / name, shared)
             if others:
-                return others
-    return []
+                return others, notes
+    return [], ()
 
 
 def _split(

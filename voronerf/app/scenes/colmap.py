@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import struct
 from collections.abc import Iterator
+from itertools import starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,10 +31,11 @@ from voronerf.app.scenes.folders import (
     image_folders,
     named_files,
     named_images,
-    stay_inside,
+    other_folder,
 )
 from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import EQUIRECTANGULAR, MODELS, OTHER_MODELS, Lens, colmap_lens
+from voronerf.app.scenes.names import is_utf16, stay_inside
 from voronerf.app.scenes.photographs import Reading, View, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.transforms import LARGEST, LONGEST
@@ -41,14 +44,16 @@ Array = NDArray[Any]
 
 FILES = ("cameras", "images", "points3D")
 #: Model folders in a scene's folder, and their image folders, in the order of the search. A model folder holds one
-#: model, or models 0, 1, ... These are the layouts of COLMAP, nerfstudio, gaussian-splatting (before undistortion) and
-#: image_undistorter.
+#: model, or models 0, 1, ... These are the layouts of COLMAP, nerfstudio, gaussian-splatting (before undistortion),
+#: image_undistorter, automatic_reconstructor and GLOMAP.
 PLACES = {
     "sparse": "images",
     "colmap/sparse": "images",
     "distorted/sparse": "input",
     "dense/sparse": "dense/images",
     ".": "images",
+    "dense/0/sparse": "dense/0/images",
+    "output": "images",
 }
 #: The largest size of a file in bytes.
 MOST_BYTES = 2**31
@@ -110,27 +115,37 @@ class Models(NamedTuple):
 
 
 def find_models(folder: Path) -> Models | None:
-    """Returns the COLMAP models in a folder, or None; the folder is a scene or a model, or holds models 0, 1, ..."""
+    """Returns the COLMAP models in a folder, or None; the folder is a scene or a model, or holds models 0, 1, ...
+
+    Of several places with models, the first one with images is taken.
+    """
+    found: list[Models] = []
     for place, images in PLACES.items():
-        folder = Path(os.path.abspath(folder)) if place == "." else folder
-        inside = folder / place
+        base = Path(os.path.abspath(folder)) if place == "." else folder
+        inside = base / place
         numbered = sorted(
             (path for path in inside.glob("[0-9]*") if path.name.isdecimal()), key=lambda path: int(path.name)
         )
         if paths := [path for path in (*numbered, inside) if _suffix(path)]:
-            return Models(*(_scene_around(folder) if place == "." else (folder, images)), paths)
-    return None
+            found.append(Models(*(_scene_around(base) if place == "." else (base, images)), paths))
+    with_images = (models for models in found if image_folders(models.folder, models.images))
+    return next(with_images, found[0] if found else None)
 
 
 def _scene_around(folder: Path) -> tuple[Path, str]:
     """Returns (scene folder, path of the images in it); ``folder`` is the scene folder or a model folder inside it."""
     models = folder.parent if folder.name.isdecimal() else folder
-    if not image_folders(folder):
-        for place, images in PLACES.items():
-            around = Path(*models.parts[: len(models.parts) - len(Path(place).parts)])
-            if around / place == models and image_folders(around, images):
-                return around, images
-    return folder, PLACES["."]
+    scenes = [
+        (around, images)
+        for place, images in PLACES.items()
+        if (around := Path(*models.parts[: len(models.parts) - len(Path(place).parts)])) / place == models
+    ]
+    if image_folders(folder) or (
+        any(path.is_dir() and not path.name.isdecimal() for path in folder.iterdir())
+        and not any(starmap(image_folders, scenes))
+    ):
+        return folder, PLACES["."]  # without `images`, one of the folders inside may have the images
+    return next((scene for scene in scenes if image_folders(*scene)), scenes[0])
 
 
 def _suffix(folder: Path) -> str | None:
@@ -266,6 +281,8 @@ def _points(path: Path) -> Iterator[tuple[int, float, float, float, int]]:
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yields the number and the words of each line except comments; empty lines have no words."""
     _check_size(path)
+    if is_utf16(path):
+        raise SceneError(f"{path}: is UTF-16 text; save it as UTF-8")
     with open(path, encoding="utf-8-sig", errors="replace") as file:  # Windows programs may write a byte order mark
         for number, line in enumerate(file, 1):
             if not line.startswith("#"):
@@ -273,18 +290,20 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 @contextlib.contextmanager
-def _line_of(what: str, path: Path, line: int) -> Iterator[None]:
+def _line_of(what: str, path: Path, line: int, words: list[str]) -> Iterator[None]:
     try:
         yield
     except (ValueError, IndexError, OverflowError):
-        raise SceneError(f"{path}: line {line} does not describe {what}") from None
+        comma = next((word for word in words if re.fullmatch(r"[-+]?\d+,\d+(e[-+]?\d+)?", word, re.IGNORECASE)), None)
+        cause = f", since it has decimal commas: write {comma.replace(',', '.')} instead of {comma}" if comma else ""
+        raise SceneError(f"{path}: line {line} does not describe {what}{cause}") from None
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     for line, words in _lines(path):
         if not words:
             continue
-        with _line_of("a camera", path, line):
+        with _line_of("a camera", path, line, words):
             number, (width, height), parameters = int(words[0]), map(int, words[2:4]), [float(x) for x in words[4:]]
         yield number, _camera(path, number, words[1], width, height, parameters)
 
@@ -294,10 +313,10 @@ def _text_images(path: Path) -> Iterator[RawImage]:
     for line, words in lines:
         if not words:
             continue
-        with _line_of("an image", path, line):
+        with _line_of("an image", path, line, words):
             values, camera, name = tuple(map(float, words[1:8])), int(words[8]), " ".join(words[9:])
         line, seen = next(lines, (line + 1, []))  # the line of the image's observations, which may be empty
-        with _line_of("the points of an image", path, line):
+        with _line_of("the points of an image", path, line, seen):
             numbers = [int(number) for number in seen[2::3]]
         yield name, camera, values, np.array([number for number in numbers if 0 <= number < NO_POINT], dtype=np.int64)
 
@@ -306,7 +325,7 @@ def _text_points(path: Path) -> Iterator[tuple[int, float, float, float, int]]:
     for line, words in _lines(path):
         if not words:
             continue
-        with _line_of("a point", path, line):
+        with _line_of("a point", path, line, words):
             number, (x, y, z), seen = int(words[0]), map(float, words[1:4]), (len(words) - 8) // 2
         yield number, x, y, z, seen
 
@@ -350,7 +369,8 @@ def _pose(values: tuple[float, ...], where: str) -> Array:
 def load_colmap(folder: Path, reading: Reading) -> Scene:
     """Loads a capture with a COLMAP model; every 8th image in the order of names is held out for testing.
 
-    If there are several models, the one with the most images is read. Masks lie in `masks` beside the images; their
+    Lists of test images override this rule, see `listed_split`. If there are several models, the one with the most
+    images is read. Masks lie in `masks` beside the images; their
     black pixels are neither trained nor scored. The bounds of a view are the depths between which 98 % of its points
     lie.
     """
@@ -364,8 +384,9 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     for part in place.iterdir():
         stay_inside(part, folder, reading.allow_outside)
     model = read_model(place)
-    chosen = choose_images(folder, reading.downscale, models.images)
     names = [image.name for image in model.images]
+    place_of_images, folder_notes = other_folder(model.path, folder, models.images, names, reading.allow_outside)
+    chosen = choose_images(folder, reading.downscale, place_of_images)
     files, notes = named_images(model.path, chosen, names, reading.allow_outside)
     images = [(file, image) for file, image in zip(files, model.images) if file is not None]
     masks, mask_notes = _find_masks(model.path, chosen, images, reading.allow_outside)
@@ -374,14 +395,16 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
         size = (float(image.camera.width), float(image.camera.height))
         points = points_seen(image, model)
         pose, bounds, seen = torch.from_numpy(image.pose), depth_bounds(image, points), torch.from_numpy(points)
-        views.append(View(file, pose, image.camera.lens, size, mask, bounds, seen, header))
+        views.append(View(file, pose, image.camera.lens, size, mask, bounds, seen, header, name=image.name))
     kinds = sorted({image.camera.model for image in model.images})
     about = [f"COLMAP model {place.relative_to(folder)} of {len(views)} images, {' and '.join(kinds)}"]
     if counts:
         sizes = ", ".join(f"{path.relative_to(folder)} of {count}" for path, count in counts.items())
         other = next(path for path in counts if path != place)
         about.append(f"the largest of the models is read: {sizes} images (--data {other} reads another one)")
-    about += [*chosen.notes, *notes, *mask_notes]
+    if place == folder / "dense/0/sparse" and (other := folder / "dense/1").is_dir():
+        about.append(f"the first of the folders in dense is read (--data {other} reads another one)")
+    about += [*folder_notes, *chosen.notes, *notes, *mask_notes]
     factor = chosen.reduction(headers)
     return photograph_scene(model.path, folder, views, None, reading, factor=factor, notes=about)
 

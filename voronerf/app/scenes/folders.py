@@ -6,22 +6,25 @@ import logging
 import os
 import posixpath
 import re
-from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from voronerf.app.files import leads_outside
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.images import Header
+from voronerf.app.scenes.images import DYNAMIC_MASK, FORMATS, Header, read_header
+from voronerf.app.scenes.names import OTHER_PICTURES, compare, compare_tails, plain, stay_inside
 from voronerf.app.scenes.photographs import least_factor
 
 log = logging.getLogger(__name__)
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif")
 #: Suffixes of phones' images, and of all images that `voronerf process` converts to JPEG or PNG.
 HEIF = (".heic", ".heif")
 CONVERTED = (".tif", ".tiff", ".bmp", ".webp", *HEIF)
+#: Suffixes of images that are not read.
+UNREAD = (*CONVERTED, ".avif", ".exr")
 
 
 class ImageFolder(NamedTuple):
@@ -34,6 +37,7 @@ class ImageFolder(NamedTuple):
         masks: the folder of the images' masks, or None.
         factor: the factor by which the images in ``path`` must still be downscaled; None to choose it by their size.
         notes: lines for the user.
+        root: the folder that must hold all files.
     """
 
     path: Path
@@ -41,6 +45,7 @@ class ImageFolder(NamedTuple):
     masks: Path | None
     factor: int | None
     notes: tuple[str, ...]
+    root: Path
 
     def reduction(self, headers: Sequence[Header]) -> int:
         """Returns the factor by which the images with these headers must still be downscaled."""
@@ -49,9 +54,11 @@ class ImageFolder(NamedTuple):
 
 def image_folders(folder: Path, images: str = "images") -> dict[int, Path]:
     """Returns {N: folder} for `images` (N = 1) and `images_N`, ignoring case; `images` is a path in ``folder``."""
+    if images == ".":
+        return {1: folder}
     parent, name = (folder / images).parent, Path(images).name
     matches = [
-        (re.fullmatch(rf"{name}(?:_([1-9]\d{{0,3}}))?", path.name, re.IGNORECASE), path)
+        (re.fullmatch(rf"{re.escape(name)}(?:_([1-9]\d{{0,3}}))?", path.name, re.IGNORECASE), path)
         for path in sorted(parent.iterdir() if parent.is_dir() else ())
     ]
     return {int(match[1] or 1): path for match, path in matches if match and path.is_dir()}
@@ -67,7 +74,10 @@ def choose_images(folder: Path, downscale: int | None, images: str = "images") -
     sizes = image_folders(folder, images)
     if not sizes:
         name = Path(images).name
-        raise SceneError(f"{folder}: has neither a folder {images} nor {name}_2, {name}_4, ...")
+        raise SceneError(
+            f"{folder}: has neither a folder {images} nor {name}_2, {name}_4, ...; rename the folder of the images to "
+            f"{images}"
+        )
     chosen = downscale if downscale in sizes else min(sizes)
     if downscale is None:
         factor = None
@@ -78,16 +88,41 @@ def choose_images(folder: Path, downscale: int | None, images: str = "images") -
     notes = () if chosen == 1 else (f"{sizes[chosen].name} is read instead of {images}",)
     masks = image_folders(folder, posixpath.join(posixpath.dirname(images), "masks"))
     full = sizes.get(1) if chosen > 1 else None
-    return ImageFolder(sizes[chosen], full, masks.get(chosen, masks.get(1)), factor, notes)
+    root = folder if images == "." else sizes[chosen].parent
+    return ImageFolder(sizes[chosen], full, masks.get(chosen, masks.get(1)), factor, notes, root)
 
 
-def stay_inside(path: Path, folder: Path, allow_outside: bool, name: str = "") -> None:
-    """Raises SceneError for a path that leads out of the scene's folder by `..` or a link, unless this is allowed.
+def other_folder(
+    source: Path, folder: Path, images: str, names: Sequence[str], allow_outside: bool
+) -> tuple[str, tuple[str, ...]]:
+    """Finds the folder of a model's images, if it is not called ``images``, a path in the scene's folder.
 
-    The error message begins with ``name`` or, if it is empty, with the path.
+    Other folders are the scene's folder and its subfolders, except for folders of masks and depths.
+
+    Returns:
+        (the path of the only other folder with files that the model names, or ``images`` if ``images`` exists or if
+        there is no such folder; lines for the user).
     """
-    if not allow_outside and leads_outside(path, folder):
-        raise SceneError(f"{name or path}: must lie in the folder of the scene; --allow-outside also reads other files")
+    if image_folders(folder, images):
+        return images, ()
+    inside = [
+        path
+        for path in sorted(folder.iterdir())
+        if path.is_dir() and not path.name.startswith(".") and not OTHER_PICTURES.fullmatch(path.name)
+    ]
+    inside = [path for path in inside if allow_outside or not leads_outside(path, folder)]
+    others = [path for path in (folder, *inside) if any(os.path.isfile(path / plain(name)) for name in names)]
+    others = others or [path for path in inside if any(named_files(source, path, names, allow_outside))]
+    found = [path.relative_to(folder).as_posix() for path in others]
+    if len(found) > 1:
+        raise SceneError(
+            f"{folder}: has no folder {images}, and {found[0]} as well as {found[1]} has images of the model; rename "
+            f"the folder of the images to {images}"
+        )
+    if not found:
+        return images, ()
+    where = folder.name if found == ["."] else found[0]
+    return found[0], (f"images are read from {where}, since there is no folder {images}",)
 
 
 def named_images(
@@ -100,75 +135,120 @@ def named_images(
     Returns:
         (the file of each name, None if it is missing; lines for the user).
     """
-    files = named_files(source, images.path, names, allow_outside)
+    files = named_files(source, images.path, names, allow_outside, images.root)
     notes: tuple[str, ...] = ()
     if not any(files):
         files = _files_in_order(source, images, names, allow_outside)
         notes = (f"no file in {images.path.name} has a name of the model: files are matched by order",)
     missing = files.count(None)
     if missing == len(files):
-        raise SceneError(f"{source}: none of its {len(files)} images exists, the first is {images.path / names[0]}")
+        raise none_exists(source, images.path, names)
     if missing:
         log.warning("%s: %d of %d listed images are missing and are skipped", source, missing, len(files))
     return files, notes
 
 
-def named_files(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
-    """Finds the file of each name in a folder and its subfolders; None for a missing file.
+def none_exists(source: Path, folder: Path, names: Sequence[str]) -> SceneError:
+    """Returns the error for a list of images, none of which exists; images in other formats are named."""
+    stems = {posixpath.splitext(posixpath.basename(plain(name)))[0].casefold() for name in names}
+    unread = (path for path in folder.rglob("*") if path.suffix.lower() in UNREAD and path.stem.casefold() in stems)
+    other = next(unread, None)
+    return SceneError(
+        f"{source}: none of its {len(names)} images exists, the first is {folder / names[0]}"
+        + (f"; {_conversion(other)}" if other else "")
+    )
 
-    A name is compared with a file's path: exactly, then with the suffix of the path removed, then with the suffixes of
-    the name and the path removed. Names without a file are compared in the same three ways again, ignoring case. If
-    none of the names has a file, and the base names are unique, base names are compared in all these ways.
+
+def _conversion(path: Path) -> str:
+    """Returns the remedy for images in a format that is not read."""
+    return f"mogrify -format png {shlex.quote(str(path.parent))}/*{path.suffix} writes PNG files, which are found"
+
+
+def named_files(
+    source: Path, folder: Path, names: Sequence[str], allow_outside: bool, root: Path | None = None
+) -> list[Path | None]:
+    """Finds the file of each name in a folder and its subfolders; None for a missing file, see `find_files`.
 
     Args:
         source: the file that lists the names, for error messages.
         folder: the folder of the files.
         names: the file names, with or without folders.
         allow_outside: whether the files may lie outside of the scene's folder.
+        root: the scene's folder; None for the folder that holds ``folder``.
     """
-    names = [posixpath.normpath(name.replace("\\", "/")) for name in names]
-    found = {
+    names, root = [plain(name) for name in names], folder.parent if root is None else root
+    exact = {
         name: folder / name
         for name in names
-        if os.path.isfile(folder / name) and (allow_outside or not leads_outside(folder / name, folder.parent))
+        if os.path.isfile(folder / name) and (allow_outside or not leads_outside(folder / name, root))
     }
-    if len(found) < len(set(names)):
-        files = image_files(folder)
-        _compare(source, folder, set(names), files, found, str)
-        if not found and len(set(map(posixpath.basename, names))) == len(set(names)):
-            _compare(source, folder, set(names), files, found, posixpath.basename)
+    found = find_files(source, folder, names, exact, of_one_folder=False)
     for name in names:
         if name in found or not posixpath.isabs(name):  # an absolute path may come from another machine
-            stay_inside(found.get(name, folder / name), folder.parent, allow_outside)
+            stay_inside(found.get(name, folder / name), root, allow_outside)
     return [found.get(name) for name in names]
 
 
-def _compare(
-    source: Path, folder: Path, names: set[str], files: list[Path], found: dict[str, Path], part: Callable[[str], str]
-) -> None:
-    """Compares names with paths after applying the function ``part`` to both, and adds the matches to ``found``.
+def find_files(
+    source: Path,
+    folder: Path,
+    names: Sequence[str],
+    exact: dict[str, Path],
+    *,
+    of_one_folder: bool,
+    all_folders: bool = False,
+    but: Sequence[Path] = (),
+) -> dict[str, Path]:
+    """Finds the image files in a folder and its subfolders of the names that have no file in ``exact``.
 
-    If ``part`` is ``str``, which keeps whole paths, several paths that match one name raise SceneError. All other
-    ambiguous matches are skipped.
+    A name is compared with a file's path: exactly, then with the suffix of the path removed, then with the suffixes of
+    the name and the path removed, where Unicode has several spellings for a name. Names without a file are compared in
+    the same three ways again, ignoring case. If none of the names has a file, they are compared by `compare_tails`.
+
+    Args:
+        source: the file that lists the names, for error messages.
+        folder: the folder of the files.
+        names: normalised names, see `plain`.
+        exact: the file of each name whose file exists as it is named.
+        of_one_folder: whether the folder of a name must be the file's, at least in its innermost part.
+        all_folders: whether files in folders of masks and depths are taken, too, although their names do not say so.
+        but: files that are not taken.
+
+    Returns:
+        The file of each name; missing files are absent. If images exist as they are named, but in a format that is not
+        read, and also as PNG or JPEG, the latter are taken.
     """
-    for fold in (str, str.casefold):
-        for cut, cut_file in ((str, str), (str, _without_suffix), (_without_suffix, _without_suffix)):
-            by_key = defaultdict(list)
-            for path in files:
-                by_key[fold(cut_file(part(path.relative_to(folder).as_posix())))].append(path)
-            keys = {name: fold(cut(part(name))) for name in names}
-            counts, taken = Counter(keys.values()), set(found.values())
-            for name in sorted(names - found.keys()):
-                paths = by_key.get(keys[name], [])
-                if len(paths) > 1 and part is str:
-                    candidates = " or ".join(path.relative_to(folder).as_posix() for path in paths[:2])
-                    raise SceneError(f"{source}: {name} may be {candidates} in {folder}: keep only one of these files")
-                if len(paths) == counts[keys[name]] == 1 and paths[0] not in taken:
-                    found[name] = paths[0]
+
+    def inside(path: Path) -> str:
+        return Path(os.path.relpath(path, folder)).as_posix()
+
+    found = {name: inside(path) for name, path in exact.items() if path.suffix.lower() not in UNREAD}
+    result = dict(exact)
+    if not set(names) <= found.keys():
+        remedy = f" in {folder}: keep only one of these files"
+        taken = {inside(path) for path in but}
+        files = [file for file in map(inside, image_files(folder)) if file not in taken]
+        compare(source, names, files, found, remedy)
+        if not found and not exact:
+            found = compare_tails(source, names, files, remedy, of_one_folder=of_one_folder, all_folders=all_folders)
+        result |= {
+            name: folder / file
+            for name, file in found.items()
+            if name not in exact or exact[name].suffix.lower() in UNREAD
+        }
+    for path in set(result.values()):
+        if path.suffix.lower() in UNREAD:
+            _check_format(path)
+    return result
 
 
-def _without_suffix(name: str) -> str:
-    return posixpath.splitext(name)[0]
+def _check_format(path: Path) -> None:
+    """Raises SceneError for an image file in a format that is not read, whatever its suffix."""
+    try:
+        read_header(path)
+    except SceneError:
+        formats = " or ".join(FORMATS)
+        raise SceneError(f"{path}: is not an image in {formats} format; {_conversion(path)}") from None
 
 
 def _files_in_order(source: Path, images: ImageFolder, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
@@ -185,7 +265,7 @@ def _files_in_order(source: Path, images: ImageFolder, names: Sequence[str], all
     places = dict(zip(ordered, files))
     if images.full is None:
         return [places.get(name) for name in names]
-    return [path and places.get(path) for path in named_files(source, images.full, names, allow_outside)]
+    return [path and places.get(path) for path in named_files(source, images.full, names, allow_outside, images.root)]
 
 
 def _in_numeric_order(paths: Sequence[Path | str]) -> bool:
@@ -207,5 +287,5 @@ def listed_images(folder: Path) -> list[Path]:
 
 
 def _is_image(path: Path) -> bool:
-    """Returns whether a path is an image file; macOS adds other files, such as ._a.jpg, which do not count."""
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+    """Returns whether a path is an image file and no mask; other files of macOS, such as ._a.jpg, do not count."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith((".", DYNAMIC_MASK)) and path.is_file()

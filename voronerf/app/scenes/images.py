@@ -40,6 +40,9 @@ DYNAMIC_MASK = "dynamic_mask_"
 ROUNDED = 2
 #: If alpha is used as a mask, pixels with an alpha below this are masked, since their colour is partly background.
 OPAQUE = 250
+#: The beginning of the names of instant-ngp's masks, whose pixels that are not black are left out. The mask of 0.jpg is
+#: dynamic_mask_0.png beside it.
+DYNAMIC_MASK = "dynamic_mask_"
 #: The largest fraction of the free memory for a scene; the rest is for the networks.
 SHARE = 0.75
 #: Bytes per pixel for rendering and scoring a view, most of them for SSIM.
@@ -261,10 +264,11 @@ def read_masks(
     name: str = "images",
     alpha: bool = False,
 ) -> Tensor | None:
-    """Decodes the masks of images; a pixel of a reduced mask is True if no pixel of its block is black.
+    """Decodes the masks of images; a pixel of a reduced mask is True if no pixel of its block is left out.
 
     Args:
-        masks: the mask file of each image, or None if the whole image counts.
+        masks: the mask file of each image, or None if the whole image counts. Black pixels are left out or, for names
+            that begin with `DYNAMIC_MASK`, the other pixels.
         paths: the image files.
         images: the decoded images, which have the size of their masks or a smaller size. Each mask is rotated like its
             image. If the images are stored on disk, the masks are stored there too.
@@ -285,7 +289,7 @@ def read_masks(
         kept: Any = np.ones((height, width), dtype=bool)
         if mask is not None:
             with _opened(mask) as file:
-                kept = drawn(file, size, turns[index])
+                kept = drawn(file, size, turns[index], inverted=mask.name.startswith(DYNAMIC_MASK))
             high, wide = kept.shape
             scale = wide / size[0]  # above 1, the image was reduced after the mask was made
             if scale < 1 or abs(high - scale * size[1]) >= scale:
@@ -312,7 +316,7 @@ def read_masks(
     return torch.from_numpy(np.stack([make(index) for index in range(len(masks))])).view(torch.bool)
 
 
-def drawn(mask: Image.Image, size: Sequence[int], turns: int) -> NDArray[np.bool_]:
+def drawn(mask: Image.Image, size: Sequence[int], turns: int, *, inverted: bool = False) -> NDArray[np.bool_]:
     """Returns bool [h, w], oriented like the stored image: whether a mask's pixel is neither black nor transparent.
 
     A mask may have been drawn on the upright image. Since JPEG blurs borders, pixels of a JPEG mask that are darker
@@ -322,10 +326,12 @@ def drawn(mask: Image.Image, size: Sequence[int], turns: int) -> NDArray[np.bool
         mask: the opened mask file.
         size: (width, height) of the image as stored, or proportional to it.
         turns: quarter turns anticlockwise that make the image upright.
+        inverted: return whether a mask's pixel is black or transparent instead.
     """
     kept = np.asarray(mask.convert("L")) > (127 if isinstance(mask, JpegImageFile) else 0)
     if mask.has_transparency_data:
         kept = kept & (np.asarray(mask.convert("RGBA"))[..., 3] > 0)
+    kept = kept != inverted
     upright = turns % 2 == 1 and (mask.width > mask.height) != (size[0] > size[1])
     return np.rot90(kept, -turns) if upright else kept
 

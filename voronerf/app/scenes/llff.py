@@ -13,9 +13,10 @@ import numpy as np
 import torch
 
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.folders import choose_images, listed_images, stay_inside
+from voronerf.app.scenes.folders import choose_images, listed_images
 from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import PERSPECTIVE, Lens
+from voronerf.app.scenes.names import stay_inside
 from voronerf.app.scenes.photographs import Reading, View, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.transforms import LARGEST, ORTHONORMAL
@@ -27,7 +28,7 @@ MOST = 1_000_000
 
 
 def load_llff(folder: Path, reading: Reading) -> Scene:
-    """Loads an LLFF capture; every 8th image is held out for testing."""
+    """Loads an LLFF capture; every 8th image is held out for testing, see `photograph_scene`."""
     path = folder / FILE
     stay_inside(path, folder, reading.allow_outside)
     rows = _read(path)

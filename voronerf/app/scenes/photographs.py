@@ -20,8 +20,9 @@ from torch import Tensor
 
 from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.images import OPAQUE, Decoded, Header, read_images, read_masks
+from voronerf.app.scenes.images import DYNAMIC_MASK, OPAQUE, Decoded, Header, read_images, read_masks
 from voronerf.app.scenes.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Lens, have_rays
+from voronerf.app.scenes.names import listed_split, stay_inside
 from voronerf.app.scenes.scene import KnownDepths, Scene, Split
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
 from voronerf.nerf.cameras import Cameras, focus_point, shared_focus
@@ -54,6 +55,11 @@ LEAST_RAYS = 0.25
 # The tolerance in pixels for the aspect ratio of a reduced image: sizes are integers, and exporters that scale images
 # may write fractions.
 ROUNDED = 2
+# The cause and the remedy of an image and a camera with different aspect ratios.
+CROPPED = (
+    "it was cropped or has another aspect ratio; use the images for which the cameras were computed, or correct the "
+    "size, focal length and principal point of its camera"
+)
 KIND_LINES = {
     "object": "an object on white, from the images' alpha",
     "forward": "forward facing, the cameras look the same way",
@@ -76,6 +82,7 @@ class View(NamedTuple):
         header: the header of the file; None if it has not been read yet.
         circle: the radius of a fisheye's image circle in pixels of ``size``, outside of which pixels are masked, or
             None.
+        name: the name of the image in lists of test images; "" for the path of its file.
     """
 
     path: Path
@@ -87,6 +94,7 @@ class View(NamedTuple):
     points: Tensor | None = None
     header: Header | None = None
     circle: float | None = None
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -138,16 +146,32 @@ def photograph_scene(
         source: the file to name in errors.
         folder: the scene's folder.
         views: the c views, sorted by name.
-        held_out: bool [c], True for test views; None for every 8th view, from the first.
+        held_out: bool [c], True for test views; None for the views in lists of test images, see `listed_split`, or
+            else for every 8th view, from the first.
         reading: the options for reading the folder.
         factor: the remaining downscale factor of the files.
         notes: the loader's lines for the user.
         transform: float64 [4, 4], the transform from the original coordinates to the coordinates of the poses.
     """
     views, held_out, repeats = _listed_once(views, held_out)
+    notes = [*notes, *repeats]
+    if held_out is None:
+        inside = [view.name or Path(os.path.relpath(view.path, folder)).as_posix() for view in views]
+        split, lines = listed_split(source, folder, inside, reading.allow_outside)
+        notes += lines
+        if split is not None:
+            views, held_out = [views[place] for place in split[0]], split[1]
+            if split[2]:
+                notes.append(f"{split[2]} images are in no list and are left out")
+    views, more = _with_dynamic_masks(views, folder, reading.allow_outside)
+    stored = [_as_stored(view) for view in views]
+    turned = [view.path.name for view, changed in zip(views, stored) if changed is not view]
+    if turned:
+        more.append(f"cameras are those of pictures turned upright by their orientation tags: {some_of(turned)}")
+    views = stored
     places = torch.stack([view.pose[:3, 3] for view in views])
     lost = lost_cameras(places)
-    notes = [*notes, *repeats, *_far_notes(views, lost, reading.keep_far)]
+    notes = [*notes, *more, *_far_notes(views, lost, reading.keep_far)]
     if not reading.keep_far:
         views = [view for view, left_out in zip(views, lost.tolist()) if not left_out]
         held_out = None if held_out is None else held_out[~lost]
@@ -166,7 +190,7 @@ def photograph_scene(
         _ = cameras.lenses
     except ValueError as error:
         raise SceneError(f"{source}: {error}") from None
-    masks, lines = _masked_by_lenses(cameras, masks, source, views, factor, pictures.turns)
+    masks, ray_notes = _masked_by_lenses(cameras, masks, source, views, factor, pictures.turns)
     box = None
     if kind == "object":
         box = carve_box(cameras[:count], pictures.images[:count, ..., 3], frame.near, frame.far)
@@ -180,7 +204,13 @@ def photograph_scene(
         for part in (slice(count), slice(count, None))
     )
     faults = camera_faults(places, bounds, ((view.lens, view.size[0]) for view in views))
-    notes = [*notes, *masked, *lines, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
+    notes = [
+        *notes,
+        *masked,
+        *ray_notes,
+        _note(kind, frame, reading),
+        *(f"check the cameras: {fault}" for fault in faults),
+    ]
     if reading.downscale is None and factor > 1:
         size = f"{cameras.width} x {cameras.height}"
         notes.append(f"images are reduced by {factor}, to {size} (--downscale 1 keeps their size)")
@@ -212,6 +242,47 @@ def _listed_once(
     names = [views[index].path.name for index in sorted(set(range(len(views))) - set(kept))]
     note = f"images are listed twice; only the first entry counts: {some_of(names)}"
     return [views[index] for index in kept], None if held_out is None else held_out[kept], (note,)
+
+
+def _with_dynamic_masks(views: Sequence[View], folder: Path, allow_outside: bool) -> tuple[Sequence[View], list[str]]:
+    """Returns the views with instant-ngp's masks, see `DYNAMIC_MASK`, where they have no other masks; and notes."""
+    masks = [view.path.with_name(f"{DYNAMIC_MASK}{view.path.stem}.png") for view in views]
+    found = {place: mask for place, mask in enumerate(masks) if mask.is_file()}
+    used = {place: mask for place, mask in found.items() if views[place].mask is None}
+    for mask in used.values():
+        stay_inside(mask, folder, allow_outside)
+    notes = []
+    if used:
+        some = f"{len(used)} of {len(views)} images have a mask {DYNAMIC_MASK}NAME.png"
+        notes.append(f"{some}, whose pixels that are not black do not count")
+    if unused := len(found) - len(used):
+        notes.append(f"{unused} masks {DYNAMIC_MASK}NAME.png are not used, since their images have other masks")
+    return [view._replace(mask=used.get(place, view.mask)) for place, view in enumerate(views)], notes
+
+
+def _fits(size: Sequence[float], stated: tuple[float, float]) -> bool:
+    """Returns whether an image of ``size`` may be a scaled copy of an image of the size ``stated``."""
+    scale_x, scale_y = size[0] / stated[0], size[1] / stated[1]
+    return abs(scale_x - scale_y) * max(stated) <= ROUNDED * max(scale_x, 1)
+
+
+def _as_stored(view: View) -> View:
+    """Returns a view whose camera belongs to the stored picture.
+
+    If the camera fits only the picture after the quarter turn of its orientation tag, the camera is turned back. Other
+    views are returned unchanged.
+    """
+    if view.header is None or view.header.turns % 2 == 0 or view.lens.model == EQUIRECTANGULAR:
+        return view
+    if _fits(view.header.size, view.size) or not _fits(view.header.size[::-1], view.size):
+        return view
+    rows = (torch.tensor([row], dtype=torch.float64) for row in (view.lens.intrinsics, view.lens.coefficients))
+    model = torch.tensor([view.lens.model], dtype=torch.int32)
+    upright = Cameras.of_images(view.pose[None], next(rows), torch.tensor([view.size]), next(rows), model)
+    stored = _turned(upright, [4 - view.header.turns])
+    assert stored.distortion is not None
+    lens = Lens(tuple(stored.intrinsics[0].tolist()), tuple(stored.distortion[0].tolist()), view.lens.model)
+    return view._replace(pose=stored.poses[0], lens=lens, size=view.size[::-1])
 
 
 def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path) -> tuple[list[View], int]:
@@ -457,12 +528,12 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
     """
     intrinsics = []
     for view, (width, height) in zip(views, sizes.tolist()):
-        scale_x, scale_y = width / view.size[0], height / view.size[1]
-        if abs(scale_x - scale_y) * max(view.size) > ROUNDED * max(scale_x, 1):
+        if not _fits((width, height), view.size):
             raise SceneError(
                 f"{view.path}: is {width} x {height} pixels as stored, but {source} says {view.size[0]:g} x "
-                f"{view.size[1]:g}"
+                f"{view.size[1]:g}: {CROPPED}"
             )
+        scale_x, scale_y = width / view.size[0], height / view.size[1]
         fx, fy, cx, cy = view.lens.intrinsics
         intrinsics.append((fx * scale_x, fy * scale_y, cx * scale_x, cy * scale_y))
     coefficients = torch.tensor([view.lens.coefficients for view in views])

@@ -10,22 +10,24 @@ import json
 import logging
 import math
 import os
-import posixpath
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from voronerf.app.files import read_json, write_text
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.folders import stay_inside
+from voronerf.app.scenes.folders import UNREAD, find_files, none_exists
 from voronerf.app.scenes.images import Header, read_header
 from voronerf.app.scenes.lenses import COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, Lens
-from voronerf.app.scenes.photographs import ROUNDED, Reading, View, least_factor, photograph_scene
+from voronerf.app.scenes.names import is_utf16, plain, split_by_lists, stay_inside
+from voronerf.app.scenes.photographs import CROPPED, ROUNDED, Reading, View, least_factor, photograph_scene
 from voronerf.app.scenes.scene import Scene
+from voronerf.app.scenes.soundness import some_of
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +57,14 @@ KNOWN = {
 }
 
 
+class Listing(NamedTuple):
+    """The contents of a transforms file: its entries, its frames with a pose and an image, and lines for the user."""
+
+    entries: dict[str, Any]
+    frames: list[ListedImage]
+    notes: tuple[str, ...]
+
+
 class ListedImage(NamedTuple):
     """An image of a transforms file.
 
@@ -73,20 +83,18 @@ class ListedImage(NamedTuple):
     mask: Path | None = None
 
 
-def read_transforms(
-    path: Path, allow_outside: bool = False, *, all_may_miss: bool = False
-) -> tuple[dict[str, Any], list[ListedImage]]:
-    """Reads a transforms file and finds its images.
+def read_transforms(path: Path, allow_outside: bool = False, *, all_may_miss: bool = False) -> Listing:
+    """Reads a transforms file and finds its images, see `find_files`.
 
     Listed images that are missing are left out, with a warning that tells their number. It is an error if all images
-    are missing, unless ``all_may_miss`` is set.
-
-    Returns:
-        (the file's entries, the frames with an existing image, in the file's order).
+    are missing, unless ``all_may_miss`` is set. Frames without a pose are left out, with a note, unless all frames are.
+    The frames stay in the file's order.
     """
     try:
         entries = read_json(path)
     except ValueError as error:
+        if is_utf16(path):
+            raise SceneError(f"{path}: is not JSON in UTF-8 but UTF-16 text; save it as UTF-8") from None
         raise SceneError(str(error)) from None
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
@@ -94,27 +102,56 @@ def read_transforms(
     if not isinstance(frames, list) or not (frames or all_may_miss):
         raise SceneError(f"{path}: has no frames")
     shared = _named_distortion(entries, path)
-    present = []
+    folder, where = path.parent, []
     for position, frame in enumerate(frames):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or "\0" in name:
             raise SceneError(f"{path}: frame {position} has no file_path")
         if not is_text(name):
             raise SceneError(f"{path}: frame {position}: file_path must be text without surrogates, got {name!r:.60}")
-        where = f"{path}: frame {position} ({name})"
-        pose = pose_of(frame.get("transform_matrix"), where)
-        image = _find_image(path.parent, name, allow_outside, where)
-        if image is not None:
-            mask = _mask(path.parent, frame.get("mask_path"), allow_outside, where)
-            present.append(ListedImage(image, pose, path, {**shared, **_named_distortion(frame, path)}, mask))
-    if not present and not all_may_miss:
-        raise SceneError(
-            f"{path}: none of its {len(frames)} images exists, the first is {path.parent / frames[0]['file_path']}"
-        )
-    missing = len(frames) - len(present)
+        where.append(f"{path}: frame {position} ({name})")
+    matrices = [frame.get("transform_matrix") for frame in frames]
+    lost = [_is_unknown(matrix) for matrix in matrices]
+    if all(lost):
+        lost = [False] * len(frames)  # the error for the first of them follows
+    poses = [None if unknown else _scaled_pose(matrix, name) for matrix, name, unknown in zip(matrices, where, lost)]
+    names = [plain(frame["file_path"]) for frame in frames]
+    images = [_exact_file(folder, frame["file_path"], allow_outside, name) for frame, name in zip(frames, where)]
+    exact = {name: image for name, image in zip(names, images) if image is not None}
+    split = path.name != "transforms.json"  # otherwise a missing test/r_0.png might be taken for train/r_0.png
+    files = find_files(path, folder, names, exact, of_one_folder=split)
+    for file in set(files.values()) - set(exact.values()):
+        stay_inside(file, folder, allow_outside)
+    images = [
+        files.get(name) if image is None or image.suffix.lower() in UNREAD else image
+        for name, image in zip(names, images)
+    ]
+    if not any(images) and not all_may_miss:
+        raise none_exists(path, folder, [frame["file_path"] for frame in frames])
+    views = [
+        (frame, name, image, pose[0])
+        for frame, name, image, pose in zip(frames, where, images, poses)
+        if image is not None and pose is not None
+    ]
+    masks = _find_masks(path, [view[:2] for view in views], [*files.values()], allow_outside)
+    present = [
+        ListedImage(image, pose, path, {**shared, **_named_distortion(frame, path)}, mask)
+        for (frame, _, image, pose), mask in zip(views, masks)
+    ]
+    missing = images.count(None)
     if missing and present:
         log.warning("%s: %d of %d listed images are missing and are skipped", path, missing, len(frames))
-    return entries, present
+    notes = []
+    if files and not exact:
+        name = next(name for name in names if name in files)
+        notes.append(f"no image exists as it is named: {name} is {files[name].relative_to(folder)}, and so on")
+    if any(lost):
+        without = some_of([names[place] for place, unknown in enumerate(lost) if unknown])
+        notes.append(f"{sum(lost)} of {len(frames)} frames have no pose and are left out: {without}")
+    if scales := [pose[1] for pose in poses if pose is not None and pose[1] != 1]:
+        length = " to ".join(dict.fromkeys(f"{scale:.4g}" for scale in (min(scales), max(scales))))
+        notes.append(f"the axes of {len(scales)} of {len(frames)} poses have length {length}, and are scaled to 1")
+    return Listing(entries, present, tuple(notes))
 
 
 def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = False) -> float | None:
@@ -166,32 +203,84 @@ def is_text(name: str) -> bool:
     return not any("\ud800" <= char <= "\udfff" for char in name)
 
 
-def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Path | None:
-    """Finds an image file; Blender's files lack the suffix, and files from Windows may have backslashes."""
+def _exact_file(folder: Path, name: str, allow_outside: bool, where: str) -> Path | None:
+    """Returns the file as it is named; Blender's names lack the suffix, and names from Windows may have backslashes."""
     for spelling in dict.fromkeys((name, name.replace("\\", "/"))):
         for suffix in SUFFIXES:
             path = Path(f"{folder / spelling}{suffix}")
-            stay_inside(path, folder, allow_outside, f"{where}: file_path")
             if os.path.isfile(path):
+                stay_inside(path, folder, allow_outside, f"{where}: file_path")
                 return path
     return None
 
 
-def _mask(folder: Path, name: object, allow_outside: bool, where: str) -> Path | None:
-    """Returns the mask file of a frame; None if the frame has no mask."""
-    if name is None:
-        return None
-    if not isinstance(name, str) or "\0" in name or not is_text(name):
-        raise SceneError(f"{where}: mask_path must be a file name, got {name!r:.60}")
-    mask = folder / name.replace("\\", "/")
-    stay_inside(mask, folder, allow_outside, f"{where}: mask_path")
-    if not mask.is_file():
-        raise SceneError(f"{where}: its mask {mask} does not exist")
-    return mask
+def _find_masks(
+    source: Path, frames: Sequence[tuple[dict[str, Any], str]], images: Sequence[Path], allow_outside: bool
+) -> list[Path | None]:
+    """Returns the mask file of each frame; None if the frame has no mask.
+
+    Args:
+        source: the transforms file.
+        frames: each frame, and its name for error messages.
+        images: the image files, which are no masks.
+        allow_outside: whether masks may lie outside of the scene's folder.
+    """
+    folder, exact, names = source.parent, dict[str, Path](), []
+    for frame, where in frames:
+        name = frame.get("mask_path")
+        if name is not None and (not isinstance(name, str) or "\0" in name or not is_text(name)):
+            raise SceneError(f"{where}: mask_path must be a file name, got {name!r:.60}")
+        names.append(None if name is None else plain(name))
+        if name is not None and os.path.isfile(file := folder / name.replace("\\", "/")):
+            stay_inside(file, folder, allow_outside, f"{where}: mask_path")
+            exact[plain(name)] = file
+    listed = [name for name in names if name is not None]
+    files = (
+        find_files(source, folder, listed, exact, of_one_folder=False, all_folders=True, but=images) if listed else {}
+    )
+    for (_, where), name in zip(frames, names):
+        if name is not None:
+            file = files.get(name, folder / name)
+            stay_inside(file, folder, allow_outside, f"{where}: mask_path")
+            if name not in files:
+                raise SceneError(f"{where}: its mask {file} does not exist")
+    return [None if name is None else files[name] for name in names]
 
 
-def pose_of(matrix: object, where: str, key: str = "transform_matrix") -> Tensor:
+def _is_unknown(matrix: object) -> bool:
+    """Returns whether a pose is missing, or has entries that are missing or not finite, as of a lost camera."""
+    rows = matrix if isinstance(matrix, list) else []
+    values = [value for row in rows for value in (row if isinstance(row, list) else ())]
+    return matrix is None or any(
+        value is None or (isinstance(value, float) and not math.isfinite(value)) for value in values
+    )
+
+
+def pose_of(matrix: object, where: str, key: str) -> Tensor:
     """Returns a pose float64 [4, 4], after checking that ``matrix`` is a rigid motion, 4 x 4 or 3 x 4."""
+    return _checked_pose(_matrix_of(matrix, where, key), where, key)
+
+
+def _scaled_pose(matrix: object, where: str) -> tuple[Tensor, float]:
+    """Returns the pose [4, 4] of a frame with axes of length 1, and the length of the axes in the file.
+
+    Blender writes the scale of a camera into its pose. The length is 1 for a pose that needs no change.
+    """
+    key = "transform_matrix"
+    values = _matrix_of(matrix, where, key)
+    gram = values[:3, :3].T @ values[:3, :3]
+    length = float(np.trace(gram) / 3) ** 0.5
+    if np.abs(gram - np.eye(3)).max() <= ORTHONORMAL or not 1 / LARGEST <= length <= LARGEST:
+        return _checked_pose(values, where, key), 1.0
+    scaled = values.copy()
+    scaled[:3, :3] /= length
+    if np.abs(gram / length**2 - np.eye(3)).max() > ORTHONORMAL:
+        return _checked_pose(values, where, key), 1.0
+    return _checked_pose(scaled, where, key), length
+
+
+def _matrix_of(matrix: object, where: str, key: str) -> NDArray[np.float64]:
+    """Returns a float64 matrix, after checking that it has numbers of a sensible size and the shape of a pose."""
     rows = matrix if isinstance(matrix, list) else [None]
     try:
         if not all(isinstance(row, list) and all(map(is_number, row)) for row in rows):
@@ -203,6 +292,11 @@ def pose_of(matrix: object, where: str, key: str = "transform_matrix") -> Tensor
         raise SceneError(f"{where}: {key} must be 4 x 4, got shape {list(values.shape)}")
     if not (np.abs(values) <= LARGEST).all():
         raise SceneError(f"{where}: {key} has values that are not finite, or above {LARGEST:.0e}")
+    return values
+
+
+def _checked_pose(values: NDArray[np.float64], where: str, key: str) -> Tensor:
+    """Returns a pose float64 [4, 4], after checking that ``values`` is a rigid motion, 4 x 4 or 3 x 4."""
     rotation = values[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > ORTHONORMAL or np.linalg.det(rotation) < 0:
@@ -224,13 +318,13 @@ def load_transforms(folder: Path, reading: Reading) -> Scene:
     Validation images are used for testing if there are no test images; otherwise they are left out.
     """
     path = folder / "transforms.json"
-    entries, frames = read_transforms(path, reading.allow_outside)
+    entries, frames, notes = read_transforms(path, reading.allow_outside)
     frames = sorted(frames, key=lambda frame: frame.path.as_posix())
     if len(frames) < 2:
         raise SceneError(f"{path}: needs at least two images, since one is held out for testing")
     declared = _declared_split(path, entries, frames)
     frames, held_out = (frames, None) if declared is None else declared
-    return capture_scene(folder, entries, frames, held_out, reading)
+    return capture_scene(folder, entries, frames, held_out, reading, notes)
 
 
 def _declared_split(
@@ -238,39 +332,26 @@ def _declared_split(
 ) -> tuple[list[ListedImage], Tensor] | None:
     """Returns the frames in nerfstudio's lists of file names, and bool held_out; None if the file has no lists.
 
-    An empty or missing list is filled with the images that are in no other list.
+    See `split_by_lists`.
     """
     lists: dict[str, set[str]] = {}
     for key in SPLITS:
         names = entries.get(key)
         if names is not None and not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
             raise SceneError(f"{path}: {key} must be a list of file names, got {names!r:.60}")
-        lists[key] = {_plain(name) for name in names or ()}
-    all_names = {_plain(frame["file_path"]) for frame in entries["frames"]}
+        lists[key] = {plain(name) for name in names or ()}
+    all_names = {plain(frame["file_path"]) for frame in entries["frames"]}
     for key, names in lists.items():
         if unknown := sorted(names - all_names):
             raise SceneError(f"{path}: {key} lists {unknown[0]}, but no frame has this file_path")
-    train, test, validation = lists.values()
-    if not (train or test or validation):
+    present = [plain(frame.values["file_path"]) for frame in frames]
+    split = split_by_lists(path, SPLITS, list(lists.values()), present, all_names)
+    if split is None:
         return None
-    test = test or validation
-    train, test = train or all_names - test - validation, test or all_names - train
-    if shared := sorted(train & test):
-        raise SceneError(f"{path}: train_filenames and the images for testing must differ, both have {shared[0]}")
-    if unused := len(all_names - train - test - validation):
+    chosen, held_out, unused = split
+    if unused:
         log.warning("%s: %d images are in none of %s and are left out", path, unused, ", ".join(SPLITS))
-    names = [_plain(frame.values["file_path"]) for frame in frames]
-    chosen = [(frame, name in test) for frame, name in zip(frames, names) if name in train | test]
-    held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool)
-    for part, present in (("training", bool((~held_out).any())), ("testing", bool(held_out.any()))):
-        if not present:
-            raise SceneError(f"{path}: {', '.join(SPLITS)} leave no image for {part}")
-    return [frame for frame, _ in chosen], held_out
-
-
-def _plain(name: str) -> str:
-    """Returns a normalised file name, so that ./images/a.png equals images/a.png."""
-    return posixpath.normpath(name.replace("\\", "/"))
+    return [frames[place] for place in chosen], held_out
 
 
 def has_lens(frames: Sequence[ListedImage]) -> bool:
@@ -295,6 +376,7 @@ def capture_scene(
     notes = [f"{path.name} of {len(frames)} images", *notes]
     if any(frame.values.get("depth_file_path") is not None for frame in frames):
         notes.append("its depth images are not used")
+    notes += time_notes(frames)
     applied = entries.get("applied_transform")
     transform = (
         torch.eye(4, dtype=torch.float64) if applied is None else pose_of(applied, str(path), "applied_transform")
@@ -302,12 +384,22 @@ def capture_scene(
     transform[:3] *= number(entries, "applied_scale", path, positive=True) or 1.0
     headers = [read_header(frame.path) for frame in frames]
     views = [_view(frame, header) for frame, header in zip(frames, headers)]
-    scaled = [(*header.size, path.name, *view.size) for view, header in zip(views, headers) if view.size != header.size]
+    scaled = [
+        (*header.size, path.name, *view.size)
+        for view, header in zip(views, headers)
+        if view.size not in (header.size, header.size[::-1])
+    ]
     if scaled:
         sizes = "{} x {} pixels, where {} says {:g} x {:g}".format(*scaled[0])
         notes.append(f"images have {sizes}: their lenses are scaled")
     factor = reading.downscale or least_factor(max(max(header.size) for header in headers))
     return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
+
+
+def time_notes(frames: Sequence[ListedImage]) -> list[str]:
+    """Returns a line on times that differ between frames, as of D-NeRF's moving scenes; [] without such times."""
+    times = {time for frame in frames if is_number(time := frame.values.get("time"))}
+    return ["its times are not used: the scene is taken as still"] if len(times) > 1 else []
 
 
 def _view(frame: ListedImage, header: Header) -> View:
@@ -324,7 +416,7 @@ def _view(frame: ListedImage, header: Header) -> View:
     if unsupported := [key for key in DISTORTION + UNSUPPORTED if key not in supported and number(values, key, path)]:
         only = f"only {', '.join(supported)}{of_lens}" if supported else f"there is none{of_lens}"
         raise SceneError(f"{path}: lens distortion {', '.join(unsupported)} is not supported, {only}")
-    width, height = size = _lens_size(frame, header.size)
+    width, height = size = _lens_size(frame, header)
     if kind == EQUIRECTANGULAR:  # nerfstudio writes half of the width as fl_x, which is ignored
         if width != 2 * height:
             raise SceneError(f"{frame.path}: an EQUIRECTANGULAR image must be 2 to 1, got {width} x {height} pixels")
@@ -345,23 +437,25 @@ def _view(frame: ListedImage, header: Header) -> View:
     return View(frame.path, frame.pose, lens, size, frame.mask, header=header, circle=circle)
 
 
-def _lens_size(frame: ListedImage, size: tuple[int, int]) -> tuple[float, float]:
-    """Returns the (width, height) to which a frame's lens refers, for an image file of ``size``.
+def _lens_size(frame: ListedImage, header: Header) -> tuple[float, float]:
+    """Returns the (width, height) to which a frame's lens refers.
 
-    This is ``size`` or, if the image was scaled after its lens was calibrated, ``w`` and ``h`` of the frame, which must
-    have the same aspect ratio.
+    This is the size of the image file or, if the image was scaled after its lens was calibrated, ``w`` and ``h`` of the
+    frame, which must have the same aspect ratio. If only the image that its orientation tag turns upright fits ``w``
+    and ``h``, the lens refers to that image.
     """
     stated = [number(frame.values, key, frame.source, positive=True) for key in ("w", "h")]
-    # Exporters that scale images may write fractional sizes.
-    wrong = [key for key, want, got in zip("wh", stated, size) if want is not None and abs(want - got) >= 1]
     w, h = stated
-    if not wrong:
-        return size
-    cropped = w is not None and abs(size[0] - w) <= ROUNDED
-    if cropped or w is None or h is None or abs(size[0] / w - size[1] / h) * max(w, h) > ROUNDED:
-        says = " and ".join(f"{key} = {want:g}" for key, want in zip("wh", stated) if want is not None)
-        raise SceneError(f"{frame.path}: is {size[0]} x {size[1]} pixels, but {frame.source} says {says}")
-    return w, h
+    for size in (header.size, header.size[::-1])[: 1 + header.turns % 2]:
+        # Exporters that scale images may write fractional sizes.
+        if not any(want is not None and abs(want - got) >= 1 for want, got in zip(stated, size)):
+            return size
+        cropped = w is not None and abs(size[0] - w) <= ROUNDED
+        if not (cropped or w is None or h is None or abs(size[0] / w - size[1] / h) * max(w, h) > ROUNDED):
+            return w, h
+    says = " and ".join(f"{key} = {want:g}" for key, want in zip("wh", stated) if want is not None)
+    width, height = header.size
+    raise SceneError(f"{frame.path}: is {width} x {height} pixels, but {frame.source} says {says}: {CROPPED}")
 
 
 def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
