@@ -78,6 +78,27 @@ def test_a_joined_run_shows_what_is_known(tmp_path, capsys):
     assert figures["PSNR [dB]"][1] == f"{psnr:.2f}" and figures["scores of"][1] == "3 views" and "makes" not in shown
 
 
+def test_cut_runs_placed_runs_and_panoramas(tmp_path, capsys, fails):
+    one, part, placed = tmp_path / "one", tmp_path / "part", tmp_path / "placed"
+    assert main(words("train --data builtin --out", one, TINY)) == 0
+    assert main(words("cut", one, "--out", part, "--sphere 0 0 0 0.4")) == 0
+    assert main(words("place", one, part, "--out", placed, "--at 0 0 1")) == 0
+    for run, is_cut in ((one, False), (part, True), (placed, False)):
+        capsys.readouterr()
+        assert main(words("eval --views 1 --panels 0", run)) == 0
+        said = f"{run} was cut: its pictures are empty outside of the part that is left, but are compared with whole"
+        assert (said in capsys.readouterr().out) == is_cut
+    assert main(words("join", part, one, "--out", tmp_path / "joined")) == 0
+    capsys.readouterr()
+    assert main(words("compare", part, placed, tmp_path / "joined")) == 0
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capsys.readouterr().out.splitlines()]
+    assert ["scores of", "1 view, cut", "1 view", "cut"] in rows
+    assert main(words("render", one, "--panorama --frames 1 --size 8x4")) == 0
+    assert (one / "panorama.mp4").is_file() and not (one / "video.mp4").exists()
+    for run in (part, placed):
+        fails("it has several parts, as runs made by join, cut or place; export the runs", "export --web x.html", run)
+
+
 def test_what_is_not_compared(tmp_path, fails):
     run, broken = make_run(tmp_path / "run", 30.0, [16]), make_run(tmp_path / "broken", 30.0, [16])
     fails("compare needs at least two runs, got 1", "compare", run)

@@ -31,8 +31,8 @@ def render(
 
     Args:
         run: The run directory.
-        out: The video file, .mp4, or with --images a new folder; default video, or the name of the path, in the run
-            directory.
+        out: The video file, .mp4, or with --images a new folder; default video, panorama or the name of the path, in
+            the run directory.
         path: Camera path in nerfstudio's format, as the viewer saves it, in the coordinates of this run's scene. It
             determines the frames and their size.
         frames: Number of frames of a video without a path.
@@ -50,7 +50,7 @@ def render(
     sides = None if size is None else _sides(size)
     flight = None if path is None else read_camera_path(path)
     opened = opening.open_without_images(run)
-    name = ("video" if path is None else path.stem) + "_depth" * depth
+    name = (path.stem if path is not None else "panorama" if panorama else "video") + "_depth" * depth
     out = out or run / (name if images else f"{name}.mp4")
     (check_folder if images else check_video)(out)
     if flight is None:
@@ -70,6 +70,9 @@ def render(
 def _sides(size: str) -> tuple[int, int]:
     """Parses a size such as "1280x720" into width and height."""
     match = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", size)
-    if not match or max(sides := (int(match[1]), int(match[2]))) > LONGEST_SIDE:
-        raise ConfigError(f"--size must be WIDTHxHEIGHT, such as 1280x720, at most {LONGEST_SIDE} each, got {size!r}")
-    return sides
+    if not match or max(int(match[1]), int(match[2])) > LONGEST_SIDE:
+        sides = re.findall(r"\d+", size)
+        hint = f"; did you mean {'x'.join(sides)}?" if len(sides) == 2 and not match else ""
+        rule = f"WIDTHxHEIGHT, such as 1280x720, at most {LONGEST_SIDE} each"
+        raise ConfigError(f"--size must be {rule}, got {size!r}{hint}")
+    return int(match[1]), int(match[2])
