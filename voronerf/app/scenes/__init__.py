@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +28,18 @@ BUILTIN, CITY = "builtin", "builtin-city"  # optional suffix: builtin:SIZE, buil
 CACHED = 100  # least side, in pixels, of a built-in scene that is cached
 MOST_PIXELS = 1600  # largest side of the built-in scene
 
-
 #: Suffixes of videos that `voronerf process` may read.
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".mpg")
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar")
+SHAPES = (".ply", ".splat", ".spz", ".sog", ".pcd", ".las", ".laz", ".e57", ".obj", ".glb", ".gltf", ".fbx", ".stl")
+#: Words about files that are no scenes, by suffix; {} is the file.
+REMEDIES = {
+    **dict.fromkeys(VIDEOS, "; voronerf process {} DIR makes one from a video"),
+    **dict.fromkeys(ARCHIVES, "; unpack the archive first"),
+    **dict.fromkeys(SHAPES, "; points, splats and meshes have no photographs to learn from"),
+    **dict.fromkeys((*SUFFIXES, *CONVERTED), "; a scene needs several pictures: voronerf process FOLDER DIR makes one"),
+    ".json": "; only transforms.json and transforms_train.json name a scene",
+}
 
 
 class Format(NamedTuple):
@@ -59,7 +69,7 @@ def _computed(size: int) -> Scene:
         return builtin_scene(size)
     try:
         return builtin_scene(size, images="cached")
-    except SceneError:  # the cache cannot be written
+    except (SceneError, OSError):  # the cache cannot be written
         return builtin_scene(size)
 
 
@@ -71,6 +81,11 @@ def is_builtin(source: str | Path | None) -> bool:
 def has_images(folder: Path) -> bool:
     """Returns whether a folder has images, with or without cameras."""
     return any(path.suffix.lower() in (*SUFFIXES, *CONVERTED) for path in folder.iterdir())
+
+
+def _formats_of(folder: Path) -> list[str]:
+    """Returns the names of the formats in which a folder holds a scene."""
+    return [name for name, item in FORMATS.items() if item.is_used_by(folder)]
 
 
 def load_scene(
@@ -140,6 +155,8 @@ def load_scene(
                 f"{source}: images must be auto or memory for a built-in scene other than a city, got disk"
             )
         return _computed(full // downscale)
+    if re.match("(?i)[a-z][a-z0-9+.-]+://", str(source)):
+        raise SceneError(f"{source}: is not a folder; download the scene, unpack it and give its folder")
     folder = Path(source)
     if folder.is_file() and folder.name in (signs := {item.sign: name for name, item in FORMATS.items()}):
         folder, format = folder.parent, signs[folder.name] if format == "auto" else format
@@ -147,9 +164,10 @@ def load_scene(
         siblings = (path for path in folder.parent.glob("*") if path.is_dir())
         raise SceneError(f"{folder}: there is no such folder{similar_path(folder, (Path(BUILTIN), *siblings))}")
     if not folder.is_dir():
-        hint = f"; voronerf process {folder} DIR makes one from a video" if folder.suffix.lower() in VIDEOS else ""
-        raise SceneError(f"{folder}: is not a folder{hint}")
-    formats = [name for name, item in FORMATS.items() if item.is_used_by(folder)]
+        around = next((outer for outer in [*folder.parents][:2] if _formats_of(outer)), None)
+        hint = REMEDIES.get(folder.suffix.lower(), "").format(shlex.quote(str(folder)))
+        raise SceneError(f"{folder}: is not a folder{hint}{f'; did you mean {around}?' if around else ''}")
+    formats = _formats_of(folder)
     models = find_models(folder)
     if "transforms" in formats and models and models.paths[0].relative_to(models.folder).parts[1:2] == ("sparse",):
         formats.remove("colmap")  # nerfstudio makes transforms.json, with further entries, from colmap/sparse/0
