@@ -7,12 +7,18 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from cli_commands import TINY, words
+from PIL import Image
+from scene_files import write_capture
 
 from voronerf.app.cli import info, main, train
+from voronerf.app.evaluate.panels import picture_of_colour
+from voronerf.app.run import open_run
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.run_directory import read_curve
+from voronerf.nerf import orbit_cameras
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -97,6 +103,21 @@ def test_cut_runs_placed_runs_and_panoramas(tmp_path, capsys, fails):
     assert (one / "panorama.mp4").is_file() and not (one / "video.mp4").exists()
     for run in (part, placed):
         fails("it has several parts, as runs made by join, cut or place; export the runs", "export --web x.html", run)
+
+
+def test_videos_through_the_cameras_of_a_capture(tmp_path, capsys):
+    capture, run = tmp_path / "capture", tmp_path / "run"
+    seen = orbit_cameras(9, radius=4, elevation=20, width=12, height=10, focal=20, centre=(1, 2, 3))
+    write_capture(capture, seen, k1=0.05)
+    assert main(words("train --out", run, TINY.replace("--downscale 6", ""), "--data", capture)) == 0
+    assert main(words("render --images --path", capture / "transforms.json", run)) == 0
+    opened = open_run(run, data=capture)
+    names = [frame["file_path"] for frame in json.loads((capture / "transforms.json").read_text())["frames"]]
+    for split in (opened.scene.train, opened.scene.test):
+        for index, name in enumerate(split.names):
+            picture = np.asarray(Image.open(run / "transforms" / f"{names.index(f'{name}.png'):05}.png"))
+            expected = picture_of_colour(opened.render(split.cameras, index).colour).numpy()
+            assert np.abs(picture.astype(int) - expected).max() <= 1
 
 
 def test_what_is_not_compared(tmp_path, fails):
