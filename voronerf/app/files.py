@@ -9,6 +9,7 @@ import math
 import os
 import stat
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -84,10 +85,19 @@ def leads_outside(path: Path, folder: Path) -> bool:
 
 
 def cache_folder() -> Path:
-    """Returns the cache folder: VORONERF_CACHE, or `voronerf` in the user's caches."""
-    return Path(
-        os.environ.get("VORONERF_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "voronerf"
-    ).expanduser()
+    """Returns the cache folder: VORONERF_CACHE, or `voronerf` in the user's caches.
+
+    For a user without a home folder, as in some containers, it is a private folder beside the system's temporary files.
+
+    Raises:
+        OSError: When this private folder belongs to another user or cannot be made.
+    """
+    caches = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    folder = os.path.expanduser(os.environ.get("VORONERF_CACHE") or os.path.join(caches, "voronerf"))
+    if folder.startswith("~"):  # nothing tells the home folder
+        user = os.getuid() if hasattr(os, "getuid") else "user"
+        return private_folder(Path(tempfile.gettempdir(), f"voronerf-{user}"))
+    return Path(folder)
 
 
 def private_folder(path: Path) -> Path:

@@ -7,15 +7,24 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-#: Names of settings in other programs, each with its name in voronerf.
+#: Names of settings and formats in other programs, each with its name in voronerf.
 SAID_ELSEWHERE = {
     **dict.fromkeys(("epochs", "iterations", "max-num-iterations"), "steps"),
     **dict.fromkeys(("input", "source-path"), "data"),
     "batch-size": "rays",
-    "cuda": "device",
-    "gpu": "device",
+    **dict.fromkeys(("cpu", "cuda", "gpu"), "device"),
     "model-path": "out",
+    **dict.fromkeys(("nerfstudio", "instant-ngp", "ngp", "polycam", "record3d"), "transforms"),
+    **dict.fromkeys(("nerf-synthetic", "synthetic", "nerf", "blendernerf", "dnerf", "d-nerf"), "blender"),
+    **dict.fromkeys(("mipnerf360", "gaussian-splatting", "3dgs"), "colmap"),
+    "nerf-llff": "llff",
 }
+
+#: Factors behind a number, in lower case, and units of time in seconds.
+FACTORS = {"": 1.0, "k": 1e3, "m": 1e6, "%": 0.01}
+TIMES = {"d(?:ays?)?": 86400, "h(?:(?:ou)?rs?)?": 3600, "m(?:in(?:ute)?s?)?": 60, "s(?:ec(?:ond)?s?)?": 1}
+#: Dashes other than the hyphen, which text processors and web pages write for it.
+DASHES = "\u2010\u2011\u2012\u2013\u2014\u2015\u2212\ufe58\ufe63\uff0d"
 
 
 def either(names: Sequence[str]) -> str:
@@ -40,9 +49,35 @@ def nearest(word: str, words: Iterable[str]) -> str | None:
     """Returns the setting that other programs call ``word``, or the most similar of ``words``, or None."""
     by_lower = {candidate.lower(): candidate for candidate in words}
     word = word.lower()
-    synonym = SAID_ELSEWHERE.get(word.replace("_", "-"))
+    synonym = SAID_ELSEWHERE.get(word.replace("_", "-").removesuffix("-data"))
     matches = [synonym] if synonym in by_lower else difflib.get_close_matches(word, by_lower, 1)
     return by_lower[matches[0]] if matches else None
+
+
+def meant_number(text: str, *, whole: bool, seconds: bool = False) -> str | None:
+    """Returns the number that people mean by a text such as 1,000, 1.5k, 2^12 or, in seconds, 10min; None if unclear.
+
+    Args:
+        text: The text, in lower case.
+        whole: Whether the number must be whole.
+        seconds: Whether the number is a time in seconds.
+    """
+    marks = ",_' ." if whole else ",_' "  # between thousands
+    plain = re.sub(rf"(?<=\d)[{marks}](?=\d{{3}}(?!\d))", "", text) if re.match(r"-?[1-9]", text) else text
+    plain = plain if whole else re.sub(r"^(-?\d+),(\d+)$", r"\1.\2", plain)  # the comma of other languages
+    number, value = r"\d+(?:\.\d+)?", None
+    if power := re.fullmatch(r"(\d{1,3})(?:\^|\*\*)(\d{1,2})", plain):
+        value = float(int(power[1]) ** int(power[2]))
+    elif seconds and re.fullmatch(r"\d+(:\d\d){1,2}", plain):
+        value = sum(60.0**place * int(part) for place, part in enumerate(reversed(plain.split(":"))))
+    elif seconds and plain and re.fullmatch("".join(rf"(?:{number} *{unit} *)?" for unit in TIMES), plain):
+        pairs = ((re.search(rf"({number}) *{unit}(?![a-z])", plain), size) for unit, size in TIMES.items())
+        value = sum(size * float(match[1]) for match, size in pairs if match)
+    elif match := re.fullmatch(rf"(-?(?:{number}|\.\d+)(?:e[+-]?\d{{1,2}})?) *([{'k' if seconds else 'km%'}]?)", plain):
+        value = None if re.match(r"-?0\d", plain) else float(match[1]) * FACTORS[match[2]]
+    if value is None or abs(value) >= 1e15 or (whole and value % 1):
+        return None
+    return f"{value:.15g}"
 
 
 def similar_path(path: Path, others: Iterable[Path]) -> str:

@@ -27,7 +27,7 @@ from voronerf.app.wording import as_typed
 from voronerf.editing.geometry import Similarity, Solid
 from voronerf.editing.network import StoredRouter, config_of
 from voronerf.editing.parts import Part, Parts
-from voronerf.editing.run import PARTS, has_parts, open_parts, write_parts
+from voronerf.editing.run import PARTS, has_parts, is_cut, open_parts, write_parts
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import OPACITY, OccupancyGrid
@@ -40,13 +40,14 @@ SMALLEST = 1e-4
 
 @dataclass(frozen=True)
 class RunContents:
-    """The contents of a run to join, cut or place: settings, scene, parts and grid."""
+    """The contents of a run to join, cut or place: settings, scene, parts, grid, and whether the run was cut."""
 
     name: str
     config: TrainConfig
     scene: Scene
     parts: Parts
     grid: OccupancyGrid | None
+    cut: bool = False
 
     @classmethod
     def of(cls, run: Path | str) -> RunContents:
@@ -59,7 +60,7 @@ class RunContents:
         config, scene, state = config_of(checkpoint), read_scene(record), checkpoint.group("occupancy")
         grid = OccupancyGrid.from_state(state) if state else None
         if has_parts(run):
-            return cls(name, config, scene, open_parts(run, checkpoint), grid)
+            return cls(name, config, scene, open_parts(run, checkpoint), grid, is_cut(run))
         if config.field_type.cones:
             raise ConfigError(f"{name}: --field {config.field} cannot be joined or cut: its cones cross borders")
         contraction, network = scene.space(config.contraction).contraction, StoredRouter(checkpoint)
@@ -215,7 +216,9 @@ def join_sources(sources: Sequence[RunContents], frames: Sequence[Similarity], *
         parts += [part.changed(frame=frame @ part.frame, layer=part.layer + above) for part in source.parts]
     joined = Parts(parts, backend=first.parts.backend)
     scene = _join_scenes(sources, frames)
-    return RunContents(first.name, _settings(sources, frames, scene), scene, joined, _join_grids(sources, frames))
+    settings, grid = _settings(sources, frames, scene), _join_grids(sources, frames)
+    is_incomplete = any(source.cut for source in (sources[:1] if on_top else sources))  # an object is cut out anyway
+    return RunContents(first.name, settings, scene, joined, grid, is_incomplete)
 
 
 def _settings(sources: Sequence[RunContents], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
@@ -393,7 +396,7 @@ def cut_source(source: RunContents, keep: Solid | Tensor) -> RunContents:
             if not bool((box[0] < box[1]).all()):
                 raise ConfigError(f"{source.name}: nothing is left, the cut is outside of the scene's box")
     if box is None:
-        return replace(source, parts=parts)
+        return replace(source, parts=parts, cut=True)
     grid = source.grid
     if grid is None:
         grid = _evaluated_grid(source, parts, box)
@@ -419,7 +422,7 @@ def cut_source(source: RunContents, keep: Solid | Tensor) -> RunContents:
         share = float((grid.box[1] - grid.box[0]).norm() / (old_box[1] - old_box[0]).norm())
         config = replace(config, samples=(max(16, math.ceil((config.samples or (64,))[0] * share - 1e-6)),))
     config = _settings([replace(source, config=config, scene=scene)], [Similarity()], scene)
-    return RunContents(source.name, config, scene, parts, grid)
+    return RunContents(source.name, config, scene, parts, grid, cut=True)
 
 
 def keep_cells(parts: Parts, keep: Tensor) -> Parts:
@@ -550,7 +553,7 @@ def _write(source: RunContents, out: Path) -> RunContents:
         partial.mkdir()
         config = replace(source.config, out=out)
         write_parts(partial, config, source.parts, source.grid)
-        write_text(partial / PARTS, json_text({"parts": len(source.parts.parts)}) + "\n")
+        write_text(partial / PARTS, json_text({"parts": len(source.parts.parts), "cut": source.cut}) + "\n")
         write_text(partial / "config.json", config.to_json())
         write_scene(partial / "scene.json", source.scene)
         os.replace(partial, out)

@@ -1,8 +1,8 @@
 """Reads and writes runs of several parts.
 
-A run directory with the file ``parts.json`` has several parts. Its checkpoint has the tensors ``part-N.diagram.*`` and
-``part-N.kept`` of each part, and the occupancy grid. ``values["parts"]`` has the placement of each part, and names the
-file of its networks, a checkpoint in the same folder.
+A run directory with the file ``parts.json`` has several parts; the file also tells whether the run was cut. The run's
+checkpoint has the tensors ``part-N.diagram.*`` and ``part-N.kept`` of each part, and the occupancy grid.
+``values["parts"]`` has the placement of each part, and names the file of its networks, a checkpoint in the same folder.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf.app.files import read_json
 from voronerf.app.run import Run, shown_scene
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import placed, read_scene
@@ -46,6 +47,11 @@ PARTS = "parts.json"
 def has_parts(run: Path) -> bool:
     """Returns whether a run directory holds a run of several parts."""
     return (run / PARTS).is_file()
+
+
+def is_cut(run: Path) -> bool:
+    """Returns whether a run was cut, or made of cut runs, so that pictures show only a part of its scene."""
+    return has_parts(run) and read_json(run / PARTS, dict).get("cut") is True
 
 
 def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGrid | None) -> None:

@@ -87,6 +87,8 @@ def test_videos_along_a_path(run, tmp_path, fails):
         assert min(colours) > 20 and {picture.size for picture in pictures} == {(16, 16)}
     succeeds("render", run, "--frames 1 --images --panorama --size 40x20 --out", tmp_path / "around")
     assert Image.open(tmp_path / "around" / "00000.png").size == (40, 20)
+    succeeds("render", run, "--frames 1 --images --panorama --depth --size 40x20")
+    assert len(list((run / "panorama_depth").iterdir())) == 1
     fails("must be 2 to 1, got 40 x 30", "render", run, "--panorama --size 40x30")
     fails("video: must be a new or empty folder", "render", run, "--images")
     fails("--size must be WIDTHxHEIGHT, such as 1280x720, at most 8192 each, got '30'", "render", run, "--size 30")

@@ -7,12 +7,18 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from cli_commands import TINY, words
+from PIL import Image
+from scene_files import write_capture
 
 from voronerf.app.cli import info, main, train
+from voronerf.app.evaluate.panels import picture_of_colour
+from voronerf.app.run import open_run
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.run_directory import read_curve
+from voronerf.nerf import orbit_cameras
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -76,6 +82,42 @@ def test_a_joined_run_shows_what_is_known(tmp_path, capsys):
     capsys.readouterr()
     figures, shown = rows()
     assert figures["PSNR [dB]"][1] == f"{psnr:.2f}" and figures["scores of"][1] == "3 views" and "makes" not in shown
+
+
+def test_cut_runs_placed_runs_and_panoramas(tmp_path, capsys, fails):
+    one, part, placed = tmp_path / "one", tmp_path / "part", tmp_path / "placed"
+    assert main(words("train --data builtin --out", one, TINY)) == 0
+    assert main(words("cut", one, "--out", part, "--sphere 0 0 0 0.4")) == 0
+    assert main(words("place", one, part, "--out", placed, "--at 0 0 1")) == 0
+    for run, is_cut in ((one, False), (part, True), (placed, False)):
+        capsys.readouterr()
+        assert main(words("eval --views 1 --panels 0", run)) == 0
+        said = f"{run} was cut: its pictures are empty outside of the part that is left, but are compared with whole"
+        assert (said in capsys.readouterr().out) == is_cut
+    assert main(words("join", part, one, "--out", tmp_path / "joined")) == 0
+    capsys.readouterr()
+    assert main(words("compare", part, placed, tmp_path / "joined")) == 0
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capsys.readouterr().out.splitlines()]
+    assert ["scores of", "1 view, cut", "1 view", "cut"] in rows
+    assert main(words("render", one, "--panorama --frames 1 --size 8x4")) == 0
+    assert (one / "panorama.mp4").is_file() and not (one / "video.mp4").exists()
+    for run in (part, placed):
+        fails("it has several parts, as runs made by join, cut or place; export the runs", "export --web x.html", run)
+
+
+def test_videos_through_the_cameras_of_a_capture(tmp_path, capsys):
+    capture, run = tmp_path / "capture", tmp_path / "run"
+    seen = orbit_cameras(9, radius=4, elevation=20, width=12, height=10, focal=20, centre=(1, 2, 3))
+    write_capture(capture, seen, k1=0.05)
+    assert main(words("train --out", run, TINY.replace("--downscale 6", ""), "--data", capture)) == 0
+    assert main(words("render --images --path", capture / "transforms.json", run)) == 0
+    opened = open_run(run, data=capture)
+    names = [frame["file_path"] for frame in json.loads((capture / "transforms.json").read_text())["frames"]]
+    for split in (opened.scene.train, opened.scene.test):
+        for index, name in enumerate(split.names):
+            picture = np.asarray(Image.open(run / "transforms" / f"{names.index(f'{name}.png'):05}.png"))
+            expected = picture_of_colour(opened.render(split.cameras, index).colour).numpy()
+            assert np.abs(picture.astype(int) - expected).max() <= 1
 
 
 def test_what_is_not_compared(tmp_path, fails):

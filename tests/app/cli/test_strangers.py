@@ -152,3 +152,34 @@ def test_shapes_are_compared_before_memory_is_taken(trained, tmp_path):
     for (name, (_, message)), said in zip(OVERSIZED.items(), zip(lines[::2], lines[1::2]), strict=True):
         assert message in said[0] and f"/{name}/" in said[0]
         assert message in said[1] or "needs" in said[1]  # more memory than the machine has
+
+
+NOBODY = """
+import os, pwd, sys, tempfile
+def unknown(uid): raise KeyError(f"getpwuid(): uid not found: {uid}")
+pwd.getpwuid = unknown
+for name in ("HOME", "USER", "LOGNAME", "LNAME", "USERNAME", "VORONERF_CACHE", "XDG_CACHE_HOME"):
+    os.environ.pop(name, None)
+tempfile.tempdir = os.getcwd()
+from voronerf.app.cli.program import run
+sys.exit(run(sys.argv[1:]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs POSIX users")
+def test_a_user_without_a_home(tmp_path):
+    """A container's user may have no entry in passwd and no HOME."""
+    cache = tmp_path / f"voronerf-{os.getuid()}"
+    for command in (f"train --data builtin --out run {TINY}", "eval run --views 1", "render run --frames 1"):
+        python("-c", NOBODY, *words(command), cwd=tmp_path)
+    assert cache.stat().st_mode & 0o777 == 0o700 and (cache / "chosen").is_dir()
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs POSIX users")
+def test_the_cache_of_another_user_is_not_used(tmp_path, monkeypatch, fails):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("VORONERF_CACHE", "~unknown/cache")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / f"voronerf-{os.getuid()}").symlink_to(tmp_path / "elsewhere")
+    fails("must be a folder of your own; set VORONERF_CACHE to another", "train --data builtin-city --images disk")
+    assert not list((tmp_path / "elsewhere").iterdir())

@@ -91,6 +91,70 @@ from voronerf.app.train.config import TrainConfig
             "render run --crop 1 2 3 4 5",
             "--crop must be 6 numbers or saved, got '1 2 3 4 5'; see voronerf render --help",
         ),
+        ("train --no-gpu", "--no-gpu; did you mean --device cpu?"),
+        ("train --no-cuda", "did you mean --device cpu?"),
+        ("train --no-helpp", "did you mean --help?"),
+        ("train --no-dat x", "did you mean --data?"),
+        ("train --no-ocupancy", "did you mean --no-occupancy?"),
+        ("train --no-normalize", "did you mean --no-normalise?"),
+        ("train --budget 10m", "--budget must be a number, got '10m'; did you mean --budget 600 (seconds)?"),
+        ("train --budget 10min", "did you mean --budget 600 (seconds)?"),
+        ("train --budget 10 min", "did you mean --budget 600 (seconds)?"),
+        ("train --budget=1h30m", "did you mean --budget 5400 (seconds)?"),
+        ("train --budget 90s", "did you mean --budget 90 (seconds)?"),
+        ("train --budget 1:30:00", "did you mean --budget 5400 (seconds)?"),
+        ("train --budget 1,000", "did you mean --budget 1000 (seconds)?"),
+        ("train --checkpoint_every 5m", "did you mean --checkpoint-every 300 (seconds)?"),
+        ("train --steps 10min", "--steps must be a whole number, got '10min'; see voronerf train --help"),
+        ("train --steps 1,000", "did you mean --steps 1000?"),
+        ("train --steps 30.000", "did you mean --steps 30000?"),
+        ("train --steps 3e4", "did you mean --steps 30000?"),
+        ("train --rays 1.5k", "did you mean --rays 1500?"),
+        ("train --rays 2^12", "did you mean --rays 4096?"),
+        ("train --parameters 1M", "did you mean --parameters 1000000?"),
+        ("train --lr 0,02", "did you mean --lr 0.02?"),
+        ("train --average 98%", "did you mean --average 0.98?"),
+        ("process clip.mp4 y --frames 1k", "did you mean --frames 1000?"),
+        ("train --cells 4x4", "got '4x4'; did you mean --cells 16 or, for levels, --cells 4 4?"),
+        ("train --cells 4,4", "did you mean --cells 4 4?"),
+        ("train --cells 1,000", "did you mean --cells 1000?"),
+        ("train --samples 64,128", "got '64,128'; did you mean --samples 64 128?"),
+        ("train --samples [64,128]", "did you mean --samples 64 128?"),
+        ("cut run --out y --box -1,-1,-1,1,1,1", "did you mean --box -1 -1 -1 1 1 1?"),
+        ("cut run --out y --box -1, -1, -1, 1, 1, 1", "did you mean --box -1 -1 -1 1 1 1?"),
+        ("export run --crop 1,2,3", "--crop must be 6 numbers or saved, got '1,2,3'; see voronerf export --help"),
+        ("place a b --out y --at \u22121 0 0.5", "did you mean --at -1 0 0.5?"),
+        ("render run --size 1280,720", "got '1280,720'; did you mean 1280x720?"),
+        ("render run --size 1280\u00d7720", "did you mean 1280x720?"),
+        ("render run --size 9000x9000", "got '9000x9000'\n"),
+        ("train --data=~/x", "--data=~/x: a shell expands ~ only at the start of a word without quotes; did you mean"),
+        ("train --data=~/x", "did you mean voronerf train --data ~/x?"),
+        ("train --config=~/x.json", "did you mean voronerf train --config ~/x.json?"),
+        ("eval ~/x --views 1", "did you mean voronerf eval ~/x --views 1?"),
+        ("render r --path ~/x --out=~/y.mp4", "did you mean voronerf render r --path ~/x --out ~/y.mp4?"),
+        ("eval r --lpips=~/x", "no run at r"),  # the program itself expands this path
+        ("train \u2013data x", "the dash of \u2013data is not a hyphen; did you mean voronerf train --data x?"),
+        ("train \u2014steps=5 \u2014data x", "did you mean voronerf train --steps=5 --data x?"),
+        ("train \u2212-data x", "did you mean voronerf train --data x?"),
+        ("train \u2013dta x", "did you mean --data?"),
+        ("\u2013-version", "did you mean voronerf --version?"),
+        ("\u2014help", "did you mean voronerf --help?"),
+        ("\u2014data x", "did you mean voronerf train --data x?"),
+        (
+            "train --budget \u201c60\u201d",
+            "quotes of \u201c60\u201d are not straight quotes; did you mean voronerf train --",
+        ),
+        ("train --data \u201cmy photos\u201d", "did you mean voronerf train --data 'my photos'?"),
+        ("train --data=\u201emy photos\u201c", "did you mean voronerf train '--data=my photos'?"),
+        ("train --data \u00abx\u00bb --steps 5", "did you mean voronerf train --data x --steps 5?"),
+        ("train --data Anna\u2019s", "Anna\u2019s: there is no such folder"),
+        ("train --format nerfstudio", "got 'nerfstudio'; did you mean transforms?"),
+        ("train --format nerfstudio-data", "did you mean transforms?"),
+        ("train --format instant-ngp", "did you mean transforms?"),
+        ("train --format ngp", "did you mean transforms?"),
+        ("train --format nerf_synthetic", "did you mean blender?"),
+        ("train --format dnerf", "did you mean blender?"),
+        ("train --data https://a.org/x.zip", "https://a.org/x.zip: is not a folder; download the scene, unpack it"),
         ("eval", "error: eval needs RUN; see voronerf eval --help"),
         (
             "place",
@@ -158,6 +222,48 @@ def test_a_path_beside_a_run(fails, tmp_path, monkeypatch, path, said):
         (tmp_path / file).write_text("{}")
     fails(f"no run at {path}: {said}", "eval", path)
     fails("--out must be a folder, got the file clip.mp4", "train --data builtin:16 --steps 1 --out clip.mp4")
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("scans/x.zip", "is not a folder; unpack the archive first\n"),
+        ("scans/x.tar.gz", "is not a folder; unpack the archive first\n"),
+        ("scans/x.ply", "is not a folder; points, splats and meshes have no photographs to learn from\n"),
+        ("scans/x.json", "is not a folder; only transforms.json and transforms_train.json name a scene\n"),
+        ("scans/x.JPG", "is not a folder; a scene needs several pictures: voronerf process FOLDER DIR makes one\n"),
+        (
+            "scans/x y.mov",
+            "must be a video in a supported container (mov,matroska,avi,mpegts,mpeg): moov atom not found",
+        ),
+        ("scans/x", "is not a folder\n"),
+        (
+            "fox/sparse.ply",
+            "is not a folder; points, splats and meshes have no photographs to learn from; did you mean fox?\n",
+        ),
+        ("fox/images/1.txt", "is not a folder; did you mean fox?\n"),
+    ],
+)
+def test_a_file_that_is_no_scene(fails, tmp_path, monkeypatch, file, said):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("fox/images", "scans"):
+        (tmp_path / folder).mkdir(parents=True)
+    for name in (file, "fox/transforms.json"):
+        (tmp_path / name).touch()
+    fails(f"{file}: {said}", "train --data", Path(file))
+
+
+def test_characters_of_existing_files(fails, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("\u201cx\u201d", "~"):
+        (tmp_path / name).mkdir()
+        fails(f"{name}: is not a scene", "train --data", name)
+
+
+def test_a_folder_of_settings(fails, tmp_path):
+    fails(f"--config {tmp_path}: it is a folder\n", "train --config", tmp_path)
+    (tmp_path / "config.json").touch()
+    fails(f"it is a folder; did you mean {tmp_path / 'config.json'}?", f"train --config={tmp_path}")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,9 @@
 
 import json
 import math
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,14 +13,22 @@ from helpers import read_json, refuses
 from voronerf.app.render.paths import (
     CameraPath,
     capture_path,
+    lists_cameras,
     panoramas,
     read_camera_path,
+    read_cameras,
     resized,
     smooth_path,
     write_camera_path,
 )
+from voronerf.app.scenes import load_scene
+from voronerf.app.scenes.colmap import read_model
+from voronerf.app.scenes.transforms import Shot, write_transforms
 from voronerf.nerf import Cameras, focus_point, orbit_cameras, turntable_cameras
 from voronerf.nerf.cameras import look_at, shared_focus
+
+sys.path.append(str(Path(__file__).parents[1] / "scenes"))
+from scene_files import COUNT, POSES, SIZE, rewrite, write_both, write_capture
 
 LEVEL = [1, 0, 0, 4, 0, 0, -1, -5, 0, 1, 0, 6, 0, 0, 0, 1]  # at (4, -5, 6), looks along +y, z is up
 
@@ -333,3 +343,101 @@ def test_a_spiral_before_a_scene_looks_where_its_cameras_do(towards):
     torch.testing.assert_close(pixels, torch.tensor([[16.0, 12]]).expand(30, 2), atol=0.05, rtol=0)
     assert len(turntable_cameras(seen, 5)) == 5
     refuses("count must be at least 1, got 0", capture_path, seen, 0, near=1, far=2)
+
+
+#: Entries of a transforms file for 12 x 10 images of three lenses.
+LENSES = {
+    "perspective": {"fl_x": 20.0, "fl_y": 19.0, "cx": 6.5, "cy": 4.5},
+    "distorted": {"fl_x": 20.0, "k1": 0.05, "p1": 0.01, "w": 12, "h": 10},
+    "fisheye": {"fl_x": 8.0, "camera_model": "OPENCV_FISHEYE", "k1": 0.02, "w": 12, "h": 10},
+}
+
+
+def check_same_cameras(file, scene, downscale=1):
+    """Checks that the cameras in a file have the rays of the scene's cameras, which are sorted by name."""
+    names = [Path(frame["file_path"]).stem for frame in read_json(file)["frames"]]
+    cameras = read_cameras(file, scene, downscale)
+    for split in (scene.train, scene.test):
+        for index, name in enumerate(split.names):
+            number = names.index(name)
+            assert cameras.size(number) == split.cameras.size(index)
+            ours, theirs = cameras.image_rays(number), split.cameras.image_rays(index)
+            torch.testing.assert_close(ours.origins, theirs.origins, atol=1e-6, rtol=0)
+            torch.testing.assert_close(ours.directions, theirs.directions, atol=1e-6, rtol=0, equal_nan=True)
+    return cameras
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("applied", [False, True])
+def test_cameras_of_a_capture_are_in_the_coordinates_of_its_files(tmp_path, normalise, lens, applied):
+    moved = {"applied_transform": [[0, 0, 1, 0], [1, 0, 0, 1], [0, 1, 0, 3]], "applied_scale": 2.5} if applied else {}
+    views = Cameras(POSES, torch.tensor([[20.0, 20, 6, 5]]).repeat(COUNT, 1), *SIZE)
+    write_capture(tmp_path / "capture", views, **LENSES[lens], **moved)
+    scene = load_scene(tmp_path / "capture", normalise=normalise)
+    file = tmp_path / "capture/transforms.json"
+    assert lists_cameras(file)
+    check_same_cameras(file, scene)
+    check_same_cameras(file, load_scene(tmp_path / "capture", normalise=normalise, downscale=2), 2)
+    if "w" in LENSES[lens]:  # images need not exist, and another file may have other coordinates
+        (tmp_path / "elsewhere").mkdir()
+        other = tmp_path / "elsewhere/path.json"
+        other.write_text(file.read_text())
+        rewrite(other.parent, lambda entries: entries.update(applied_scale=5.0), "path")
+        far = read_cameras(other, scene)
+        moved = scene.transform @ torch.diag(torch.tensor([0.2, 0.2, 0.2, 1], dtype=torch.float64))
+        if not applied:
+            place = torch.tensor(read_json(file)["frames"][0]["transform_matrix"], dtype=torch.float64)[:, 3]
+            torch.testing.assert_close(far.origins[0], (moved @ place)[:3].float(), atol=1e-5, rtol=0)
+        rotation = far.poses[:, :3, :3]
+        torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(COUNT, 3, 3), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_cameras_beside_a_colmap_model(tmp_path, normalise):
+    write_both(tmp_path)
+    scene = load_scene(tmp_path, format="colmap", normalise=normalise)
+    images = read_model(tmp_path / "sparse/0").images
+    shots = [Shot(f"images/{i.name}", torch.as_tensor(i.pose), i.camera.lens, *SIZE) for i in images]
+    write_transforms(tmp_path / "transforms.json", shots)
+    check_same_cameras(tmp_path / "transforms.json", scene)
+
+
+def test_cameras_of_blender_and_of_several_sizes(tmp_path):
+    scene, file = load_scene("builtin:16", downscale=2), tmp_path / "transforms_test.json"
+    poses = scene.test.cameras.poses
+    focal = float(scene.test.cameras.intrinsics[0, 0])
+    frames = [{"file_path": f"r_{n}", "transform_matrix": pose.tolist()} for n, pose in enumerate(poses)]
+    entries = {"camera_angle_x": 2 * math.atan(4 / focal), "frames": frames}
+    file.write_text(json.dumps(entries))
+    cameras = read_cameras(file, scene, 2)
+    assert (len(cameras), cameras.width, cameras.height, cameras.distortion) == (len(poses), 8, 8, None)
+    torch.testing.assert_close(cameras.intrinsics, scene.test.cameras.intrinsics, atol=1e-4, rtol=0)
+    assert torch.equal(cameras.poses, poses)
+    frames[1] |= {"w": 32, "h": 24}
+    file.write_text(json.dumps(entries))
+    cameras = read_cameras(file, scene)
+    assert cameras.sizes is None and cameras.width == cameras.height == 8
+    fx, _, cx, cy = cameras.intrinsics[1].tolist()
+    assert (fx, cx, cy) == pytest.approx((focal / 8 * 32 / 3, 4, 4), rel=1e-4)
+    entries["camera_path"] = []
+    file.write_text(json.dumps(entries))
+    assert not lists_cameras(file)
+
+
+@pytest.mark.parametrize(
+    ("frames", "rule"),
+    [
+        ([], "frames must be a list of 1 to 100000 frames, got 0 of them"),
+        ([7], "frame 0 must be an object, got 7"),
+        ([{"file_path": "a"}], "frame 0: transform_matrix is not a matrix of numbers"),
+        ([{"transform_matrix": torch.eye(4).tolist()}], "has no focal length (fl_x or camera_angle_x)"),
+        ([{"transform_matrix": torch.eye(4).tolist(), "fl_x": 9e3, "w": 9e3, "h": 10}], "at most 8192 pixels a side"),
+    ],
+)
+def test_cameras_that_cannot_be_read(tmp_path, frames, rule):
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({"frames": frames}))
+    refuses(rule, read_cameras, file, load_scene("builtin:16"))
+    scene = replace(load_scene("builtin:16"), kind="unbounded")
+    refuses("the coordinates of its files are not known", read_cameras, file, scene)

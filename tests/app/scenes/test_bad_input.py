@@ -14,6 +14,7 @@ from scene_files import rewrite
 
 from voronerf.app import files
 from voronerf.app.scenes import SceneError, load_scene
+from voronerf.app.scenes.images import read_image
 
 POSE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1]]
 NOISE = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
@@ -176,9 +177,11 @@ def test_images(tmp_path):
     ):
         path.write_bytes(broken)
         fails(tmp_path, f"2.png: {reason}")
-    for colour in (0, 2, 4, 6):  # grey, RGB, grey with alpha, RGBA
+    path.write_bytes(deep_png(8, 6, 0))
+    fails(tmp_path, "2.png: has grey values of more than 8 bits; write it with 8 bits a channel")
+    for colour in (2, 4, 6):  # RGB, grey with alpha, RGBA
         path.write_bytes(deep_png(8, 6, colour))
-        fails(tmp_path, "2.png: has more than 8 bits a channel")
+        assert not read_image(path, 1)[..., :3].any()
     for kind in ("EPS", "GIF", "TIFF", "PPM"):  # for EPS, Pillow starts Ghostscript
         with open(path, "wb") as file:
             Image.fromarray(NOISE).save(file, kind)

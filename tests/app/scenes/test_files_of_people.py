@@ -232,7 +232,7 @@ def test_colours_of_hd_video(tmp_path):
 
 @pytest.mark.parametrize(("name", "kind", "psnr"), [("hlg", "HLG", 19.5), ("pq", "PQ", 24.5)])
 def test_hdr_video(tmp_path, name, kind, psnr):
-    """The videos have no tag of their transfer function, and colours beyond those of the chart."""
+    """The videos have no tag of their transfer function, and more saturated colours than the chart."""
     chart, _ = first_frame(case("bt709_colours") / "clip.mp4", tmp_path / "chart")
     image, said = first_frame(case("hdr_video") / f"{name}.mp4", tmp_path / "frames")
     assert f"is HDR ({kind}) and is tone-mapped to sRGB" in said
@@ -242,7 +242,7 @@ def test_hdr_video(tmp_path, name, kind, psnr):
 def test_videos_that_cannot_be_read(tmp_path):
     pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed")
     for name, line in (
-        ("no_moov.mp4", "moov atom not found, so the recording or the download was cut off"),
+        ("no_moov.mp4", "moov atom not found, as in a recording or a download that was cut off"),
         ("sound.m4a", "it has no moving pictures"),
     ):
         path = case("unreadable_videos") / name
@@ -275,6 +275,7 @@ def test_images_of_16_bits():
     scene = load_scene(folder)
     with Image.open(folder / "images/001.png") as image:
         assert torch.equal(scene.train.images[0], torch.from_numpy(np.array(image.convert("RGB"))))
+    assert any("6 images have 16 bits a channel, of which the upper 8 are read" in note for note in scene.notes)
 
 
 def test_two_lenses_with_one_size(tmp_path):

@@ -15,7 +15,7 @@ from voronerf.app.train.callbacks import views_of
 from voronerf.app.train.checkpoint import last_checkpoint, no_run
 from voronerf.app.train.config import ConfigError
 from voronerf.app.train.run_directory import check_folders, read_metrics
-from voronerf.editing.run import has_parts, open_parts
+from voronerf.editing.run import has_parts, is_cut, open_parts
 
 #: Rows of the table: the name in summary.json, the heading, and the decimals.
 FIGURES = (
@@ -36,7 +36,7 @@ def compare(runs: tuple[Path, ...], /) -> int:
 
     Args:
         runs: The run directories, at least two. An unfinished run shows its last evaluation. A run that was made by
-            join, cut or place shows the scores of voronerf eval.
+            join, cut or place shows the scores of voronerf eval; a cut run has low scores, since a part is missing.
     """
     if len(runs) < 2:
         raise ConfigError(f"compare needs at least two runs, got {len(runs)}")
@@ -49,7 +49,8 @@ def compare(runs: tuple[Path, ...], /) -> int:
         marks = [PARTLY * (key in SCORES and figures.get("part", 1) != 1) for figures, _ in read]
         numbers = (shown(figures.get(key), places) for figures, _ in read)
         table.add_row(escape(heading), *map("".join, zip(numbers, marks, strict=True)))
-    table.add_row("scores of", *(views_of(figures) or "-" for figures, _ in read))
+    viewed = ([views_of(figures), "cut" * is_cut(run)] for run, (figures, _) in zip(runs, read, strict=True))
+    table.add_row("scores of", *(", ".join(filter(None, words)) or "-" for words in viewed))
     table.add_section()
     for name in dict.fromkeys(name for _, settings in read for name in settings if name not in PLACES):
         values = [escape(printable(str(settings.get(name)))) for _, settings in read]

@@ -13,6 +13,7 @@ from voronerf.app.cli.opening import AS_IN_TRAINING, Opening, check_counts
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import json_text, write_text
 from voronerf.app.train.config import ConfigError
+from voronerf.editing.run import is_cut
 
 
 def evaluate_run(
@@ -48,6 +49,11 @@ def evaluate_run(
     table.add_row("mean", *_figures(result))
     console.print(table)
     say(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB")
+    if is_cut(run):
+        say(
+            f"{run} was cut: its pictures are empty outside of the part that is left, but are compared with whole "
+            "images; voronerf eval of the run before the cut tells its quality"
+        )
     write_text(run / "eval.json", json_text(result, indent=2) + "\n")
     if panels:
         write_panels(opened.renderer, opened.diagram, opened.scene, run / "images", views=panels, track=tracked)

@@ -31,7 +31,7 @@ from voronerf.app.cli.info import info
 from voronerf.app.cli.parsing import parse
 from voronerf.app.cli.process import process
 from voronerf.app.cli.render import render
-from voronerf.app.cli.suggest import argument_names
+from voronerf.app.cli.suggest import argument_names, check_characters, hyphenated
 from voronerf.app.cli.train import WHAT_TO_TRY, train, with_stored_settings
 from voronerf.app.cli.view import view
 from voronerf.app.train.config import ConfigError
@@ -154,15 +154,17 @@ def parse_command(name: str = "--help", *words: str) -> Callable[[], int]:
         print(f"voronerf {__version__}")
         return lambda: 0
     if name not in COMMANDS:
-        word = name.lstrip("-")
-        if name.startswith("--") and word.partition("=")[0] in argument_names(train)[1]:
-            hint = f"did you mean {shlex.join(['voronerf', 'train', name, *words])}?"
+        plain = hyphenated(name)
+        word = plain.lstrip("-")
+        if plain.startswith("--") and word != "help" and word.partition("=")[0] in argument_names(train)[1]:
+            hint = f"did you mean {shlex.join(['voronerf', 'train', plain, *map(hyphenated, words)])}?"
         elif near := nearest(word, [*COMMANDS, "help", "version"]):
             hint = f"did you mean {near if near in COMMANDS else f'voronerf --{near}'}?"
         else:
             hint = "see voronerf --help"
         raise ConfigError(f"there is no command {name}; {hint}")
     command = COMMANDS[name]
+    check_characters(name, command, list(words))
     return parse(name, with_stored_settings(command, list(words)) if name == "train" else command, words)
 
 

@@ -8,7 +8,15 @@ from pathlib import Path
 from voronerf.app.cli.display import say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
 from voronerf.app.export.video import FRAMES, check_folder, export_video, video_cameras
-from voronerf.app.render.paths import LONGEST_SIDE, panoramas, read_camera_path, resized, see_all_around
+from voronerf.app.render.paths import (
+    LONGEST_SIDE,
+    lists_cameras,
+    panoramas,
+    read_camera_path,
+    read_cameras,
+    resized,
+    see_all_around,
+)
 from voronerf.app.render.video import check_video
 from voronerf.app.train.config import ConfigError
 
@@ -31,10 +39,11 @@ def render(
 
     Args:
         run: The run directory.
-        out: The video file, .mp4, or with --images a new folder; default video, or the name of the path, in the run
-            directory.
-        path: Camera path in nerfstudio's format, as the viewer saves it, in the coordinates of this run's scene. It
-            determines the frames and their size.
+        out: The video file, .mp4, or with --images a new folder; default video, panorama or the name of the path, in
+            the run directory.
+        path: Camera path in nerfstudio's format, as the viewer saves it, in the coordinates of this run's scene. Or a
+            transforms.json (or transforms_test.json and so on) with cameras in the coordinates of the scene's files;
+            its images need not exist. The path determines the frames and their size.
         frames: Number of frames of a video without a path.
         fps: Frames per second; default 24, or the rate of the path.
         size: Width and height of the frames, such as 1280x720; default the size of the training images, or of the path.
@@ -48,13 +57,15 @@ def render(
     if fps is not None and not 0.01 <= fps <= 1000:
         raise ConfigError(f"--fps must be 0.01 to 1000, got {fps:g}")
     sides = None if size is None else _sides(size)
-    flight = None if path is None else read_camera_path(path)
+    flight = None if path is None or lists_cameras(path) else read_camera_path(path)
     opened = opening.open_without_images(run)
-    name = ("video" if path is None else path.stem) + "_depth" * depth
+    name = (path.stem if path is not None else "panorama" if panorama else "video") + "_depth" * depth
     out = out or run / (name if images else f"{name}.mp4")
     (check_folder if images else check_video)(out)
-    if flight is None:
+    if path is None:
         cameras, rate = video_cameras(opened.scene, frames), 24.0
+    elif flight is None:
+        cameras, rate = read_cameras(path, opened.scene, opening.downscale or 1), 24.0
     else:
         cameras, rate = flight.frames.downscaled(opening.downscale or 1), flight.fps
     if panorama or (sides is not None and see_all_around(cameras)):
@@ -70,6 +81,9 @@ def render(
 def _sides(size: str) -> tuple[int, int]:
     """Parses a size such as "1280x720" into width and height."""
     match = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", size)
-    if not match or max(sides := (int(match[1]), int(match[2]))) > LONGEST_SIDE:
-        raise ConfigError(f"--size must be WIDTHxHEIGHT, such as 1280x720, at most {LONGEST_SIDE} each, got {size!r}")
-    return sides
+    if not match or max(int(match[1]), int(match[2])) > LONGEST_SIDE:
+        sides = re.findall(r"\d+", size)
+        hint = f"; did you mean {'x'.join(sides)}?" if len(sides) == 2 and not match else ""
+        rule = f"WIDTHxHEIGHT, such as 1280x720, at most {LONGEST_SIDE} each"
+        raise ConfigError(f"--size must be {rule}, got {size!r}{hint}")
+    return int(match[1]), int(match[2])

@@ -346,7 +346,9 @@ def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callab
     if file is not None and "--resume" in args:
         raise ConfigError("--config must be left out with --resume, which continues with the settings of the run")
     if file is not None and not file.is_file():
-        raise ConfigError(f"--config {file}: there is no such file")
+        inside = file / "config.json"
+        hint = f"it is a folder; did you mean {inside}?" if inside.is_file() else "it is a folder"
+        raise ConfigError(f"--config {file}: {hint if file.is_dir() else 'there is no such file'}")
     stored = read_config(file) if file is not None else None if out is None else stored_config(out)
     folder = out if file is None else file.parent
     if folder is None or stored is None:

@@ -132,7 +132,7 @@ def find_lpips(
     named = str(setting or os.environ.get(VARIABLE, ""))
     if named == OFF:
         return None, "LPIPS is off"
-    path = Path(named).expanduser()
+    path = Path(os.path.expanduser(named))  # keeps ~ if nothing tells the home folder
     if named and not path.exists():
         raise LpipsError(f"{path}: there is no such file or folder, as set by {'--lpips' if setting else VARIABLE}")
     if min(size) < SMALLEST:

@@ -1,4 +1,4 @@
-"""Camera paths: near the cameras of a capture, smooth through keyframes, or read from nerfstudio's files.
+"""Camera paths: near or through the cameras of a capture, smooth through keyframes, or read from nerfstudio's files.
 
 c cameras, f frames. Poses and pixels as in :mod:`voronerf.nerf.cameras`.
 
@@ -22,6 +22,8 @@ import torch
 from torch import Tensor
 
 from voronerf.app.files import json_text, read_json, write_text
+from voronerf.app.scenes.scene import Scene
+from voronerf.app.scenes.transforms import views_without_images
 from voronerf.nerf.cameras import Cameras, focus_point, look_at, shared_focus
 from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE
 
@@ -118,6 +120,85 @@ def read_camera_path(file: Path | str) -> CameraPath:
     with contextlib.suppress(RecursionError, TypeError, ValueError):  # a path is usable without keyframes
         keyframes = _read_cameras(entries.get("keyframes"), "matrix", angle, width, height, f"{file}: keyframes")
     return CameraPath(frames, fps, keyframes, entries.get("is_cycle") is True)
+
+
+def lists_cameras(file: Path | str) -> bool:
+    """Returns whether a JSON file lists the cameras of a capture, such as transforms.json, and is no camera path.
+
+    Raises:
+        ValueError: the file is not JSON, or is too large.
+        OSError: the file cannot be read.
+    """
+    entries = read_json(Path(file))
+    return isinstance(entries, dict) and "camera_path" not in entries and isinstance(entries.get("frames"), list)
+
+
+def read_cameras(file: Path | str, scene: Scene, downscale: int = 1) -> Cameras:
+    """Reads the cameras of a transforms file, such as transforms.json, as cameras in a scene; images need not exist.
+
+    The cameras are in the order of the file. Poses are in the coordinates of the scene's files, before
+    these were moved, turned and scaled. Lenses keep their distortion. All cameras get the commonest size,
+    see :func:`resized`; a camera of unknown size, as in Blender's files, has the commonest size of the training images.
+
+    Args:
+        file: the file, with a list `frames` of which each entry has a `transform_matrix`.
+        scene: the scene, with the transform from the coordinates of its files.
+        downscale: the factor by which stated sizes are reduced.
+
+    Raises:
+        ValueError: the file is invalid, or the coordinates of the scene's files are unknown.
+        OSError: the file cannot be read.
+
+    Examples:
+        >>> import json, tempfile, torch
+        >>> from pathlib import Path
+        >>> from voronerf.app.render.paths import read_cameras
+        >>> from voronerf.app.scenes import load_scene
+        >>> camera = {"transform_matrix": torch.eye(4).tolist()}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder) / "transforms_test.json"
+        ...     _ = file.write_text(json.dumps({"camera_angle_x": 0.7, "frames": [camera]}))
+        ...     cameras = read_cameras(file, load_scene("builtin", downscale=20))
+        >>> len(cameras), cameras.width
+        (1, 5)
+    """
+    file = Path(file)
+    if scene.transform is None and scene.kind != "object":
+        raise ValueError(f"{file}: the scene is joined from several, and the coordinates of its files are not known")
+    if not 1 <= (count := len(read_json(file, dict)["frames"])) <= MOST_FRAMES:
+        raise ValueError(f"{file}: frames must be a list of 1 to {MOST_FRAMES} frames, got {count} of them")
+    default = like_most(scene.train.cameras)
+    views, applied = views_without_images(file, (default.width * downscale, default.height * downscale))
+    matrix = torch.linalg.inv(applied) if scene.transform is None else scene.transform @ torch.linalg.inv(applied)
+    poses = matrix @ torch.stack([view.pose for view in views])
+    poses[:, :3, :3] /= torch.linalg.det(matrix[:3, :3]) ** (1 / 3)
+    sizes = torch.tensor([view.size for view in views]).long()
+    models = torch.tensor([view.lens.model for view in views], dtype=torch.int32)
+    coefficients = torch.tensor([view.lens.coefficients for view in views])
+    is_plain = not bool(models.any() or coefficients.any())  # perspective cameras without distortion
+    lenses = (None, None) if is_plain else (coefficients, models)
+    cameras = Cameras.of_images(poses.float(), torch.tensor([view.lens.intrinsics for view in views]), sizes, *lenses)
+    try:
+        cameras = _of_one_size(cameras.downscaled(downscale))
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    if max(cameras.width, cameras.height) > LONGEST_SIDE:
+        size = f"{cameras.width} x {cameras.height}"
+        raise ValueError(f"{file}: frames must have at most {LONGEST_SIDE} pixels a side, got {size}; --downscale N")
+    return cameras
+
+
+def _of_one_size(cameras: Cameras) -> Cameras:
+    """Returns the cameras with the commonest size of their images; images of other sizes are resized."""
+    if cameras.sizes is None:
+        return cameras
+    sizes = [cameras.size(index) for index in range(len(cameras))]
+    common = max(sizes, key=sizes.count)
+    each = (
+        resized(replace(cameras[[index]], width=size[0], height=size[1], sizes=None), common)
+        for index, size in enumerate(sizes)
+    )
+    return Cameras.joined([*each])
 
 
 def write_camera_path(file: Path | str, path: CameraPath) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from voronerf.app.scenes.builtin.city import city_of
 from voronerf.app.scenes.colmap import find_models, load_colmap
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import CONVERTED, SUFFIXES
-from voronerf.app.scenes.gather import VIDEOS
+from voronerf.app.scenes.gather import POLYCAM, VIDEOS
 from voronerf.app.scenes.llff import FILE, load_llff
 from voronerf.app.scenes.photographs import Reading
 from voronerf.app.scenes.scene import KINDS, Scene, Split
@@ -27,6 +28,17 @@ BUILTIN_SIZE = 100
 BUILTIN, CITY = "builtin", "builtin-city"  # optional suffix: builtin:SIZE, builtin-city:BLOCKS
 CACHED = 100  # least side, in pixels, of a built-in scene that is cached
 MOST_PIXELS = 1600  # largest side of the built-in scene
+
+#: Suffixes of files that are no scenes, and words about them; {} is the file.
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar")
+SHAPES = (".ply", ".splat", ".spz", ".sog", ".pcd", ".las", ".laz", ".e57", ".obj", ".glb", ".gltf", ".fbx", ".stl")
+REMEDIES = {
+    **dict.fromkeys(VIDEOS, "; voronerf process {} DIR makes one from a video"),
+    **dict.fromkeys(ARCHIVES, "; unpack the archive first"),
+    **dict.fromkeys(SHAPES, "; points, splats and meshes have no photographs to learn from"),
+    **dict.fromkeys((*SUFFIXES, *CONVERTED), "; a scene needs several pictures: voronerf process FOLDER DIR makes one"),
+    ".json": "; only transforms.json and transforms_train.json name a scene",
+}
 
 
 class Format(NamedTuple):
@@ -56,7 +68,7 @@ def _computed(size: int) -> Scene:
         return builtin_scene(size)
     try:
         return builtin_scene(size, images="cached")
-    except SceneError:  # the cache cannot be written
+    except (SceneError, OSError):  # the cache cannot be written
         return builtin_scene(size)
 
 
@@ -70,15 +82,26 @@ def has_images(folder: Path) -> bool:
     return any(path.suffix.lower() in (*SUFFIXES, *CONVERTED) for path in folder.iterdir())
 
 
+def _formats_of(folder: Path) -> list[str]:
+    """Returns the names of the formats in which a folder holds a scene."""
+    return [name for name, item in FORMATS.items() if item.is_used_by(folder)]
+
+
 def needs_cameras(source: str | Path) -> bool:
-    """Returns whether a source is a video or a folder of pictures or videos without cameras, for `voronerf process`."""
+    """Returns whether a source is a video, or a folder of pictures or videos without cameras, for `voronerf process`.
+
+    The pictures may lie in subfolders, unless one of these is a scene or a run.
+    """
     path = Path(source)
     if path.is_file():
         return path.suffix.lower() in VIDEOS
-    if is_builtin(source) or not path.is_dir() or any(item.is_used_by(path) for item in FORMATS.values()):
+    if is_builtin(source) or not path.is_dir():
         return False
-    suffixes = (*SUFFIXES, *CONVERTED, *VIDEOS)
-    return any(file.suffix.lower() in suffixes for file in path.rglob("*") if not file.name.startswith("."))
+    places = [path, *(inner for inner in path.iterdir() if inner.is_dir())]
+    if any(_formats_of(place) or (place / "config.json").is_file() for place in places):
+        return False
+    files = (file for place in (*places, *path.glob(f"*/{POLYCAM}")) for file in place.iterdir())
+    return any(file.suffix.lower() in (*SUFFIXES, *CONVERTED, *VIDEOS) for file in files)
 
 
 def load_scene(
@@ -148,6 +171,8 @@ def load_scene(
                 f"{source}: images must be auto or memory for a built-in scene other than a city, got disk"
             )
         return _computed(full // downscale)
+    if re.match("(?i)[a-z][a-z0-9+.-]+://", str(source)):
+        raise SceneError(f"{source}: is not a folder; download the scene, unpack it and give its folder")
     folder = Path(source)
     if folder.is_file() and folder.name in (signs := {item.sign: name for name, item in FORMATS.items()}):
         folder, format = folder.parent, signs[folder.name] if format == "auto" else format
@@ -155,9 +180,10 @@ def load_scene(
         siblings = (path for path in folder.parent.glob("*") if path.is_dir())
         raise SceneError(f"{folder}: there is no such folder{similar_path(folder, (Path(BUILTIN), *siblings))}")
     if not folder.is_dir():
-        hint = f"; voronerf process {folder} DIR makes one from a video" if folder.suffix.lower() in VIDEOS else ""
-        raise SceneError(f"{folder}: is not a folder{hint}")
-    formats = [name for name, item in FORMATS.items() if item.is_used_by(folder)]
+        around = next((outer for outer in [*folder.parents][:2] if _formats_of(outer)), None)
+        hint = REMEDIES.get(folder.suffix.lower(), "").replace("{}", shlex.quote(str(folder)))
+        raise SceneError(f"{folder}: is not a folder{hint}{f'; did you mean {around}?' if around else ''}")
+    formats = _formats_of(folder)
     models = find_models(folder)
     place = models.paths[0].relative_to(models.folder).parts if models else ()
     if "transforms" in formats and place[:1] in (("colmap",), ("distorted",), ("dense",), ("output",)):

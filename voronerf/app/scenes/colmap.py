@@ -370,9 +370,8 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     """Loads a capture with a COLMAP model; every 8th image in the order of names is held out for testing.
 
     Lists of test images override this rule, see `listed_split`. If there are several models, the one with the most
-    images is read. Masks lie in `masks` beside the images; their
-    black pixels are neither trained nor scored. The bounds of a view are the depths between which 98 % of its points
-    lie.
+    images is read. Masks lie in `masks` beside the images; their black pixels are neither trained nor scored. The
+    bounds of a view are the depths between which 98 % of its points lie.
     """
     models = find_models(folder)
     if models is None:

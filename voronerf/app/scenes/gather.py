@@ -30,6 +30,7 @@ from voronerf.app.scenes.images import (
     read_header,
     read_image,
 )
+from voronerf.app.scenes.names import COPIES, OTHER_PICTURES
 from voronerf.app.scenes.soundness import some_of
 
 #: Container formats of videos. Playlists are excluded, since they name other files.
@@ -58,8 +59,6 @@ LENS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 KINDS = (*reversed(SUFFIXES), *CONVERTED)
 #: Files and folders of operating systems, which are ignored like hidden ones.
 IGNORED = ("thumbs.db", "desktop.ini", "__macosx", "@eadir")
-#: Folders of masks, depths and smaller copies that programs keep beside photographs.
-BESIDE = re.compile(r"(?i)masks?|depths?|confidences?|images_\d+")
 #: The folder of Polycam's images without distortion, beside the distorted ones in `images`.
 POLYCAM = "corrected_images"
 LEAST_IMAGES = 3
@@ -131,8 +130,11 @@ def _files(folder: Path) -> Iterator[Path]:
     def counts(path: Path) -> bool:
         return not path.name.startswith((".", DYNAMIC_MASK)) and path.name.lower() not in IGNORED
 
+    def is_beside(name: str) -> bool:
+        return bool(OTHER_PICTURES.fullmatch(name) or COPIES.fullmatch(name))
+
     for place, folders, files in os.walk(folder):
-        inside = [path for name in folders if counts(path := Path(place, name)) and not BESIDE.fullmatch(name)]
+        inside = [path for name in folders if counts(path := Path(place, name)) and not is_beside(name)]
         folders[:] = [path.name for path in inside if not (path / "colmap" / "settings.json").is_file()]
         if POLYCAM in folders and "images" in folders:
             folders.remove("images")
@@ -272,8 +274,7 @@ def read_mask(path: Path, name: str, header: Header) -> NDArray[np.bool_]:
             if image.size not in (header.size, upright):
                 size, actual = (" x ".join(map(str, sides)) for sides in (header.size, image.size))
                 raise SceneError(f"{path}: is {actual} pixels, {name} is {size}")
-            kept = drawn(image, header.size, header.turns)
-            return kept ^ path.name.startswith(DYNAMIC_MASK)
+            return drawn(image, header.size, header.turns, inverted=path.name.startswith(DYNAMIC_MASK))
     except SceneError:
         raise
     except UNREADABLE as error:
@@ -356,7 +357,7 @@ def _open_video(path: Path) -> Video:
         if "matches no streams" in copied.stderr:
             reason = "it has no moving pictures"
         elif "moov atom not found" in copied.stderr:
-            reason += ", so the recording or the download was cut off"
+            reason += ", as in a recording or a download that was cut off"
         raise SceneError(f"{path}: must be a video in a supported container ({CONTAINERS}): {reason}")
     printed = ["-vf", "showinfo,signalstats,metadata=print", "-frames:v", "1", "-f", "null", "-"]
     output = _run_ffmpeg(path, [*stream, *printed]).stderr

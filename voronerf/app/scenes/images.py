@@ -66,11 +66,11 @@ class Header(NamedTuple):
     """
 
     size: tuple[int, int]
-    alpha: bool
-    depth: int
-    jpeg: bool
-    turns: int
-    deep: bool
+    alpha: bool = False
+    depth: int = 4
+    jpeg: bool = False
+    turns: int = 0
+    deep: bool = False
 
     def decoded(self, factor: int) -> int:
         """Returns the memory for decoding the image, in bytes."""

@@ -15,8 +15,8 @@ from torch import Tensor
 from voronerf.app.files import leads_outside
 from voronerf.app.scenes.errors import SceneError
 
-#: Folders that programs keep beside photographs: masks and depths, and smaller copies.
-OTHER_PICTURES, COPIES = re.compile(r"(?i)masks?|depths?"), re.compile(r"(?i)images_\d+")
+#: Folders that programs keep beside photographs: masks, depths and confidences of depths, and smaller copies.
+OTHER_PICTURES, COPIES = re.compile(r"(?i)masks?|depths?|confidences?"), re.compile(r"(?i)images_\d+")
 #: The files in a scene's folder that list the names of images for training and for testing (nerfbaselines), and the
 #: file in a COLMAP model's folder that lists the names of test images (gaussian-splatting, hierarchical-3d-gaussians).
 TRAIN_LIST, TEST_LIST, MODEL_LIST = "train_list.txt", "test_list.txt", "test.txt"
@@ -119,7 +119,7 @@ def compare_tails(
         files: paths in a folder, separated by `/`.
         remedy: the end of the message of the error for a name that may be several files.
         of_one_folder: whether the innermost folders must be equal. They must in any case if base names repeat.
-        all_folders: whether files in folders of masks and depths are taken, too.
+        all_folders: whether files in folders of `OTHER_PICTURES` are taken, too.
     """
     names = set(names)
     least = int(of_one_folder or len(set(map(posixpath.basename, names))) < len(names))

@@ -169,6 +169,8 @@ def photograph_scene(
     if turned:
         more.append(f"cameras are those of pictures turned upright by their orientation tags: {some_of(turned)}")
     views = stored
+    if deep := [view.path.name for view in views if view.header is not None and view.header.deep]:
+        more.append(f"{len(deep)} images have 16 bits a channel, of which the upper 8 are read: {some_of(deep)}")
     places = torch.stack([view.pose[:3, 3] for view in views])
     lost = lost_cameras(places)
     notes = [*notes, *more, *_far_notes(views, lost, reading.keep_far)]

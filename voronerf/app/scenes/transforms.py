@@ -6,6 +6,7 @@ everywhere in voronerf.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import math
@@ -496,3 +497,47 @@ def write_transforms(path: Path, shots: Sequence[Shot]) -> None:
     shared = {key: value for key, value in frames[0].items() if all(frame.get(key) == value for frame in frames)}
     rest = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
     write_text(path, json.dumps({**shared, "frames": rest}, indent=1))
+
+
+def views_without_images(path: Path, size: tuple[int, int]) -> tuple[list[View], Tensor]:
+    """Reads the cameras of a transforms file, in the file's order; their images need not exist.
+
+    A camera without ``w`` and ``h`` has the size of its image, if its lens is in pixels and the image exists, or else
+    ``size``.
+
+    Args:
+        path: the file.
+        size: (width, height) of images of unknown size.
+
+    Returns:
+        (the views, the transform float64 [4, 4] from the original coordinates to the coordinates of the poses).
+    """
+    entries = read_json(path, dict)
+    shared, views = _named_distortion(entries, path), []
+    for position, frame in enumerate(entries["frames"]):
+        if not isinstance(frame, dict):
+            raise SceneError(f"{path}: frame {position} must be an object, got {frame!r:.60}")
+        pose, _ = _scaled_pose(frame.get("transform_matrix"), f"{path}: frame {position}")
+        values = {**shared, **_named_distortion(frame, path)}
+        width, height = (
+            number(values, side, path, positive=True) or default
+            for side, default in zip("wh", _image_size(path, values) or size)
+        )
+        header = Header((max(round(width), 1), max(round(height), 1)))
+        views.append(_view(ListedImage(path, pose, path, values), header))
+    applied = entries.get("applied_transform")
+    matrix = torch.eye(4).tolist() if applied is None else applied
+    transform = pose_of(matrix, str(path), "applied_transform")
+    transform[:3] *= number(entries, "applied_scale", path, positive=True) or 1.0
+    return views, transform
+
+
+def _image_size(path: Path, values: dict[str, Any]) -> tuple[int, int] | None:
+    """Returns the size of a frame's image if its lens is in pixels and the image exists in the folder, or None."""
+    name = values.get("file_path")
+    if not isinstance(name, str) or not is_text(name) or not any(values.get(key) for key in ("fl_x", "fl_y", "cx")):
+        return None
+    with contextlib.suppress(SceneError):
+        image = _exact_file(path.parent, name, False, str(path))
+        return None if image is None else read_header(image).size
+    return None

@@ -121,6 +121,9 @@ def pack(run: Run) -> Packed:
 def _networks(run: Run) -> Radiance:
     """Returns the networks of a run; raises CannotDraw if a page cannot draw them."""
     renderer = run.renderer
+    if hasattr(run.router, "parts"):
+        made = "it has several parts, as runs made by join, cut or place"
+        raise CannotDraw(f"{made}; export the runs of which it was made, or show this run by voronerf render or view")
     if renderer.cones:
         raise CannotDraw("its field takes cones, a page can only evaluate points")
     if not isinstance(renderer.sampler, Occupancy):
