@@ -1,5 +1,6 @@
 """Tests of decoding and downscaling against slow averages."""
 
+import struct
 import sys
 
 import numpy as np
@@ -131,3 +132,56 @@ def test_what_does_not_fit_into_memory_is_not_decoded(tmp_path, monkeypatch):
     )
     refuses(message, read_images, paths, 1, keep="memory", error=SceneError)
     assert read_images(paths, 2)[0].shape == (4, 25, 50, 3)
+
+
+def to_linear(values):
+    """Returns the linear values of sRGB's."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def write_profile(primaries):
+    """Returns an ICC profile with sRGB's curve and these primaries, rows XYZ relative to D50 (ICC.1:2010, 8.3)."""
+
+    def xyz(values):
+        return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(65536 * value) for value in values))
+
+    curve = b"curv\0\0\0\0" + struct.pack(
+        ">I1024H", 1024, *np.rint(65535 * to_linear(np.linspace(0, 1, 1024))).astype(int)
+    )
+    tags = {b"desc": b"desc" + bytes(8) + struct.pack(">I", 2) + b"p\0" + bytes(78), b"wtpt": xyz((0.9642, 1, 0.8249))}
+    tags |= {name: xyz(row) for name, row in zip((b"rXYZ", b"gXYZ", b"bXYZ"), primaries)}
+    tags |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)
+    table, data, start = b"", b"", 132 + 12 * len(tags)
+    for name, content in tags.items():
+        table += name + struct.pack(">II", start + len(data), len(content))
+        data += content + bytes(-len(content) % 4)
+    header = struct.pack(">I4sI4s4s4s", start + len(data), b"    ", 0x02400000, b"mntr", b"RGB ", b"XYZ ")
+    header = header.ljust(36, b"\0") + b"acsp".ljust(32, b"\0") + struct.pack(">3i", 63190, 65536, 54061)
+    return header.ljust(128, b"\0") + struct.pack(">I", len(tags)) + table + data
+
+
+SRGB = ((0.4361, 0.2225, 0.0139), (0.3851, 0.7169, 0.0971), (0.1431, 0.0606, 0.7141))
+DISPLAY_P3 = ((0.5151, 0.2412, -0.0011), (0.292, 0.6922, 0.0419), (0.1571, 0.0666, 0.7841))
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+@pytest.mark.parametrize("kind", ["png", "jpg"])
+def test_colours_of_a_profile_become_srgb(tmp_path, mode, kind):
+    """Phones write the colours of Display P3, whose numbers are less saturated than those of sRGB."""
+    if (mode, kind) == ("RGBA", "jpg"):
+        pytest.skip("JPEG has no alpha")
+    values = np.broadcast_to(np.array([200, 80, 60, 100][: len(mode)], dtype=np.uint8), (16, 16, len(mode)))
+    read = {}
+    for name, profile in (
+        ("none", None),
+        ("srgb", write_profile(SRGB)),
+        ("p3", write_profile(DISPLAY_P3)),
+        ("bad", b"x"),
+    ):
+        Image.fromarray(values).save(tmp_path / f"{name}.{kind}", icc_profile=profile, quality=100)
+        read[name] = read_image(tmp_path / f"{name}.{kind}", 2)[3, 3].tolist()
+    assert read["none"] == read["srgb"] == read["bad"]
+    linear = np.linalg.solve(np.array(SRGB).T, np.array(DISPLAY_P3).T @ to_linear(np.array(read["none"][:3]) / 255))
+    expected = 255 * np.where(linear > 0.0031308, 1.055 * linear.clip(0) ** (1 / 2.4) - 0.055, 12.92 * linear)
+    assert np.abs(np.array(read["p3"][:3]) - expected.clip(0, 255)).max() <= 3 and read["p3"][0] > 210
+    assert read["p3"][3:] == read["none"][3:]

@@ -34,8 +34,6 @@ UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.err
 COLOURS = ("RGB", "RGBA", "P")
 #: Quarter turns anticlockwise that make an image upright, by its orientation tag. Mirrored images stay mirrored.
 TURNS = {3: 2, 6: 3, 8: 1}
-#: The first part of the names of instant-ngp's masks, whose pixels are left out where they are not black.
-DYNAMIC_MASK = "dynamic_mask_"
 #: The largest difference of colours in a profile that counts as sRGB.
 ROUNDED = 2
 #: If alpha is used as a mask, pixels with an alpha below this are masked, since their colour is partly background.
