@@ -491,6 +491,6 @@ def cameras_of(images: Sequence[Path], places: Mapping[str, str]) -> dict[str, s
             told = [str(exif[tag]).strip("\0 ") for tag in CAMERA if tag in exif]
             focal = [f"{lens[tag]} mm" for tag in LENS if tag in lens]
             place = places.get(path.name, ".")
-            where = [" ".join(told + focal)] if focal else [f"in {place}"] * (place != ".")
+            where = [" ".join(told + focal)] if focal else [f"in {place!s:.60}"] * (place != ".")
             labels[path.name] = ", ".join(["{} x {}".format(*image.size), *where])
     return labels
