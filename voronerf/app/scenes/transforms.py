@@ -261,7 +261,7 @@ def _declared_split(
         log.warning("%s: %d images are in none of %s and are left out", path, unused, ", ".join(SPLITS))
     names = [_plain(frame.values["file_path"]) for frame in frames]
     chosen = [(frame, name in test) for frame, name in zip(frames, names) if name in train | test]
-    held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool)
+    held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool, device="cpu")
     for part, present in (("training", bool((~held_out).any())), ("testing", bool(held_out.any()))):
         if not present:
             raise SceneError(f"{path}: {', '.join(SPLITS)} leave no image for {part}")
@@ -297,7 +297,9 @@ def capture_scene(
         notes.append("its depth images are not used")
     applied = entries.get("applied_transform")
     transform = (
-        torch.eye(4, dtype=torch.float64) if applied is None else pose_of(applied, str(path), "applied_transform")
+        torch.eye(4, dtype=torch.float64, device="cpu")
+        if applied is None
+        else pose_of(applied, str(path), "applied_transform")
     )
     transform[:3] *= number(entries, "applied_scale", path, positive=True) or 1.0
     headers = [read_header(frame.path) for frame in frames]
