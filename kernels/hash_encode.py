@@ -256,7 +256,7 @@ def _inputs(arguments: Hashed, table: Tensor) -> tuple[list[object], list[object
 @functools.lru_cache(maxsize=64)
 def _levels(text: str, device: torch.device) -> tuple[Tensor, Tensor]:
     rows = HashGrid.parse(text).rows
-    numbers = torch.tensor([[row.scale, row.shift] for row in rows], device=device)
+    numbers = torch.tensor([[row.scale, row.shift] for row in rows], dtype=torch.float32, device=device)
     sizes = [[row.side, row.entries, row.offset, row.hashed] for row in rows]
     return numbers, torch.tensor(sizes, dtype=torch.int32, device=device)
 

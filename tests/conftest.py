@@ -15,6 +15,8 @@ CPU::
 or Warp. A test whose requirement is missing is skipped, with the reason; ``--require native,cuda,warp`` turns these
 skips into failures.
 
+``--device-in-package DEVICE`` gives the package, but not the tests, a default device.
+
 ``--emulate-cuda SEED`` runs the native backend's CUDA kernels on the CPU, instead of its CPU kernels (cuda_emulation/).
 """
 
@@ -25,14 +27,19 @@ import gc
 import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._device import _device_constructors
 
+import voronerf
 from voronerf.ops._core import backends
 
 PARTS = ("native", "cuda", "warp")
+PACKAGE = str(Path(voronerf.__file__).parent)
 NO_CUDA = backends.missing("reference", torch.device("cuda")) is not None
 
 pytest_plugins = ("pytester",)
@@ -40,6 +47,7 @@ pytest_plugins = ("pytester",)
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--require", default="", help=f"parts that must be present, from {','.join(PARTS)}")
+    parser.addoption("--device-in-package", metavar="DEVICE", help="the default device of calls in the package")
     parser.addoption(
         "--emulate-cuda", type=int, metavar="SEED", help="run the native backend's CUDA kernels on the CPU"
     )
@@ -123,6 +131,42 @@ def _same_seed() -> None:
     torch.default_generator.manual_seed(0)  # torch.manual_seed is slower: it formats the stack per device type
     if not NO_CUDA:
         torch.cuda.manual_seed_all(0)
+
+
+class DeviceInPackage(TorchFunctionMode):
+    """A default device, as of ``torch.set_default_device``, for the calls of functions in voronerf/ alone.
+
+    A call of a test's module that a mode of the package passes on, or that the package repeats, is no call of the
+    package.
+    """
+
+    def __init__(self, device: str) -> None:
+        super().__init__()
+        self.device = torch.device(device)
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func in _device_constructors() and kwargs.get("device") is None and self._in_package(func):
+            kwargs = {**kwargs, "device": self.device}
+        return func(*args, **kwargs)
+
+    def _in_package(self, func: Any) -> bool:
+        frame: FrameType | None = sys._getframe(2)
+        first = frame
+        while frame is not None and frame.f_code.co_filename.startswith(PACKAGE):
+            if getattr(frame.f_locals.get("node"), "target", None) == func:
+                return False
+            passed_on = frame.f_code.co_name == "__torch_function__" and frame.f_locals.get("func") == func
+            frame = frame.f_back
+            first = frame if passed_on else first
+        return first is not None and first.f_code.co_filename.startswith(PACKAGE)
+
+
+@pytest.fixture(autouse=True)
+def _device_in_package(request: pytest.FixtureRequest) -> Iterator[None]:
+    device = request.config.getoption("--device-in-package")
+    with contextlib.nullcontext() if device is None else DeviceInPackage(device):
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -73,10 +73,10 @@ def on_any_number_of_threads(run, counts=(1, 2, 3)):
     return results[0]
 
 
-def python(*args, **options):
-    """Runs Python in a new process, which must succeed; returns its output."""
+def python(*args, timeout=600, **options):
+    """Runs Python in a new process, which must succeed within ``timeout`` seconds; returns its output."""
     command = [sys.executable, *map(str, args)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600, **options)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, **options)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

@@ -149,9 +149,9 @@ def write_crop(folder: Path, box: Tensor) -> None:
 def _box(value: Any, where: str) -> Tensor:
     """Returns a box float32 [2, 3], lowest and highest corner, after checking it."""
     try:
-        box = torch.as_tensor(value, dtype=torch.float32).cpu()
+        box = torch.as_tensor(value, dtype=torch.float32, device="cpu")
     except (TypeError, ValueError, RuntimeError):
-        box = torch.empty(0)
+        box = torch.empty(0, device="cpu")
     if box.shape != (2, 3) or not bool(box.isfinite().all()) or not bool((box[0] < box[1]).all()):
         actual = value.flatten().tolist() if isinstance(value, Tensor) else value
         raise ConfigError(f"{where} must be {BOX}, got {as_typed(actual):.200}")

@@ -182,10 +182,10 @@ def first_centres(samples: Tensor, masses: Tensor, k: int, centres: str, generat
     # Sorting exponential variates divided by the weights draws without replacement in proportion to the weights
     # (Efraimidis and Spirakis 2006). Of several samples at the same point, only the first counts, because two equal
     # centres would make an empty cell.
-    keys = torch.empty(samples.shape[0], dtype=torch.float64).exponential_(generator=generator)
+    keys = torch.empty(samples.shape[0], dtype=torch.float64, device=samples.device).exponential_(generator=generator)
     order = torch.argsort(keys / masses if centres == "centroidal" else keys, stable=True)
-    place = torch.full((distinct.shape[0],), samples.shape[0], dtype=torch.int64)
-    place.scatter_reduce_(0, member[order], torch.arange(samples.shape[0]), "amin")
+    place = torch.full_like(distinct[:, 0], samples.shape[0], dtype=torch.int64)
+    place.scatter_reduce_(0, member[order], torch.arange(samples.shape[0], device=samples.device), "amin")
     return samples[order[place.sort().values[:k]]]
 
 

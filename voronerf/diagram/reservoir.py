@@ -56,8 +56,8 @@ class SampleReservoir:
             raise ValueError(f"SampleReservoir: capacity, batches and d must be at least 1, got {came}")
         self.capacity, self.batches = capacity, batches
         self.quota = -(-capacity // batches)
-        self._points = torch.zeros(batches, self.quota, d, device=device)
-        self._importance = torch.zeros(batches, self.quota, device=device)
+        self._points = torch.zeros(batches, self.quota, d, dtype=torch.float32, device=device)
+        self._importance = torch.zeros(batches, self.quota, dtype=torch.float32, device=device)
         self._added = torch.zeros(1, dtype=torch.int64, device=device)  # the op reads it on the device
 
     @torch.no_grad()

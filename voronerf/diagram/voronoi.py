@@ -145,7 +145,7 @@ class VoronoiDiagram(nn.Module):
         weights = torch.ones_like(flat[:, 0]) if importance is None else importance.detach().reshape(-1)
         count = max(_DECIDE, _DECIDE_CELL * k)
         if len(flat) > count and len(weights) == len(flat):
-            drawn = torch.randperm(len(flat), generator=generator)[:count].to(flat.device)
+            drawn = torch.randperm(len(flat), generator=generator, device="cpu")[:count].to(flat.device)
             enough = len(torch.unique(flat[drawn], dim=0)) >= k and bool((weights[drawn] > 0).any())
             if enough:  # otherwise all points are needed
                 flat, weights = flat[drawn], weights[drawn]
@@ -170,7 +170,7 @@ class VoronoiDiagram(nn.Module):
 
     @classmethod
     def without_centres(cls, k: int) -> "VoronoiDiagram":
-        """Makes a diagram of k cells without centres (`centres` [k, 0]); labels assign samples to cells.
+        """Makes a diagram of k cells without centres (`centres` [k, 0]), on the CPU; labels assign samples to cells.
 
         Args:
             k: the number of cells, at least 1.
@@ -185,8 +185,9 @@ class VoronoiDiagram(nn.Module):
             VoronoiDiagram(cells=8, depth=1)
         """
         check_integer("VoronoiDiagram.without_centres", "k", k, 1)
-        leaves = -1 - torch.arange(k, dtype=torch.int32)
-        return cls._from_tables(torch.empty(k, 0), torch.tensor([0, k], dtype=torch.int32), leaves)
+        leaves = -1 - torch.arange(k, dtype=torch.int32, device="cpu")
+        centres = torch.empty(k, 0, dtype=torch.float32, device="cpu")
+        return cls._from_tables(centres, torch.tensor([0, k], dtype=torch.int32, device="cpu"), leaves)
 
     @property
     def leaf_rows(self) -> Tensor:
@@ -206,7 +207,7 @@ class VoronoiDiagram(nn.Module):
         `paths()[:, 0]` is the cell of the root diagram in which each leaf lies, useful as a colour in drawings.
         """
         offsets, child = self.child_offsets.tolist(), self.child.tolist()
-        paths = torch.full((self.num_cells, self.depth), -1, dtype=torch.int64)
+        paths = torch.full((self.num_cells, self.depth), -1, dtype=torch.int64, device="cpu")
         pending: list[tuple[int, list[int]]] = [(0, [])]
         while pending:
             node, path = pending.pop()
@@ -215,7 +216,7 @@ class VoronoiDiagram(nn.Module):
                 if child[row] >= 0:
                     pending.append((child[row], here))
                 else:
-                    paths[-child[row] - 1, : len(here)] = torch.tensor(here)
+                    paths[-child[row] - 1, : len(here)] = torch.tensor(here, device="cpu")
         return paths.to(self.centres.device)
 
     def locate(self, points: Tensor, *, backend: str = "auto") -> Tensor:
@@ -357,10 +358,10 @@ class VoronoiDiagram(nn.Module):
                 raise ValueError(f"refine: children must have centres [k, {self.centres.shape[1]}], got [k, {d}]")
             grafts[leaf] = graft
 
-        counts = torch.ones(self.num_cells, dtype=torch.int64)
+        counts = torch.ones(self.num_cells, dtype=torch.int64, device="cpu")
         for leaf, graft in grafts.items():
             counts[leaf] = graft.num_cells
-        parents = torch.repeat_interleave(torch.arange(self.num_cells), counts).to(device)
+        parents = torch.repeat_interleave(counts).to(device)
         if self.num_cells == 1 and grafts:
             graft = grafts[0]
             copies = (table.to(device, copy=True) for table in (graft.centres, graft.child_offsets, graft.child))
@@ -412,10 +413,10 @@ class VoronoiDiagram(nn.Module):
         nodes = {node: i for i, node in enumerate(node for node, node_rows in enumerate(rows) if node_rows)}
         kept = [row for node_rows in rows for row in node_rows]
         links = [nodes[child[row]] if child[row] >= 0 else -1 - number[-child[row] - 1] for row in kept]
-        ends = torch.tensor([0, *(len(node_rows) for node_rows in rows if node_rows)]).cumsum(0)
+        ends = torch.tensor([0, *(len(node_rows) for node_rows in rows if node_rows)], device="cpu")
         device = self.centres.device
         table = torch.tensor(links, dtype=torch.int32, device=device)
-        return VoronoiDiagram._from_tables(self.centres[kept], ends.to(device, torch.int32), table)
+        return VoronoiDiagram._from_tables(self.centres[kept], ends.cumsum(0).to(device, torch.int32), table)
 
     def extra_repr(self) -> str:
         """Returns the text that `print` shows in parentheses."""

@@ -140,7 +140,7 @@ def cut(run: Path | str, keep: Solid | Sequence[int], out: Path | str, *, outsid
     k = source.parts.num_cells
     if not keep or not 0 <= min(keep) <= max(keep) < k:
         raise ConfigError(f"--cells must be numbers of 0..{k - 1}, at least one, got {as_typed([*keep][:20])}")
-    chosen = torch.full((k,), outside)
+    chosen = torch.full((k,), outside, device="cpu")
     chosen[list(keep)] = not outside
     return _write(cut_source(source, chosen), Path(out))
 
@@ -271,7 +271,7 @@ def _join_scenes(sources: Sequence[RunContents], frames: Sequence[Similarity]) -
 
 def _corners(box: Tensor | None) -> Tensor:
     assert box is not None
-    return torch.tensor([[box[i][0], box[j][1], box[k][2]] for i, j, k in itertools.product((0, 1), repeat=3)])
+    return torch.cartesian_prod(*box.float().T)
 
 
 def _join_views(views: Sequence[tuple[str, Split, Similarity]]) -> Split:
@@ -283,7 +283,7 @@ def _join_views(views: Sequence[tuple[str, Split, Similarity]]) -> Split:
     names = [name for _, split, _ in views for name in split.names]
     if len(set(names)) < len(names):
         names = [f"{i}-{name}" for i, (_, split, _) in enumerate(views) for name in split.names]
-    none = torch.empty(0, 1, 1, 3, dtype=torch.uint8)
+    none = torch.empty(0, 1, 1, 3, dtype=torch.uint8, device="cpu")
     if len(cameras) == 1:
         return Split(cameras[0], none, tuple(names))
     return Split(Cameras.joined(cameras), none, tuple(names))
@@ -319,22 +319,19 @@ def _join_grids(sources: Sequence[RunContents], frames: Sequence[Similarity]) ->
         return grid
     corners = torch.cat([frame.points(_corners(grid.box)) for grid, frame in pairs])
     low, high = corners.amin(0), corners.amax(0)
-    side = min(
-        float(((grid.box[1] - grid.box[0]) / torch.tensor(grid.density.shape)).min()) * frame.scale
-        for grid, frame in pairs
-    )
+    side = min(float(_voxel_size(grid).min()) * frame.scale for grid, frame in pairs)
     extent = (high - low).double()
     side = max(side, float((extent.prod() / MOST_VOXELS) ** (1 / 3)))
     shape = (extent / side).round().clamp(min=1).long().tolist()
     grid = _empty_grid(torch.stack((low, high)), shape, threshold)
     for source, frame in pairs:
-        density, marked = torch.zeros(grid.density.numel()), torch.zeros(grid.density.numel(), dtype=torch.bool)
+        density, marked = torch.zeros_like(grid.density).view(-1), torch.zeros_like(grid.occupied).view(-1)
         occupied = source.occupied.view(-1).nonzero()[:, 0]
-        size = float(((source.box[1] - source.box[0]) / torch.tensor(source.density.shape)).max()) * frame.scale
+        size = float(_voxel_size(source).max()) * frame.scale
         steps = math.ceil(size / side) + 1  # sample points along an axis of a voxel; no voxel is skipped
-        places = torch.linspace(1e-3, 1 - 1e-3, steps)
+        places = torch.linspace(1e-3, 1 - 1e-3, steps, dtype=torch.float32, device="cpu")
         for offset in itertools.product(places.tolist(), repeat=3):
-            inside = torch.tensor([offset]).expand(len(occupied), 3)
+            inside = source.box.new_tensor([offset]).expand(len(occupied), 3)
             voxels = grid.voxels(frame.points(source.points(occupied, inside))).long()
             marked[voxels] = True
             density.scatter_reduce_(0, voxels, source.density.view(-1)[occupied] / frame.scale, "amax")
@@ -347,6 +344,11 @@ def _join_grids(sources: Sequence[RunContents], frames: Sequence[Similarity]) ->
         grid.occupied |= filled
         grid.density = torch.maximum(grid.density, values)
     return grid
+
+
+def _voxel_size(grid: OccupancyGrid) -> Tensor:
+    """Returns the size of a grid's voxels, float32 [3]."""
+    return (grid.box[1] - grid.box[0]) / grid.box.new_tensor(grid.occupied.shape)
 
 
 def _empty_grid(box: Tensor, shape: Sequence[int], threshold: float) -> OccupancyGrid:
@@ -401,17 +403,18 @@ def cut_source(source: RunContents, keep: Solid | Tensor) -> RunContents:
     if grid is None:
         grid = _evaluated_grid(source, parts, box)
     occupied = grid.occupied.view(-1).nonzero()[:, 0]
-    size = (grid.box[1] - grid.box[0]) / torch.tensor(grid.occupied.shape)
+    size = _voxel_size(grid)
     places = grid.points(occupied)
     near = ((places > box[0] - size) & (places < box[1] + size)).all(-1)
     grid = _trimmed(grid, parts, occupied[near])
     if grid is None:
         raise ConfigError(f"{source.name}: the cut leaves nothing of it")
     if not isinstance(keep, Tensor):
-        occupied, shown = grid.occupied.view(-1).nonzero()[:, 0], torch.zeros(parts.num_cells, dtype=torch.bool)
+        occupied = grid.occupied.view(-1).nonzero()[:, 0]
+        shown = torch.zeros(parts.num_cells, dtype=torch.bool, device="cpu")
         for offset in _LATTICE:
             if not bool(shown.all()):
-                places = grid.points(occupied, offset.expand(len(occupied), 3))
+                places = grid.points(occupied, grid.box.new_tensor([offset]).expand(len(occupied), 3))
                 for claim in (claim for layer in range(len(parts.layers)) for claim in parts.claims(layer, places)):
                     shown[parts.cells_of(claim).long()] = True
         if not bool(shown.all()):
@@ -441,14 +444,14 @@ def keep_cells(parts: Parts, keep: Tensor) -> Parts:
 def _inside_ball(solid: Solid, contraction: Contraction) -> bool:
     """Returns whether a solid lies inside of a contraction's sphere, where the contraction is the identity."""
     if solid.ball is not None:
-        farthest = float((torch.tensor(solid.ball[:3]) - contraction.centre).norm()) + solid.ball[3]
+        farthest = float((contraction.centre.new_tensor(solid.ball[:3]) - contraction.centre).norm()) + solid.ball[3]
     else:
         farthest = float((_corners(solid.bounds()) - contraction.centre).norm(dim=-1).max())
     return farthest <= contraction.radius * (1 + 1e-4)
 
 
-#: Sample points in a voxel; a part covers the voxel if it covers one of these points.
-_LATTICE = torch.tensor([*itertools.product((0.5, 1e-3, 1 - 1e-3), repeat=3)])
+#: Sample points in a voxel, as shares of its sides; a part covers the voxel if it covers one of these points.
+_LATTICE = [*itertools.product((0.5, 1e-3, 1 - 1e-3), repeat=3)]
 
 
 def _trimmed(grid: OccupancyGrid, parts: Parts, voxels: Tensor) -> OccupancyGrid | None:
@@ -456,17 +459,18 @@ def _trimmed(grid: OccupancyGrid, parts: Parts, voxels: Tensor) -> OccupancyGrid
 
     The result is None if no part covers any of the voxels.
     """
-    covered = torch.zeros(len(voxels), dtype=torch.bool)
+    covered = torch.zeros_like(voxels, dtype=torch.bool)
     for offset in _LATTICE:
         uncovered = (~covered).nonzero()[:, 0]
-        covered[uncovered] = parts.assign(grid.points(voxels[uncovered], offset.expand(len(uncovered), 3))) >= 0
+        inside = grid.box.new_tensor([offset]).expand(len(uncovered), 3)
+        covered[uncovered] = parts.assign(grid.points(voxels[uncovered], inside)) >= 0
     if not bool(covered.any()):
         return None
     occupied = torch.zeros_like(grid.occupied)
     occupied.view(-1)[voxels[covered]] = True
     indices = occupied.nonzero()
     first, last = indices.amin(0), indices.amax(0) + 1
-    shape = torch.tensor(occupied.shape)
+    shape = grid.box.new_tensor(occupied.shape)
     box = torch.stack([torch.lerp(grid.box[0], grid.box[1], edge / shape) for edge in (first, last)])
     block = tuple(slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True))
     trimmed = _empty_grid(box, (last - first).tolist(), grid.threshold)
@@ -511,7 +515,7 @@ def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, in
         raise ConfigError(
             f"{name}: --align needs cameras that are not on one line; the {len(shared)} shared cameras are"
         )
-    sign = torch.ones(3, dtype=torch.float64)
+    sign = torch.ones_like(spread)
     sign[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(v))
     rotation = u @ torch.diag(sign) @ v
     scale = float((spread * sign).sum() / (sources - source_mean).square().sum(1).mean())

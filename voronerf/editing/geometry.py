@@ -17,11 +17,11 @@ _ORTHONORMAL = 1e-4
 
 
 def _eye() -> Tensor:
-    return torch.eye(3, dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64, device="cpu")
 
 
 def _zeros() -> Tensor:
-    return torch.zeros(3, dtype=torch.float64)
+    return torch.zeros(3, dtype=torch.float64, device="cpu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Similarity:
 
     def __post_init__(self) -> None:
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
-            value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            value = torch.as_tensor(getattr(self, name), dtype=torch.float64, device="cpu")
             object.__setattr__(self, name, value)
             if value.shape != shape or not bool(value.isfinite().all()):
                 raise ValueError(f"Similarity: {name} must be {list(shape)} finite numbers, got {value.tolist()}")
@@ -77,7 +77,7 @@ class Similarity:
             i, j = (axis + 1) % 3, (axis + 2) % 3
             turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
             rotation = turn @ rotation
-        return cls(float(scale), rotation, torch.tensor(translation, dtype=torch.float64))
+        return cls(float(scale), rotation, torch.tensor(translation, dtype=torch.float64, device="cpu"))
 
     @functools.cached_property
     def is_identity(self) -> bool:
@@ -173,9 +173,9 @@ class Solid:
             ValueError: The intersection of the half-spaces has no corner.
         """
         if self.ball is not None:
-            centre, radius = torch.tensor(self.ball[:3]), self.ball[3]
+            centre, radius = torch.tensor(self.ball[:3], dtype=torch.float32, device="cpu"), self.ball[3]
             return torch.stack((centre - radius, centre + radius))
-        planes = torch.tensor(self.planes, dtype=torch.float64)
+        planes = torch.tensor(self.planes, dtype=torch.float64, device="cpu")
         normals, ends = planes[:, :3], planes[:, 3]
         corners = []
         for rows in itertools.combinations(range(len(planes)), 3):
@@ -191,9 +191,9 @@ class Solid:
     def moved(self, move: Similarity) -> Solid:
         """Returns the solid after a similarity."""
         if self.ball is not None:
-            centre = move.points(torch.tensor(self.ball[:3], dtype=torch.float64)).tolist()
+            centre = move.points(torch.tensor(self.ball[:3], dtype=torch.float64, device="cpu")).tolist()
             return Solid(ball=(*centre, self.ball[3] * move.scale), outside=self.outside)
-        planes = torch.tensor(self.planes, dtype=torch.float64)
+        planes = torch.tensor(self.planes, dtype=torch.float64, device="cpu")
         normals = move.directions(planes[:, :3])
         ends = planes[:, 3] * move.scale + normals @ move.translation
         rows = torch.cat((normals, ends[:, None]), 1).tolist()

@@ -59,7 +59,7 @@ class Part(nn.Module):
         super().__init__()
         self.network, self.diagram = network, network.diagram if diagram is None else diagram
         leaves, cells, device = self.diagram.num_cells, network.diagram.num_cells, self.diagram.centres.device
-        kept = torch.ones(leaves, dtype=torch.bool) if kept is None else kept.bool()
+        kept = torch.ones(leaves, dtype=torch.bool, device=device) if kept is None else kept.bool()
         if kept.shape != (leaves,):
             raise ValueError(f"Part: kept must have shape [{leaves}], got {list(kept.shape)}")
         self.num_cells = int(kept.sum())

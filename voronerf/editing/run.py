@@ -102,7 +102,9 @@ def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "
                 frame=Similarity(**values["frame"]),
                 contraction=None
                 if sphere is None
-                else Contraction(torch.tensor(sphere["centre"]), float(sphere["radius"])),
+                else Contraction(
+                    torch.tensor(sphere["centre"], dtype=torch.float32, device="cpu"), float(sphere["radius"])
+                ),
                 region=[Solid.from_values(solid) for solid in values["region"]],
                 layer=int(values["layer"]),
             )

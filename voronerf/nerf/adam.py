@@ -262,7 +262,7 @@ class Adam(torch.optim.Adam):
         state = self.state[parameter]
         if not state:  # the entries are added at once, so an interrupt leaves none of them
             moments = {"exp_avg": torch.zeros_like(parameter), "exp_avg_sq": torch.zeros_like(parameter)}
-            state.update(step=torch.zeros((), device=parameter.device), **moments)
+            state.update(step=torch.zeros((), dtype=torch.float32, device=parameter.device), **moments)
         if state["step"].get_device() != parameter.get_device():
             state["step"] = state["step"].to(parameter.device)
         return state

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -155,16 +155,19 @@ class Cameras:
             pairs = zip(several, values, strict=True)
             return torch.cat([missing(len(cameras)) if tensor is None else tensor for cameras, tensor in pairs])
 
+        device = several[0].poses.device
         sizes = [
-            torch.tensor([[each.width, each.height]]).expand(len(each), 2) if each.sizes is None else each.sizes
+            torch.tensor([[each.width, each.height]], device=device).expand(len(each), 2)
+            if each.sizes is None
+            else each.sizes
             for each in several
         ]
         return cls.of_images(
             torch.cat([cameras.poses for cameras in several]),
             torch.cat([cameras.intrinsics for cameras in several]),
             torch.cat(sizes),
-            concatenated("distortion", lambda n: torch.zeros(n, 8)),
-            concatenated("models", lambda n: torch.zeros(n, dtype=torch.int32)),
+            concatenated("distortion", lambda n: torch.zeros(n, 8, dtype=torch.float32, device=device)),
+            concatenated("models", lambda n: torch.zeros(n, dtype=torch.int32, device=device)),
         )
 
     def __len__(self) -> int:
@@ -493,15 +496,16 @@ def orbit_cameras(
     """
     if count < 1:
         raise ValueError(f"orbit_cameras: count must be >= 1, got {count}")
-    azimuth = math.radians(start) + torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+    exact = partial(torch.tensor, dtype=torch.float64, device="cpu")
+    azimuth = math.radians(start) + exact(range(count)) * (2 * math.pi / count)
     climb = math.radians(elevation)
     around = torch.stack(
         (azimuth.cos() * math.cos(climb), azimuth.sin() * math.cos(climb), torch.full_like(azimuth, math.sin(climb))),
         dim=-1,
     )
-    target = torch.tensor(centre, dtype=torch.float64)
-    poses = look_at(target + radius * around, target, torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64))
-    intrinsics = torch.tensor((focal, focal, width / 2, height / 2)).repeat(count, 1)
+    target = exact(centre)
+    poses = look_at(target + radius * around, target, exact((0.0, 0.0, 1.0)))
+    intrinsics = exact((focal, focal, width / 2, height / 2)).repeat(count, 1)
     return Cameras(poses.float(), intrinsics.float(), width, height)
 
 

@@ -96,8 +96,8 @@ def _inverse_roots(factors: Sequence[float]) -> Tensor:
     `factors` are the coefficients in ascending order; the first one, the constant term, must be 1. The results
     are eigenvalues of a matrix whose entries need no division, so tiny coefficients do no harm.
     """
-    matrix = torch.diag(torch.ones(len(factors) - 1, dtype=torch.float64), -1)[:-1, :-1]
-    matrix[:1] -= torch.tensor(factors[1:], dtype=torch.float64)
+    matrix = torch.diag(torch.ones(len(factors) - 1, dtype=torch.float64, device="cpu"), -1)[:-1, :-1]
+    matrix[:1] -= torch.tensor(factors[1:], dtype=torch.float64, device="cpu")
     return torch.linalg.eigvals(matrix)
 
 
@@ -199,7 +199,7 @@ class LensTables:
             )
         self._lenses, self._width, self._height = lenses.double().cpu(), width, height
         self._by_device: dict[torch.device, Tensor] = {}
-        self._has_direction = torch.empty(0, dtype=torch.bool)
+        self._has_direction = torch.empty(0, dtype=torch.bool, device="cpu")
 
     def on(self, device: torch.device) -> Tensor:
         """Returns the tables float32 [l, h, w, 2] on a device."""
@@ -215,9 +215,11 @@ class LensTables:
         return self._has_direction[lens]
 
     def _compute(self) -> Tensor:
-        tables = torch.empty(len(self._lenses), self._height, self._width, 2)
-        self._has_direction = torch.empty(tables.shape[:3], dtype=torch.bool)
-        y, x = torch.meshgrid(torch.arange(self._height) + 0.5, torch.arange(self._width) + 0.5, indexing="ij")
+        shape = len(self._lenses), self._height, self._width
+        tables = torch.empty(*shape, 2, dtype=torch.float32, device="cpu")
+        self._has_direction = torch.empty(shape, dtype=torch.bool, device="cpu")
+        middles = (torch.arange(size, dtype=torch.float32, device="cpu") + 0.5 for size in shape[1:])
+        y, x = torch.meshgrid(*middles, indexing="ij")
         for table, mask, lens in zip(tables, self._has_direction, self._lenses):
             directions, valid = unproject(x, y, lens[:4], lens[4:12], int(lens[12]))
             mask.copy_(valid)

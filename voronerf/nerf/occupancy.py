@@ -119,7 +119,7 @@ class OccupancyGrid:
         self.contraction = contraction
         self.settled: int | None = None
         self._numbers = None if contraction is None else contraction.numbers.to(self.box)
-        self.density = torch.full(shape, remembered * self.threshold, device=self.box.device)
+        self.density = torch.full(shape, remembered * self.threshold, dtype=torch.float32, device=self.box.device)
         self.occupied = torch.ones(shape, dtype=torch.bool, device=self.box.device)
 
     @classmethod
@@ -218,8 +218,9 @@ class OccupancyGrid:
             >>> grid.can_learn_from(fog), grid.can_learn_from(ball)
             (False, True)
         """
-        uniforms = torch.rand(CONTRAST_POINTS, 3, generator=torch.Generator().manual_seed(0)).to(self.box)
-        points = torch.lerp(self.box[0], self.box[1], uniforms)
+        generator = torch.Generator().manual_seed(0)
+        uniforms = torch.rand(CONTRAST_POINTS, 3, generator=generator, dtype=torch.float32, device="cpu")
+        points = torch.lerp(self.box[0], self.box[1], uniforms.to(self.box))
         if fixed is not None:
             points = points[~fixed.view(-1)[self.voxels(points).long()]]
         density = density_of(field, points).nan_to_num().double()
@@ -376,8 +377,8 @@ class OccupancyGrid:
             "box": self.box.clone(),
             "density": self.density.clone(),
             "occupied": self.occupied.clone(),
-            "threshold": torch.tensor(self.threshold, dtype=torch.float64),
-            "settled": torch.tensor(-1 if self.settled is None else self.settled),
+            "threshold": torch.tensor(self.threshold, dtype=torch.float64, device="cpu"),
+            "settled": torch.tensor(-1 if self.settled is None else self.settled, device="cpu"),
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -446,4 +447,4 @@ def _density_of(field: Field, points: Tensor) -> Tensor:
 @functools.lru_cache(maxsize=8)
 def _along_z(device: torch.device) -> Tensor:
     """Returns the direction of the z axis, [1, 3]."""
-    return torch.tensor(((0.0, 0.0, 1.0),), device=device)
+    return torch.tensor(((0.0, 0.0, 1.0),), dtype=torch.float32, device=device)

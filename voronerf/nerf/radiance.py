@@ -111,7 +111,8 @@ def router_of(field: Field) -> VoronoiRouter | None:
 @functools.lru_cache(maxsize=8)
 def _example(inputs: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Returns example samples [2, inputs] and directions [2, 3]."""
-    return torch.zeros(2, inputs, device=device), torch.zeros(2, 3, device=device)
+    samples = torch.zeros(2, inputs, dtype=torch.float32, device=device)
+    return samples, samples.new_zeros(2, 3)
 
 
 @functools.lru_cache(maxsize=256)

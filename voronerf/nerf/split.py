@@ -291,7 +291,7 @@ class SplitStrategy(Strategy):
                 f"SplitStrategy: {children} cells need at least {children} samples, got {len(points)} after {step} "
                 f"steps; split later"
             )
-        split = Split(self.diagram, torch.arange(cells), {})
+        split = Split(self.diagram, torch.arange(cells, device=self.diagram.centres.device), {})
         if len(points) >= children:
             split = split_diagram(
                 self.diagram,
@@ -336,7 +336,7 @@ class SplitStrategy(Strategy):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns the tensors from which `load_state_dict` restores the kept samples and the split count exactly."""
-        return {**self.reservoir.state_dict(), "splits": torch.tensor(self.splits)}
+        return {**self.reservoir.state_dict(), "splits": torch.tensor(self.splits, device="cpu")}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restores a result of `state_dict`; cells are restored by the routers, moments by the optimiser.

@@ -41,7 +41,7 @@ class ParameterEntries:
     def __init__(self, of: Any, codes: Tensor) -> None:
         self.of, self._shape, numbers = of, codes.shape, codes.flatten()
         self._is_of_cells = isinstance(of, fx.Node) and of.meta["on"] == CELLS
-        every = torch.arange((of.meta["value"] if isinstance(of, fx.Node) else of).numel())
+        every = torch.arange((of.meta["value"] if isinstance(of, fx.Node) else of).numel(), device="cpu")
         self._is_whole = torch.equal(numbers, every)
         self._is_transposed = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
         self._numbers = numbers.clone()  # a copy, because an inference tensor cannot be saved for a backward pass
@@ -199,7 +199,7 @@ class Fused:
             self._entries[node] = (
                 self._lowering.input(node, value.shape, node.meta["axis"], self._ready[node])
                 if node.meta["on"] == SAMPLES
-                else Entries(torch.arange(value.numel()).reshape(value.shape), node)
+                else Entries.whole(value, node)
             )
             _match_strides(self._entries[node], value)
         return self._entries[node]
@@ -278,7 +278,7 @@ class Fused:
         """Returns the columns of a node's value, and stores their layout in the node."""
         codes, axis = self._entries[node].codes, node.meta["axis"]
         turned = codes if axis is None else codes.movedim(axis.dim, 0).reshape(self._lowering.rows, -1)
-        if axis is None or not torch.equal(turned >> 32, torch.arange(self._lowering.rows)[:, None].expand_as(turned)):
+        if axis is None or not self._lowering.is_by_row(turned):
             raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} mixes samples")
         node.meta["layout"] = [*codes.shape[: axis.dim], *codes.shape[axis.dim + 1 :]], *axis
         columns = self._lowering.operand(turned[0] & ((1 << 32) - 1))
@@ -491,7 +491,7 @@ def _renumbered(steps: list[Step], results: list[Columns], lowering: Lowering, o
 def _match_strides(entries: Entries, tensor: Tensor) -> None:
     """Gives codes the strides of their tensor, which decide whether a later view is possible."""
     if entries.codes.stride() != tensor.stride() and 0 not in tensor.stride():
-        codes = torch.empty_strided(tensor.shape, tensor.stride(), dtype=entries.codes.dtype)
+        codes = torch.empty_strided(tensor.shape, tensor.stride(), dtype=entries.codes.dtype, device="cpu")
         entries.codes = codes.copy_(entries.codes)
 
 

@@ -276,13 +276,18 @@ class Entries:
     """The sources of a tensor's entries.
 
     Attributes:
-        codes: A code for each entry, in the tensor's shape: (sample << 32) + column for a tensor of samples, else the
-            entry's number in the parameter.
+        codes: A code for each entry, in the tensor's shape, on the CPU: (sample << 32) + column for a tensor of
+            samples, else the entry's number in the parameter.
         of: The parameter, which is a node of the trace or a tensor; None for a tensor of samples.
     """
 
     def __init__(self, codes: Tensor, of: Any = None) -> None:
         self.codes, self.of = codes, of
+
+    @classmethod
+    def whole(cls, tensor: Tensor, of: Any) -> Entries:
+        """Returns the entries of a tensor that is a whole parameter."""
+        return cls(torch.arange(tensor.numel(), device="cpu").reshape(tensor.shape), of)
 
 
 class Lowering:
@@ -324,7 +329,12 @@ class Lowering:
             self._numbered[x.index] = len(self.columns)
             self.columns += [(x.index, i) for i in range(x.start + x.width)]
         first = self._numbered[x.index] + x.start
-        return (torch.arange(self.rows)[:, None] << 32) + torch.arange(first, first + x.width)
+        columns = torch.arange(first, first + x.width, device="cpu")
+        return (torch.arange(self.rows, device="cpu")[:, None] << 32) + columns
+
+    def is_by_row(self, codes: Tensor) -> bool:
+        """Returns whether row i of codes [rows, w] belongs to sample i."""
+        return torch.equal(codes >> 32, torch.arange(self.rows, device="cpu")[:, None].expand_as(codes))
 
     def level(self, value: int) -> int:
         """Returns the index of the run (a group of fused steps) that computes a value."""
@@ -342,7 +352,7 @@ class Lowering:
             raise NotAStep("entries of a tensor do not belong to single samples")
         places = torch.argsort(rows, stable=True).reshape(self.rows, -1)
         numbers = codes.flatten()[places]
-        if not torch.equal(numbers >> 32, torch.arange(self.rows)[:, None].expand_as(numbers)):
+        if not self.is_by_row(numbers):
             raise NotAStep("entries of a tensor do not belong to single samples")
         columns = numbers & _LOW
         if not (columns == columns[:1]).all():
@@ -523,7 +533,7 @@ class _EntryMode(TorchDispatchMode):
         """Returns the entries of a constant tensor."""
         with torch.inference_mode(False):
             of = self.originals[id(tensor)] if id(tensor) in self.originals else tensor.clone()
-        return Entries(torch.arange(tensor.numel()).reshape(tensor.shape), of)
+        return Entries.whole(tensor, of)
 
     def _moved(self, func: Any, args: Any, kwargs: Any, rows: bool, name: str) -> list[Entries | None]:
         tensors = tensors_of((args, kwargs))
@@ -580,7 +590,7 @@ class _EntryMode(TorchDispatchMode):
 
     def _placed(self, value: Columns, places: Tensor, shape: Sequence[int]) -> Entries:
         """Returns the entries of a tensor that holds a value's columns at the flat indices ``places``, [rows, w]."""
-        codes = torch.empty(math.prod(shape), dtype=torch.int64)
+        codes = torch.empty(math.prod(shape), dtype=torch.int64, device="cpu")
         columns = self.b.rows(value)
         codes[places] = self.lowering._codes(columns).expand(places.shape) if columns.width > 0 else 0
         return Entries(codes.reshape(list(shape)))
@@ -732,7 +742,7 @@ class _EntryMode(TorchDispatchMode):
         if not (numbers == numbers[:1]).all():
             raise NotAStep("the tensor's layout differs between samples")
         weight, (width, _) = self.lowering.parameter(matrix, matrix=True), matrix.codes.shape
-        table = torch.empty(len(flat), width, dtype=torch.int64)
+        table = torch.empty(len(flat), width, dtype=torch.int64, device="cpu")
         for i in range(m):
             add = None
             if bias is not None:

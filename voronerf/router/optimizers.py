@@ -64,10 +64,10 @@ def drop_state(optimizer: torch.optim.Optimizer) -> None:
     for group in optimizer.param_groups:
         for parameter in group["params"]:
             if is_stale(optimizer, parameter):
-                optimizer.state.pop(parameter)
+                state = optimizer.state.pop(parameter)
                 if isinstance(optimizer, torch.optim.Adagrad):  # Adagrad creates its state in its constructor
                     total = torch.full_like(parameter, group["initial_accumulator_value"])
-                    optimizer.state[parameter].update(step=torch.tensor(0.0), sum=total)
+                    optimizer.state[parameter].update(step=torch.zeros_like(state["step"]), sum=total)
     if isinstance(optimizer, torch.optim.LBFGS):
         _begin_anew(optimizer)
 

@@ -272,7 +272,7 @@ class Probe:
         results, generator, total = self._run(way), torch.Generator().manual_seed(7), []
         for tensor in results.tensors:
             tensor = torch.view_as_real(tensor) if tensor.is_complex() else tensor
-            weights = torch.randn(tensor.shape, generator=generator)  # drawn for constants too
+            weights = torch.randn(tensor.shape, generator=generator, device="cpu")  # drawn for constants too
             if tensor.requires_grad:
                 total.append((tensor * weights.to(tensor)).sum().float())
         if not total or not torch.is_grad_enabled():
@@ -386,7 +386,8 @@ def _widened(call: Call, generator: torch.Generator) -> Call:
             return tensor
         rows = tensor.detach().repeat(count, *[1] * (tensor.dim() - 1))
         if rows.is_floating_point():  # towards 0.3, which lies in the usual boxes of positions, [0, 1] and [-1, 1]
-            rows = rows.lerp(torch.full_like(rows, 0.3), 0.1 * torch.rand(rows.shape, generator=generator).to(rows))
+            noise = torch.rand(rows.shape, generator=generator, device="cpu").to(rows)
+            rows = rows.lerp(torch.full_like(rows, 0.3), 0.1 * noise)
         return rows.requires_grad_(tensor.requires_grad)
 
     args, kwargs = call.changed(widen)
@@ -401,7 +402,8 @@ def _perturbed(parameter: Tensor, generator: torch.Generator) -> nn.Parameter:
         if (values.is_floating_point() or values.is_complex()) and values.numel():
             numbers = torch.view_as_real(values) if values.is_complex() else values
             size = float(numbers.float().square().mean().sqrt()) or 0.1
-            numbers += (0.2 * size * torch.randn(numbers.shape, generator=generator)).to(numbers)
+            noise = torch.randn(numbers.shape, generator=generator, device="cpu")
+            numbers += (0.2 * size * noise).to(numbers)
         return nn.Parameter(values, requires_grad=parameter.requires_grad)
 
 

@@ -100,7 +100,7 @@ def layered_program(
 def _steps_of(function: Callable[..., Any], width: int) -> tuple[Program, tuple[tuple[int, ...], ...]]:
     """Traces a function of rows [n, width]; returns its program, and the shapes of its results for one row."""
     rows = next(rows for rows in _ROWS if width % rows)
-    x = torch.linspace(-2, 2, rows * width).reshape(width, rows).t().contiguous()
+    x = torch.linspace(-2, 2, rows * width, dtype=torch.float32, device="cpu").reshape(width, rows).t().contiguous()
     lowering = Lowering(rows)
     entries = lowering.input(None, x.shape, Axis(0), 0)
     result, _, entries_of = lowering.run(function, (x,), {}, lambda tensor: entries if tensor is x else None)
@@ -108,7 +108,7 @@ def _steps_of(function: Callable[..., Any], width: int) -> tuple[Program, tuple[
     program = lowering.builder.program([lowering.operand(numbers) for numbers in columns])
     if program.parameters:
         raise NotAStep("a function with constants of its own")
-    offsets = torch.tensor([0, rows], dtype=torch.int32)
+    offsets = torch.tensor([0, rows], dtype=torch.int32, device="cpu")
     results = grouped_program([x], [], offsets, program=program, backend="reference")
     if not all(agree(a.reshape(b.shape), b) for a, b in zip(results, tensors_of(result), strict=True)):
         raise NotAStep("a function whose steps give other results")

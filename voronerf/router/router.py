@@ -379,7 +379,7 @@ class VoronoiRouter(nn.Module):
         device, k = self.diagram.centres.device, self.num_cells
         if cells is None:
             return torch.ones(k, dtype=torch.bool, device=device)
-        chosen = torch.as_tensor(cells if len(cells) else torch.zeros(0, dtype=torch.int64), device=device)
+        chosen = torch.as_tensor(cells, dtype=None if len(cells) else torch.int64, device=device)
         rule = f"VoronoiRouter.{method}: cells must be"
         if chosen.dtype == torch.bool:
             if chosen.shape != (k,):
@@ -531,7 +531,7 @@ class VoronoiRouter(nn.Module):
             diagram, k = VoronoiDiagram.from_state(state_dict, f"{prefix}diagram."), self.num_cells
             self.diagram = diagram.to(self.diagram.centres.device)
             if diagram.num_cells != k:
-                renew_cells(self.module, torch.zeros(diagram.num_cells, dtype=torch.int64))
+                renew_cells(self.module, torch.zeros(diagram.num_cells, dtype=torch.int64, device="cpu"))
                 self._set_frozen(None)
                 self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
         self._drop_frozen_checks()

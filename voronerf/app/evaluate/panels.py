@@ -43,7 +43,7 @@ def palette(count: int) -> Tensor:
         red, green, blue = colorsys.hsv_to_rgb(index * HUE_STEP % 1, saturation, value)
         colours.setdefault((round(red * 255), round(green * 255), round(blue * 255)))
         index += 1
-    return torch.tensor(list(colours), dtype=torch.uint8).reshape(count, 3)
+    return torch.tensor(list(colours), dtype=torch.uint8, device="cpu").reshape(count, 3)
 
 
 def picture_of_colour(colour: Tensor) -> Tensor:

@@ -125,7 +125,7 @@ def looked_at(views: list[SurfaceView]) -> Tensor | None:
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])
     points = points[points.isfinite().all(-1)]
     points = points[:: len(points) // POINTS + 1]
-    shared = torch.zeros(len(points))
+    shared = points.new_zeros(len(points))
     for view in views:
         shared += _in_picture(points, view)[1]
     kept = shared >= SHARED * len(views)
@@ -239,26 +239,26 @@ def _fused(
         track: Shows progress.
     """
     counts: list[int] = blocks.tolist()
-    value, seen = torch.ones(counts), torch.zeros([BLOCK * count for count in counts], dtype=torch.bool)
-    near = torch.zeros(counts, dtype=torch.bool)
+    value, near = low.new_ones(counts), low.new_zeros(counts, dtype=torch.bool)
+    seen = low.new_zeros([BLOCK * count for count in counts], dtype=torch.bool)
     reach = REACH * side
     if closed:  # blocks far from a surface are solid or empty; blocks between them are filled
-        centres = low + side * (BLOCK * near.logical_not().nonzero() + (BLOCK - 1) / 2)
+        centres = low + side * (BLOCK * near.logical_not().nonzero().float() + (BLOCK - 1) / 2)
         value = _distance(centres, views, reach)[0].view(counts)
         greatest, least = (sign * max_pool3d(sign * value[None], 3, 1, 1)[0] for sign in (1, -1))
         near |= greatest != least
-    has_surface = torch.zeros(counts)
+    has_surface = low.new_zeros(counts)
     for view in views:
-        points = view.surface[((view.surface > low) & (view.surface < low + BLOCK * side * blocks)).all(-1)]
+        points = view.surface[((view.surface > low) & (view.surface < low + BLOCK * side * blocks.float())).all(-1)]
         place = ((points - low) / (BLOCK * side)).long()
         has_surface[torch.minimum(place, blocks - 1).unbind(-1)] = 1
     near |= max_pool3d(has_surface[None], 3, 1, 1)[0] > 0  # blocks are `REACH` cubes wide, so neighbours suffice
     for axis in range(3):
         value = value.repeat_interleave(BLOCK, axis)
-    inside = torch.cartesian_prod(*[torch.arange(BLOCK)] * 3)
+    inside = torch.cartesian_prod(*[torch.arange(BLOCK, device=low.device)] * 3)
     for part in track(near.nonzero().split(BLOCKS), "fusing"):
         nodes = (BLOCK * part[:, None] + inside).reshape(-1, 3)
-        value[nodes.unbind(-1)], seen[nodes.unbind(-1)] = _distance(low + side * nodes, views, reach)
+        value[nodes.unbind(-1)], seen[nodes.unbind(-1)] = _distance(low + side * nodes.float(), views, reach)
     return value, seen
 
 
@@ -269,14 +269,14 @@ def _distance(points: Tensor, views: list[SurfaceView], reach: float) -> tuple[T
     behind the surface by less than `reach`. The distance of an unseen point is -1 behind a surface, and 1 outside of
     all pictures.
     """
-    total, count, inside = (torch.zeros(len(points)) for _ in range(3))
+    total, count, inside = points.new_zeros(3, len(points))
     for view in views:
         _, gap = _gap(points, view)
         sees = gap > -reach
         total += torch.where(sees, (gap / reach).clamp_max(1), 0)
         count += sees
         inside += gap == gap
-    return torch.where(count > 0, total / count.clamp_min(1), torch.where(inside > 0, -1.0, 1.0)), count > 0
+    return torch.where(count > 0, total / count.clamp_min(1), 1 - 2 * (inside > 0).to(total)), count > 0
 
 
 def _in_picture(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
@@ -305,7 +305,7 @@ def _colours(points: Tensor, normals: Tensor, views: list[SurfaceView], margin: 
     """
     from scipy.spatial import cKDTree
 
-    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
+    total, weight = points.new_zeros(len(points), 3), points.new_zeros(len(points))
     for view in views:
         pixels, gap = _gap(points, view)
         towards = view.camera.origins[0] - points

@@ -70,7 +70,8 @@ def _surface(run: Run, count: int, box: Tensor | None) -> Any:
     positions = torch.cat(points)
     if len(positions) == 0:
         raise ConfigError(f"{run.path}: the training views show no surface in the box")
-    chosen = torch.randperm(len(positions), generator=torch.Generator().manual_seed(0))[:count]
+    order = torch.randperm(len(positions), generator=torch.Generator().manual_seed(0), device="cpu")
+    chosen = order[:count]
     positions, colour, toward = positions[chosen], torch.cat(colours)[chosen], torch.cat(towards)[chosen]
     normals = spread_around(positions, NEIGHBOURS)[0][..., 0]
     normals = torch.where((normals * toward).sum(-1, keepdim=True) < 0, -normals, normals)

@@ -17,6 +17,7 @@ from torch import Tensor
 from voronerf.app.evaluate.scores import Track, in_silence
 from voronerf.app.export.gltf import follow_conventions
 from voronerf.app.files import write_bytes
+from voronerf.app.render.paths import evenly_spaced
 from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
 from voronerf.nerf.cameras import Cameras
@@ -97,8 +98,7 @@ class SurfaceView:
 def views_of(run: Run, cameras: Cameras, track: Track = in_silence) -> list[SurfaceView]:
     """Renders at most `VIEWS` of the cameras, evenly spread."""
     views, contraction = [], run.renderer.contraction
-    numbers = torch.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().long().tolist()
-    for number in track(numbers, "views"):
+    for number in track(evenly_spaced(len(cameras), VIEWS), "views"):
         image = run.render(cameras, number)
         surface = image.heaviest.cpu() if contraction is None else contraction.inverse(image.heaviest.cpu())
         mask = (image.opacity.cpu() > SOLID) & (surface.abs().amax(-1) < FARTHEST)

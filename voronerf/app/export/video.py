@@ -10,7 +10,7 @@ from torch import Tensor
 
 from voronerf.app.evaluate.panels import SOLID, picture_of_colour, picture_of_depth, save_picture
 from voronerf.app.export.space import Track, in_silence
-from voronerf.app.render.paths import capture_path
+from voronerf.app.render.paths import capture_path, evenly_spaced
 from voronerf.app.render.video import write_video
 from voronerf.app.run import Run
 from voronerf.app.scenes import Scene
@@ -104,7 +104,7 @@ def _depths(run: Run, cameras: Cameras, numbers: Iterable[int]) -> Iterator[Tens
         far = run.scene.spacing == "disparity"
         return -1 / image.depth.clamp_min(1e-6) if far else image.depth, image.opacity
 
-    numbers_of_range = torch.linspace(0, len(cameras) - 1, min(RANGE_FRAMES, len(cameras))).round().long().tolist()
+    numbers_of_range = evenly_spaced(len(cameras), RANGE_FRAMES)
     solid = torch.cat([value[opacity > SOLID] for value, opacity in map(measured, numbers_of_range)])
     for number in numbers:
         yield picture_of_depth(*measured(number), among=solid)

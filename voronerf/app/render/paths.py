@@ -172,12 +172,14 @@ def read_cameras(file: Path | str, scene: Scene, downscale: int = 1) -> Cameras:
     matrix = torch.linalg.inv(applied) if scene.transform is None else scene.transform @ torch.linalg.inv(applied)
     poses = matrix @ torch.stack([view.pose for view in views])
     poses[:, :3, :3] /= torch.linalg.det(matrix[:3, :3]) ** (1 / 3)
-    sizes = torch.tensor([view.size for view in views]).long()
-    models = torch.tensor([view.lens.model for view in views], dtype=torch.int32)
-    coefficients = torch.tensor([view.lens.coefficients for view in views])
+    sizes = torch.tensor([view.size for view in views], device="cpu").long()
+    models = torch.tensor([view.lens.model for view in views], dtype=torch.int32, device="cpu")
+    coefficients = torch.tensor([view.lens.coefficients for view in views], dtype=torch.float32, device="cpu")
     is_plain = not bool(models.any() or coefficients.any())  # perspective cameras without distortion
     lenses = (None, None) if is_plain else (coefficients, models)
-    cameras = Cameras.of_images(poses.float(), torch.tensor([view.lens.intrinsics for view in views]), sizes, *lenses)
+    cameras = Cameras.of_images(
+        poses.float(), coefficients.new_tensor([view.lens.intrinsics for view in views]), sizes, *lenses
+    )
     try:
         cameras = _of_one_size(cameras.downscaled(downscale))
     except ValueError as error:
@@ -303,11 +305,17 @@ def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Ca
     elif (focus := shared_focus(cameras)) is not None:
         poses = _around(cameras, count, focus.double())
     else:
-        chosen = torch.linspace(0, len(cameras) - 1, min(max(count // BETWEEN, 2), len(cameras))).round().long()
+        chosen = evenly_spaced(len(cameras), max(count // BETWEEN, 2))
         poses = smooth_path(cameras[chosen], count).poses
     focal = float(common.intrinsics[:, :2].mean())
     intrinsics = cameras.intrinsics.new_tensor((focal, focal, common.width / 2, common.height / 2)).repeat(count, 1)
     return Cameras(poses.float(), intrinsics, common.width, common.height)
+
+
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """Returns the indices of at most ``most`` of ``count`` cameras, evenly spaced from the first to the last."""
+    chosen = torch.linspace(0, count - 1, min(most, count), dtype=torch.float32, device="cpu")
+    return chosen.round().long().tolist()
 
 
 def like_most(cameras: Cameras) -> Cameras:
@@ -409,20 +417,21 @@ def _read_cameras(
             focals.append([height / 2 / math.tan(math.radians(fov) / 2)] * 2)
         else:
             focals.append([width / 2 / math.pi, height / math.pi])
-    poses = torch.tensor(matrices, dtype=torch.float64).view(-1, 4, 4)
+    poses = torch.tensor(matrices, dtype=torch.float64, device="cpu").view(-1, 4, 4)
     poses[:, :3, :3] /= torch.linalg.det(poses[:, :3, :3]).clamp_min(1e-18)[:, None, None] ** (1 / 3)
     rotations = poses[:, :3, :3]
-    invalid = (rotations @ rotations.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2)) > ORTHONORMAL
+    identity = torch.eye(3, dtype=poses.dtype, device=poses.device)
+    invalid = (rotations @ rotations.mT - identity).abs().amax((1, 2)) > ORTHONORMAL
     invalid |= (poses[:, 3] - poses.new_tensor((0, 0, 0, 1))).abs().amax(-1) > ORTHONORMAL
     if invalid.any():
         raise ValueError(f"{where}[{int(invalid.nonzero()[0])}].{key} must be a rotation and a position")
     poses[:, 3] = poses.new_tensor((0, 0, 0, 1))
-    principal_point = torch.tensor((width / 2, height / 2)).repeat(len(focals), 1)
-    cameras = Cameras(poses.float(), torch.cat((torch.tensor(focals), principal_point), dim=-1), width, height)
+    intrinsics = poses.new_tensor([(*focal, width / 2, height / 2) for focal in focals])
+    cameras = Cameras(poses.float(), intrinsics.float(), width, height)
     if model == PERSPECTIVE:
         return cameras
-    models = torch.full((len(poses),), model, dtype=torch.int32)
-    return replace(cameras, distortion=torch.zeros(len(poses), 8), models=models)
+    models = torch.full((len(poses),), model, dtype=torch.int32, device=poses.device)
+    return replace(cameras, distortion=cameras.poses.new_zeros(len(poses), 8), models=models)
 
 
 def _matrix(value: Any, where: str) -> list[float]:

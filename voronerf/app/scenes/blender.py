@@ -61,7 +61,8 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
         if "near" in entries or "far" in entries:
             log.warning("%s: near and far are not used, since the scene of a capture is moved and scaled", train_file)
         frames = [*train_frames, *test_frames]
-        return capture_scene(folder, entries, frames, torch.arange(len(frames)) >= len(train_frames), reading, notes)
+        held_out = torch.arange(len(frames), device="cpu") >= len(train_frames)
+        return capture_scene(folder, entries, frames, held_out, reading, notes)
 
     if reading.kind not in ("auto", "object"):
         raise SceneError(f"{train_file}: --kind must be auto or object for a Blender scene, got {reading.kind}")
@@ -111,5 +112,5 @@ def _split(
             raise SceneError(f"{path}: camera_angle_x must be an angle between 0 and pi, got None")
         intrinsics.append((focal, focal, width / 2, height / 2))
     poses = torch.stack([frame.pose for frame in frames]).float()
-    cameras = Cameras.of_images(poses, torch.tensor(intrinsics), sizes).downscaled(downscale)
+    cameras = Cameras.of_images(poses, poses.new_tensor(intrinsics), sizes).downscaled(downscale)
     return Split(cameras, images, tuple(distinct_names([frame.path for frame in frames], path.parent)), on_disk=on_disk)

@@ -131,7 +131,8 @@ def _rays(image: ColmapImage, places: Array) -> Tensor:
     """Returns the world ray directions float64 [f, 3] of image positions [f, 2]; NaN where the lens has no ray."""
     x, y = torch.from_numpy(places.astype(np.float64)).unbind(-1)
     intrinsics, coefficients, model = image.camera.lens
-    directions, valid = unproject(x, y, torch.tensor(intrinsics), torch.tensor(coefficients), model)
+    lens = [torch.tensor(values, dtype=torch.float32, device="cpu") for values in (intrinsics, coefficients)]
+    directions, valid = unproject(x, y, lens[0], lens[1], model)
     directions[~valid] = torch.nan
     return directions @ torch.from_numpy(image.pose[:3, :3]).T
 

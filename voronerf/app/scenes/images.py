@@ -207,9 +207,9 @@ def read_images(
     for path, header in zip(paths, found_headers):
         if factor > min(header.size):
             raise SceneError(f"{path}: downscaling by {factor} leaves no pixel of {header.size[0]} x {header.size[1]}")
-    sizes = torch.tensor([header.size for header in found_headers])
+    sizes = torch.tensor([header.size for header in found_headers], device="cpu")
     turns = [header.turns if upright else 0 for header in found_headers]
-    size = torch.where((torch.tensor(turns) % 2 == 1)[:, None], sizes.flip(1), sizes).amax(0).tolist()
+    size = torch.where((sizes.new_tensor(turns) % 2 == 1)[:, None], sizes.flip(1), sizes).amax(0).tolist()
     differ = bool((sizes != sizes[:1]).any())
     channels = min(4 if any(header.alpha for header in found_headers) else 3, most_channels)
     shape = (len(paths), size[1] // factor, size[0] // factor, channels)

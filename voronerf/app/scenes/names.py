@@ -190,7 +190,7 @@ def split_by_lists(
     if shared := sorted(train & test):
         raise SceneError(f"{path}: {kinds[0]} and the images for testing must differ, both have {shared[0]}")
     chosen = [(place, name in test) for place, name in enumerate(names) if name in train | test]
-    held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool)
+    held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool, device="cpu")
     for part, present in (("training", bool((~held_out).any())), ("testing", bool(held_out.any()))):
         if not present:
             raise SceneError(f"{path}: {', '.join(kinds)} leave no image for {part}")

@@ -181,8 +181,8 @@ def photograph_scene(
     name = folder.resolve().name
     poses = torch.stack([view.pose for view in views])
     pictures, masks, kind, masked = _read_pictures(views, poses, factor, reading, source, name)
-    bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
-    upright = _turned(Cameras(poses, torch.ones(len(poses), 4), 1, 1), pictures.turns).poses
+    bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64, device="cpu")
+    upright = _turned(_of_poses(poses), pictures.turns).poses
     frame = find_frame(upright, kind, bounds if len(bounds) else None, normalise=reading.normalise)
     cameras = _cameras(frame.poses(poses), views, pictures.sizes, source)
     contraction = _contraction(kind, frame, cameras)
@@ -278,9 +278,10 @@ def _as_stored(view: View) -> View:
         return view
     if _fits(view.header.size, view.size) or not _fits(view.header.size[::-1], view.size):
         return view
-    rows = (torch.tensor([row], dtype=torch.float64) for row in (view.lens.intrinsics, view.lens.coefficients))
-    model = torch.tensor([view.lens.model], dtype=torch.int32)
-    upright = Cameras.of_images(view.pose[None], next(rows), torch.tensor([view.size]), next(rows), model)
+    poses, model = view.pose[None], torch.tensor([view.lens.model], dtype=torch.int32, device="cpu")
+    intrinsics, coefficients = (poses.new_tensor([row]) for row in (view.lens.intrinsics, view.lens.coefficients))
+    sizes = torch.tensor([view.size], dtype=torch.float32, device="cpu")
+    upright = Cameras.of_images(poses, intrinsics, sizes, coefficients, model)
     stored = _turned(upright, [4 - view.header.turns])
     assert stored.distortion is not None
     lens = Lens(tuple(stored.intrinsics[0].tolist()), tuple(stored.distortion[0].tolist()), view.lens.model)
@@ -290,7 +291,7 @@ def _as_stored(view: View) -> View:
 def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path) -> tuple[list[View], int]:
     """Returns the views, training views first so that both splits are slices, and the number of training views."""
     if held_out is None:
-        held_out = torch.arange(len(views)) % HOLD_OUT == 0
+        held_out = torch.arange(len(views), device="cpu") % HOLD_OUT == 0
     order = held_out.int().argsort(stable=True).tolist()
     count = int((~held_out).sum())
     if not 0 < count < len(views):
@@ -369,7 +370,7 @@ def find_depths(split: Split, views: Sequence[View], frame: Frame) -> KnownDepth
             continue
         points = (view.points @ frame.matrix[:3, :3].T + frame.matrix[:3, 3]).float()
         places, depth = split.cameras.project(points, index)
-        inside = (depth > 0) & (places >= 0).all(-1) & (places < torch.tensor(split.cameras.size(index))).all(-1)
+        inside = (depth > 0) & (places >= 0).all(-1) & (places < places.new_tensor(split.cameras.size(index))).all(-1)
         points, (column, row) = points[inside], places[inside].long().unbind(-1)
         if (mask := split.mask(index)) is not None:
             points, row, column = (part[mask[row, column]] for part in (points, row, column))
@@ -430,7 +431,7 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
         bounds: float64 [m, 2], the least and the largest depth of the points of m views.
         normalise: False to keep the coordinates of the files.
     """
-    cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
+    cameras = _of_poses(poses)
     outward = kind in ("forward", "inside-out")
     centre = None if outward else focus_point(cameras)
     if centre is None:
@@ -442,7 +443,7 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
         low, high = bounds.median(0).values.tolist()  # a longer unit would leave too few cells for near objects
         length = float(bounds[:, 0].min()) if kind == "forward" else min(max(length, low), high)
     length = length if length > 0 else 1.0
-    matrix = torch.eye(4, dtype=torch.float64)
+    matrix = torch.eye(4, dtype=torch.float64, device="cpu")
     matrix[:3, :3] = rotation / length
     matrix[:3, 3] = -rotation @ centre / length
     nearest = float(distances.min()) / length
@@ -454,10 +455,10 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
         nearest_points = NEARER * bounds[:, 0] / length
         near = max(float(nearest_points.min()), min(LEAST_NEAR, float(nearest_points.quantile(NOISY))))
         far = max(FARTHER * float(bounds[:, 1].max()) / length, FAR)
-    axes = torch.eye(3, dtype=torch.float64)[[0, 2, 1]]
+    axes = matrix.new_tensor([[1, 0, 0], [0, 0, 1], [0, 1, 0]])
     if normalise:
-        return Frame(matrix, near, far, torch.zeros(3, dtype=torch.float64), 1.0, axes, measured)
-    identity = torch.eye(4, dtype=torch.float64)
+        return Frame(matrix, near, far, matrix.new_zeros(3), 1.0, axes, measured)
+    identity = torch.eye(4, dtype=torch.float64, device="cpu")
     return Frame(identity, near * length, far * length, centre.double(), length, axes @ rotation, measured)
 
 
@@ -468,13 +469,14 @@ def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Per
         return None
     if kind != "forward" or cameras.models is not None:  # a fisheye may see sideways or backwards
         return Contraction(centre, frame.radius)
-    slopes = torch.zeros(2)
     axes = frame.axes.float()
+    slopes = axes.new_zeros(2)
     for index in range(len(cameras)):
         width, height = cameras.size(index)
-        x, y = torch.cartesian_prod(torch.tensor([0.0, width]), torch.tensor([0.0, height])).T
+        x, y = torch.cartesian_prod(axes.new_tensor([0.0, width]), axes.new_tensor([0.0, height])).T
         if not (valid := have_rays(cameras, index, x, y)).all():  # corners of a wide lens may have no ray
-            x, y = torch.cartesian_prod(torch.linspace(0, width, ACROSS), torch.linspace(0, height, ACROSS)).T
+            steps = (torch.linspace(0, side, ACROSS, dtype=torch.float32, device="cpu") for side in (width, height))
+            x, y = torch.cartesian_prod(*steps).T
             valid = have_rays(cameras, index, x, y)
         rays = cameras.rays(index, x[valid], y[valid])
         for distance in (frame.near, frame.far):
@@ -492,9 +494,9 @@ def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
             x = torch.nn.functional.normalize(x, dim=0)
             return torch.stack((x, y, torch.linalg.cross(x, y)))
     if up.norm() <= 0.1:
-        return torch.eye(3, dtype=up.dtype)
+        return torch.eye(3, dtype=up.dtype, device=up.device)
     z = up / up.norm()
-    axis = torch.eye(3, dtype=up.dtype)[int(z.abs().argmin())]
+    axis = torch.eye(3, dtype=up.dtype, device=up.device)[int(z.abs().argmin())]
     x = torch.nn.functional.normalize(torch.linalg.cross(axis, z), dim=0)
     return torch.stack((x, torch.linalg.cross(z, x), z))
 
@@ -513,7 +515,12 @@ def _kind(poses: Tensor, transparent: bool, cut_out: bool, panoramic: bool, read
         return "object"
     if panoramic:
         return "inside-out"
-    return kind_of(Cameras(poses, torch.ones(len(poses), 4), 1, 1))
+    return kind_of(_of_poses(poses))
+
+
+def _of_poses(poses: Tensor) -> Cameras:
+    """Returns cameras of which only the poses count."""
+    return Cameras(poses, poses.new_ones(len(poses), 4), 1, 1)
 
 
 def kind_of(cameras: Cameras) -> str:
@@ -538,11 +545,11 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
         scale_x, scale_y = width / view.size[0], height / view.size[1]
         fx, fy, cx, cy = view.lens.intrinsics
         intrinsics.append((fx * scale_x, fy * scale_y, cx * scale_x, cy * scale_y))
-    coefficients = torch.tensor([view.lens.coefficients for view in views])
-    models = torch.tensor([view.lens.model for view in views], dtype=torch.int32)
+    coefficients = torch.tensor([view.lens.coefficients for view in views], dtype=torch.float32, device="cpu")
+    models = torch.tensor([view.lens.model for view in views], dtype=torch.int32, device="cpu")
     others = models if bool((models != PERSPECTIVE).any()) else None
     distortion = coefficients if others is not None or bool(coefficients.any()) else None
-    return Cameras.of_images(poses.float(), torch.tensor(intrinsics), sizes, distortion, others)
+    return Cameras.of_images(poses.float(), coefficients.new_tensor(intrinsics), sizes, distortion, others)
 
 
 def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
@@ -554,11 +561,12 @@ def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
     if not any(turns):
         return cameras
     poses, intrinsics, coefficients = cameras.poses.clone(), cameras.intrinsics.clone(), cameras.distortion
-    coefficients = torch.zeros(len(cameras), 8) if coefficients is None else coefficients.clone()
-    prism = torch.zeros(len(cameras), dtype=torch.bool) if cameras.models is None else cameras.models == FISHEYE
-    sizes = torch.tensor([cameras.size(index) for index in range(len(cameras))])
+    coefficients = intrinsics.new_zeros(len(cameras), 8) if coefficients is None else coefficients.clone()
+    turns_of = torch.tensor(turns, device="cpu")
+    prism = torch.zeros_like(turns_of, dtype=torch.bool) if cameras.models is None else cameras.models == FISHEYE
+    sizes = turns_of.new_tensor([cameras.size(index) for index in range(len(cameras))])
     for step in range(3):
-        turning = torch.tensor(turns) > step
+        turning = turns_of > step
         right, up = poses[turning, :3, :2].unbind(-1)
         poses[turning, :3, :2] = torch.stack((-up, right), -1)
         fx, fy, cx, cy = intrinsics[turning].unbind(-1)
@@ -592,14 +600,15 @@ def _masked_by_lenses(
     if not seen:
         return masks, ()
     if masks is None:
-        masks = torch.ones(len(cameras), cameras.height, cameras.width, dtype=torch.bool)
+        masks = torch.ones(len(cameras), cameras.height, cameras.width, dtype=torch.bool, device="cpu")
     masks = masks.clone()  # the tensor may be mapped from a file, read-only
     for index, valid in seen.items():
         height, width = valid.shape
         masks[index, :height, :width] &= valid
         if not masks[index].any():
             raise SceneError(f"{views[index].path}: its mask and its lens exclude all pixels")
-    share = 1 - sum(map(torch.sum, seen.values())) / sum(map(torch.numel, seen.values()))
+    valid = torch.cat([valid.flatten() for valid in seen.values()])
+    share = 1 - valid.sum().float() / len(valid)
     return masks, (f"{share:.0%} of the pixels of {len(seen)} images have no ray of their lens, and are masked",)
 
 
@@ -607,11 +616,9 @@ def _circle(view: View, factor: int) -> Tensor:
     """Returns bool [h, w] in the stored orientation: whether pixels of a reduced image lie in the fisheye's circle."""
     assert view.header is not None and view.circle is not None
     width, height = view.header.size
-    y, x = torch.meshgrid(
-        factor * (torch.arange(height // factor) + 0.5) - height / 2,
-        factor * (torch.arange(width // factor) + 0.5) - width / 2,
-        indexing="ij",
-    )
+    counts = (torch.arange(side // factor, dtype=torch.float32, device="cpu") for side in (height, width))
+    y, x = (factor * (count + 0.5) - side / 2 for count, side in zip(counts, (height, width)))
+    y, x = torch.meshgrid(y, x, indexing="ij")
     return torch.hypot(x, y) <= view.circle * width / view.size[0]
 
 

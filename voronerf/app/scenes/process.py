@@ -569,7 +569,8 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Se
     images = [image for image in model.images if image.name not in lost]
     origins = torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images]))
     bounds = [bound for image in images if (bound := depth_bounds(image, points_seen(image, model))) is not None]
-    faults = camera_faults(origins, torch.tensor(bounds), ((image.camera.lens, image.camera.width) for image in images))
+    depths = torch.tensor(bounds, dtype=torch.float32, device="cpu")
+    faults = camera_faults(origins, depths, ((image.camera.lens, image.camera.width) for image in images))
     _keep_model(largest)
     with named_errors(f"pycolmap: {largest}"):
         error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())

@@ -50,7 +50,7 @@ def placed(scene: Scene, other: Scene) -> Scene:
     train, test = scene.train, scene.test
     if other.transform is not None and scene.transform is not None:
         motion = other.transform @ torch.linalg.inv(scene.transform)
-        if not torch.allclose(motion, torch.eye(4, dtype=motion.dtype), atol=1e-6):
+        if not torch.allclose(motion, torch.eye(4, dtype=motion.dtype, device=motion.device), atol=1e-6):
             scale = float(torch.linalg.det(motion[:3, :3]).abs()) ** (1 / 3)
             train, test = (replace(part, cameras=part.cameras.moved(motion)) for part in (train, test))
             if train.sparse_depth is not None:
@@ -93,7 +93,7 @@ def _split(values: dict[str, Any]) -> Split:
     cameras = _build(Cameras, values)
     if len(names) != len(cameras) or not names:
         raise ValueError(f"names must be as many as poses and at least one, got {len(names)} and {len(cameras)}")
-    return Split(cameras, torch.empty(0, 1, 1, 3, dtype=torch.uint8), names)
+    return Split(cameras, torch.empty(0, 1, 1, 3, dtype=torch.uint8, device="cpu"), names)
 
 
 def _field_values(value: Any) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def _build(kind: type, values: dict[str, Any]) -> Any:
 def _tensor(name: str, value: Any, dtype: torch.dtype = torch.float32) -> Tensor | None:
     if value is None:
         return None
-    tensor = torch.tensor(value, dtype=INTEGERS.get(name, dtype))
+    tensor = torch.tensor(value, dtype=INTEGERS.get(name, dtype), device="cpu")
     if not bool(tensor.isfinite().all()):
         raise ValueError(f"{name} must be finite")
     return tensor

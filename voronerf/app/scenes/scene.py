@@ -126,7 +126,7 @@ class Scene:
 
     def background_colour(self, device: torch.device | str = "cpu") -> Tensor | None:
         """Returns the background as float32 [3] in 0..1, or None."""
-        return None if self.background is None else torch.ones(3, device=device)
+        return None if self.background is None else torch.ones(3, dtype=torch.float32, device=device)
 
     def space(self, contraction: str = "auto", *, cones: bool = False, device: torch.device | str = "cpu") -> Space:
         """Returns the space in which a field is evaluated.
@@ -162,7 +162,7 @@ class Scene:
             radius = float(self.train.cameras.origins.norm(dim=-1).max())
             if radius == 0:
                 raise SceneError(f"{self.name}: contraction sphere needs cameras in several places, got one place")
-            sphere = Contraction(torch.zeros(3, device=device), radius)
+            sphere = Contraction(torch.zeros(3, dtype=torch.float32, device=device), radius)
         return Space(sphere, self.spacing, cones, sphere.radius if self.kind == "unbounded" else None)
 
     def cube(self, space: Space) -> tuple[tuple[float, ...], ...]:
@@ -194,7 +194,7 @@ class Scene:
             return 1 / (focal * max(space.contraction.slopes))
         if self.kind in ("forward", "inside-out"):
             return 2 / (1 / self.near + 1 / self.far) / focal
-        centre = torch.zeros(3) if self.contraction is None else self.contraction.centre
+        centre = cameras.origins.new_zeros(3) if self.contraction is None else self.contraction.centre
         centre = centre if self.box is None else self.box.mean(0)
         distance = float((cameras.origins - centre).norm(dim=-1).mean()) or self.near  # 0 for panoramas from one place
         return distance / focal

@@ -45,7 +45,7 @@ MOST_NAMED = 8
 def lost_cameras(origins: Tensor) -> Tensor:
     """Returns bool [c]: whether cameras at ``origins`` [c, 3] lie far from the others; all False for two or fewer."""
     if len(origins) < 3:
-        return torch.zeros(len(origins), dtype=torch.bool)
+        return origins.new_zeros(len(origins), dtype=torch.bool)
     nearest, some = _nearest(origins), origins[:: len(origins) // MOST_CAMERAS + 1]
     distances = torch.pdist(some)
     alone = (nearest > LOST * nearest.median()) & (nearest > distances.sort().values[int(EXTENT * len(distances))])
@@ -99,9 +99,9 @@ def some_of(names: list[str]) -> str:
 
 def _nearest(origins: Tensor) -> Tensor:
     """Returns the distance of each camera to its nearest neighbour, [c]."""
-    nearest = torch.empty(len(origins), dtype=origins.dtype)
-    for rows in torch.arange(len(origins)).split(1024):
+    nearest, numbers = origins.new_empty(len(origins)), torch.arange(len(origins), device=origins.device)
+    for rows in numbers.split(1024):
         distances = torch.cdist(origins[rows], origins)
-        distances[torch.arange(len(rows)), rows] = float("inf")
+        distances[numbers[: len(rows)], rows] = float("inf")
         nearest[rows] = distances.amin(1)
     return nearest

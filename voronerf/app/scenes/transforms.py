@@ -378,11 +378,7 @@ def capture_scene(
     if any(frame.values.get("depth_file_path") is not None for frame in frames):
         notes.append("its depth images are not used")
     notes += time_notes(frames)
-    applied = entries.get("applied_transform")
-    transform = (
-        torch.eye(4, dtype=torch.float64) if applied is None else pose_of(applied, str(path), "applied_transform")
-    )
-    transform[:3] *= number(entries, "applied_scale", path, positive=True) or 1.0
+    transform = _applied(entries, path)
     headers = [read_header(frame.path) for frame in frames]
     views = [_view(frame, header) for frame, header in zip(frames, headers)]
     scaled = [
@@ -395,6 +391,14 @@ def capture_scene(
         notes.append(f"images have {sizes}: their lenses are scaled")
     factor = reading.downscale or least_factor(max(max(header.size) for header in headers))
     return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
+
+
+def _applied(entries: dict[str, Any], path: Path) -> Tensor:
+    """Returns the transform float64 [4, 4] from nerfstudio's original coordinates to the coordinates of the poses."""
+    matrix = entries.get("applied_transform")
+    transform = pose_of(np.eye(4).tolist() if matrix is None else matrix, str(path), "applied_transform")
+    transform[:3] *= number(entries, "applied_scale", path, positive=True) or 1.0
+    return transform
 
 
 def time_notes(frames: Sequence[ListedImage]) -> list[str]:
@@ -525,11 +529,7 @@ def views_without_images(path: Path, size: tuple[int, int]) -> tuple[list[View],
         )
         header = Header((max(round(width), 1), max(round(height), 1)))
         views.append(_view(ListedImage(path, pose, path, values), header))
-    applied = entries.get("applied_transform")
-    matrix = torch.eye(4).tolist() if applied is None else applied
-    transform = pose_of(matrix, str(path), "applied_transform")
-    transform[:3] *= number(entries, "applied_scale", path, positive=True) or 1.0
-    return views, transform
+    return views, _applied(entries, path)
 
 
 def _image_size(path: Path, values: dict[str, Any]) -> tuple[int, int] | None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -168,13 +169,13 @@ def make_routers(config: TrainConfig, device: torch.device | str | None = None) 
     """Returns one-cell routers for the coarse stage, one for each network; the seed alone determines the parameters."""
     kind = config.field_type
     names = SAMPLERS[config.sampling].networks(kind.cones)
-    with torch.random.fork_rng():  # includes GPUs, which manual_seed also seeds
+    with torch.random.fork_rng(), _usual_defaults():  # includes GPUs, which manual_seed also seeds
         torch.manual_seed(config.seed)
         networks = {name: kind.build(config.network_options) for name in names}
     return {
         name: VoronoiRouter(
             network,
-            VoronoiDiagram(torch.zeros(1, 3)),
+            VoronoiDiagram(torch.zeros(1, 3, dtype=torch.float32, device="cpu")),
             coords="first3",
             assignment=config.assignment,
             temperature=TEMPERATURE,
@@ -183,6 +184,18 @@ def make_routers(config: TrainConfig, device: torch.device | str | None = None) 
         ).to(config.device if device is None else device)
         for name, network in networks.items()
     }
+
+
+@contextlib.contextmanager
+def _usual_defaults() -> Iterator[None]:
+    """Makes new parameters float32 on the CPU, whatever the defaults of the program are."""
+    dtype = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        with torch.device("cpu"):
+            yield
+    finally:
+        torch.set_default_dtype(dtype)
 
 
 def make_renderer(
@@ -226,12 +239,13 @@ def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) ->
     """
     device, cameras = grid.box.device, scene.train.cameras.to(grid.box.device)
     voxel = float((grid.box[1] - grid.box[0]).min()) / max(grid.occupied.shape)
-    depths = torch.arange(voxel / 4, max(scene.near - voxel / 2, voxel / 4), voxel / 2, device=device)
+    end = max(scene.near - voxel / 2, voxel / 4)
+    depths = torch.arange(voxel / 4, end, voxel / 2, dtype=torch.float32, device=device)
     empty = torch.zeros(grid.occupied.numel(), dtype=torch.bool, device=device)
     for image in range(len(cameras)):
         width, height = cameras.size(image)
         stride = max(width, height, LOOKS) / LOOKS
-        columns, rows = (torch.arange(0, side, stride, device=device) for side in (width, height))
+        columns, rows = (torch.arange(0, side, stride, dtype=torch.float32, device=device) for side in (width, height))
         y, x = (values.reshape(-1) for values in torch.meshgrid(rows, columns, indexing="ij"))
         if (mask := scene.train.mask(image)) is not None:  # masked pixels may have no ray
             y, x = y.long(), x.long()
@@ -290,7 +304,7 @@ def parameter_shapes(config: TrainConfig, **options: Any) -> dict[str, tuple[tor
         with torch.device("meta"):
             network = make()
     except RuntimeError:  # some fields compute values in their constructor
-        with torch.random.fork_rng(devices=[]):  # keeps the caller's random state
+        with torch.random.fork_rng(devices=[]), torch.device("cpu"):  # keeps the caller's random state
             network = make()
     return {
         key: (parameter.shape, any(fnmatch.fnmatchcase(key, pattern) for pattern in share.get("share", ())))

@@ -217,7 +217,7 @@ def _checksum(tensor: Tensor) -> int:
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """Returns the optimiser's per-parameter state as tensors named ``INDEX.KEY`` (Adam's state is tensors alone)."""
     state = optimizer.state_dict()["state"]
-    return {f"{index}.{key}": torch.as_tensor(value) for index, s in state.items() for key, value in s.items()}
+    return {f"{index}.{key}": value for index, s in state.items() for key, value in s.items()}
 
 
 def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:

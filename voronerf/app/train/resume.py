@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from voronerf.app.train.build import make_routers, parameter_shapes
 from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, load_optimizer_tensors, optimizer_tensors
@@ -52,11 +53,15 @@ def snapshot(state: State) -> Checkpoint:
     if state.scaler.is_enabled():
         groups["scaler"] = state.scaler.state_dict()
     tensors = {
-        f"{prefix}.{name}": torch.as_tensor(value).detach().to("cpu", copy=True).contiguous()  # copied
+        f"{prefix}.{name}": _tensor(value).detach().to("cpu", copy=True).contiguous()  # copied
         for prefix, entries in groups.items()
         for name, value in entries.items()
     }
     return Checkpoint(tensors, values)
+
+
+def _tensor(value: Tensor | float) -> Tensor:
+    return value if isinstance(value, Tensor) else torch.tensor(value, device="cpu")
 
 
 def load(state: State, checkpoint: Checkpoint) -> None:

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
-
 from voronerf.app.train.build import make_grid, make_routers
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.state import State
@@ -87,8 +85,7 @@ def judged_at(state: State) -> int:
 
 def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
     """Returns the fault of a start, judged by the r rays of a step, or None. Waits for the device."""
-    background = torch.zeros(3) if batch.background is None else batch.background
-    background = background.to(batch.target)
+    background = batch.target.new_zeros(3) if batch.background is None else batch.background.to(batch.target)
     opacity = output.error.new_zeros(len(batch.rays)).index_add(
         0, output.samples.ray_index.long(), output.weights.float()
     )

@@ -217,10 +217,9 @@ class State:
     def begin_stage(self, done: SplitDone) -> None:
         """Adds the stage of training that begins after a split."""
         balances = list(done.split.balances.values())
-        before, after = (
-            float(torch.tensor([getattr(balance, name) for balance in balances]).median()) if balances else None
-            for name in ("imbalance_before", "imbalance_after")
-        )
+        pairs = [(balance.imbalance_before, balance.imbalance_after) for balance in balances]
+        imbalances = torch.tensor(pairs, dtype=torch.float32, device="cpu").view(-1, 2)
+        before, after = imbalances.median(0).values.tolist() if balances else (None, None)
         self.stages.append(TrainingStage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
 
     def begin_again(self) -> None:
@@ -261,5 +260,5 @@ class State:
 @functools.cache
 def _samples(columns: int) -> tuple[Tensor, Tensor]:
     """Returns inputs for tracing networks: positions or Gaussians [16, columns], and directions [16, 3]."""
-    points = torch.linspace(-1, 1, 16 * columns).reshape(16, columns)
+    points = torch.linspace(-1, 1, 16 * columns, dtype=torch.float32, device="cpu").reshape(16, columns)
     return points, torch.nn.functional.normalize(points[:, :3], dim=-1)

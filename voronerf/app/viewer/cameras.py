@@ -47,8 +47,8 @@ def make_camera(
     # Rounding to whole pixels changes the aspect a little; stretching the picture over the canvas undoes that.
     down = height / 2 / math.tan(fov / 2)
     across = down * width / (height * aspect)
-    intrinsics = torch.tensor([[across, down, width / 2, height / 2]])
-    return Cameras(torch.from_numpy(pose).float()[None], intrinsics, width, height)
+    poses = torch.from_numpy(pose).float()[None]
+    return Cameras(poses, poses.new_tensor([[across, down, width / 2, height / 2]]), width, height)
 
 
 def frustum(cameras: Cameras, number: int) -> dict[str, Any]:
@@ -69,8 +69,8 @@ def angle_of_view(cameras: Cameras, number: int, aspect: float) -> float:
 def axial_depth(camera: Cameras, depth: Tensor) -> Tensor:
     """Converts distances along rays [h, w] to distances along the optical axis."""
     fx, fy, cx, cy = camera.intrinsics[0].to(depth).unbind()
-    u = (torch.arange(camera.width).to(depth) + 0.5 - cx) / fx
-    v = (torch.arange(camera.height).to(depth) + 0.5 - cy) / fy
+    u = (torch.arange(camera.width, dtype=depth.dtype, device=depth.device) + 0.5 - cx) / fx
+    v = (torch.arange(camera.height, dtype=depth.dtype, device=depth.device) + 0.5 - cy) / fy
     return depth / (1 + u.square() + v.square()[:, None]).sqrt()
 
 

@@ -122,6 +122,6 @@ def same_size(cameras: list[Cameras]) -> Cameras:
     """Resizes cameras to the last camera's size, made even for a video; keeps vertical angles of view."""
     width, height = (max(2, side // 2 * 2) for side in (cameras[-1].width, cameras[-1].height))
     focal = torch.stack([camera.intrinsics[0, 1] * (height / camera.height) for camera in cameras])
-    middle = torch.tensor((width / 2, height / 2)).repeat(len(cameras), 1)
+    middle = focal.new_tensor((width / 2, height / 2)).repeat(len(cameras), 1)
     intrinsics = torch.cat((focal[:, None], focal[:, None], middle), dim=1)
     return Cameras(torch.cat([camera.poses for camera in cameras]), intrinsics, width, height)

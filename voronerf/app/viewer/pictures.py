@@ -104,7 +104,7 @@ def groups_of(diagram: VoronoiDiagram, level: int) -> Tensor:
     The cells of a level are numbered in the order of their leaves.
     """
     paths = diagram.paths()[:, : max(1, level)].cpu()
-    starts = torch.ones(len(paths), dtype=torch.bool)
+    starts = paths.new_ones(len(paths), dtype=torch.bool)
     starts[1:] = (paths[1:] != paths[:-1]).any(1)
     return starts.cumsum(0) - 1
 
@@ -125,13 +125,13 @@ def render_bands(subject: Subject, camera: Cameras, look: Look, rows: int) -> It
     """Renders a camera in bands of `rows` rows from top to bottom, with the hidden cells and the crop of a look."""
     renderer, scene = subject.renderer, space_from(subject.scene, camera)
     if look.hidden:
-        hidden = torch.zeros(subject.diagram.num_cells, dtype=torch.bool)
+        hidden = torch.zeros(subject.diagram.num_cells, dtype=torch.bool, device="cpu")
         hidden[list(look.hidden)] = True
         hidden = hidden.to(renderer.device)
         renderer = copy.copy(renderer)
         renderer.fields = {name: VisibleCells(field, subject.router, hidden) for name, field in renderer.fields.items()}
     if look.crop is not None:
-        scene = replace(scene, box=torch.tensor(look.crop))
+        scene = replace(scene, box=torch.tensor(look.crop, dtype=torch.float32, device="cpu"))
     for top in range(0, camera.height, rows):
         band = crop_camera(camera, 0, top, camera.width, min(rows, camera.height - top))
         with subject.weights():
@@ -163,7 +163,7 @@ def picture_of(subject: Subject, image: RenderedImage, look: Look) -> Tensor:
     groups = groups_of(subject.diagram, look.level)
     inside = (groups[cells_of(subject, image.heaviest)] == groups[look.picked]) & (image.opacity > 0.5)
     outside = torch.nn.functional.max_pool2d((~inside)[None].float(), 3, 1, 1)[0] > 0
-    picture[inside & outside] = torch.tensor(OUTLINE, dtype=picture.dtype)
+    picture[inside & outside] = picture.new_tensor(OUTLINE)
     return picture
 
 

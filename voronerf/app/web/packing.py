@@ -128,12 +128,11 @@ def _networks(run: Run) -> Radiance:
         raise CannotDraw("its field takes cones, a page can only evaluate points")
     if not isinstance(renderer.sampler, Occupancy):
         raise CannotDraw("it has no occupancy grid; train it with --occupancy")
-    directions = torch.nn.functional.normalize(torch.linspace(-1, 1, 3 * TRACED).view(-1, 3), dim=-1)
-    samples = torch.linspace(-1, 1, 3 * TRACED).view(-1, 3), directions
-    radiance = radiance_of(renderer.field, (samples[0].to(renderer.device), samples[1].to(renderer.device)))
+    points = torch.linspace(-1, 1, 3 * TRACED, dtype=torch.float32, device="cpu").view(-1, 3).to(renderer.device)
+    radiance = radiance_of(renderer.field, (points, torch.nn.functional.normalize(points, dim=-1)))
     if isinstance(radiance, str):
         raise CannotDraw(f"its field does not have one network per cell ({radiance})")
-    if radiance.router.places(samples[0].to(renderer.device)).cells is not None:
+    if radiance.router.places(points).cells is not None:
         raise CannotDraw("its cells are not assigned by the nearest centre")
     return radiance
 

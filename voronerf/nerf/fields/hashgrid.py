@@ -118,7 +118,7 @@ class HashGridField(RadianceField):
                 f"HashGridField: log2_entries must be smaller: {levels} levels of {level_features} features and up to "
                 f"2^{log2_entries} entries take {size / 2**20:.1f} MiB, the machine has {memory / 2**20:.1f}"
             )
-        self.features = nn.Parameter(torch.empty(grid.table_shape))
+        self.features = nn.Parameter(torch.empty(grid.table_shape, device=torch.get_default_device()))
         linears = [nn.Linear(i, o) for o, i in self.layers.weight_shapes(3, 3)]
         self.trunk = nn.ModuleList(linears[:depth])
         self.density, self.view, self.colour = linears[depth:]

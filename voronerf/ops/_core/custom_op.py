@@ -260,16 +260,16 @@ class Op:
         )
 
     def gradients(self, ctx: Any, *of_results: Any) -> tuple[Any, ...]:
-        """Returns the gradients of the custom op's arguments."""
+        """Returns the gradients of the custom op's arguments; raises NotImplementedError for batched gradients."""
         assert self._backward is not None
+        for gradient in of_results[0] if self._listed else of_results:
+            if gradient is not None and torch._C._functorch.is_legacy_batchedtensor(gradient):
+                raise self.no_batches
         gradients = self._backward(ctx, *of_results)
         return tuple(self._fields.flat(gradients if isinstance(gradients, tuple) else (gradients,)))
 
     def flat_gradients(self, ctx: Any, of_results: Sequence[Any]) -> tuple[Any, ...]:
-        """Returns the gradients of the custom op's arguments; raises NotImplementedError for batched gradients."""
-        for gradient in of_results:
-            if gradient is not None and torch._C._functorch.is_legacy_batchedtensor(gradient):
-                raise self.no_batches
+        """Returns the results of `gradients` for the gradients of the results in one sequence."""
         return self.gradients(ctx, of_results) if self._listed else self.gradients(ctx, *of_results)
 
     def results(self, arguments: Sequence[Any]) -> Any:

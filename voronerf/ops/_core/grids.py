@@ -111,7 +111,7 @@ class HashGrid:
         max_entries, levels, offset = 2**self.log2_entries, [], 0
         # Computed in float32 like the libraries in CONVENTIONS, because rounding may change the number of corners.
         growth = math.exp((math.log(self.finest) - math.log(self.base)) / max(self.levels - 1, 1))
-        index = torch.arange(self.levels, device="cpu")  # on the CPU even if the default device is meta
+        index = torch.arange(self.levels, dtype=torch.float32, device="cpu")
         if self.convention == "nerfstudio":
             scales, shift, extra = torch.floor(self.base * growth**index), 0.0, None
         else:

@@ -159,7 +159,7 @@ class Recording(TorchDispatchMode):
     def count(self, source: Callable[[], int]) -> int:
         """Returns the number of rows of this run; replays call ``source`` for the number before each run."""
         with self._paused():
-            memory = torch.empty(1, dtype=torch.int64)
+            memory = torch.empty(1, dtype=torch.int64, device="cpu")
         ctypes.c_int64.from_address(memory.data_ptr()).value = source()
         count = self._new_count(memory, source)
         self._counts.append(count)
@@ -182,7 +182,7 @@ class Recording(TorchDispatchMode):
     def vary(self, value: Callable[[], float]) -> Tensor:
         """Returns a number that varies from run to run, float32 []."""
         with self._paused():
-            number = torch.empty((), dtype=torch.float32)
+            number = torch.empty((), dtype=torch.float32, device="cpu")
         memory = ctypes.c_float.from_address(number.data_ptr())
         memory.value = value()
         self._numbers.append((memory, number, value))
@@ -257,7 +257,8 @@ class Recording(TorchDispatchMode):
         if self._range is None:
             return self._run(threads, times, 0, [], 0)
         low, high, generator, dtype, size = self._range
-        state, drawn = generator.get_state(), torch.empty(times, len(self._drawn), size, dtype=dtype)
+        state = generator.get_state()
+        drawn = torch.empty(times, len(self._drawn), size, dtype=dtype, device="cpu")
         drawn.random_(low, high, generator=generator)
         places = [integers.data_ptr() for integers in self._drawn]
         completed = self._run(threads, times, drawn.data_ptr(), places, size * drawn.element_size())

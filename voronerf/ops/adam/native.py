@@ -46,5 +46,5 @@ def average(averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, sha
     if native.on_cuda(averages[0]):
         reference.average(averages, parameters, share)  # one launch for many tensors
         return
-    share, sizes = torch.as_tensor(share, dtype=torch.float32), [tensor.numel() for tensor in averages]
+    share, sizes = torch.as_tensor(share, dtype=torch.float32, device="cpu"), [tensor.numel() for tensor in averages]
     native.compiled.average(averages, parameters, share, sizes, native.cpu())

@@ -60,7 +60,7 @@ class Guard(NamedTuple):
     @staticmethod
     def on(device: torch.device | str) -> Guard:
         """Returns a guard that has skipped no steps."""
-        skip, skipped, in_a_row = (torch.zeros((), device=device) for _ in range(3))
+        skip, skipped, in_a_row = (torch.zeros((), dtype=torch.float32, device=device) for _ in range(3))
         return Guard(skip, skipped, in_a_row)
 
     def begin(self, skipped: int) -> None:

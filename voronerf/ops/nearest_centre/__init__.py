@@ -94,7 +94,8 @@ def index_centres(centres: Tensor) -> Tensor | None:
     with _disable_current_modes():  # a recording of a step does not record this
         rows = centres.detach().to("cpu", torch.promote_types(centres.dtype, torch.float32)).contiguous()
         k, d = rows.shape
-        index = torch.empty(native.compiled.centre_index_words(k, d, rows.itemsize), dtype=torch.int32)
+        words = native.compiled.centre_index_words(k, d, rows.itemsize)
+        index = torch.empty(words, dtype=torch.int32, device="cpu")
         native.compiled.index_centres(rows, index, k, d, native.cpu().threads)
         return index.to(centres.device)
 

@@ -305,7 +305,7 @@ def _fill_on_cuda(
     tf32 = call.products == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32"
     written = list(outputs)
     for i in program.by_ray:
-        written[i] = torch.empty(n, outputs[i].shape[1], device=offsets.device)
+        written[i] = torch.empty(n, outputs[i].shape[1], dtype=torch.float32, device=offsets.device)
     machine = native.compiled.Cuda(*native.stream(offsets))
     size = native.compiled.grouped_program_workspace(lowered.program, n, r, k, machine)
     workspace = torch.empty(size, dtype=torch.uint8, device=offsets.device)
@@ -314,7 +314,7 @@ def _fill_on_cuda(
     code, results = _code(program.text, layout, offsets.device), _results_of(written, sums)
     native.compiled.grouped_program(lowered.program, code, inputs, results, products, workspace, machine)
     for i in program.by_ray:
-        total = torch.zeros(r, outputs[i].shape[1], device=offsets.device)
+        total = torch.zeros(r, outputs[i].shape[1], dtype=torch.float32, device=offsets.device)
         if index is not None and n and r:
             total.index_add_(0, index.clamp(0, r - 1), written[i])
         outputs[i].copy_(total)
@@ -328,7 +328,7 @@ def _results_of(outputs: list[Tensor], sums: list[Tensor]) -> native.compiled.Pr
 def _code(text: str, layout: str, device: torch.device) -> Tensor:
     """Returns the records of a program on a device, cached."""
     program = lower(text, layout, True).program
-    code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8)
+    code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8, device="cpu")
     native.compiled.program_code(program, code)
     return code.to(device)
 

@@ -35,7 +35,7 @@ _outputs = _OP.outputs(native.compiled.SeeOutputs)
 def render_opaque(*flat: Any) -> RenderedRays:
     """Renders every ray until it is opaque, in float32; see ``voronerf.ops.render_opaque``."""
     arguments = _OP.Inputs._make(flat)
-    network, cells, none = arguments.network, arguments.cells, torch.empty(0, dtype=torch.int32)
+    network, cells, none = arguments.network, arguments.cells, torch.empty(0, dtype=torch.int32, device="cpu")
     centres, index, k = cells.centres, cells.centre_index, network.count(cells)
     inputs = [arguments.origins, arguments.directions][: len(network.program.inputs)]
     tensors = (*inputs, *network.parameters, centres)
@@ -44,7 +44,8 @@ def render_opaque(*flat: Any) -> RenderedRays:
         composed: RenderedRays = partial(reference.render_opaque, backend="native")(*arguments)
         return composed
     program, parameters, names = network.program, network.parameters, network.names
-    rows, ray_index = Sorted(None, None, torch.zeros(k + 1, dtype=torch.int32)), none if network.program.rays else None
+    rows = Sorted(None, None, torch.zeros(k + 1, dtype=torch.int32, device="cpu"))
+    ray_index = none if network.program.rays else None
     run = Run.of(program, parameters, names, inputs, ray_index, rows, torch.float32)
     lowered = lower(run.text)
     if k == 1:

@@ -99,9 +99,9 @@ def city_cameras(size: int, blocks: tuple[int, int], views: int, seed: int) -> C
                 eyes.append(middle + eye)
                 aims.append(middle + aim)
                 angles.append(STREET_ANGLE if view % 2 == 0 else ABOVE_ANGLE)
-    up = torch.tensor((0.0, 0.0, 1.0))
-    poses = look_at(torch.from_numpy(np.stack(eyes)).float(), torch.from_numpy(np.stack(aims)).float(), up)
-    focal = 0.5 * size / (0.5 * torch.tensor(angles)).tan()
+    origins = torch.from_numpy(np.stack(eyes)).float()
+    poses = look_at(origins, torch.from_numpy(np.stack(aims)).float(), origins.new_tensor((0.0, 0.0, 1.0)))
+    focal = 0.5 * size / (0.5 * origins.new_tensor(angles)).tan()
     middles = torch.full_like(focal, size / 2)
     return Cameras(poses, torch.stack((focal, focal, middles, middles), dim=1), size, size)
 

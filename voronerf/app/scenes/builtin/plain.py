@@ -55,10 +55,11 @@ def builtin_scene(
         )
     if images not in ("memory", "cached"):
         raise ValueError(f"builtin: images must be memory or cached, got {images!r:.60}")
-    height = (torch.arange(train_views) + 0.5) / train_views
+    numbers = torch.arange(max(train_views, test_views), dtype=torch.float32, device="cpu")
+    height = (numbers[:train_views] + 0.5) / train_views
     golden = math.pi * (3 - math.sqrt(5))
-    turn = 2 * math.pi * torch.arange(test_views) / test_views
-    train = _cameras(torch.asin(0.02 + 0.96 * height), golden * torch.arange(train_views), size)
+    turn = 2 * math.pi * numbers[:test_views] / test_views
+    train = _cameras(torch.asin(0.02 + 0.96 * height), golden * numbers[:train_views], size)
     test = _cameras(torch.deg2rad(28 + 16 * torch.sin(2 * turn)), turn + 0.05, size)
     caster = Caster(SOLIDS, LIGHT)
     train_split, test_split = (
@@ -71,9 +72,9 @@ def builtin_scene(
 
 def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
     around = torch.stack((elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()), dim=-1)
-    poses = look_at(DISTANCE * around, torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
+    poses = look_at(DISTANCE * around, around.new_zeros(3), around.new_tensor((0.0, 0.0, 1.0)))
     focal = 0.5 * size / math.tan(0.5 * ANGLE_X)
-    return Cameras(poses, torch.tensor((focal, focal, size / 2, size / 2)).repeat(len(poses), 1), size, size)
+    return Cameras(poses, poses.new_tensor((focal, focal, size / 2, size / 2)).repeat(len(poses), 1), size, size)
 
 
 def _solids() -> tuple[Solid, ...]:
