@@ -176,10 +176,17 @@ def _read_text(path: Path) -> str:
     if len(data) > JSON_LIMIT:
         size = path.stat().st_size
         raise ValueError(f"{path}: must be at most {JSON_LIMIT / 2**20:g} MiB of JSON, got {size / 2**20:.1f}")
+    if is_utf16(data):
+        raise ValueError(f"{path}: is not JSON in UTF-8 but UTF-16 text; save it as UTF-8")
     try:
         return data.decode("utf-8-sig")
     except ValueError as error:
         raise ValueError(f"{path}: is not JSON: {error}") from None
+
+
+def is_utf16(start: bytes) -> bool:
+    """Returns whether a text that begins with these bytes is UTF-16, as editors on Windows may write it."""
+    return start[:2] in (b"\xff\xfe", b"\xfe\xff") or start[:2].count(0) == 1
 
 
 def parse_json(text: str) -> Any:

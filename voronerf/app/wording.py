@@ -20,8 +20,7 @@ SAID_ELSEWHERE = {
     "nerf-llff": "llff",
 }
 
-#: Factors behind a number, in lower case, and units of time in seconds.
-FACTORS = {"": 1.0, "k": 1e3, "m": 1e6, "%": 0.01}
+#: Units of time in seconds.
 TIMES = {"d(?:ays?)?": 86400, "h(?:(?:ou)?rs?)?": 3600, "m(?:in(?:ute)?s?)?": 60, "s(?:ec(?:ond)?s?)?": 1}
 #: Dashes other than the hyphen, which text processors and web pages write for it.
 DASHES = "\u2010\u2011\u2012\u2013\u2014\u2015\u2212\ufe58\ufe63\uff0d"
@@ -55,27 +54,25 @@ def nearest(word: str, words: Iterable[str]) -> str | None:
 
 
 def meant_number(text: str, *, whole: bool, seconds: bool = False) -> str | None:
-    """Returns the number that people mean by a text such as 1,000, 1.5k, 2^12 or, in seconds, 10min; None if unclear.
+    """Returns the number that people mean by a text such as 1,000, 1.5k, 0,02 or, in seconds, 10min; None if unclear.
 
     Args:
         text: The text, in lower case.
         whole: Whether the number must be whole.
         seconds: Whether the number is a time in seconds.
     """
-    marks = ",_' ." if whole else ",_' "  # between thousands
-    plain = re.sub(rf"(?<=\d)[{marks}](?=\d{{3}}(?!\d))", "", text) if re.match(r"-?[1-9]", text) else text
-    plain = plain if whole else re.sub(r"^(-?\d+),(\d+)$", r"\1.\2", plain)  # the comma of other languages
+    if (whole or seconds) and re.fullmatch(r"[1-9]\d{0,2}([,' ]\d{3})+", text):
+        return re.sub("[,' ]", "", text)
+    plain = text if whole else re.sub(r"^(-?\d+),(\d{1,2}|\d{4,})$", r"\1.\2", text)  # the comma of other languages
     number, value = r"\d+(?:\.\d+)?", None
-    if power := re.fullmatch(r"(\d{1,3})(?:\^|\*\*)(\d{1,2})", plain):
-        value = float(int(power[1]) ** int(power[2]))
-    elif seconds and re.fullmatch(r"\d+(:\d\d){1,2}", plain):
+    if seconds and re.fullmatch(r"\d+(:\d\d){1,2}", plain):
         value = sum(60.0**place * int(part) for place, part in enumerate(reversed(plain.split(":"))))
     elif seconds and plain and re.fullmatch("".join(rf"(?:{number} *{unit} *)?" for unit in TIMES), plain):
         pairs = ((re.search(rf"({number}) *{unit}(?![a-z])", plain), size) for unit, size in TIMES.items())
         value = sum(size * float(match[1]) for match, size in pairs if match)
-    elif match := re.fullmatch(rf"(-?(?:{number}|\.\d+)(?:e[+-]?\d{{1,2}})?) *([{'k' if seconds else 'km%'}]?)", plain):
-        value = None if re.match(r"-?0\d", plain) else float(match[1]) * FACTORS[match[2]]
-    if value is None or abs(value) >= 1e15 or (whole and value % 1):
+    elif match := re.fullmatch(rf"(-?(?:{number}|\.\d+)(?:e[+-]?\d{{1,2}})?) *(k?)", plain):
+        value = float(match[1]) * (1000 if match[2] else 1)
+    if value is None or abs(value) >= 1e15 or (whole and (value % 1 or ("." in plain and not plain.endswith("k")))):
         return None
     return f"{value:.15g}"
 

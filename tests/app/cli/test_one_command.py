@@ -80,4 +80,4 @@ def test_without_cameras_nothing_is_left(tmp_path, monkeypatch, fails):
 def test_one_line_names_what_is_missing(tmp_path, monkeypatch, pictures, fails):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    fails("voronerf process needs pycolmap: pip install 'voronerf[colmap]'", "train --out run --data", pictures)
+    fails("finding cameras needs pycolmap: pip install 'voronerf[colmap]'", "train --out run --data", pictures)

@@ -431,6 +431,7 @@ def test_cameras_of_blender_and_of_several_sizes(tmp_path):
         ([], "frames must be a list of 1 to 100000 frames, got 0 of them"),
         ([7], "frame 0 must be an object, got 7"),
         ([{"file_path": "a"}], "frame 0: transform_matrix is not a matrix of numbers"),
+        ([{"transform_matrix": torch.eye(4).tolist(), "fl_x": 9}], "must state w and h, or cx and cy, since its lens"),
         ([{"transform_matrix": torch.eye(4).tolist()}], "has no focal length (fl_x or camera_angle_x)"),
         ([{"transform_matrix": torch.eye(4).tolist(), "fl_x": 9e3, "w": 9e3, "h": 10}], "at most 8192 pixels a side"),
     ],

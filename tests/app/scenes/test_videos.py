@@ -161,8 +161,12 @@ def taken_from(path, **options):
         ("scale=out_color_matrix=bt601:out_range=full,format=yuvj420p,setparams=range=full", ""),
         (f"{HD},zscale=p=2020:m=2020_ncl,format=yuv420p10le", "bt2020, which are converted to sRGB"),
         (f"{HD},zscale=p=smpte432,format=yuv420p10le", "smpte432, which are converted to sRGB"),
-        (f"{LINEAR},zscale=p=2020,zscale=t=arib-std-b67:m=2020_ncl:npl=203,format=yuv420p10le", "is HDR (HLG) and is"),
+        (
+            f"{LINEAR},zscale=p=2020,zscale=t=arib-std-b67:m=2020_ncl:npl=203:agamma=false,format=yuv420p10le",
+            "is HDR (HLG) and is",
+        ),
         (f"{LINEAR},zscale=p=2020,zscale=t=smpte2084:m=2020_ncl:npl=203,format=yuv420p10le", "is HDR (PQ) and is tone"),
+        ("format=yuv420p,setparams=color_primaries=smpte432:color_trc=bt1361e,crop=239:79", "smpte432, which are"),
         (f"{HD},setfield=tff,setparams=field_mode=tff", "is interlaced: one of two lines is interpolated"),
     ],
 )

@@ -81,7 +81,7 @@ def option_of(word: str) -> str:
 
 def suggest(name: str, command: Callable[..., int], words: list[str], error: str) -> str:
     """Returns "; did you mean ...?" for a command line that the parser rejected with `error`, or ""."""
-    if numbers := meant_value(words, error):
+    if numbers := meant_value(name, words, error):
         return f"; did you mean {numbers}?"
     arguments, options, paths = argument_names(command)
     line = [*map(hyphenated, words)]
@@ -114,7 +114,7 @@ def _nearest_option(option: str, arguments: list[str], options: list[str]) -> st
     return "device cpu" if positive == "device" else f"no-{positive}" if f"no-{positive}" in options else positive
 
 
-def meant_value(words: list[str], error: str) -> str:
+def meant_value(name: str, words: list[str], error: str) -> str:
     """Returns an option with the numbers that its rejected value probably means, such as "--samples 64 128", or ""."""
     rule = re.match(r"--(\S+) (?:must be (an? )?(whole )?(\d*) ?number|needs (\d+) value)", error)
     if rule:
@@ -130,8 +130,10 @@ def meant_value(words: list[str], error: str) -> str:
         if None in numbers or count not in (0, len(numbers)):
             continue
         meant = " ".join(map(str, numbers))
-        if option == "cells" and re.search(r"[x*\u00d7]", text):
-            return f"--cells {math.prod(map(int, map(str, numbers)))} or, for levels, --cells {meant}"
+        product = str(math.prod(map(int, map(str, numbers)))) if re.search(r"[x*\u00d7]", text) else None
+        if name == "train" and option == "cells" and (cells := product or meant_number(text, whole=True)):
+            levels = "" if {"0", "1"} & set(map(str, numbers)) else f" or, for levels, --cells {meant}"
+            return f"--cells {cells}{levels}"
         return f"--{option} {meant}" + " (seconds)" * (option in SECONDS)
     return ""
 

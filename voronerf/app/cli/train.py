@@ -5,16 +5,17 @@ from __future__ import annotations
 import contextlib
 import functools
 import glob
-import importlib
+import importlib.util
 import inspect
 import itertools
 import os
+import re
 import shlex
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -32,6 +33,7 @@ from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import read_json
 from voronerf.app.run import open_run
 from voronerf.app.scenes import Scene, SceneError, load_scene, needs_cameras
+from voronerf.app.scenes.process import RECORD, Settings
 from voronerf.app.train.build import build, present_device
 from voronerf.app.train.callbacks import (
     CHECKPOINT_EVERY,
@@ -126,7 +128,7 @@ def train(
         config, status = with_cameras(config, capture)
         if status:
             return status
-    is_capture = Path(config.data).name == CAPTURE
+    is_capture = config.out is not None and Path(config.data).resolve() == (config.out / CAPTURE).resolve()
     try:
         with busy(f"reading {config.data}"):
             scene = load_scene(config.data, **config.reading)
@@ -162,7 +164,9 @@ def train(
         options: dict[str, Any] = {"checkpoint_every": checkpoint_every, "panels": panels, "tensorboard": tensorboard}
         summary = run_training(chosen, scene, resume=resume, watch=watch if view else None, **options)
         if is_capture and summary["complete"]:
-            finish(chosen.out)
+            status = finish(chosen.out)
+            if status:
+                return status
         for viewer in viewers:
             if summary["complete"]:
                 say(f"{viewer.address} shows the run until Ctrl-C")
@@ -181,10 +185,12 @@ def with_cameras(config: TrainConfig, settings: CaptureSettings) -> tuple[TrainC
     Returns:
         (the settings with this scene and run, 0 or the exit status after a stop).
     """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise ImportError("finding cameras needs pycolmap: pip install 'voronerf[colmap]'")
     source = Path(config.data)
-    resolved = source.resolve()
-    name = resolved.stem if source.is_file() else resolved.name
-    begun = _begun(name, {"source": str(resolved), **vars(settings)}) if config.out is None else None
+    name = source.resolve().stem if source.is_file() else source.resolve().name
+    wanted = Settings.of([source], **vars(settings))
+    begun = _begun(name, wanted) if config.out is None else None
     chosen = choose_directory(replace(config, out=begun or config.out), name)
     assert chosen.out is not None
     capture = chosen.out / CAPTURE
@@ -193,27 +199,39 @@ def with_cameras(config: TrainConfig, settings: CaptureSettings) -> tuple[TrainC
             stack.callback(_remove_empty, chosen.out)
         stack.enter_context(held(chosen.out))
         stack.enter_context(exit_on_sigterm())
-        is_made = (capture / "sparse" / "0").is_dir()
-        status = 0 if is_made else find_cameras([source], capture, settings)
+        try:
+            is_made = (capture / "colmap" / RECORD).is_file() and wanted.is_done(capture)
+            status = 0 if is_made else find_cameras([source], capture, settings)
+        except SceneError as error:
+            options = "|".join(field.name.replace("_", "-") for field in fields(settings))
+            raise SceneError(re.sub(rf"--(?=({options})\b)", "--process-", str(error))) from None
     return replace(chosen, data=str(capture)), status
 
 
-def _begun(name: str, settings: dict[str, Any]) -> Path | None:
+def _begun(name: str, settings: Settings) -> Path | None:
     """Returns the last run of this name that was stopped, with these settings, before its training; or None."""
-    for record in sorted(Path("runs").glob(f"{glob.escape(name)}*/{CAPTURE}/colmap/settings.json"), reverse=True):
+    for record in sorted(Path("runs").glob(f"{glob.escape(name)}*/{CAPTURE}/colmap/{RECORD}"), reverse=True):
         run = record.parents[2]
-        if not checkpoint_paths(run) and read_json(record, dict).items() <= settings.items():
-            return run
+        with contextlib.suppress(ValueError, OSError, ConfigError):  # damaged, or in use by another process
+            if not checkpoint_paths(run) and read_json(record, dict) == settings._asdict():
+                with held(run):
+                    return run
     return None
 
 
-def finish(run: Path) -> None:
-    """Makes a video and a page of a trained run."""
-    render(run)
+def finish(run: Path) -> int:
+    """Makes a video and a page of a trained run, and returns the exit status."""
     try:
-        export(run, web=run / "scene.html")
-    except ValueError as error:  # a page has no code for some fields
-        say(f"no page: {error}")
+        with exit_on_sigterm():
+            for make in (lambda: render(run), lambda: export(run, web=run / "scene.html")):
+                try:
+                    make()
+                except (ValueError, ImportError, OSError) as error:  # such as a field for which pages have no code
+                    say(f"{error}")
+    except (KeyboardInterrupt, SystemExit) as stop:
+        say(f"stopped; the run is trained: voronerf render {shlex.quote(str(run))} makes its video")
+        return stop.code if isinstance(stop, SystemExit) and isinstance(stop.code, int) else 130
+    return 0
 
 
 def continuation(config: TrainConfig) -> str:

@@ -95,7 +95,7 @@ def needs_cameras(source: str | Path) -> bool:
     path = Path(source)
     if path.is_file():
         return path.suffix.lower() in VIDEOS
-    if is_builtin(source) or not path.is_dir():
+    if is_builtin(source) or not path.is_dir() or _formats_of(path.resolve().parent):
         return False
     places = [path, *(inner for inner in path.iterdir() if inner.is_dir())]
     if any(_formats_of(place) or (place / "config.json").is_file() for place in places):
@@ -192,9 +192,11 @@ def load_scene(
     if not formats:
         message = f"{folder}: is not a scene: it has none of {', '.join(item.sign for item in FORMATS.values())}"
         photographs = next((item for item in (folder, folder / "images") if item.is_dir() and has_images(item)), None)
-        raise SceneError(
-            message + (f"; voronerf process {photographs} DIR finds the cameras of its images" if photographs else "")
-        )
+        if _formats_of(folder.resolve().parent):
+            message += f"; did you mean {folder.parent}?"
+        elif photographs:
+            message += f"; voronerf process {photographs} DIR finds the cameras of its images"
+        raise SceneError(message)
     if format != "auto" and format not in formats:
         raise SceneError(f"{folder}: format must be one that the folder has, {' or '.join(formats)}, got {format}")
     chosen = formats[0] if format == "auto" else format

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from voronerf.app.files import leads_outside
+from voronerf.app.files import is_utf16, leads_outside
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import (
     ImageFolder,
@@ -35,7 +35,7 @@ from voronerf.app.scenes.folders import (
 )
 from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import EQUIRECTANGULAR, MODELS, OTHER_MODELS, Lens, colmap_lens
-from voronerf.app.scenes.names import is_utf16, stay_inside
+from voronerf.app.scenes.names import stay_inside
 from voronerf.app.scenes.photographs import Reading, View, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.transforms import LARGEST, LONGEST
@@ -281,7 +281,9 @@ def _points(path: Path) -> Iterator[tuple[int, float, float, float, int]]:
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yields the number and the words of each line except comments; empty lines have no words."""
     _check_size(path)
-    if is_utf16(path):
+    with open(path, "rb") as start:
+        utf16 = is_utf16(start.read(2))
+    if utf16:
         raise SceneError(f"{path}: is UTF-16 text; save it as UTF-8")
     with open(path, encoding="utf-8-sig", errors="replace") as file:  # Windows programs may write a byte order mark
         for number, line in enumerate(file, 1):

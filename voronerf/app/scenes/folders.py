@@ -14,7 +14,15 @@ from typing import Any, NamedTuple
 from voronerf.app.files import leads_outside
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import DYNAMIC_MASK, FORMATS, Header, read_header
-from voronerf.app.scenes.names import OTHER_PICTURES, compare, compare_tails, plain, stay_inside
+from voronerf.app.scenes.names import (
+    OTHER_PICTURES,
+    Accepts,
+    compare,
+    compare_tails,
+    has_images,
+    plain,
+    stay_inside,
+)
 from voronerf.app.scenes.photographs import least_factor
 
 log = logging.getLogger(__name__)
@@ -100,7 +108,7 @@ def other_folder(
     Other folders are the scene's folder and its subfolders, except for folders of masks and depths.
 
     Returns:
-        (the path of the only other folder with files that the model names, or ``images`` if ``images`` exists or if
+        (the path of the other folder with most files that the model names, or ``images`` if ``images`` exists or if
         there is no such folder; lines for the user).
     """
     if image_folders(folder, images):
@@ -111,9 +119,12 @@ def other_folder(
         if path.is_dir() and not path.name.startswith(".") and not OTHER_PICTURES.fullmatch(path.name)
     ]
     inside = [path for path in inside if allow_outside or not leads_outside(path, folder)]
-    others = [path for path in (folder, *inside) if any(os.path.isfile(path / plain(name)) for name in names)]
-    others = others or [path for path in inside if any(named_files(source, path, names, allow_outside))]
-    found = [path.relative_to(folder).as_posix() for path in others]
+    counts = {path: sum(os.path.isfile(path / plain(name)) for name in names) for path in (folder, *inside)}
+    if not any(counts.values()):
+        files = {path: named_files(source, path, names, allow_outside) for path in inside}
+        counts = {path: len(found) - found.count(None) for path, found in files.items()}
+    most = max(counts.values(), default=0)
+    found = [path.relative_to(folder).as_posix() for path, count in counts.items() if count == most > 0]
     if len(found) > 1:
         raise SceneError(
             f"{folder}: has no folder {images}, and {found[0]} as well as {found[1]} has images of the model; rename "
@@ -196,7 +207,7 @@ def find_files(
     exact: dict[str, Path],
     *,
     of_one_folder: bool,
-    all_folders: bool = False,
+    accepts: Accepts = has_images,
     but: Sequence[Path] = (),
 ) -> dict[str, Path]:
     """Finds the image files in a folder and its subfolders of the names that have no file in ``exact``.
@@ -211,7 +222,7 @@ def find_files(
         names: normalised names, see `plain`.
         exact: the file of each name whose file exists as it is named.
         of_one_folder: whether the folder of a name must be the file's, at least in its innermost part.
-        all_folders: whether files in folders of masks and depths are taken, too, although their names do not say so.
+        accepts: see `compare_tails`.
         but: files that are not taken.
 
     Returns:
@@ -230,7 +241,7 @@ def find_files(
         files = [file for file in map(inside, image_files(folder)) if file not in taken]
         compare(source, names, files, found, remedy)
         if not found and not exact:
-            found = compare_tails(source, names, files, remedy, of_one_folder=of_one_folder, all_folders=all_folders)
+            found = compare_tails(source, names, files, remedy, of_one_folder=of_one_folder, accepts=accepts)
         result |= {
             name: folder / file
             for name, file in found.items()

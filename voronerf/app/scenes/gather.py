@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.util
+import math
 import os
 import re
 import shutil
@@ -11,7 +13,7 @@ import subprocess
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +44,12 @@ HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
 BRIGHT = 0.63
 #: The filters from HDR to sRGB: white is at 203 cd/m2 (BT.2408); up to 0.8 of it, colours are kept.
 TONE_MAPPING = (
-    "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,"
+    "zscale=t=linear:npl=203:agamma=false,format=gbrpf32le,zscale=p=bt709,"
     "tonemap=mobius:param=0.8:peak=5:desat=0,zscale=t=iec61966-2-1"
 )
-#: Primaries, by ffmpeg's names, with more colours than sRGB has.
+#: Primaries, by ffmpeg's names, with more colours than sRGB has, and the transfer functions that they come with.
 WIDE = ("bt2020", "smpte431", "smpte432")
+CURVES = (*HDR, "smpte170m", "iec61966-2-1", "bt2020-10", "bt2020-12")
 #: Image formats, recognised by the content of a file, and the formats that are copied unchanged. MPO is JPEG with two
 #: pictures.
 FORMATS = ("PNG", "JPEG", "WebP", "TIFF", "BMP")
@@ -91,7 +94,7 @@ def gather(
     clips = [source] if isinstance(source, Path) else list(source)
     folder, places, copied = clips[0], dict[str, str](), dict[Path, Path]()
     if folder.is_dir():
-        files = sorted(_files(folder))
+        files = sorted(files_of(folder))
         if any(path.suffix.lower() in KINDS for path in files):
             clips = []
             folder, files = _list_images(folder, say)
@@ -99,8 +102,9 @@ def gather(
             copied = _copy_images(folder, files, images, say, progress)
             places = {copy.name: path.parent.relative_to(folder).as_posix() for copy, path in copied.items()}
         else:
-            clips = [path for path in files if path.suffix.lower() in VIDEOS]
-            say(f"{folder}: has no images; frames are taken from {some_of([path.name for path in clips])}")
+            if clips := [path for path in files if path.suffix.lower() in VIDEOS]:
+                names = [path.relative_to(folder).as_posix() for path in clips]
+                say(f"{folder}: has no images; frames are taken from {some_of(names)}")
     if clips:
         progress("images", 0, 0)
         places = _take_clips(clips, images, frames, say)
@@ -120,8 +124,8 @@ def emptied(folder: Path) -> Path:
     return folder
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    """Yields the files of a folder and its subfolders.
+def files_of(folder: Path) -> Iterator[Path]:
+    """Yields the files of a folder and its subfolders, or the file itself.
 
     It skips hidden files, system files, masks, folders of masks, depths and smaller copies, and scenes made by
     :func:`process`. Of Polycam's raw folders, it takes only the images without distortion.
@@ -133,12 +137,14 @@ def _files(folder: Path) -> Iterator[Path]:
     def is_beside(name: str) -> bool:
         return bool(OTHER_PICTURES.fullmatch(name) or COPIES.fullmatch(name))
 
+    if folder.is_file():
+        yield folder
     for place, folders, files in os.walk(folder):
         inside = [path for name in folders if counts(path := Path(place, name)) and not is_beside(name)]
         folders[:] = [path.name for path in inside if not (path / "colmap" / "settings.json").is_file()]
-        if POLYCAM in folders and "images" in folders:
-            folders.remove("images")
-        yield from (path for name in files if counts(path := Path(place, name)))
+        if POLYCAM in folders and any(Path(place, POLYCAM).iterdir()):
+            folders[:] = [name for name in folders if name.lower() != "images"]
+        yield from (path for name in sorted(files) if counts(path := Path(place, name)) and path.is_file())
 
 
 def _list_images(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[Path]]:
@@ -146,14 +152,15 @@ def _list_images(folder: Path, say: Callable[[str], None]) -> tuple[Path, list[P
 
     The images are in ``folder`` itself or, if it has none, in its subfolder `images`, or in all its subfolders.
     """
-    files = sorted(_files(folder))
+    files = sorted(files_of(folder))
     images = [path for path in files if path.suffix.lower() in KINDS]
     deeper = [path for path in images if path.parent != folder]
+    wanted = POLYCAM if any((folder / POLYCAM).glob("*")) else "images"
     if len(deeper) < len(images):
         if deeper:
             say(f"{folder}: {len(deeper)} images in subfolders are left out, since the folder itself has images")
         files, images = ([path for path in paths if path.parent == folder] for paths in (files, images))
-    elif inner := next((path for path in folder.iterdir() if path.is_dir() and path.name.lower() == "images"), None):
+    elif inner := next((path for path in folder.iterdir() if path.is_dir() and path.name.lower() == wanted), None):
         if skipped := sum(inner not in path.parents for path in images):
             say(f"{folder}: {skipped} images outside of {inner.name} are left out")
         return _list_images(inner, say)
@@ -227,10 +234,9 @@ def _copy_image(path: Path, copy: Path) -> tuple[Path, bool]:
             check_grey(image, path)
             lossy = image.format is None or (image.format == "WEBP" and b"VP8L" not in path.read_bytes())
             copy = copy.with_suffix(".jpg" if lossy and not image.has_transparency_data else ".png")
-            exif = image.getexif()
-            lens, written = exif.get_ifd(ExifTags.IFD.Exif), Image.Exif()
-            written[ExifTags.IFD.Exif] = {tag: lens[tag] for tag in LENS if tag in lens}
-            written.update({tag: exif[tag] for tag in CAMERA if tag in exif})
+            written, (camera, lens) = Image.Exif(), _lens_tags(image)
+            written[ExifTags.IFD.Exif] = lens
+            written.update(camera)
             mode = "RGBA" if image.has_transparency_data else "RGB"
             profile = image.info.get("icc_profile") if image.mode in COLOURS else None
             upright = ImageOps.exif_transpose(image).convert(mode)
@@ -242,6 +248,20 @@ def _copy_image(path: Path, copy: Path) -> tuple[Path, bool]:
     except (*UNREADABLE, RuntimeError) as error:
         raise SceneError(f"{path}: cannot be copied: {error}") from None
     return copy, deep
+
+
+def _lens_tags(image: Image.Image) -> tuple[dict[int, str], dict[int, Any]]:
+    """Returns the EXIF tags of the make and model, and of the focal lengths, of an image; broken tags are left out."""
+    camera, lens = dict[int, str](), dict[int, Any]()
+    with contextlib.suppress(*UNREADABLE):
+        exif = image.getexif()
+        camera = {tag: exif[tag] for tag in CAMERA if isinstance(exif.get(tag), str)}
+        values = exif.get_ifd(ExifTags.IFD.Exif)
+        for tag in LENS:
+            with contextlib.suppress(TypeError, ValueError, ArithmeticError):
+                if 0 < float(values.get(tag, 0)) < math.inf:
+                    lens[tag] = values[tag]
+    return camera, lens
 
 
 def _remove_repeats(folder: Path) -> list[str]:
@@ -390,15 +410,18 @@ def _colour_filters(frame: Mapping[str, str], bright: float) -> tuple[list[str],
     if matrix.startswith("bt2020") and transfer == "unknown":
         transfer = "arib-std-b67" if bright > BRIGHT else "smpte2084"
         notes.append(f"has no tag of its transfer function: {HDR[transfer]} is assumed, by its brightness")
-    if matrix == "unknown" and transfer in HDR:
+    if primaries == "unknown" and (transfer in HDR or matrix.startswith("bt2020")):
+        primaries = "bt2020"
+    if matrix == "unknown" and (transfer in HDR or primaries == "bt2020"):
         matrix = "bt2020nc"
     elif matrix == "unknown" and (width >= 1280 or height > 576):  # the rule of players
         matrix = "bt709"
         notes.append("has no colour tags: those of HD video (bt709) are assumed")
-    if matrix.startswith("bt2020") and primaries == "unknown":
-        primaries = "bt2020"
     if transfer in HDR or primaries in WIDE:
-        tags = f"color_primaries={primaries}:color_trc={transfer.replace('unknown', 'bt709')}"
+        matrix = "smpte170m" if matrix == "unknown" else matrix
+        tags = f"color_primaries={primaries}:color_trc={transfer if transfer in CURVES else 'bt709'}"
+        if not re.search("444|rgb|gbr", frame["fmt"]):
+            filters.append("format=yuv444p16le")  # zscale refuses odd sizes of smaller colour planes
         filters += [f"setparams=colorspace={matrix}:{tags}", TONE_MAPPING if transfer in HDR else "zscale=p=bt709"]
         filters += ["zscale=m=bt709:r=limited", "format=yuv444p"]
         mapped = (
@@ -424,7 +447,7 @@ def _take_frames(video: Path, folder: Path, count: int, say: Callable[[str], Non
 
 
 def _take_clips(paths: Sequence[Path], folder: Path, count: int, say: Callable[[str], None]) -> dict[str, str]:
-    """Writes evenly spaced frames of videos as JPEG to a folder, and returns the video's name for each frame's name.
+    """Writes evenly spaced frames of videos as JPEG to a folder, and returns the video of each frame by its name.
 
     Each video has its share of ``count`` frames by its length, but at least one. If there are several videos, the
     frames' names begin with a video's number.
@@ -441,7 +464,8 @@ def _take_clips(paths: Sequence[Path], folder: Path, count: int, say: Callable[[
         taken += _write_frames(video, folder, share, prefix)
     if taken < count:
         say(f"{some_of(list(map(str, paths)))}: all {taken} frames are taken, fewer than --frames {count}")
-    return {path.name: paths[int(path.stem.rpartition("_")[0] or 1) - 1].name for path in listed_images(folder)}
+    numbers = {path.name: int(path.stem.rpartition("_")[0] or 1) for path in listed_images(folder)}
+    return {name: f"video {number}, {paths[number - 1].name}" for name, number in numbers.items()}
 
 
 def _write_frames(video: Video, folder: Path, count: int, prefix: str) -> int:
@@ -486,11 +510,9 @@ def cameras_of(images: Sequence[Path], places: Mapping[str, str]) -> dict[str, s
     labels = {}
     for path in images:
         with Image.open(path, formats=COPIED) as image:
-            exif = image.getexif()
-            lens = exif.get_ifd(ExifTags.IFD.Exif)
-            told = [str(exif[tag]).strip("\0 ") for tag in CAMERA if tag in exif]
-            focal = [f"{lens[tag]} mm" for tag in LENS if tag in lens]
+            camera, lens = _lens_tags(image)
+            told = [text.strip("\0 ") for text in camera.values()] + [f"{value} mm" for value in lens.values()]
             place = places.get(path.name, ".")
-            where = [" ".join(told + focal)] if focal else [f"in {place!s:.60}"] * (place != ".")
+            where = [" ".join(told)] if lens else [f"in {place!s:.60}"] * (place != ".")
             labels[path.name] = ", ".join(["{} x {}".format(*image.size), *where])
     return labels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import posixpath
 import re
 import unicodedata
@@ -12,11 +13,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from voronerf.app.files import leads_outside
+from voronerf.app.files import is_utf16, leads_outside
 from voronerf.app.scenes.errors import SceneError
 
-#: Folders that programs keep beside photographs: masks, depths and confidences of depths, and smaller copies.
-OTHER_PICTURES, COPIES = re.compile(r"(?i)masks?|depths?|confidences?"), re.compile(r"(?i)images_\d+")
+#: Folders that programs keep beside photographs: masks, depths and the like, and smaller copies.
+OTHER_PICTURES = re.compile(r"(?i)(.+[_-])?(masks?|depths?|confidences?|normals?|semantics?|segmentations?)([_-].+)?")
+MASKS = re.compile(r"(?i)(.+[_-])?masks?([_-].+)?")
+COPIES = re.compile(r"(?i)images_\d+")
+#: The suffix of an image in a name.
+SUFFIX = re.compile(r"(?i)\.(png|jpe?g|jfif|tiff?|bmp|webp|hei[cf]|avif|exr)$")
 #: The files in a scene's folder that list the names of images for training and for testing (nerfbaselines), and the
 #: file in a COLMAP model's folder that lists the names of test images (gaussian-splatting, hierarchical-3d-gaussians).
 TRAIN_LIST, TEST_LIST, MODEL_LIST = "train_list.txt", "test_list.txt", "test.txt"
@@ -36,13 +41,6 @@ def stay_inside(path: Path, folder: Path, allow_outside: bool, name: str = "") -
 def plain(name: str) -> str:
     """Returns a normalised file name, so that ./images/a.png equals images/a.png, and images\\a.png on Windows."""
     return posixpath.normpath(name.replace("\\", "/"))
-
-
-def is_utf16(path: Path) -> bool:
-    """Returns whether a text file is UTF-16, as editors and shells on Windows may write it."""
-    with open(path, "rb") as file:
-        start = file.read(2)
-    return start in (b"\xff\xfe", b"\xfe\xff") or start.count(0) == 1
 
 
 def _composed(name: str) -> str:
@@ -91,11 +89,26 @@ def compare(source: Path, names: Iterable[str], files: Sequence[str], found: dic
         keys = {name: fold(cut(name)) for name in names}
         counts, taken = Counter(keys.values()), set(found.values())
         for name in sorted(names - found.keys()):
+            if taken and cut is _whole and cut_file is _without_suffix and SUFFIX.search(name):
+                continue  # 0.jpg.png is the mask of a 0.jpg that is missing
             same = by_key.get(keys[name], [])
             if len(same) > 1:
                 raise SceneError(f"{source}: {name} may be {' or '.join(same[:2])}{remedy}")
             if len(same) == counts[keys[name]] == 1 and same[0] not in taken:
                 found[name] = same[0]
+
+
+Accepts = Callable[[int, list[str]], bool]
+
+
+def has_images(tail: int, rest: list[str]) -> bool:
+    """Returns whether a folder may have images; ``rest`` are the names that the folder of a listed name lacks."""
+    return not any(map(OTHER_PICTURES.fullmatch, rest))
+
+
+def has_masks(tail: int, rest: list[str]) -> bool:
+    """Returns whether a folder may have masks: it is called so, or as the folder of a listed name."""
+    return tail > 0 or any(map(MASKS.fullmatch, rest))
 
 
 def compare_tails(
@@ -105,13 +118,12 @@ def compare_tails(
     remedy: str,
     *,
     of_one_folder: bool,
-    all_folders: bool = False,
+    accepts: Accepts = lambda tail, rest: True,
 ) -> dict[str, str]:
     """Returns files of names whose beginnings differ, as in paths of another machine; names without a file are absent.
 
-    The base names must be equal by one of `LEVELS`. Among several files, the one with the longest common tail of
-    folders is taken. A name with a shorter tail than another name of the same folder has no file, and two names never
-    take one file.
+    The names of one folder get files of one folder: of the same innermost name if there is such a folder, with files
+    for most names, and with the longest common tail of folders. `compare` compares the base names.
 
     Args:
         source: the file that lists the names, for error messages.
@@ -119,48 +131,57 @@ def compare_tails(
         files: paths in a folder, separated by `/`.
         remedy: the end of the message of the error for a name that may be several files.
         of_one_folder: whether the innermost folders must be equal. They must in any case if base names repeat.
-        all_folders: whether files in folders of `OTHER_PICTURES` are taken, too.
+        accepts: whether files are taken of a folder with this number of common names, and these other names.
     """
-    names = set(names)
-    least = int(of_one_folder or len(set(map(posixpath.basename, names))) < len(names))
-    by_level = []
-    for fold, _, cut_file in LEVELS:
-        by_key = defaultdict(list)
-        for file in files:
-            by_key[fold(cut_file(posixpath.basename(file)))].append(file)
-        by_level.append(by_key)
-    best: dict[str, tuple[tuple[int, bool, bool, int], list[str]]] = {}
-    for name in names:
-        folder, base = _caseless(posixpath.dirname(name)).split("/"), posixpath.basename(name)
-        scores: dict[str, tuple[int, bool, bool, int]] = {}
-        for level, (fold, cut, _) in enumerate(LEVELS):
-            for file in by_level[level].get(fold(cut(base)), ()):
-                parts = _caseless(posixpath.dirname(file)).split("/") if "/" in file else []
-                tail = next((at for at, (a, b) in enumerate(zip(folder[::-1], parts[::-1])) if a != b), None)
-                tail = min(len(folder), len(parts)) if tail is None else tail
-                others = parts[: len(parts) - tail]
-                if tail < least or (not all_folders and any(map(OTHER_PICTURES.fullmatch, others))):
-                    continue
-                scores.setdefault(file, (tail, not any(map(COPIES.fullmatch, others)), tail > 0 and not others, -level))
+    listed, inside = _by_folder(names), _by_folder(files)
+    bases = Counter(base for group in listed.values() for base in group)
+    of_one_folder = of_one_folder or max(bases.values(), default=1) > 1
+    keys = {folder: set().union(*map(_keys, group)) for folder, group in inside.items()}
+    alike = defaultdict(list)
+    for folder in inside:
+        alike[tuple(_parts(folder)[:1])].append(folder)
+    choices = []
+    for folder, group in listed.items():
+        scores = {}
+        for other in alike.get(tuple(_parts(folder)[:1])) or ([] if of_one_folder else inside):
+            pairs = zip(_parts(folder), _parts(other))
+            tail = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+            rest = _parts(other)[tail:]
+            count = sum(not keys[other].isdisjoint(_keys(base)) for base in group)
+            if count and accepts(tail, rest):
+                scores[other] = (count, tail, not any(map(COPIES.fullmatch, rest)), -len(rest))
         if scores:
             top = max(scores.values())
-            best[name] = top, [file for file, score in scores.items() if score == top]
-    deepest: dict[str, int] = defaultdict(int)
-    for name, (score, _) in best.items():
-        deepest[posixpath.dirname(name)] = max(deepest[posixpath.dirname(name)], score[0])
-    claims = defaultdict(list)
-    for name, (score, same) in sorted(best.items()):
-        if score[0] < deepest[posixpath.dirname(name)]:
-            continue
-        if len(same) > 1:
-            raise SceneError(f"{source}: {name} may be {' or '.join(sorted(same)[:2])}{remedy}")
-        claims[same[0]].append((score, name))
-    found = {}
-    for file, claiming in claims.items():
-        score, name = max(claiming)
-        if [other for other, _ in claiming].count(score) == 1:
-            found[name] = file
+            choices.append((top, folder, [other for other, score in scores.items() if score == top]))
+    found: dict[str, str] = {}
+    for _, folder, best in sorted(choices, reverse=True):
+        if len(best) > 1:
+            base = listed[folder][0]
+            candidates = " or ".join(posixpath.join(other, base) for other in sorted(best)[:2])
+            raise SceneError(f"{source}: {posixpath.join(folder, base)} may be {candidates}{remedy}")
+        taken, matches = set(found.values()), dict[str, str]()
+        rest = [base for base in inside[best[0]] if posixpath.join(best[0], base) not in taken]
+        compare(source, listed[folder], rest, matches, remedy)
+        found |= {posixpath.join(folder, base): posixpath.join(best[0], file) for base, file in matches.items()}
     return found
+
+
+def _by_folder(paths: Iterable[str]) -> dict[str, list[str]]:
+    """Returns the base names of paths by their folders."""
+    folders = defaultdict(list)
+    for path in sorted(set(paths)):
+        folders[posixpath.dirname(path)].append(posixpath.basename(path))
+    return folders
+
+
+def _keys(base: str) -> set[str]:
+    """Returns a base name with and without its suffix, in one spelling and without upper case."""
+    return {_caseless(base), _caseless(_without_suffix(base))}
+
+
+def _parts(folder: str) -> list[str]:
+    """Returns the names of a path of folders, the innermost first, in one spelling and without upper case."""
+    return _caseless(folder).split("/")[::-1] if folder else []
 
 
 def split_by_lists(
@@ -225,7 +246,7 @@ def listed_split(
         remedy = ": the list must give its folder and its suffix"
         images = sorted(set(names))
         compare(path, listed, images, found, remedy)
-        found = found or compare_tails(path, listed, images, remedy, of_one_folder=False, all_folders=True)
+        found = found or compare_tails(path, listed, images, remedy, of_one_folder=False)
         lists[kind] = set(found.values())
         if missing := len(listed) - len(found):
             notes.append(f"{missing} of {len(listed)} names in {path.relative_to(folder)} have no image")
@@ -242,7 +263,7 @@ def _read_list(path: Path) -> list[str]:
     """Returns the distinct names in a text file."""
     if path.stat().st_size > MOST_BYTES:
         raise SceneError(f"{path}: must be at most {MOST_BYTES / 2**20:g} MiB")
-    if is_utf16(path):
+    if is_utf16(path.read_bytes()):
         raise SceneError(f"{path}: is UTF-16 text; save it as UTF-8")
     lines = (line.strip() for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines())
     return list(dict.fromkeys(plain(line) for line in lines if line and not line.startswith("#")))

@@ -164,7 +164,8 @@ def photograph_scene(
             if split[2]:
                 notes.append(f"{split[2]} images are in no list and are left out")
     views, more = _with_dynamic_masks(views, folder, reading.allow_outside)
-    stored = [_as_stored(view) for view in views]
+    fits_upright = any(map(_is_upright, views))
+    stored = [_as_stored(view) for view in views] if fits_upright else [*views]
     turned = [view.path.name for view, changed in zip(views, stored) if changed is not view]
     if turned:
         more.append(f"cameras are those of pictures turned upright by their orientation tags: {some_of(turned)}")
@@ -249,7 +250,7 @@ def _listed_once(
 def _with_dynamic_masks(views: Sequence[View], folder: Path, allow_outside: bool) -> tuple[Sequence[View], list[str]]:
     """Returns the views with instant-ngp's masks, see `DYNAMIC_MASK`, where they have no other masks; and notes."""
     masks = [view.path.with_name(f"{DYNAMIC_MASK}{view.path.stem}.png") for view in views]
-    found = {place: mask for place, mask in enumerate(masks) if mask.is_file()}
+    found = {place: mask for place, mask in enumerate(masks) if os.path.isfile(mask)}
     used = {place: mask for place, mask in found.items() if views[place].mask is None}
     for mask in used.values():
         stay_inside(mask, folder, allow_outside)
@@ -268,24 +269,31 @@ def _fits(size: Sequence[float], stated: tuple[float, float]) -> bool:
     return abs(scale_x - scale_y) * max(stated) <= ROUNDED * max(scale_x, 1)
 
 
-def _as_stored(view: View) -> View:
-    """Returns a view whose camera belongs to the stored picture.
-
-    If the camera fits only the picture after the quarter turn of its orientation tag, the camera is turned back. Other
-    views are returned unchanged.
-    """
+def _is_upright(view: View) -> bool:
+    """Returns whether a camera fits a picture only after the quarter turn of the picture's orientation tag."""
     if view.header is None or view.header.turns % 2 == 0 or view.lens.model == EQUIRECTANGULAR:
-        return view
-    if _fits(view.header.size, view.size) or not _fits(view.header.size[::-1], view.size):
+        return False
+    return _fits(view.header.size[::-1], view.size) and not _fits(view.header.size, view.size)
+
+
+def _as_stored(view: View) -> View:
+    """Returns a view of a scene with cameras of upright pictures; its camera is turned to the stored picture.
+
+    The camera of a square picture, or of one that is upside down, may be that of either picture, and is turned, too.
+    """
+    assert view.header is not None
+    turns = view.header.turns
+    upright = view.header.size[::-1] if turns % 2 else view.header.size
+    if turns == 0 or view.lens.model == EQUIRECTANGULAR or not _fits(upright, view.size):
         return view
     poses, model = view.pose[None], torch.tensor([view.lens.model], dtype=torch.int32, device="cpu")
     intrinsics, coefficients = (poses.new_tensor([row]) for row in (view.lens.intrinsics, view.lens.coefficients))
     sizes = torch.tensor([view.size], dtype=torch.float32, device="cpu")
-    upright = Cameras.of_images(poses, intrinsics, sizes, coefficients, model)
-    stored = _turned(upright, [4 - view.header.turns])
+    cameras = Cameras.of_images(poses, intrinsics, sizes, coefficients, model)
+    stored = _turned(cameras, [4 - turns])
     assert stored.distortion is not None
     lens = Lens(tuple(stored.intrinsics[0].tolist()), tuple(stored.distortion[0].tolist()), view.lens.model)
-    return view._replace(pose=stored.poses[0], lens=lens, size=view.size[::-1])
+    return view._replace(pose=stored.poses[0], lens=lens, size=view.size[::-1] if turns % 2 else view.size)
 
 
 def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path) -> tuple[list[View], int]:

@@ -17,6 +17,7 @@ from Motion", section 4. The global mapper is by Pan et al. 2024, "Global Struct
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import json
 import os
@@ -50,7 +51,7 @@ from voronerf.app.scenes.folds import (
     trusted_pairs,
     wide_pairs,
 )
-from voronerf.app.scenes.gather import Progress, cameras_of, emptied, gather, read_mask
+from voronerf.app.scenes.gather import Progress, cameras_of, emptied, files_of, gather, read_mask
 from voronerf.app.scenes.images import read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
 from voronerf.app.scenes.results import (
@@ -98,8 +99,8 @@ LARGEST_ERROR, ERROR_SHARE = 2.0, 1 / 800
 TRACKS = 200
 #: The name of the mapper's thread, which cannot be interrupted.
 MAPPER = "mapper"
-#: The file with the folder or the video of each image.
-PLACES = "places.json"
+#: The files with the settings, and with the folder or the video of each image.
+RECORD, PLACES = "settings.json", "places.json"
 #: The temporary name of the stages' folder, until its settings are written.
 BEGUN = ".colmap"
 #: Reduced images are written only if their longer side has at least this number of pixels.
@@ -113,14 +114,47 @@ Item = TypeVar("Item")
 
 
 class Settings(NamedTuple):
-    """The settings of all stages; a folder with results of other settings is refused."""
+    """The settings of all stages; a folder with results of other settings is refused.
+
+    Attributes:
+        source: the paths of the sources.
+        files: a checksum of the names and sizes of their files.
+        frames, matching, camera_model, max_features, size: see :func:`process`.
+    """
 
     source: str
+    files: str
     frames: int
     matching: str
     camera_model: str
     max_features: int
     size: int
+
+    @classmethod
+    def of(cls, sources: Sequence[Path], **options: Any) -> Settings:
+        """Returns the settings of sources and of options of :func:`process`, of which some have no effect on stages."""
+        sizes = [(str(file), file.stat().st_size) for source in sources for file in files_of(source)]
+        listed = hashlib.sha256(json.dumps(sizes).encode(errors="surrogateescape")).hexdigest()
+        paths = os.pathsep.join(str(path.resolve()) for path in sources)
+        return cls(paths, listed, **{name: value for name, value in options.items() if name in cls._fields})
+
+    def is_done(self, out: Path) -> bool:
+        """Returns whether a folder has a scene of these settings.
+
+        Raises:
+            SceneError: the folder has results of other settings.
+        """
+        work = out / "colmap"
+        stored = read_result(work / RECORD, dict)
+        if changed := [name for name, value in self._asdict().items() if stored.get(name) != value]:
+            name = changed[0].replace("_", "-")
+            if name == "files":
+                raise SceneError(f"{work}: was started with other files in {self.source}; choose another folder")
+            raise SceneError(
+                f"{work}: was started with --{name} {stored.get(changed[0])!s:.60}, got {getattr(self, changed[0])}; "
+                "give the same value, or another folder"
+            )
+        return (out / "sparse" / "0").exists()
 
 
 @dataclass(frozen=True)
@@ -212,8 +246,8 @@ def process(
             raise SceneError(f"{path}: there is no such video or folder")
         if len(sources) > 1 and not path.is_file():
             raise SceneError(f"{path}: several sources must be videos, got a folder; put all pictures into one folder")
-    resolved = os.pathsep.join(str(path.resolve()) for path in sources)
-    settings = Settings(resolved, frames, matching, camera_model, max_features, size)
+    options = {"matching": matching, "camera_model": camera_model, "max_features": max_features, "size": size}
+    settings = Settings.of(sources, frames=frames, **options)
     work = _begin(out, settings)
     places = work / PLACES
     if not (images := out / "images").is_dir():
@@ -286,23 +320,15 @@ def process(
 def _begin(out: Path, settings: Settings) -> Path:
     """Returns the folder of the stages: a new folder, or the folder of a stopped process with the same settings."""
     work = out / "colmap"
-    record = work / "settings.json"
-    if record.is_file():
+    if (work / RECORD).is_file():
         check_files(out)
-        stored, wanted = read_result(record, dict), settings._asdict()
-        if changed := [name for name, value in wanted.items() if stored.get(name) != value]:
-            name = changed[0]
-            raise SceneError(
-                f"{work}: was started with --{name.replace('_', '-')} {stored.get(name)!s:.60}, got {wanted[name]}; "
-                "give the same value, or another folder"
-            )
-        if (out / "sparse" / "0").exists():
+        if settings.is_done(out):
             raise SceneError(f"{out}: is a scene already")
         return work
     partial = out / BEGUN
     if out.exists() and (not out.is_dir() or any(path != partial for path in out.iterdir())):
         raise SceneError(f"{out}: must be a new or empty folder, or the folder of a stopped process")
-    write_text(emptied(partial) / record.name, json.dumps(settings._asdict(), indent=1))
+    write_text(emptied(partial) / RECORD, json.dumps(settings._asdict(), indent=1))
     os.replace(partial, work)
     return work
 

@@ -20,12 +20,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from voronerf.app.files import read_json, write_text
+from voronerf.app.files import leads_outside, read_json, write_text
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.folders import UNREAD, find_files, none_exists
+from voronerf.app.scenes.folders import find_files, none_exists
 from voronerf.app.scenes.images import Header, read_header
 from voronerf.app.scenes.lenses import COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, Lens
-from voronerf.app.scenes.names import is_utf16, plain, split_by_lists, stay_inside
+from voronerf.app.scenes.names import has_masks, plain, split_by_lists, stay_inside
 from voronerf.app.scenes.photographs import CROPPED, ROUNDED, Reading, View, least_factor, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.soundness import some_of
@@ -94,8 +94,6 @@ def read_transforms(path: Path, allow_outside: bool = False, *, all_may_miss: bo
     try:
         entries = read_json(path)
     except ValueError as error:
-        if is_utf16(path):
-            raise SceneError(f"{path}: is not JSON in UTF-8 but UTF-16 text; save it as UTF-8") from None
         raise SceneError(str(error)) from None
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
@@ -117,16 +115,14 @@ def read_transforms(path: Path, allow_outside: bool = False, *, all_may_miss: bo
         lost = [False] * len(frames)  # the error for the first of them follows
     poses = [None if unknown else _scaled_pose(matrix, name) for matrix, name, unknown in zip(matrices, where, lost)]
     names = [plain(frame["file_path"]) for frame in frames]
-    images = [_exact_file(folder, frame["file_path"], allow_outside, name) for frame, name in zip(frames, where)]
-    exact = {name: image for name, image in zip(names, images) if image is not None}
+    exact = {name: file for frame, name in zip(frames, names) if (file := _exact_file(folder, frame["file_path"]))}
+    inside = {name: file for name, file in exact.items() if allow_outside or not leads_outside(file, folder)}
     split = path.name != "transforms.json"  # otherwise a missing test/r_0.png might be taken for train/r_0.png
-    files = find_files(path, folder, names, exact, of_one_folder=split)
-    for file in set(files.values()) - set(exact.values()):
-        stay_inside(file, folder, allow_outside)
-    images = [
-        files.get(name) if image is None or image.suffix.lower() in UNREAD else image
-        for name, image in zip(names, images)
-    ]
+    files = find_files(path, folder, names, inside, of_one_folder=split)
+    images = [files.get(name) for name in names]
+    for image, name, text in zip(images, names, where):  # a copy inside of the folder replaces a file outside
+        if file := image or exact.get(name):
+            stay_inside(file, folder, allow_outside, f"{text}: file_path")
     if not any(images) and not all_may_miss:
         raise none_exists(path, folder, [frame["file_path"] for frame in frames])
     views = [
@@ -143,7 +139,7 @@ def read_transforms(path: Path, allow_outside: bool = False, *, all_may_miss: bo
     if missing and present:
         log.warning("%s: %d of %d listed images are missing and are skipped", path, missing, len(frames))
     notes = []
-    if files and not exact:
+    if files and not inside:
         name = next(name for name in names if name in files)
         notes.append(f"no image exists as it is named: {name} is {files[name].relative_to(folder)}, and so on")
     if any(lost):
@@ -204,15 +200,11 @@ def is_text(name: str) -> bool:
     return not any("\ud800" <= char <= "\udfff" for char in name)
 
 
-def _exact_file(folder: Path, name: str, allow_outside: bool, where: str) -> Path | None:
+def _exact_file(folder: Path, name: str) -> Path | None:
     """Returns the file as it is named; Blender's names lack the suffix, and names from Windows may have backslashes."""
-    for spelling in dict.fromkeys((name, name.replace("\\", "/"))):
-        for suffix in SUFFIXES:
-            path = Path(f"{folder / spelling}{suffix}")
-            if os.path.isfile(path):
-                stay_inside(path, folder, allow_outside, f"{where}: file_path")
-                return path
-    return None
+    spellings = dict.fromkeys((name, name.replace("\\", "/")))
+    paths = (Path(f"{folder / spelling}{suffix}") for spelling in spellings for suffix in SUFFIXES)
+    return next((path for path in paths if os.path.isfile(path)), None)
 
 
 def _find_masks(
@@ -237,7 +229,7 @@ def _find_masks(
             exact[plain(name)] = file
     listed = [name for name in names if name is not None]
     files = (
-        find_files(source, folder, listed, exact, of_one_folder=False, all_folders=True, but=images) if listed else {}
+        find_files(source, folder, listed, exact, of_one_folder=False, accepts=has_masks, but=images) if listed else {}
     )
     for (_, where), name in zip(frames, names):
         if name is not None:
@@ -507,7 +499,7 @@ def views_without_images(path: Path, size: tuple[int, int]) -> tuple[list[View],
     """Reads the cameras of a transforms file, in the file's order; their images need not exist.
 
     A camera without ``w`` and ``h`` has the size of its image, if its lens is in pixels and the image exists, or else
-    ``size``.
+    twice its principal point, or else ``size``. Frames without a pose are left out.
 
     Args:
         path: the file.
@@ -517,27 +509,32 @@ def views_without_images(path: Path, size: tuple[int, int]) -> tuple[list[View],
         (the views, the transform float64 [4, 4] from the original coordinates to the coordinates of the poses).
     """
     entries = read_json(path, dict)
-    shared, views = _named_distortion(entries, path), []
+    shared, views = _named_distortion(entries, path), list[View]()
     for position, frame in enumerate(entries["frames"]):
         if not isinstance(frame, dict):
             raise SceneError(f"{path}: frame {position} must be an object, got {frame!r:.60}")
+        is_last = position == len(entries["frames"]) - 1
+        if _is_unknown(frame.get("transform_matrix")) and (views or not is_last):
+            continue
         pose, _ = _scaled_pose(frame.get("transform_matrix"), f"{path}: frame {position}")
         values = {**shared, **_named_distortion(frame, path)}
-        width, height = (
-            number(values, side, path, positive=True) or default
-            for side, default in zip("wh", _image_size(path, values) or size)
-        )
+        stated = [number(values, side, path, positive=True) for side in "wh"]
+        default = (_image_size(path, values) if None in stated else None) or size
+        width, height = (side or other for side, other in zip(stated, default))
         header = Header((max(round(width), 1), max(round(height), 1)))
         views.append(_view(ListedImage(path, pose, path, values), header))
     return views, _applied(entries, path)
 
 
 def _image_size(path: Path, values: dict[str, Any]) -> tuple[int, int] | None:
-    """Returns the size of a frame's image if its lens is in pixels and the image exists in the folder, or None."""
-    name = values.get("file_path")
-    if not isinstance(name, str) or not is_text(name) or not any(values.get(key) for key in ("fl_x", "fl_y", "cx")):
+    """Returns the size of a frame's image in the folder or by its principal point; None for a lens in other units."""
+    name, (cx, cy) = values.get("file_path"), (number(values, key, path, positive=True) for key in ("cx", "cy"))
+    if not any(values.get(key) for key in ("fl_x", "fl_y", "cx", "cy")):
         return None
     with contextlib.suppress(SceneError):
-        image = _exact_file(path.parent, name, False, str(path))
-        return None if image is None else read_header(image).size
-    return None
+        image = _exact_file(path.parent, name) if isinstance(name, str) and is_text(name) else None
+        if image is not None and not leads_outside(image, path.parent):
+            return read_header(image).size
+    if cx is None or cy is None:
+        raise SceneError(f"{path}: must state w and h, or cx and cy, since its lens is in pixels")
+    return round(2 * cx), round(2 * cy)
