@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable
 from typing import Any
@@ -234,8 +235,9 @@ def test_what_would_be_wrong_is_refused_in_one_line(way: str, cold: bool, genera
 def test_batches_of_gradients_are_refused_in_one_line(way: str, generator: torch.Generator) -> None:
     router, x = router_of(net(), generator, **WAYS[way]), torch.rand(64, 3, generator=generator).requires_grad_()
     y = router(x)
-    with pytest.raises(NotImplementedError, match=r"is_grads_batched=True.*once for each gradient"):
-        torch.autograd.grad(y, x, torch.ones(2, *y.shape), is_grads_batched=True)
+    for context in (contextlib.nullcontext(), torch.device("cpu")):  # alone, and with a default device
+        with context, pytest.raises(NotImplementedError, match=r"is_grads_batched=True.*once for each gradient"):
+            torch.autograd.grad(router(x), x, torch.ones(2, *y.shape), is_grads_batched=True)
     with pytest.raises(NotImplementedError, match=r"vectorize=True.*once for each gradient"):
         torch.autograd.functional.jacobian(router, x.detach(), vectorize=True)
     with pytest.raises(NotImplementedError, match=r"jacrev.*once for each gradient"):
