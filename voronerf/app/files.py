@@ -186,7 +186,7 @@ def _read_text(path: Path) -> str:
 
 def is_utf16(start: bytes) -> bool:
     """Returns whether a text that begins with these bytes is UTF-16, as editors on Windows may write it."""
-    return start[:2] in (b"\xff\xfe", b"\xfe\xff") or start[:2].count(0) == 1
+    return start[:2] in (b"\xff\xfe", b"\xfe\xff") or (len(start) > 1 and start[:2].count(0) == 1)
 
 
 def parse_json(text: str) -> Any:

@@ -62,6 +62,25 @@ def test_pictures_become_a_run_with_a_video_and_a_page(tmp_path, monkeypatch, ca
     )
 
 
+def test_a_capture_of_other_pictures_is_not_trained(tmp_path, monkeypatch, pictures, fails):
+    pytest.importorskip("pycolmap", reason="voronerf process needs pycolmap")
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(pictures, "first")
+    # A training that fails after its cameras are found.
+    fails("leaves no pixel", "train --data first --out run --downscale 1000 --process-max-features 300")
+    shutil.copytree(pictures, "second")
+    fails("was started with --source", "train --data second --out run --process-max-features 300")
+    fails(
+        "was started with --process-max-features 300, got 400",
+        "train --data first --out run --process-max-features 400",
+    )
+    for content in ("{", "{}"):  # the record of another run
+        (tmp_path / "runs/first/capture/colmap").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "runs/first/capture/colmap/settings.json").write_text(content)
+        fails("leaves no pixel", "train --data first --downscale 1000 --process-max-features 300")
+    fails("did you mean run/capture?", "train --data run/capture/images")
+
+
 def test_without_cameras_nothing_is_left(tmp_path, monkeypatch, fails):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "photos").mkdir()

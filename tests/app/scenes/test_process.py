@@ -19,11 +19,13 @@ import pytest
 import torch
 from helpers import refuses
 from PIL import ExifTags, Image, ImageOps
+from PIL.TiffImagePlugin import IFDRational
 from scene_files import write_images, write_walls
 
 from voronerf.app.cli import main
 from voronerf.app.scenes import SceneError, gather, load_scene, process
 from voronerf.app.scenes.colmap import read_model
+from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import colmap_lens
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
 from voronerf.nerf.cameras import orbit_cameras
@@ -546,6 +548,7 @@ def numbered(*patterns, first=0, count=3):
             [f"k_corrected_images_{i}.jpg" for i in range(3)],
             [],
         ),
+        (numbered("images/{}.jpg", "corrected_images/{}.jpg"), ["0.jpg", "1.jpg", "2.jpg"], []),
         (numbered("#{}.jpg", "a #{}.jfif"), [*(f"_{i}.jpg" for i in range(3)), *(f"a_#{i}.jpg" for i in range(3))], []),
     ],
 )
@@ -809,6 +812,36 @@ def test_each_lens_has_a_camera(tmp_path, pictures, monkeypatch):
     with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
         taken = {image.name[:-5]: image.camera_id for image in opened.read_all_images()}
     assert len(taken) == len(set(taken.values())) == 4
+
+
+@pytest.mark.parametrize("focal", [0, IFDRational(1, 0), IFDRational(0, 0), -5, "x"])
+def test_focal_lengths_that_tell_nothing(tmp_path, focal):
+    """Manual lenses write 0; then the folder of an image tells its lens."""
+    for name in ("a", "b"):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm if focal == 0 else 37386] = focal
+        picture(1).save(tmp_path / f"{name}.jpg", exif=exif)
+    labels = gather.cameras_of(sorted(tmp_path.iterdir()), {"a.jpg": "left", "b.jpg": "right"})
+    assert [label.partition(", ")[2] for label in labels.values()] == ["in left", "in right"]
+
+
+def test_broken_tags_are_left_out(tmp_path):
+    for suffix in ("png", "webp"):
+        picture(1).save(tmp_path / f"a.{suffix}", exif=b"Exif\0\0junkjunk")
+        copy, _ = gather._copy_image(tmp_path / f"a.{suffix}", tmp_path / f"copy.{suffix}")
+        assert gather.cameras_of([copy], {}) == {copy.name: "{} x {}".format(*read_header(copy).size)}
+
+
+def test_other_files_are_not_taken_for_those_of_a_stopped_process(tmp_path, monkeypatch, pictures):
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    few = tmp_path / "few"
+    few.mkdir()
+    paths = sorted(pictures.iterdir())
+    for path in paths[:4]:
+        shutil.copy(path, few)
+    refuses("finds no model", process.process, few, tmp_path / "out", error=SceneError)
+    shutil.copy(paths[4], few)
+    refuses("was started with other files in", process.process, few, tmp_path / "out", error=SceneError)
 
 
 def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch):

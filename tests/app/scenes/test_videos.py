@@ -166,7 +166,6 @@ def taken_from(path, **options):
             "is HDR (HLG) and is",
         ),
         (f"{LINEAR},zscale=p=2020,zscale=t=smpte2084:m=2020_ncl:npl=203,format=yuv420p10le", "is HDR (PQ) and is tone"),
-        ("format=yuv420p,setparams=color_primaries=smpte432:color_trc=bt1361e,crop=239:79", "smpte432, which are"),
         (f"{HD},setfield=tff,setparams=field_mode=tff", "is interlaced: one of two lines is interpolated"),
     ],
 )
@@ -176,6 +175,22 @@ def test_frames_have_the_colours_of_the_video(tmp_path, filters, line):
     middles = image[40, 20::40].astype(int)
     assert np.abs(middles - COLOURS).max() <= 8, middles.tolist()
     assert line in said and bool(line) == ("a.mkv: " in said.replace("all 2 frames", ""))
+
+
+@pytest.mark.parametrize(
+    ("tags", "line"),
+    [
+        ("color_primaries=smpte432:color_trc=bt1361e", "has colours of smpte432"),
+        ("color_primaries=bt2020", "has colours of bt2020"),
+        ("color_trc=smpte2084:colorspace=bt709", "is HDR (PQ)"),
+        ("color_trc=arib-std-b67", "is HDR (HLG)"),
+    ],
+)
+def test_incomplete_tags_of_wide_colours(tmp_path, tags, line):
+    Image.fromarray(chart(234, 79)[:, :233]).save(tmp_path / "chart.png")
+    convert(tmp_path / "chart.png", tmp_path / "a.mkv", "-vf", f"format=yuv420p10le,setparams={tags}", "-c:v", "ffv1")
+    image, said = taken_from(tmp_path / "a.mkv")
+    assert image.shape == (79, 233, 3) and line in said
 
 
 def test_large_videos_without_tags_have_the_colours_of_hd(tmp_path):
@@ -211,7 +226,8 @@ def test_several_videos_share_the_frames_by_their_lengths(tmp_path):
     said = []
     out, options = tmp_path / "frames", {"say": said.append, "progress": lambda *_: None}
     places = gather.gather(paths, out.with_name("a"), tmp_path / "masks", 5, **options)
-    assert places == {**{f"1_0000{n}.jpg": "GX02.MP4" for n in range(1, 5)}, "2_00001.jpg": "GX01.MP4"}
+    first = {f"1_0000{n}.jpg": "video 1, GX02.MP4" for n in range(1, 5)}
+    assert places == {**first, "2_00001.jpg": "video 2, GX01.MP4"}
     assert steps_of(out.with_name("a")) == [2, 7, 12, 17, 46] and not said
     (tmp_path / "in/GX01.THM").write_bytes(b"")
     assert len(gather.gather(tmp_path / "in", out, tmp_path / "masks", 150, **options)) == 25
