@@ -11,6 +11,8 @@ from torch import nn
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
 
 FOLDER = Path(__file__).resolve().parent
+# Long tests of the same code in threads, modes of torch and conventions of axes.
+LONG = ("test_conventions.py", "test_router_inference.py", "test_router_threads.py")
 # Tests of torch.compile, which cannot trace the mode of --device-in-package.
 LEFT_OUT = (
     "test_call_cache.py::test_known_calls_are_part_of_a_graph",
@@ -91,6 +93,7 @@ def test_changes_of_cells_with_another_default_device(meta):
 def test_all_tests_with_another_default_device_in_the_package():
     """Runs the other quick tests; functions of the package see the default device meta, and the tests the CPU."""
     options = ("-q", "-m", "not slow", "-p", "no:cacheprovider", "--device-in-package", "meta")
-    left_out = [option for name in LEFT_OUT for option in ("--deselect", f"tests/router/{name}")]
+    left_out = [f"--ignore={FOLDER / name}" for name in LONG]
+    left_out += [option for name in LEFT_OUT for option in ("--deselect", f"tests/router/{name}")]
     said = python("-m", "pytest", *options, *left_out, FOLDER, cwd=FOLDER.parents[1], timeout=3600)
     assert re.search(r"[1-9]\d{2,} passed", said), said
