@@ -279,7 +279,7 @@ def _is_upright(view: View) -> bool:
 def _as_stored(view: View) -> View:
     """Returns a view of a scene with cameras of upright pictures; its camera is turned to the stored picture.
 
-    The camera of a square picture, or of one that is upside down, may be that of either picture, and is turned, too.
+    The camera of a square picture, or of one that is upside down, fits both pictures, and is turned, too.
     """
     assert view.header is not None
     turns = view.header.turns
