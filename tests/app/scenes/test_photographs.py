@@ -458,6 +458,46 @@ def test_a_path_of_this_machine_that_leads_outside_is_read_only_inside(tmp_path)
     assert len(load_scene(scene, allow_outside=True).train) == 7
 
 
+def test_pictures_of_runs_and_depths_are_not_photographs(tmp_path):
+    """A run of the scene has the scene's name, and panels with the names of its test images in `images`."""
+    folder = tmp_path / "scan"
+    names = [f"/home/me/scan/images/{index:02d}.jpg" for index in range(9)]
+    write_listed(folder, names, [f"rgb/{index:02d}.jpg" for index in range(9)])
+    for other in ("runs/scan/images", "normals", "depth_maps", "images_2"):
+        (folder / other).mkdir(parents=True)
+        for index in range(9 if other != "runs/scan/images" else 2):
+            Image.new("RGB", SIZE, (250, 0, 0)).save(folder / other / f"{index:02d}.png")
+    (folder / "runs/scan/checkpoints").mkdir()
+    check_listed(folder, 9)
+    (folder / "rgb").rename(folder / "images")
+    check_listed(folder, 9)
+
+
+def test_a_mask_beside_the_pictures_is_no_missing_picture(tmp_path, caplog):
+    write_listed(tmp_path, [f"{index:02d}.jpg" for index in range(9)], [f"{index:02d}.jpg" for index in range(9)])
+    (tmp_path / "03.jpg").rename(tmp_path / "03.jpg.png")
+    check_listed(tmp_path, 8)
+    assert "1 of 9 listed images are missing" in caplog.text
+
+
+def test_missing_masks_are_not_replaced_by_depths(tmp_path):
+    write_listed(tmp_path, [f"images/{index}.png" for index in range(9)], [f"images/{index}.png" for index in range(9)])
+    rewrite(
+        tmp_path, lambda entries: [frame.update(mask_path=f"mask/{k}.png") for k, frame in enumerate(entries["frames"])]
+    )
+    shutil.copytree(tmp_path / "images", tmp_path / "depths")
+    refuses("frame 0 (images/0.png): its mask", load_scene, tmp_path, error=SceneError)
+    (tmp_path / "depths").rename(tmp_path / "my_masks")
+    Image.new("L", SIZE, 255).save(tmp_path / "my_masks/0.png")
+    assert load_scene(tmp_path).train.masks is not None
+
+
+def test_long_names(tmp_path):
+    names = [f"{index}{240 * 'n'}.png" for index in range(9)]
+    write_listed(tmp_path, names, names)
+    check_listed(tmp_path, 9)
+
+
 def test_masks_of_another_machine(tmp_path):
     write_listed(
         tmp_path,
@@ -552,6 +592,16 @@ def test_cameras_of_upright_pictures(tmp_path, tag, model, lens, scale):
             torch.testing.assert_close(rays[0].directions, rays[1].directions, atol=2e-6, rtol=0)
             torch.testing.assert_close(rays[0].origins, rays[1].origins, atol=1e-6, rtol=0)
     assert torch.equal(plain.train.sparse_depth.pixels, tagged.train.sparse_depth.pixels)
+    other = tmp_path / "tagged/images/04.jpg"  # upside down: the other cameras tell that its camera is upright, too
+    upright = np.asarray(Image.open(tmp_path / "plain/images/04.png"))
+    exif[0x0112] = 3
+    Image.fromarray(np.rot90(upright, 2)).save(other, exif=exif, quality=100, subsampling=0)
+    mixed = load_scene(tmp_path / "tagged", downscale=1).train
+    rays = [split.cameras.image_rays(3) for split in (plain.train, mixed)]
+    torch.testing.assert_close(rays[0].directions, rays[1].directions, atol=2e-6, rtol=0)
+    other.unlink()
+    exif[0x0112] = tag
+    Image.fromarray(np.rot90(upright, -turns)).save(other, exif=exif, quality=100, subsampling=0)
     tagged = load_scene(tmp_path / "tagged", downscale=3).train.cameras  # drops a column of the stored pictures
     full = plain.train.cameras
     assert (tagged.width, tagged.height) == (3, 4)

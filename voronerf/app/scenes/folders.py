@@ -287,8 +287,11 @@ def _in_numeric_order(paths: Sequence[Path | str]) -> bool:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Returns the image files of a folder and its subfolders, sorted by path."""
-    files = (path for path in folder.rglob("*") if _is_image(path))
+    """Returns the image files of a folder and its subfolders, except for the pictures of runs, sorted by path."""
+    files: list[Path] = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not (Path(place, name) / "checkpoints").is_dir()]
+        files += (path for name in names if _is_image(path := Path(place, name)))
     return sorted(files, key=lambda path: path.relative_to(folder).as_posix())
 
 

@@ -25,7 +25,7 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import find_files, none_exists
 from voronerf.app.scenes.images import Header, read_header
 from voronerf.app.scenes.lenses import COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, Lens
-from voronerf.app.scenes.names import has_masks, plain, split_by_lists, stay_inside
+from voronerf.app.scenes.names import SUFFIX, has_masks, plain, split_by_lists, stay_inside
 from voronerf.app.scenes.photographs import CROPPED, ROUNDED, Reading, View, least_factor, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.soundness import some_of
@@ -203,7 +203,8 @@ def is_text(name: str) -> bool:
 def _exact_file(folder: Path, name: str) -> Path | None:
     """Returns the file as it is named; Blender's names lack the suffix, and names from Windows may have backslashes."""
     spellings = dict.fromkeys((name, name.replace("\\", "/")))
-    paths = (Path(f"{folder / spelling}{suffix}") for spelling in spellings for suffix in SUFFIXES)
+    suffixes = SUFFIXES[:1] if SUFFIX.search(name) else SUFFIXES  # 0.jpg.png is a mask of 0.jpg
+    paths = (Path(f"{folder / spelling}{suffix}") for spelling in spellings for suffix in suffixes)
     return next((path for path in paths if os.path.isfile(path)), None)
 
 
