@@ -8,7 +8,6 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from voronerf.app.cli.opening import Opening
 from voronerf.app.cli.parsing import field_docs, group_name
 from voronerf.app.cli.program import COMMANDS
 from voronerf.app.train.config import TrainConfig
@@ -40,8 +39,10 @@ def train_tables() -> list[str]:
 
 def settings(kind: type) -> list[str]:
     """Returns a row for each field of a dataclass."""
-    texts, kinds = field_docs(kind), get_type_hints(kind)
-    return [row(f"--{dashed(f.name)}", kinds[f.name], f.default, texts[f.name]) for f in dataclasses.fields(kind)]
+    texts, kinds, prefix = field_docs(kind), get_type_hints(kind), getattr(kind, "prefix", "")
+    return [
+        row(f"--{dashed(prefix + f.name)}", kinds[f.name], f.default, texts[f.name]) for f in dataclasses.fields(kind)
+    ]
 
 
 def table(function: Callable[..., Any], arguments: str) -> list[str]:
@@ -52,8 +53,8 @@ def table(function: Callable[..., Any], arguments: str) -> list[str]:
     for name, parameter in inspect.signature(function).parameters.items():
         if kinds[name] is TrainConfig:
             continue
-        if kinds[name] is Opening:
-            lines += settings(Opening)
+        if dataclasses.is_dataclass(kinds[name]):
+            lines += settings(kinds[name])
             continue
         positional = parameter.kind is parameter.POSITIONAL_ONLY
         shown = next(
