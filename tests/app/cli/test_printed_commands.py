@@ -48,6 +48,7 @@ STAND_INS = {
     "JOINED": "made",
     "FILE": "path.json",
     "FILE.json": "path.json",
+    "walk.mp4": "scene",  # test_one_command.py finds cameras
 }
 #: Commands that other tests run, with the files of these tests.
 ELSEWHERE = {"process": "tests/app/scenes/test_process.py", "demo": "tests/app/cli"}
