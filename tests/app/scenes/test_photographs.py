@@ -469,6 +469,10 @@ def test_pictures_of_runs_and_depths_are_not_photographs(tmp_path):
             Image.new("RGB", SIZE, (250, 0, 0)).save(folder / other / f"{index:02d}.png")
     (folder / "runs/scan/checkpoints").mkdir()
     check_listed(folder, 9)
+    (folder / "images").mkdir()
+    Image.new("RGB", SIZE).save(folder / "images/thumbnail.png")
+    check_listed(folder, 9)
+    shutil.rmtree(folder / "images")
     (folder / "rgb").rename(folder / "images")
     check_listed(folder, 9)
 

@@ -137,19 +137,19 @@ def compare_tails(
     bases = Counter(base for group in listed.values() for base in group)
     of_one_folder = of_one_folder or max(bases.values(), default=1) > 1
     keys = {folder: set().union(*map(_keys, group)) for folder, group in inside.items()}
-    alike = defaultdict(list)
-    for folder in inside:
-        alike[tuple(_parts(folder)[:1])].append(folder)
+    parts, alike = {folder: _parts(folder) for folder in inside}, defaultdict(list)
+    for folder, names_inside in parts.items():
+        alike[tuple(names_inside[:1])].append(folder)
     choices = []
     for folder, group in listed.items():
-        scores = {}
-        for other in alike.get(tuple(_parts(folder)[:1])) or ([] if of_one_folder else inside):
-            pairs = zip(_parts(folder), _parts(other))
-            tail = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
-            rest = _parts(other)[tail:]
-            count = sum(not keys[other].isdisjoint(_keys(base)) for base in group)
-            if count and accepts(tail, rest):
-                scores[other] = (count, tail, not any(map(COPIES.fullmatch, rest)), -len(rest))
+        names_of, scores = _parts(folder), dict[str, tuple[int, int, bool, int]]()
+        for others in (alike[tuple(names_of[:1])], () if of_one_folder else inside):
+            for other in others if not scores else ():
+                tail = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(names_of, parts[other])))
+                rest = parts[other][tail:]
+                count = sum(not keys[other].isdisjoint(_keys(base)) for base in group)
+                if count and accepts(tail, rest):
+                    scores[other] = (count, tail, not any(map(COPIES.fullmatch, rest)), -len(rest))
         if scores:
             top = max(scores.values())
             choices.append((top, folder, [other for other, score in scores.items() if score == top]))
