@@ -304,16 +304,16 @@ def test_images_outside_of_the_folder(tmp_path, kind):
     elif kind == "linked folder":
         (scene / "images").symlink_to(elsewhere)
     elif kind == "suffix":
-        (scene / "1.png.JPG").symlink_to(elsewhere / "1.png")
+        (scene / "1.JPG").symlink_to(elsewhere / "1.png")
     named = {"above": "a/../../elsewhere/1.png", "absolute": str(elsewhere / "1.png"), "linked folder": "images/1.png"}
-    named["backslash"] = "..\\elsewhere\\1.png"
+    named |= {"backslash": "..\\elsewhere\\1.png", "suffix": "1"}
     name = named.get(kind, "1.png")
     (scene / "a").mkdir()
     rewrite(scene, lambda contents: contents["frames"][1].update(file_path=name))
     fails(scene, f"transforms.json: frame 1 ({name}): file_path: must lie in the folder of the scene")
     assert len(load_scene(scene, allow_outside=True).train.names) == 2
     (tmp_path / "link").symlink_to(scene)  # the scene folder itself may be a link
-    (scene / "1.png.JPG").unlink(missing_ok=True)
+    (scene / "1.JPG").unlink(missing_ok=True)
     (scene / "1.png").unlink(missing_ok=True)
     (elsewhere / "1.png").rename(scene / "1.png")
     rewrite(scene, lambda contents: contents["frames"][1].update(file_path="1.png"))
