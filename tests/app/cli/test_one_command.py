@@ -82,6 +82,7 @@ def test_a_capture_of_other_pictures_is_not_trained(tmp_path, monkeypatch, pictu
 
 
 def test_without_cameras_nothing_is_left(tmp_path, monkeypatch, fails):
+    pytest.importorskip("pycolmap", reason="voronerf process needs pycolmap")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (32, 32)).save("photos/0.jpg")
