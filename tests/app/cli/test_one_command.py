@@ -97,6 +97,13 @@ def test_without_cameras_nothing_is_left(tmp_path, monkeypatch, fails):
     fails("did you mean --process-frames?", "train --data photos --process-frame 3")
 
 
+def test_lines_name_the_options_of_the_command():
+    with process.prefixed_options(process.AS_IN_PROCESS) as renamed:
+        assert renamed("fewer than --frames 150 (--budget)") == "fewer than --process-frames 150 (--budget)"
+    with process.prefixed_options(process.ProcessSettings()) as renamed:
+        assert renamed("fewer than --frames 150") == "fewer than --frames 150"
+
+
 def test_one_line_names_what_is_missing(tmp_path, monkeypatch, pictures, fails):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "pycolmap", None)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import sys
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from datetime import timedelta
 from pathlib import Path
 from typing import Literal
@@ -17,6 +19,7 @@ from rich.text import Text
 
 from voronerf.app.cli.display import console, say
 from voronerf.app.cli.opening import check_counts
+from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.process import MAPPER
 from voronerf.app.scenes.process import process as make_scene
 
@@ -24,6 +27,8 @@ from voronerf.app.scenes.process import process as make_scene
 @dataclass(frozen=True)
 class ProcessSettings:
     """The search for the cameras of images."""
+
+    prefix = ""  # of the options
 
     frames: int = 150
     """Number of evenly spaced frames to take from the videos; all frames if they have fewer."""
@@ -47,7 +52,7 @@ class ProcessSettings:
 class CaptureSettings(ProcessSettings):
     """The search for cameras if --data is a video or a folder of pictures without cameras, as in voronerf process."""
 
-    prefix = "process_"  # of the options
+    prefix = "process_"
 
 
 AS_IN_PROCESS = CaptureSettings()
@@ -76,8 +81,8 @@ def find_cameras(sources: Sequence[Path], out: Path, settings: ProcessSettings) 
     check_counts(frames=settings.frames, max_features=settings.max_features, size=settings.size)
     display = StageDisplay()
     try:
-        with display.progress:
-            make_scene(sources, out, **vars(settings), say=say, progress=display.show)
+        with display.progress, prefixed_options(settings) as renamed:
+            make_scene(sources, out, **vars(settings), say=lambda line: say(renamed(line)), progress=display.show)
     except (KeyboardInterrupt, SystemExit) as stop:  # Ctrl-C, SIGTERM
         say("stopped; continue with the same command")
         status = stop.code if isinstance(stop, SystemExit) and isinstance(stop.code, int) else 130
@@ -86,6 +91,20 @@ def find_cameras(sources: Sequence[Path], out: Path, settings: ProcessSettings) 
             os._exit(status)  # COLMAP's thread still runs, and would crash when Python's shutdown frees its memory
         return status
     return 0
+
+
+@contextlib.contextmanager
+def prefixed_options(settings: ProcessSettings) -> Iterator[Callable[[str], str]]:
+    """A context in which errors name the options as the command does; yields a function that renames them in a text."""
+    names = "|".join(field.name.replace("_", "-") for field in fields(settings))
+
+    def renamed(text: str) -> str:
+        return re.sub(rf"--(?=({names})\b)", f"--{settings.prefix.replace('_', '-')}", text)
+
+    try:
+        yield renamed
+    except SceneError as error:
+        raise SceneError(renamed(str(error))) from None
 
 
 #: Width of a bar in characters; it fits beside the longest name of a stage in 80 columns.

@@ -9,13 +9,12 @@ import importlib.util
 import inspect
 import itertools
 import os
-import re
 import shlex
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -25,7 +24,7 @@ import tyro
 
 from voronerf.app.cli.display import TrainingDisplay, busy, exit_on_sigterm, say, tracked
 from voronerf.app.cli.export import export
-from voronerf.app.cli.process import AS_IN_PROCESS, CaptureSettings, find_cameras
+from voronerf.app.cli.process import AS_IN_PROCESS, CaptureSettings, find_cameras, prefixed_options
 from voronerf.app.cli.render import render
 from voronerf.app.cli.view import import_viewer
 from voronerf.app.evaluate.lpips import find_lpips
@@ -199,12 +198,9 @@ def with_cameras(config: TrainConfig, settings: CaptureSettings) -> tuple[TrainC
             stack.callback(_remove_empty, chosen.out)
         stack.enter_context(held(chosen.out))
         stack.enter_context(exit_on_sigterm())
-        try:
+        with prefixed_options(settings):
             is_made = (capture / "colmap" / RECORD).is_file() and wanted.is_done(capture)
-            status = 0 if is_made else find_cameras([source], capture, settings)
-        except SceneError as error:
-            options = "|".join(field.name.replace("_", "-") for field in fields(settings))
-            raise SceneError(re.sub(rf"--(?=({options})\b)", "--process-", str(error))) from None
+        status = 0 if is_made else find_cameras([source], capture, settings)
     return replace(chosen, data=str(capture)), status
 
 

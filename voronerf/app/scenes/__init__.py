@@ -77,11 +77,6 @@ def is_builtin(source: str | Path | None) -> bool:
     return str(source).partition(":")[0] in (BUILTIN, CITY)
 
 
-def has_images(folder: Path) -> bool:
-    """Returns whether a folder has images, with or without cameras."""
-    return any(path.suffix.lower() in (*SUFFIXES, *CONVERTED) for path in folder.iterdir())
-
-
 def _formats_of(folder: Path) -> list[str]:
     """Returns the names of the formats in which a folder holds a scene."""
     return [name for name, item in FORMATS.items() if item.is_used_by(folder)]
@@ -191,10 +186,10 @@ def load_scene(
         formats.append("colmap")
     if not formats:
         message = f"{folder}: is not a scene: it has none of {', '.join(item.sign for item in FORMATS.values())}"
-        photographs = next((item for item in (folder, folder / "images") if item.is_dir() and has_images(item)), None)
         if _formats_of(folder.resolve().parent):
             message += f"; did you mean {folder.parent}?"
-        elif photographs:
+        elif needs_cameras(folder):
+            photographs = inner if (inner := folder / "images").is_dir() else folder
             message += f"; voronerf process {photographs} DIR finds the cameras of its images"
         raise SceneError(message)
     if format != "auto" and format not in formats:

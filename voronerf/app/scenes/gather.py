@@ -107,7 +107,7 @@ def gather(
                 say(f"{folder}: has no images; frames are taken from {some_of(names)}")
     if clips:
         progress("images", 0, 0)
-        places = _take_clips(clips, images, frames, say)
+        places = _take_frames(clips, images, frames, say)
     if repeats := _remove_repeats(images):
         say(f"{folder}: {len(repeats)} byte-identical copies of images are left out: {some_of(repeats)}")
     names = [path.name for path in listed_images(images)]
@@ -441,17 +441,15 @@ def _colour_filters(frame: Mapping[str, str], bright: float) -> tuple[list[str],
     return [*filters, "=".join(("scale", ":".join(scale))).rstrip("=")], notes
 
 
-def _take_frames(video: Path, folder: Path, count: int, say: Callable[[str], None]) -> None:
-    """Writes evenly spaced frames of a video as JPEG to a folder, none of them twice."""
-    _take_clips([video], folder, count, say)
+def _take_frames(source: Path | Sequence[Path], folder: Path, count: int, say: Callable[[str], None]) -> dict[str, str]:
+    """Writes evenly spaced frames of a video or videos as JPEG to a folder, none of them twice.
 
-
-def _take_clips(paths: Sequence[Path], folder: Path, count: int, say: Callable[[str], None]) -> dict[str, str]:
-    """Writes evenly spaced frames of videos as JPEG to a folder, and returns the video of each frame by its name.
+    Returns the video of each frame by the frame's name.
 
     Each video has its share of ``count`` frames by its length, but at least one. If there are several videos, the
     frames' names begin with a video's number.
     """
+    paths = [source] if isinstance(source, Path) else source
     videos = [_open_video(path) for path in paths]
     ends = np.cumsum([0, *(video.packets for video in videos)])
     shares = np.diff(np.rint(count * ends / ends[-1])).astype(int).clip(1).tolist()
