@@ -69,10 +69,10 @@ def test_a_capture_of_other_pictures_is_not_trained(tmp_path, monkeypatch, pictu
     # A training that fails after its cameras are found.
     fails("leaves no pixel", "train --data first --out run --downscale 1000 --process-max-features 300")
     shutil.copytree(pictures, "second")
-    fails("was started with --source", "train --data second --out run --steps 1 --process-max-features 300")
+    fails("was started with --source", "train --data second --out run --explain --process-max-features 300")
     fails(
         "was started with --process-max-features 300, got 400",
-        "train --data first --out run --steps 1 --process-max-features 400",
+        "train --data first --out run --explain --process-max-features 400",
     )
     for content in ("{", "{}"):  # the record of another run
         (tmp_path / "runs/first/capture/colmap").mkdir(parents=True, exist_ok=True)
