@@ -126,8 +126,9 @@ class Run:
             track: Function that shows progress: it yields the items of a sequence, and takes the sequence's name.
 
         Returns:
-            A dict with the mean "psnr" in dB, "ssim" and "lpips" (None without weights), "psnr_of_mean_error", and
-            "views", a list with "name", "psnr", "ssim" and "lpips" of each view.
+            A dict with the mean "psnr" in dB, "ssim" and "lpips" (None without weights), "psnr_of_mean_error",
+            "far_views", and "views", a list with the values of a :class:`voronerf.app.evaluate.ViewScore` for each
+            view.
         """
         if not isinstance(lpips, Lpips):
             lpips, _ = self.find_lpips(lpips)

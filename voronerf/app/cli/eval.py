@@ -10,6 +10,7 @@ from rich.table import Table
 
 from voronerf.app.cli.display import console, printable, say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Opening, check_counts
+from voronerf.app.evaluate.angles import FAR_ANGLE
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import json_text, write_text
 from voronerf.app.train.config import ConfigError
@@ -42,13 +43,17 @@ def evaluate_run(
     if metric is None:
         say(source)
     result = opened.evaluate(views=views, lpips=metric or "off", track=tracked)
-    table = Table("view", "PSNR, dB", "SSIM", "LPIPS")
+    table = Table("view", "PSNR, dB", "SSIM", "LPIPS", "angle")
     for view in result["views"]:
         table.add_row(escape(printable(view["name"])), *_figures(view))
     table.add_section()
     table.add_row("mean", *_figures(result))
     console.print(table)
     say(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB")
+    say(
+        f"{result['far_views']} of {len(result['views'])} views are over {FAR_ANGLE:g} degrees from the training "
+        "cameras (angle: from the nearest training camera, at the surfaces of the view)"
+    )
     if is_cut(run):
         say(
             f"{run} was cut: its pictures are empty outside of the part that is left, but are compared with whole "
@@ -63,5 +68,6 @@ def evaluate_run(
 
 def _figures(score: dict[str, Any]) -> list[str]:
     """Formats the scores of a view for the table; a missing score is a dash."""
-    places = {"psnr": 2, "ssim": 4, "lpips": 4}
-    return ["-" if score[name] is None else f"{score[name]:.{digits}f}" for name, digits in places.items()]
+    places = {"psnr": 2, "ssim": 4, "lpips": 4, "angle": 1}
+    values = {name: score.get(name) for name in places}
+    return ["-" if value is None else f"{value:.{places[name]}f}" for name, value in values.items()]

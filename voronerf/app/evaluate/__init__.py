@@ -3,6 +3,7 @@
 Pictures are in ``panels``, ``plots`` and ``video``, which import matplotlib, Pillow or ffmpeg.
 """
 
+from voronerf.app.evaluate.angles import nearest_angle
 from voronerf.app.evaluate.lpips import Lpips, LpipsError, find_lpips
 from voronerf.app.evaluate.metrics import psnr, ssim
 from voronerf.app.evaluate.scores import ViewScore, evaluate, mean_scores
@@ -14,6 +15,7 @@ __all__ = [
     "evaluate",
     "find_lpips",
     "mean_scores",
+    "nearest_angle",
     "psnr",
     "ssim",
 ]

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from voronerf.app.evaluate.angles import FAR_ANGLE, nearest_angle
 from voronerf.app.evaluate.lpips import Lpips
 from voronerf.app.evaluate.metrics import psnr, ssim
 from voronerf.app.render.camera import crop_camera, render_camera
@@ -29,16 +30,19 @@ def in_silence(items: Sequence[Any], name: str) -> Iterable[Any]:
 class ViewScore:
     """PSNR in dB, SSIM and LPIPS (None without its weights) of one view, composited on the scene's background.
 
+    ``angle`` is the angle in degrees between the view and the nearest training camera, see :func:`nearest_angle`.
+
     Examples:
         >>> from voronerf.app.evaluate import ViewScore
         >>> ViewScore("r_0", psnr=30.0, ssim=0.95)
-        ViewScore(name='r_0', psnr=30.0, ssim=0.95, lpips=None)
+        ViewScore(name='r_0', psnr=30.0, ssim=0.95, lpips=None, angle=None)
     """
 
     name: str
     psnr: float
     ssim: float
     lpips: float | None = None
+    angle: float | None = None
 
 
 def view_numbers(count: int, views: int | None) -> list[int]:
@@ -98,8 +102,8 @@ def evaluate(
             colour = torch.where(mask[..., None], colour, target)
             noise = psnr(colour[mask][None], target[mask][None])
         distance = None if lpips is None else float(lpips(colour, target))
-        name = scene.test.names[view]
-        scores.append(ViewScore(name, float(noise), float(ssim(colour, target)), distance))
+        angle = nearest_angle(image, camera, 0, scene.train.cameras)
+        scores.append(ViewScore(scene.test.names[view], float(noise), float(ssim(colour, target)), distance, angle))
     return scores
 
 
@@ -119,7 +123,8 @@ def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
     """Averages the scores over the views, like the tables in the literature.
 
     "psnr_of_mean_error" is the PSNR of the mean squared error over all views, as in the paper's curves; it is never
-    above the mean of the PSNRs. "lpips" is None unless every view has one.
+    above the mean of the PSNRs. "lpips" is None unless every view has one. "far_views" is the number of views more than
+    `FAR_ANGLE` degrees from every training camera.
 
     Examples:
         >>> from voronerf.app.evaluate import ViewScore, mean_scores
@@ -134,4 +139,5 @@ def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
         "ssim": sum(s.ssim for s in scores) / len(scores),
         "lpips": sum(distances) / len(scores) if len(distances) == len(scores) else None,
         "psnr_of_mean_error": math.inf if error == 0 else -10 * math.log10(error),
+        "far_views": sum(s.angle is not None and s.angle > FAR_ANGLE for s in scores),
     }

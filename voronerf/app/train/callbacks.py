@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 
+from voronerf.app.evaluate.angles import FAR_ANGLE
 from voronerf.app.evaluate.lpips import Lpips
 from voronerf.app.evaluate.scores import Track, ViewScore, evaluate, in_silence, mean_scores, view_numbers
 from voronerf.app.files import json_text, write_bytes, write_text
@@ -43,7 +44,7 @@ PARTS = 8
 #: Side of the corner of a view on which LPIPS is timed.
 LPIPS_PROBE = 128
 #: The entries of the last evaluation that are copied to summary.json.
-FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views", "part")
+FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "far_views", "views", "part")
 #: Number of consecutive skipped steps after which a training has diverged.
 PATIENCE = 10
 #: Drop of the PSNR from its best value, in dB, that counts as a collapse.
@@ -289,6 +290,7 @@ class Scores(Callback):
             "views": len(scores),
             "part": 1 / middle**2,
             **mean_scores(scores),
+            "scores": [asdict(score) for score in scores],
         }
         self.metrics = [line for line in self.metrics if line["step"] < state.step] + [entry]
         if self.out is not None:
@@ -307,10 +309,11 @@ class Scores(Callback):
 
 def views_of(scores: Mapping[str, Any]) -> str:
     """Describes the scored views, such as "3 views" or "the middle 6% of 1 view"; empty if unknown."""
-    views, part = scores.get("views"), scores.get("part", 1)
+    views, part, far = scores.get("views"), scores.get("part", 1), scores.get("far_views", 0)
     if not isinstance(views, int) or not isinstance(part, int | float):
         return ""
-    return f"the middle {part:.0%} of " * (part < 1) + counted(views, "view")
+    distant = f", {far} over {FAR_ANGLE:g} degrees from the training cameras" if far else ""
+    return f"the middle {part:.0%} of " * (part < 1) + counted(views, "view") + distant
 
 
 def counted(count: int, noun: str) -> str:
