@@ -24,10 +24,10 @@ from scene_files import write_images, write_walls
 
 from voronerf.app.cli import main
 from voronerf.app.scenes import SceneError, gather, load_scene, process
-from voronerf.app.scenes.colmap import read_model
+from voronerf.app.scenes.colmap import ColmapCamera, ColmapImage, ColmapModel, read_model
 from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import colmap_lens
-from voronerf.app.scenes.soundness import camera_faults, lost_cameras
+from voronerf.app.scenes.soundness import camera_faults, lost_cameras, spread_of_lenses
 from voronerf.nerf.cameras import orbit_cameras
 
 pycolmap = pytest.importorskip("pycolmap", reason="voronerf process needs pycolmap")
@@ -271,6 +271,35 @@ def test_a_lost_camera_is_named_left_out_and_another_mapper_is_tried(tmp_path, p
         assert len(names) == kept and ("05_a.png" in names) == (mapper == "auto")
         assert len(json.loads((out / "transforms.json").read_text())["frames"]) == kept
         assert f"cameras of {kept} of {COUNT} images" in said[-1]
+
+
+def test_a_camera_that_determines_its_lens_alone_needs_more_points(tmp_path):
+    shared, alone = (
+        ColmapCamera("SIMPLE_RADIAL", colmap_lens("SIMPLE_RADIAL", (focal, 120, 90, k)), 240, 180)
+        for focal, k in ((200, 0.0), (150, -0.424))
+    )
+    points = np.arange(400)
+
+    def lost(held, lenses):
+        poses = np.tile(np.eye(4), (len(held), 1, 1))
+        poses[:, :3, 3] = circle(len(held)).numpy()
+        images = [
+            ColmapImage(f"{i}.png", lens, pose, points[:count])
+            for i, (count, lens, pose) in enumerate(zip(held, lenses, poses, strict=True))
+        ]
+        return process._lost(ColmapModel(tmp_path, images, points, np.zeros((400, 3))))
+
+    others = [shared] * 10
+    reason = "alone with its lens, and held by 31 points, others by 400"
+    assert lost([400] * 10 + [31], [*others, alone]) == {"10.png": reason}
+    assert not lost([400] * 10 + [31], [*others, shared]) and not lost([400] * 10 + [100], [*others, alone])
+
+
+def test_lenses_of_one_device_have_similar_focal_lengths():
+    lenses = [(colmap_lens("PINHOLE", (focal, focal, 192, 144)), 384) for focal in (180, 250, 376)]
+    assert "each of 3 images has its own lens, with focal lengths from 0.47 to 0.98" in spread_of_lenses(lenses)
+    assert not spread_of_lenses(lenses * 2) and not spread_of_lenses(lenses[:2]) and not spread_of_lenses([])
+    assert not spread_of_lenses([(lens, side) for (lens, _), side in zip(lenses, (300, 410, 610))])
 
 
 def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):

@@ -24,7 +24,7 @@ from voronerf.app.scenes.images import DYNAMIC_MASK, OPAQUE, Decoded, Header, re
 from voronerf.app.scenes.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Lens, have_rays
 from voronerf.app.scenes.names import listed_split, stay_inside
 from voronerf.app.scenes.scene import KnownDepths, Scene, Split
-from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
+from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of, spread_of_lenses
 from voronerf.nerf.cameras import Cameras, focus_point, shared_focus
 from voronerf.nerf.contraction import Contraction, Perspective
 
@@ -207,6 +207,8 @@ def photograph_scene(
         for part in (slice(count), slice(count, None))
     )
     faults = camera_faults(places, bounds, ((view.lens, view.size[0]) for view in views))
+    if spread := spread_of_lenses([(view.lens, max(view.size)) for view in views]):
+        faults.append(spread)
     notes = [
         *notes,
         *masked,
@@ -617,7 +619,8 @@ def _masked_by_lenses(
             raise SceneError(f"{views[index].path}: its mask and its lens exclude all pixels")
     valid = torch.cat([valid.flatten() for valid in seen.values()])
     share = 1 - valid.sum().float() / len(valid)
-    return masks, (f"{share:.0%} of the pixels of {len(seen)} images have no ray of their lens, and are masked",)
+    names = some_of([views[index].path.name for index in seen])
+    return masks, (f"{share:.0%} of the pixels of these images have no ray of their lens, and are masked: {names}",)
 
 
 def _circle(view: View, factor: int) -> Tensor:

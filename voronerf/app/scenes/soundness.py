@@ -5,7 +5,7 @@ c cameras, in any coordinates.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -36,6 +36,8 @@ FOCAL_LENGTHS = (0.25, 15.0)
 #: The largest plausible magnitudes of three quantities: the relative difference of fx and fy, the first distortion
 #: coefficient, and the tangential distortion coefficients p1 and p2.
 ASPECT, BENT, TILTED = 0.05, 1.0, 0.05
+#: The largest plausible ratio of the focal lengths of one device, relative to the longer sides of its images.
+SPREAD = 1.25
 
 
 #: The maximum number of names in a line.
@@ -89,6 +91,22 @@ def camera_faults(
         elif max(abs(tilt) for tilt in lens.coefficients[2:4]) > TILTED:
             faults.append(f"a lens is tilted, p1 {lens.coefficients[2]:.3g} and p2 {lens.coefficients[3]:.3g}")
     return list(dict.fromkeys(faults))
+
+
+def spread_of_lenses(lenses: Sequence[tuple[Lens, float]]) -> str:
+    """Returns a phrase about images with a lens each whose focal lengths differ much; empty for plausible lenses.
+
+    Args:
+        lenses: the lens of each image, and the longer side of the image in pixels.
+    """
+    lengths = [lens.intrinsics[0] / side for lens, side in lenses if lens.model != EQUIRECTANGULAR]
+    least, largest = min(lengths, default=1.0), max(lengths, default=1.0)
+    if len({lens for lens, _ in lenses}) < max(len(lenses), 3) or largest < SPREAD * least:
+        return ""
+    return (
+        f"each of {len(lenses)} images has its own lens, with focal lengths from {least:.2f} to {largest:.2f} of the "
+        "longer side; if one lens took them, run voronerf process on the images"
+    )
 
 
 def some_of(names: list[str]) -> str:
