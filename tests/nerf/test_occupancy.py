@@ -264,11 +264,11 @@ def test_holes_in_a_surface_are_filled_where_the_field_is_dense():
         return grid, grid.occupied & ~before
 
     grid, filled = emptied(60.0)
-    assert bool(filled[8, 8, 8]) and bool(filled[10, 8, 8]) and float(grid.density[8, 8, 8]) == 2.0
+    assert bool(filled[8, 8, 8]) and bool(filled[10, 8, 8]) and float(grid.density[8, 8, 8]) == 4.0
     assert bool((radius[filled] < 0.5 + 3**0.5 / 16).all())
-    assert not bool(emptied(1.5)[1].any())  # the density is below twice the threshold
+    assert not bool(emptied(3.0)[1].any())  # the density is below four times the threshold
     # Thresholds apply to density per contracted unit, which is longer in the world away from the centre.
-    contracted = emptied(1.5, Contraction(torch.zeros(3), 0.2))[1]
+    contracted = emptied(3.0, Contraction(torch.zeros(3), 0.2))[1]
     assert bool(contracted[10, 8, 8]) and not bool(contracted[8, 8, 8])
 
 

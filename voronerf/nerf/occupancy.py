@@ -48,8 +48,8 @@ DECAY = 0.8
 CHUNK = 1 << 17  # points in one evaluation of a field
 HIDDEN = 1e-3  # a sample is hidden if at most this fraction of the light reaches it
 # A hole is an empty voxel whose 3 x 3 x 3 block has at least HOLE_NEIGHBOURS occupied voxels, and whose density is at
-# least HOLE_DENSITY times the threshold at each of HOLE_POINTS random points.
-HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 9, 2, 2.0
+# least HOLE_DENSITY times the threshold at half of HOLE_POINTS random points. It may be the edge of a thin thing.
+HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 3, 8, 4.0
 #: A field can tell empty space once its densities have a mean deviation of at least `CONTRAST` times their mean, and at
 #: most the fraction `LOST` of the density lies below the grid's threshold; both are measured at `CONTRAST_POINTS`
 #: points. The deviation of an untrained field is below 0.01.
@@ -318,25 +318,25 @@ class OccupancyGrid:
         """Fills holes in surfaces: marks empty voxels with a dense field and many occupied neighbours as occupied.
 
         Call it after the training, since filled voxels would cost samples in every step. The field can be dense by
-        chance where no ray samples it. So a voxel with few occupied neighbours, or with a point of low density, stays
-        empty.
+        chance where no ray samples it. So a voxel with few occupied neighbours, or with a low density at most points,
+        stays empty.
 
         Args:
             field: The trained field, which is called without gradients.
             generator: Random generator of the points, on any device.
         """
-        neighbours = self._neighbours()
-        holes = ((neighbours >= HOLE_NEIGHBOURS) & ~self.occupied).view(-1).nonzero()[:, 0]
+        holes = ((self._neighbours() >= HOLE_NEIGHBOURS) & ~self.occupied).view(-1).nonzero()[:, 0]
         minimum = HOLE_DENSITY * self.threshold
-        for _ in range(HOLE_POINTS):
-            dense = [holes[:0]]
-            for part in holes.split(CHUNK):
-                points = self.points(part, random_uniforms(len(part), 3, self.box, generator))
-                density = density_of(field, points)
-                if self.contraction is not None:
-                    density = density * self.contraction.stretch(points)
-                dense.append(part[density >= minimum])
-            holes = torch.cat(dense)
+        dense = [holes[:0]]
+        for part in holes.split(CHUNK // HOLE_POINTS):
+            count = HOLE_POINTS * len(part)
+            points = self.points(part.repeat(HOLE_POINTS), random_uniforms(count, 3, self.box, generator))
+            density = density_of(field, points)
+            if self.contraction is not None:
+                density = density * self.contraction.stretch(points)
+            above = (density >= minimum).view(HOLE_POINTS, len(part)).sum(0)
+            dense.append(part[above >= HOLE_POINTS / 2])
+        holes = torch.cat(dense)
         self.density.view(-1)[holes] = minimum
         self.occupied.view(-1)[holes] = True
 

@@ -47,10 +47,11 @@ SETTLING_STEPS = 400
 #: The fraction of voxels that are evaluated at random before each `GROUP` of steps, and the maximum number of these
 #: voxels: about the number of samples of a few steps.
 REVISITED, MOST_REVISITED = 1 / 8, 32_768
-#: The number of strata per ray in pictures: the ratio to the number in training, and the maximum. A training needs
-#: fewer strata, since its jittered samples cover each stratum over time. Twice the 256 strata of a long training would
-#: improve no picture by more than 0.05 dB.
-PICTURE_SAMPLES, MOST_PICTURE_SAMPLES = 2, 384
+#: The number of strata per ray in pictures: the ratio to the number in training, and the maximum in a box and in
+#: contracted space. A training needs fewer strata, since its jittered samples cover each stratum over time. In a box,
+#: twice the 256 strata of a long training would improve no picture by more than 0.05 dB. Photographs with 576 strata
+#: instead of 384 have less grain at edges: 0.08 dB and 0.006 of SSIM on bonsai.
+PICTURE_SAMPLES, MOST_PICTURE_SAMPLES, MOST_CONTRACTED_SAMPLES = 2, 384, 576
 #: The transmittance below which a ray of a picture ends; the ray then counts as opaque with its colour so far.
 OPAQUE = 0.05
 #: Pictures are rendered in waves. A wave evaluates the next few samples of each ray that is not yet opaque. These are
@@ -336,7 +337,8 @@ class Occupancy(Sampler):
             raise ValueError("Occupancy: grid requires point samples and the same contraction as the space")
         self.empty = None if empty is None else empty.view(grid.occupied.shape)
         self.grid = grid
-        self.picture_samples = picture_samples or max(min(PICTURE_SAMPLES * samples, MOST_PICTURE_SAMPLES), samples)
+        most = MOST_PICTURE_SAMPLES if grid.contraction is None else MOST_CONTRACTED_SAMPLES
+        self.picture_samples = picture_samples or max(min(PICTURE_SAMPLES * samples, most), samples)
         self.settling = False
 
     @property
