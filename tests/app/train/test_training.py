@@ -5,6 +5,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from voronerf.app.train.defaults import octaves_for, resolve
 from voronerf.app.train.run_directory import choose_directory, held
 from voronerf.nerf import OccupancyGrid
 from voronerf.nerf.cameras import Cameras
+from voronerf.nerf.schedule import FINAL
 from voronerf.ops._core import backends, native
 from voronerf.ops._core.backends import BackendUnavailable
 
@@ -270,6 +272,30 @@ def test_holes_of_the_grid_are_filled_once_at_the_end_by_the_averaged_field(scen
     assert not torch.equal(filled[0], weight_of(state))
     train(build(small(occupancy=True, contraction="none"), scene))  # not needed in a box
     assert len(filled) == 1
+
+
+def test_long_trainings_in_contracted_space_have_a_lower_rate_and_more_rays(scene):
+    """Twice `LONG_STEPS` halve the rate, known or estimated; with a budget, they also double the rays."""
+
+    def at_half(**options):
+        table = ("levels=2", "log2_entries=10")
+        state = build(TrainConfig(width=8, cells=(4,), rays=64, field_options=table, **options), scene)
+        state.step, state.seconds = 3904, 50.0
+        output = SimpleNamespace(loss=0.0, samples=10**9)  # so many that `next_rays` takes no more rays than needed
+        rate = state.learning_rate()
+        state.read_output(output)
+        return rate / state.config.lr, state.rays
+
+    decay = lambda fraction: FINAL ** ((fraction - 0.25) / 0.75)  # noqa: E731
+    for options, length, fraction, rays in (
+        ({"steps": 7808, "contraction": "sphere"}, 7808 / 3500, 0.5, 64),
+        ({"steps": 7808}, 1, 0.5, 64),
+        ({"budget": 100.0, "contraction": "sphere"}, 2, 0.5, 128),
+        ({"budget": 100.0}, 1, 0.5, 64),
+        ({"steps": 3600, "contraction": "none"}, 1, 1, 64),
+    ):
+        rate, drawn = at_half(**options)
+        assert rate == pytest.approx(decay(fraction) / length, rel=5e-3) and drawn == rays
 
 
 @pytest.mark.native

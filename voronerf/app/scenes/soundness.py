@@ -105,7 +105,7 @@ def spread_of_lenses(lenses: Sequence[tuple[Lens, float]]) -> str:
         return ""
     return (
         f"each of {len(lenses)} images has its own lens, with focal lengths from {least:.2f} to {largest:.2f} of the "
-        "longer side; if one lens took them, run voronerf process on the images"
+        "longer side; this is unlikely unless the camera zoomed or the images were cropped"
     )
 
 

@@ -132,7 +132,8 @@ class SamplingSettings:
 
     rays: int | None = None
     """Rays per training step; default 512, and more on a hash grid in a box for a long --budget. With --occupancy, this
-    number is for the first steps: hashgrid takes up to eight times as many when most samples of a ray are skipped."""
+    number is for the first steps: hashgrid takes up to eight times as many when most samples of a ray are skipped. On a
+    hash grid in contracted space, the number also grows with the length of a --budget, see --lr."""
     sampling: str = "stratified"
     """Samples along a ray: stratified in one pass, or hierarchical, with a second pass concentrated where the first
     pass has large weights (nerf: a coarse and a fine network)."""
@@ -163,7 +164,9 @@ class OptimiserSettings:
     """Precision of the networks' matrix products in training: float32, bfloat16, or float16 with a scaled loss. Sums,
     parameters and moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""
     lr: float | None = None
-    """Initial learning rate of Adam; default: 0.02 up to width 64, inversely proportional to larger widths."""
+    """Initial learning rate of Adam; default: 0.02 up to width 64, inversely proportional to larger widths. On a hash
+    grid in contracted space, a training of more than 3,500 steps divides the rate by (number of steps) / 3,500, at most
+    by 8; with --budget, it multiplies the number of rays by the same factor."""
     average: float = 0.98
     """Decay per step of the averaged weights, which evaluations and pictures use; 0 is off. The decay is smaller in the
     first steps. Training itself uses the weights without averaging."""
