@@ -2,7 +2,7 @@
 
 import pytest
 
-from voronerf.nerf.schedule import learning_rate, next_rays, stretch
+from voronerf.nerf.schedule import learning_rate, next_rays, relative_length
 
 
 def test_a_long_run_warms_up_in_a_hundred_steps():
@@ -28,6 +28,6 @@ def test_steps_on_large_images_keep_more_samples():
 
 
 def test_the_length_of_a_training_is_known_or_estimated():
-    assert [stretch(0, 0.0, steps) for steps in (100, 3_500, 7_000, 10**6)] == [1, 1, 2, 8]
-    assert [stretch(step, 0.5) for step in (0, 400, 2_150, 3_900)] == [1, 1, 1, 2]
-    assert stretch(50, 0.0) == 1
+    assert [relative_length(0, 0.0, steps) for steps in (100, 3_500, 7_000, 10**6)] == [1, 1, 2, 8]
+    assert [relative_length(step, 0.5) for step in (0, 400, 2_150, 3_900)] == [1, 1, 1, 2]
+    assert relative_length(50, 0.0) == 1

@@ -19,17 +19,17 @@ FINAL = 0.05
 #: strata than `FILL_SAMPLES`, or `CONTRACTED_FILL_SAMPLES` in contracted space, the factor `FILL` is enlarged in
 #: proportion: trainings with more strata also have larger tables, whose update costs less per ray in a larger batch.
 FILL, FILL_SAMPLES, CONTRACTED_FILL_SAMPLES = 0.25, 64, 128
-#: In contracted space, the number of steps from which a training is long, and the largest result of `stretch`. An
+#: In contracted space, the number of steps from which a training is long, and the maximum of `relative_length`. An
 #: estimate of the number of steps leaves out the first `CHEAP_STEPS` steps, which have few strata.
-LONG_STEPS, MOST_STRETCH, CHEAP_STEPS = 3500, 8.0, 400
+LONG_STEPS, MOST_LENGTH, CHEAP_STEPS = 3500, 8.0, 400
 
 
-def stretch(step: int, fraction: float, steps: int | None = None) -> float:
-    """Returns the length of a training in contracted space: its number of steps / `LONG_STEPS`, 1..`MOST_STRETCH`.
+def relative_length(step: int, fraction: float, steps: int | None = None) -> float:
+    """Returns the length of a training in contracted space: its number of steps / `LONG_STEPS`, 1..`MOST_LENGTH`.
 
-    The learning rate is divided by this length, and the rays of a step are multiplied by it. Adam moves a table entry
-    that few rays read by about the full rate, whatever the noise of its gradient. With more steps at the same rate,
-    entries walk farther at random: fog beside the training rays becomes contrasted clouds.
+    The learning rate is divided by this length; with a time budget, the rays of a step are multiplied by it. Adam moves
+    a table entry that few rays read by about the full rate, whatever the noise of its gradient. With more steps at the
+    same rate, entries walk farther at random: pale fog beside the training rays becomes clouds with contrast.
 
     Args:
         step: The number of steps done.
@@ -37,7 +37,7 @@ def stretch(step: int, fraction: float, steps: int | None = None) -> float:
         steps: The number of steps of the training; None to estimate it from ``step`` and ``fraction``.
     """
     expected = (step - CHEAP_STEPS) / max(fraction, 1e-9) if steps is None else steps
-    return min(max(1.0, expected / LONG_STEPS), MOST_STRETCH)
+    return min(max(1.0, expected / LONG_STEPS), MOST_LENGTH)
 
 
 def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0, began: int = 0) -> float:

@@ -15,8 +15,8 @@ from voronerf.nerf.renderer import RenderedImage
 POINTS = 16
 #: Points with less opacity show no surface.
 OPAQUE = 0.5
-#: The angle in degrees beyond which a test view counts as far from the training cameras. Of a view that is farther
-#: away, a field has to invent more than it has seen.
+#: The angle in degrees beyond which a test view counts as far from the training cameras. The training views hardly
+#: determine such a view.
 FAR_ANGLE = 15.0
 
 

@@ -312,7 +312,7 @@ def views_of(scores: Mapping[str, Any]) -> str:
     views, part, far = scores.get("views"), scores.get("part", 1), scores.get("far_views", 0)
     if not isinstance(views, int) or not isinstance(part, int | float):
         return ""
-    distant = f", {far} over {FAR_ANGLE:g} degrees from the training cameras" if far else ""
+    distant = f", {far} over {FAR_ANGLE:g} degrees from the training cameras" if far and isinstance(far, int) else ""
     return f"the middle {part:.0%} of " * (part < 1) + counted(views, "view") + distant
 
 

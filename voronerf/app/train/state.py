@@ -174,16 +174,16 @@ class State:
         """Returns the learning rate of the next step, which is computed at the middle of its group of steps."""
         group = schedule.GROUP
         middle = self.step - (self.step - self.began) % group + group // 2
-        highest, hold = float(self.config.lr or 0) / self.stretch, self.config.field_type.lr_hold
+        highest, hold = float(self.config.lr or 0) / self.relative_length, self.config.field_type.lr_hold
         return learning_rate(highest, self.fraction_at(middle), middle, hold=hold, began=self.began)
 
     @property
-    def stretch(self) -> float:
-        """The length of a training of photographs relative to a short one, see `voronerf.nerf.schedule.stretch`."""
+    def relative_length(self) -> float:
+        """The length of a training of photographs relative to a short one, see :func:`schedule.relative_length`."""
         if self.config.contraction == "none" or self.config.field_type.scene_options is None:
             return 1.0
         first = self.step - (self.step - self.began) % schedule.GROUP
-        return schedule.stretch(first, self.fraction_at(first), self.config.steps)
+        return schedule.relative_length(first, self.fraction_at(first), self.config.steps)
 
     def steps_per_update(self) -> int:
         """Returns the number of next steps that can be made in one call, because no setting changes between them."""
@@ -212,7 +212,7 @@ class State:
             self.rays = next_rays(
                 self.rays,
                 output.samples,
-                rays=int((self.config.rays or 0) * (1.0 if self.config.budget is None else self.stretch)),
+                rays=int((self.config.rays or 0) * (1.0 if self.config.budget is None else self.relative_length)),
                 samples=self.sampler.strata,
                 growth=self.config.field_type.ray_growth,
                 contracted=self.config.contraction != "none",
