@@ -30,7 +30,7 @@ from voronerf.nerf import (
 from voronerf.nerf.radiance import radiance_of
 from voronerf.nerf.samplers import SETTLING_PART
 from voronerf.nerf.schedule import GROUP
-from voronerf.nerf.volume import RenderOutput
+from voronerf.nerf.volume import RenderOutput, Space
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 WHITE = torch.ones(3)
@@ -270,6 +270,13 @@ def test_holes_in_a_surface_are_filled_where_the_field_is_dense():
     # Thresholds apply to density per contracted unit, which is longer in the world away from the centre.
     contracted = emptied(3.0, Contraction(torch.zeros(3), 0.2))[1]
     assert bool(contracted[10, 8, 8]) and not bool(contracted[8, 8, 8])
+
+
+def test_pictures_have_more_strata_in_contracted_space():
+    for contraction, strata in ((None, {40: 80, 256: 384, 500: 500}), (Contraction(torch.zeros(3), 1.0), {384: 576})):
+        grid = OccupancyGrid(BOX, 4, threshold=0.1, contraction=contraction)
+        space = Space(contraction=contraction)
+        assert {n: Occupancy(grid, n, space=space).picture_samples for n in strata} == strata
 
 
 def test_specks_are_dropped_and_thin_things_stay():

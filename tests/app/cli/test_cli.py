@@ -55,7 +55,8 @@ def test_eval_scores_every_view(run, capsys, fails):
     assert len(result["views"]) == 3
     assert result["psnr"] == pytest.approx(sum(v["psnr"] for v in result["views"]) / 3)
     output = capsys.readouterr().out
-    assert all(v["name"] in output for v in result["views"])
+    assert all(v["name"] in output and f"{v['angle']:.1f}" in output for v in result["views"])
+    assert f"{result['far_views']} of 3 views are over 15 degrees from the training" in output
     assert result["lpips"] is None and result["psnr_of_mean_error"] <= result["psnr"]
     assert "LPIPS is not computed, images of 16 x 16 are below AlexNet's smallest, 31 x 31" in " ".join(output.split())
     fails("--lpips must be off or come with larger images", "eval", run, "--lpips", run)

@@ -46,6 +46,8 @@ def test_a_run_and_its_directory(tmp_path, scene):
     metrics = read_json_lines(tmp_path / "metrics.jsonl")
     assert [line["step"] for line in metrics] == [12, 24]
     assert all(metrics[-1][name] == summary[name] for name in ("psnr", "psnr_of_mean_error"))
+    assert [score["psnr"] for score in metrics[-1]["scores"]] and len(metrics[-1]["scores"]) == metrics[-1]["views"]
+    assert summary["far_views"] == sum((score["angle"] or 0) > 15 for score in metrics[-1]["scores"])
     assert summary["psnr_of_mean_error"] <= summary["psnr"] and 0 < summary["ssim"] <= 1
     config = TrainConfig.from_values(read_json(tmp_path / "config.json"))
     assert config == resolve(small(tmp_path), scene)

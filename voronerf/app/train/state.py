@@ -182,8 +182,7 @@ class State:
         """The length of a training of photographs relative to a short one, see :func:`schedule.relative_length`."""
         if self.config.contraction == "none" or self.config.field_type.scene_options is None:
             return 1.0
-        first = self.step - (self.step - self.began) % schedule.GROUP
-        return schedule.relative_length(first, self.fraction_at(first), self.config.steps)
+        return schedule.relative_length(self.step, self.fraction, self.config.steps)
 
     def steps_per_update(self) -> int:
         """Returns the number of next steps that can be made in one call, because no setting changes between them."""
