@@ -272,6 +272,34 @@ def test_holes_in_a_surface_are_filled_where_the_field_is_dense():
     assert bool(contracted[10, 8, 8]) and not bool(contracted[8, 8, 8])
 
 
+def test_what_few_cameras_see_is_dropped_inside_the_sphere():
+    """A wall that four cameras see stays, also beyond the sphere; a cloud before one of them is dropped."""
+    contraction = Contraction(torch.zeros(3), 1.0)
+    grid = OccupancyGrid.for_training(None, 64, contraction=contraction, resolution=32)
+    x, y, z = grid.points(torch.arange(32**3)).T.view(3, 32, 32, 32)
+    cloud = (x - 0.5).square() + y.square() + (z - 0.3).square() < 0.2**2
+
+    def field(positions, directions, ray_index):
+        wall = positions[:, 2] < -0.5
+        near_cloud = (positions - positions.new_tensor([0.5, 0, 0.3])).norm(dim=-1) < 0.2
+        return torch.ones_like(positions), torch.where(wall | near_cloud, 1e3, 0.0)
+
+    views = []
+    for place in (-0.5, -0.2, 0.2, 0.5):
+        across = torch.linspace(-0.4, 0.4, 40)
+        ends = torch.stack(
+            (*torch.meshgrid(across + 0.4 * (place > 0.4), across, indexing="ij"), torch.full((40, 40), -0.5)), -1
+        )
+        origin = torch.tensor([place, 0.0, 0.9])
+        views.append(Rays(origin.expand(1600, 3), torch.nn.functional.normalize(ends.view(-1, 3) - origin, dim=-1)))
+    sampler = Occupancy(grid, 64, space=Space(contraction=contraction))
+    sampler.drop_floaters(field, views, near=0.05, far=4.0)
+    outside = x.square() + y.square() + z.square() >= 1
+    assert not bool(grid.occupied[cloud].any()) and bool(grid.occupied[outside].all())
+    assert bool(grid.occupied[(z < -0.5) & (z > -0.56) & (x.abs() < 0.3) & (y.abs() < 0.3)].all())
+    assert torch.equal(grid.occupied, grid.density >= grid.threshold)
+
+
 def test_pictures_have_more_strata_in_contracted_space():
     for contraction, strata in ((None, {40: 80, 256: 384, 500: 500}), (Contraction(torch.zeros(3), 1.0), {384: 576})):
         grid = OccupancyGrid(BOX, 4, threshold=0.1, contraction=contraction)

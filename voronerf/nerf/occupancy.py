@@ -50,6 +50,8 @@ HIDDEN = 1e-3  # a sample is hidden if at most this fraction of the light reache
 # A hole is an empty voxel whose 3 x 3 x 3 block has at least HOLE_NEIGHBOURS occupied voxels, and whose density is at
 # least HOLE_DENSITY times the threshold at half of HOLE_POINTS random points. It may be the edge of a thin thing.
 HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 3, 8, 4.0
+#: A surface that fewer cameras see may be a floater, a cloud that fits their pictures alone.
+FLOATER_CAMERAS = 3
 #: A field can tell empty space once its densities have a mean deviation of at least `CONTRAST` times their mean, and at
 #: most the fraction `LOST` of the density lies below the grid's threshold; both are measured at `CONTRAST_POINTS`
 #: points. The deviation of an untrained field is below 0.01.
@@ -339,6 +341,23 @@ class OccupancyGrid:
         holes = torch.cat(dense)
         self.density.view(-1)[holes] = minimum
         self.occupied.view(-1)[holes] = True
+
+    def drop_floaters(self, seen: Tensor) -> None:
+        """Marks voxels inside a contraction's sphere as empty, except near surfaces that several cameras see.
+
+        A floater, a cloud in front of the scene, can fit the pictures of one or two cameras, and hides the scene from
+        others. Outside the sphere, which goes around the cameras, few cameras may see a true surface.
+
+        Args:
+            seen: int [x, y, z], the number of cameras that see a surface in each voxel.
+        """
+        assert isinstance(self.contraction, Contraction)
+        is_near = torch.nn.functional.max_pool3d(seen[None].float(), 3, 1, 1)[0] >= FLOATER_CAMERAS
+        voxels = torch.arange(self.occupied.numel(), device=self.box.device)
+        distances = (self.points(voxels) - self.contraction.centre.to(self.box)).norm(dim=-1)
+        floaters = ~is_near & (distances < self.contraction.radius).view(is_near.shape)
+        self.density[floaters] = 0
+        self.occupied[floaters] = False
 
     def drop_specks(self) -> None:
         """Marks isolated groups of one or two occupied voxels as empty; they look like dust in pictures."""

@@ -6,7 +6,7 @@ A new sampler is a class here and a line in `SAMPLERS`. r rays, m samples of all
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -485,6 +485,27 @@ class Occupancy(Sampler):
             with evaluating(field):
                 self.grid.fill_holes(field, generator=torch.Generator().manual_seed(seed))
             self._leave_empty()
+
+    @torch.no_grad()
+    def drop_floaters(self, field: Field, views: Iterable[Rays], *, near: float, far: float) -> None:
+        """Removes floaters from a grid over space contracted to a ball; see `OccupancyGrid.drop_floaters`.
+
+        Args:
+            field: The trained field.
+            views: Rays of the training views, evenly distributed over the pixels of each view.
+            near: The distance along a ray at which the scene begins.
+            far: The distance along a ray at which the scene ends.
+        """
+        grid = self.grid
+        if not isinstance(grid.contraction, Contraction):
+            return
+        seen = torch.zeros(grid.occupied.numel(), dtype=torch.int32, device=grid.box.device)
+        with evaluating(field):
+            for rays in views:
+                ends = (rays.origins.new_full((len(rays),), distance) for distance in (near, far))
+                image = self.render_colours(field, rays, *ends, background=None, heaviest=True)
+                seen[grid.voxels(image.heaviest[image.opacity > 0.5]).long().unique()] += 1
+        grid.drop_floaters(seen.view(grid.occupied.shape))
 
     def sample(
         self,

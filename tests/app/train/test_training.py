@@ -17,7 +17,8 @@ from voronerf.app import open_run
 from voronerf.app.evaluate.scores import evaluate
 from voronerf.app.files import read_json_lines
 from voronerf.app.render.camera import render_camera
-from voronerf.app.train import ConfigError, TrainConfig, build, run, train
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train import ConfigError, TrainConfig, build, loop, run, train
 from voronerf.app.train.build import count_parameters, solve_width
 from voronerf.app.train.defaults import octaves_for, resolve
 from voronerf.app.train.run_directory import choose_directory, held
@@ -274,6 +275,21 @@ def test_holes_of_the_grid_are_filled_once_at_the_end_by_the_averaged_field(scen
     assert not torch.equal(filled[0], weight_of(state))
     train(build(small(occupancy=True, contraction="none"), scene))  # not needed in a box
     assert len(filled) == 1
+
+
+def test_floaters_are_dropped_at_the_end_of_a_long_training_with_many_views(monkeypatch):
+    scene, dropped = builtin_scene(16, train_views=4, test_views=2), []
+    monkeypatch.setattr(OccupancyGrid, "drop_floaters", lambda grid, seen: dropped.append(seen))
+    monkeypatch.setattr(loop, "FLOATER_STEPS", 24)
+    for views, steps, contraction, expected in (
+        *((5, 24, "sphere", 0), (4, 23, "sphere", 0)),
+        *((4, 24, "sphere", 1), (4, 24, "none", 1)),
+    ):
+        monkeypatch.setattr(loop, "FLOATER_VIEWS", views)
+        state = started(scene, 12, occupancy=True, contraction=contraction, steps=steps)
+        train(state)
+        assert len(dropped) == expected
+    assert dropped[0].shape == (128, 128, 128) and 0 <= int(dropped[0].max()) <= 4
 
 
 def test_long_trainings_in_contracted_space_have_a_lower_rate_and_more_rays(scene):

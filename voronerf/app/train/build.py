@@ -22,6 +22,7 @@ from voronerf.app.wording import device_of
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
+from voronerf.nerf.cameras import Rays
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.field import DirectionPerSample, Field
 from voronerf.nerf.loss import RayLoss
@@ -237,24 +238,30 @@ def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) ->
     A camera stands in empty space. Fog in front of it could fit the images of other cameras, but would hide the scene
     in a view from beside this camera.
     """
-    device, cameras = grid.box.device, scene.train.cameras.to(grid.box.device)
+    device = grid.box.device
     voxel = float((grid.box[1] - grid.box[0]).min()) / max(grid.occupied.shape)
     end = max(scene.near - voxel / 2, voxel / 4)
     depths = torch.arange(voxel / 4, end, voxel / 2, dtype=torch.float32, device=device)
     empty = torch.zeros(grid.occupied.numel(), dtype=torch.bool, device=device)
+    for rays in view_rays(scene, LOOKS, device):
+        points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]
+        empty[grid.voxels(contraction.points(points.reshape(-1, 3))).long()] = True
+    return empty.view(grid.occupied.shape)
+
+
+def view_rays(scene: Scene, count: int, device: torch.device) -> Iterator[Rays]:
+    """Yields the rays of each training view through a grid of pixels, with ``count`` pixels along the longer side."""
+    cameras = scene.train.cameras.to(device)
     for image in range(len(cameras)):
         width, height = cameras.size(image)
-        stride = max(width, height, LOOKS) / LOOKS
+        stride = max(width, height, count) / count
         columns, rows = (torch.arange(0, side, stride, dtype=torch.float32, device=device) for side in (width, height))
         y, x = (values.reshape(-1) for values in torch.meshgrid(rows, columns, indexing="ij"))
         if (mask := scene.train.mask(image)) is not None:  # masked pixels may have no ray
             y, x = y.long(), x.long()
             seen = mask[y.cpu(), x.cpu()].to(device)
             y, x = y[seen], x[seen]
-        rays = cameras.rays(image, x, y)
-        points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]
-        empty[grid.voxels(contraction.points(points.reshape(-1, 3))).long()] = True
-    return empty.view(grid.occupied.shape)
+        yield cameras.rays(image, x, y)
 
 
 def as_field(router: VoronoiRouter) -> Field:

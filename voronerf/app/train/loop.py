@@ -7,8 +7,10 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 
+from voronerf.app.train.build import view_rays
 from voronerf.app.train.start import judge_start, steps_to_judgement
 from voronerf.app.train.state import State
+from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.split import SplitDone
 from voronerf.nerf.step import StepOutput
@@ -16,6 +18,10 @@ from voronerf.ops._core import backends
 
 #: On a GPU, number of steps between two reads of the loss; for each read, the host waits for the device.
 READ_EVERY = 3 * GROUP
+#: Floaters are dropped after a training with at least `FLOATER_VIEWS` views and `FLOATER_STEPS` steps, by rays through
+#: at most `FLOATER_RAYS` pixels along the longer side of each view. With few views, few cameras see the same surface;
+#: after few steps, there is fog but no floater.
+FLOATER_VIEWS, FLOATER_STEPS, FLOATER_RAYS = 20, 1000, 96
 #: Target duration of a group of steps in seconds, so that a training reacts quickly, for example to Ctrl-C.
 ANSWER = 0.3
 
@@ -74,7 +80,8 @@ def train(
         until: Training seconds at which to return.
         clock: Function that returns the time in seconds.
     """
-    first_step, one_thread = state.step, backends.torch_on_one_thread if state.thread_deterministic else nullcontext
+    scene, first_step = state.scene, state.step
+    one_thread = backends.torch_on_one_thread if state.thread_deterministic else nullcontext
     quick_steps = GROUP
     state.training_step.run_within(one_thread)
     while state.fraction < 1 and state.seconds < until and not state.stopped:
@@ -95,6 +102,10 @@ def train(
         started = clock()
         with state.averaged():
             state.sampler.finish(state.renderer.field, state.config.seed)
+            has_floaters = len(scene.train) >= FLOATER_VIEWS and state.step >= FLOATER_STEPS
+            if has_floaters and isinstance(state.sampler, Occupancy):
+                rays = view_rays(scene, FLOATER_RAYS, state.device)
+                state.sampler.drop_floaters(state.renderer.field, rays, near=scene.near, far=scene.far)
         state.add_seconds(clock() - started)
 
 
