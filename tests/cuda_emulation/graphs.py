@@ -54,6 +54,10 @@ class Graph(TorchDispatchMode):
         super().__init__()
         self._seen, self._work, self._generators = seen, list[Callable[[], Any]](), set[int]()
 
+    def __del__(self) -> None:
+        if self._seen.capturing is not None:
+            self._seen.calls.append("destroyed in a capture")
+
     def register_generator_state(self, generator: torch.Generator) -> None:
         self._seen.calls.append("register")
         self._generators.add(generator._cdata)
@@ -131,7 +135,8 @@ class Seen:
     """The recorded use of torch's graphs.
 
     Attributes:
-        calls: The calls in order: "register", "capture", "replay".
+        calls: The calls in order: "register", "capture", "replay"; "destroyed in a capture" for a graph that is
+            destroyed during another one's capture, which invalidates it.
         pools: The memory pool argument of each capture.
         capturing: The graph in capture, or None.
     """

@@ -15,6 +15,7 @@ from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
 from voronerf.nerf import SplitStrategy, batches, loss, replayed, terms
 from voronerf.ops.keep_heaviest import reference
+from voronerf.router import optimizers
 
 pytestmark = pytest.mark.native
 
@@ -174,6 +175,35 @@ def test_precision_of_a_traced_field():
         training.step.autocast = torch.bfloat16
         training.train(3)
         assert training.step.explain() == "step: runs eagerly, since Scaled.forward runs under autocast"
+
+
+def test_a_router_does_not_check_its_parameters_in_a_capture(monkeypatch):
+    """After some calls in Python a router reads its parameters; with each number of rays a step is captured anew."""
+    monkeypatch.setattr(optimizers, "PATIENCE", 3)
+    with emulated(), graphs() as seen:
+        state = built()
+        for rays in (32, 33, 34, 35):
+            state.rays = rays
+            steps(state, 1)
+        assert state.training_step.explain() == "step: captured and replayed as a CUDA graph"
+        assert seen.calls.count("capture") == 2
+
+
+def test_no_other_graph_is_destroyed_in_a_capture():
+    with emulated(), graphs() as seen:
+        state = built()
+        old = [torch.cuda.CUDAGraph()]
+        old.append(old)  # only the garbage collector can destroy it
+        gc.collect()
+        limits = gc.get_threshold()
+        del old
+        gc.set_threshold(1)
+        try:
+            state.training_step(32)
+            state.training_step(32)
+        finally:
+            gc.set_threshold(*limits)
+        assert "capture" in seen.calls and "destroyed in a capture" not in seen.calls
 
 
 def test_another_precision_is_captured_anew():

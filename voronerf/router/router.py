@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.diagram.voronoi import MANY_CELLS
+from voronerf.ops._core.active import is_recorded
 from voronerf.ops._core.backends import BACKENDS
 from voronerf.ops._core.compiler import not_compiled
 from voronerf.ops.network import Cells
@@ -783,10 +784,11 @@ class VoronoiRouter(nn.Module):
 
     def _run_training_checks(self) -> None:
         """Warns in the first training calls if parameters are not trained; raises if frozen cells change."""
-        if self._training_checks and torch.is_grad_enabled() and not torch.compiler.is_compiling():
-            going_on = [check for check in self._training_checks if not check.is_over(self._dispatch.warn_once)]
-            if len(going_on) < len(self._training_checks):  # setting an attribute of a module takes 3 us
-                self._training_checks = going_on
+        if not self._training_checks or not torch.is_grad_enabled() or torch.compiler.is_compiling() or is_recorded():
+            return
+        going_on = [check for check in self._training_checks if not check.is_over(self._dispatch.warn_once)]
+        if len(going_on) < len(self._training_checks):  # setting an attribute of a module takes 3 us
+            self._training_checks = going_on
 
     def _drop_frozen_checks(self) -> None:
         """Drops the checks of frozen cells, whose set or values may change after this call."""

@@ -11,6 +11,7 @@ number of rows is fixed by the captured run.
 
 from __future__ import annotations
 
+import gc
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -81,13 +82,17 @@ class Capture:
 
     def capture(self, function: Callable[[], T]) -> T:
         """Captures the function without running its kernels. Each replay fills the tensors of the returned result."""
+        collects = gc.isenabled()
         try:
+            gc.disable()  # destroying another graph would invalidate this one
             active.vary = self._take_number
             # Other threads, such as a viewer's, may allocate device memory during the capture.
             with torch.cuda.graph(self._graph, self._pool, self._stream, capture_error_mode="thread_local"):
                 return function()
         finally:
             active.vary = None
+            if collects:
+                gc.enable()
 
     def count(self, count: Callable[[], int]) -> int:
         """Returns the number of rows of this run; a replay with another number is refused."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from voronerf.ops.composite.reference import check_ray_offsets, ray_spans, saveable, sums_in_front
+from voronerf.ops.composite.reference import check_ray_offsets, ray_spans, ray_sums, saveable, sums_in_front
 from voronerf.ops.render_loss.reference import robust_error
 
 #: The largest distance of a sparse model's point from the surface, relative to the point's distance from the camera.
@@ -23,15 +23,14 @@ def sparse_depth(weights: Tensor, depths: Tensor, deltas: Tensor, ray_offsets: T
     ray, *_ = ray_spans(ray_offsets[: len(distances) + 1], len(weights))
     points = pad(distances, (1, 1), value=torch.nan)
     near = (depths - points[ray]).abs() <= NEARBY * points[ray] + deltas
-    light = torch.zeros_like(points).index_add(0, ray, torch.where(near, weights, 0))[1:-1]
+    light = ray_sums(torch.where(near, weights, 0), ray, ray_offsets[: len(distances) + 1])
     return -torch.log(light.clamp_min(1e-3)).sum() / max(len(distances), 1)
 
 
 def smooth_depth(weights: Tensor, depths: Tensor, ray_offsets: Tensor, far: Tensor, triples: int) -> Tensor:
     """Returns the mean [] of the losses of ``voronerf.ops.smooth_depth_loss``, differentiable in the weights."""
     ray, *_ = ray_spans(ray_offsets, len(weights))
-    sums = weights.new_zeros(2, len(far) + 2).index_add(1, ray, torch.stack((weights / depths, weights)))
-    disparity, opacity = sums[:, 1:-1]
+    disparity, opacity = ray_sums(torch.stack((weights / depths, weights), dim=1), ray, ray_offsets).T
     middle, one, other = (disparity + (1 - opacity) / far)[len(far) - 3 * triples :].view(3, triples)
     bent = ((one + other) / (2 * middle)).log()
     return robust_error(bent.square(), EDGE).mean() if triples else bent.sum()
