@@ -189,21 +189,36 @@ def test_a_router_does_not_check_its_parameters_in_a_capture(monkeypatch):
         assert seen.calls.count("capture") == 2
 
 
-def test_no_other_graph_is_destroyed_in_a_capture():
+def test_no_other_graph_is_destroyed_in_a_capture(monkeypatch):
     with emulated(), graphs() as seen:
-        state = built()
-        old = [torch.cuda.CUDAGraph()]
-        old.append(old)  # only the garbage collector can destroy it
-        gc.collect()
-        limits = gc.get_threshold()
-        del old
-        gc.set_threshold(1)
-        try:
-            state.training_step(32)
-            state.training_step(32)
-        finally:
-            gc.set_threshold(*limits)
+        step = built().training_step
+        update = step._update
+
+        def leaves_garbage(output):
+            old = [torch.cuda.CUDAGraph()]
+            old.append(old)  # only the garbage collector can destroy it
+            del old
+            lists = [[] for _ in range(100_000)]  # so many new objects that garbage is collected
+            return update(output) if lists else None
+
+        monkeypatch.setattr(step, "_update", leaves_garbage)
+        step(32), step(32)
         assert "capture" in seen.calls and "destroyed in a capture" not in seen.calls
+
+
+def test_a_capture_is_freed_without_the_garbage_collector():
+    with emulated(), graphs():
+        step = built().training_step
+        step(32), step(32)
+        (segment,) = step._step._segments
+        capture = weakref.ref(segment.recording)
+        gc.disable()
+        try:
+            while segment.recording is capture():
+                step(33)
+            assert capture() is None
+        finally:
+            gc.enable()
 
 
 def test_another_precision_is_captured_anew():

@@ -221,15 +221,11 @@ class _Segment:
         """Runs the stages on the inputs of the last :meth:`replay`, and records or captures the compiled calls."""
         inputs = self._inputs
 
-        def take(held: Any) -> Any:
-            if type(held) is int and held:
-                return recording.count(lambda: held)
-            return recording.take(held) if isinstance(held, Tensor) else mapped(take, held)
-
         def run_recorded() -> dict[str, Any]:
             results = {} if earlier.recording is None else dict(earlier.recording.counted_now(earlier.value))
             for name, held in inputs.items():
-                results[name] = take(held) if type(held) is not int else recording.count(lambda n=name: self._inputs[n])
+                is_count = type(held) is int
+                results[name] = recording.count(lambda n=name: self._inputs[n]) if is_count else _take(recording, held)
             return run(self.stages, results)
 
         value, self.recorded, self.recording = recording.record(run_recorded), None, None
@@ -242,6 +238,15 @@ class _Segment:
             return Results(value)
         self.recorded = Results(value, recording)
         return self.recorded
+
+
+def _take(recording: Any, held: Any) -> Any:
+    """Replaces the tensors and row counts of an input by those of a recording."""
+    # A nested function that calls itself would keep the recording, and its memory, until garbage is collected.
+    if type(held) is int and held:
+        return recording.count(lambda: held)
+    take = functools.partial(_take, recording)
+    return recording.take(held) if isinstance(held, Tensor) else mapped(take, held)
 
 
 def _restore(stages: Iterable[Stage], results: Results) -> None:
