@@ -96,6 +96,9 @@ def test_tables_shrink_by_the_rate_of_their_group_where_they_learn():
     optimizer.after_step(16)
     assert torch.equal(table, torch.full((6, 2), 1 - 16 * 0.5 * 0.01))
     assert bool((asleep == 1).all()) and bool((other == 1).all())
+    optimizer.set_learning_rate(0.25, decay=4.0)
+    optimizer.after_step(32)
+    assert torch.equal(table, torch.full((6, 2), (1 - 16 * 0.5 * 0.01) * (1 - 16 * 0.25 * 4 * 0.01)))
 
 
 def test_frozen_cells_do_not_shrink():

@@ -83,11 +83,11 @@ class Adam(torch.optim.Adam):
         backend: str = "auto",
     ) -> None:
         super().__init__(params, lr=lr, betas=betas, eps=eps, fused=True)
-        self.average, self.backend, self.steps_done = average, backend, 0
+        self.average, self.backend, self.steps_done, self.decay = average, backend, 0, 1.0
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns the state of torch's optimiser for a copy, and the attributes of this class."""
-        own = {"average": self.average, "backend": self.backend, "steps_done": self.steps_done}
+        own = {name: vars(self)[name] for name in ("average", "backend", "steps_done", "decay")}
         return {**super().__getstate__(), **own}
 
     @classmethod
@@ -139,15 +139,16 @@ class Adam(torch.optim.Adam):
         inspect.unwrap(torch.optim.Adam.add_param_group)(self, param_group)
 
     def note_dependencies(self, noted: Any) -> list[Any]:
-        """Notes the attributes that a recorded update depends on; learning rates and ``steps_done`` may change."""
-        noted.contents(vars(self), ["steps_done"])
+        """Notes the attributes that a recorded update depends on; rates and ``steps_done`` may change."""
+        noted.contents(vars(self), ["steps_done", "decay"])
         noted.contents(self.param_groups)
         for group in self.param_groups:
             noted.contents(group, ["lr"])
         return [self.state, *(group[name] for group in self.param_groups for name in ("params", "betas"))]
 
-    def set_learning_rate(self, rate: float) -> None:
-        """Sets the learning rate of all groups."""
+    def set_learning_rate(self, rate: float, *, decay: float = 1.0) -> None:
+        """Sets the learning rate of all groups, and the factor by which all weight decays are multiplied."""
+        self.decay = decay
         for group in self.param_groups:
             group["lr"] = rate
 
@@ -171,9 +172,9 @@ class Adam(torch.optim.Adam):
         take time.
 
         Weight decay is decoupled from the gradients (Loshchilov and Hutter 2019): weights are multiplied by
-        1 - lr * shrink * `GROUP`, with the rate ``shrink`` of the parameter group. Parameters without a gradient and
-        frozen cells do not decay. The moving averages have a decay factor of 1 - 1 / w per step, with the window
-        w = `WINDOW` * step, until the factor reaches ``average``.
+        1 - lr * shrink * decay * `GROUP`, with the rate ``shrink`` of the parameter group and the factor ``decay`` of
+        `set_learning_rate`. Parameters without a gradient and frozen cells do not decay. The moving averages have a
+        decay factor of 1 - 1 / w per step, with the window w = `WINDOW` * step, until the factor reaches ``average``.
 
         Args:
             step: The number of steps done.
@@ -189,7 +190,11 @@ class Adam(torch.optim.Adam):
             decaying = [p for p in group["params"] if p.grad is not None] if group.get("shrink") else []
             shrunk = [p[part] for p, parts in zip(decaying, trained_parts(decaying), strict=True) for part in parts]
             if shrunk:
-                average(shrunk, None, varying(functools.partial(_shrink_rate, group)), backend=self.backend)
+                average(shrunk, None, varying(functools.partial(self._shrink_rate, group)), backend=self.backend)
+
+    def _shrink_rate(self, group: Mapping[str, Any]) -> float:
+        """Returns the fraction by which the weights of a parameter group shrink in `GROUP` steps."""
+        return schedule.GROUP * float(group["lr"]) * float(group["shrink"]) * self.decay
 
     def _average_rate(self) -> float:
         """Returns the fraction by which averages move towards the weights in this group of steps."""
@@ -278,11 +283,6 @@ def _check_group(group: Mapping[str, Any]) -> None:
         if group.get(option):
             remedy = "; use shrink=RATE for decoupled weight decay" if option == "weight_decay" else ""
             raise ValueError(f"Adam: {option} of a group must be 0 or False, got {group[option]}{remedy}")
-
-
-def _shrink_rate(group: Mapping[str, Any]) -> float:
-    """Returns the fraction by which the weights of a parameter group shrink in `GROUP` steps."""
-    return schedule.GROUP * float(group["lr"]) * float(group["shrink"])
 
 
 def parameter_groups(

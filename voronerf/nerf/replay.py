@@ -241,7 +241,7 @@ class _Segment:
 
 
 def _take(recording: Any, held: Any) -> Any:
-    """Replaces the tensors and row counts of an input by those of a recording."""
+    """Replaces the tensors and row counts of an input by the tensors and counts of a recording."""
     # A nested function that calls itself would keep the recording, and its memory, until garbage is collected.
     if type(held) is int and held:
         return recording.count(lambda: held)

@@ -27,9 +27,11 @@ LONG_STEPS, MOST_LENGTH, CHEAP_STEPS = 3500, 8.0, 400
 def relative_length(step: int, fraction: float, steps: int | None = None) -> float:
     """Returns the length of a training in contracted space: its number of steps / `LONG_STEPS`, 1..`MOST_LENGTH`.
 
-    The learning rate is divided by this length; with a time budget, the rays of a step are multiplied by it. Adam moves
-    a table entry that few rays read by about the full rate, whatever the noise of its gradient. With more steps at the
-    same rate, entries walk farther at random: pale fog beside the training rays becomes clouds with contrast.
+    The learning rate is divided by this length. Adam moves a table entry that few rays read by about the full rate,
+    whatever the noise of its gradient. With more steps at the same rate, entries walk farther at random: pale fog
+    beside the training rays becomes clouds with contrast. The weight decay of tables, which is proportional to the
+    rate, is multiplied by the length: each step shrinks such entries as in a short training. With a time budget, the
+    rays of a step are multiplied by the square of the length: eight times the time makes twice as many steps.
 
     Args:
         step: The number of steps done.

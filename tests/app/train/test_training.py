@@ -21,6 +21,7 @@ from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import ConfigError, TrainConfig, build, loop, run, train
 from voronerf.app.train.build import count_parameters, solve_width
 from voronerf.app.train.defaults import octaves_for, resolve
+from voronerf.app.train.loop import prepare
 from voronerf.app.train.run_directory import choose_directory, held
 from voronerf.nerf import OccupancyGrid
 from voronerf.nerf.cameras import Cameras
@@ -293,27 +294,29 @@ def test_floaters_are_dropped_at_the_end_of_a_long_training_with_many_views(monk
 
 
 def test_long_trainings_in_contracted_space_have_a_lower_rate_and_more_rays(scene):
-    """Twice `LONG_STEPS` halve the rate, known or estimated; with a budget, they also double the rays."""
+    """Twice `LONG_STEPS` halve the rate, but not the weight decay; with a budget, there are four times as many rays."""
 
     def at_half(**options):
         table = ("levels=2", "log2_entries=10")
-        state = build(TrainConfig(width=8, cells=(4,), rays=64, field_options=table, **options), scene)
+        state = build(TrainConfig(width=8, cells=(), rays=64, field_options=table, **options), scene)
         state.step, state.seconds = 3904, 50.0
         output = SimpleNamespace(loss=0.0, samples=10**9)  # so many that `next_rays` takes no more rays than needed
-        rate = state.learning_rate()
+        prepare(state)
         state.read_output(output)
-        return rate / state.config.lr, state.rays
+        (rate, _), decay = (group["lr"] for group in state.optimizer.param_groups), state.optimizer.decay
+        return rate / state.config.lr, rate / state.config.lr * decay, state.rays
 
     decay = lambda fraction: FINAL ** ((fraction - 0.25) / 0.75)  # noqa: E731
     for options, length, fraction, rays in (
         ({"steps": 7808, "contraction": "sphere"}, 7808 / 3500, 0.5, 64),
         ({"steps": 7808}, 1, 0.5, 64),
-        ({"budget": 100.0, "contraction": "sphere"}, 2, 0.5, 128),
+        ({"budget": 100.0, "contraction": "sphere"}, 2, 0.5, 256),
         ({"budget": 100.0}, 1, 0.5, 64),
         ({"steps": 3600, "contraction": "none"}, 1, 1, 64),
     ):
-        rate, drawn = at_half(**options)
+        rate, decayed, drawn = at_half(**options)
         assert rate == pytest.approx(decay(fraction) / length, rel=5e-3) and drawn == rays
+        assert decayed == pytest.approx(decay(fraction), rel=5e-3)
 
 
 @pytest.mark.native

@@ -125,7 +125,7 @@ def prepare(state: State, callbacks: Sequence[Callback] = ()) -> None:
                 optimizer.drop_averages()
             for callback in callbacks:
                 callback.after_split(state, done)
-    optimizer.set_learning_rate(state.learning_rate())
+    optimizer.set_learning_rate(state.learning_rate(), decay=state.relative_length)
     group = state.step - (state.step - state.began) % GROUP  # first step of the group, which may be cut short
     if state.batches.unseen and state.fraction_at(group) >= state.unseen_share:
         state.batches.stop_unseen_rays()

@@ -208,10 +208,11 @@ class State:
         """Reads a step's loss, guard and sample count, which waits for the device; updates the number of rays."""
         self.loss, self.skipped_in_a_row = float(output.loss), int(self.guard.in_a_row)
         if self.sampler.grid is not None and (self.step - self.began) % schedule.GROUP == 0:
+            more = 1.0 if self.config.budget is None else self.relative_length**2
             self.rays = next_rays(
                 self.rays,
                 output.samples,
-                rays=int((self.config.rays or 0) * (1.0 if self.config.budget is None else self.relative_length)),
+                rays=int((self.config.rays or 0) * more),
                 samples=self.sampler.strata,
                 growth=self.config.field_type.ray_growth,
                 contracted=self.config.contraction != "none",
