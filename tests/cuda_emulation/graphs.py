@@ -11,12 +11,14 @@ from __future__ import annotations
 import sys
 import traceback
 import warnings
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
+import numpy as np
 import torch
 from launches import FREE, READING, aten
 from torch import Tensor
@@ -53,10 +55,7 @@ class Graph(TorchDispatchMode):
     def __init__(self, seen: Seen) -> None:
         super().__init__()
         self._seen, self._work, self._generators = seen, list[Callable[[], Any]](), set[int]()
-
-    def __del__(self) -> None:
-        if self._seen.capturing is not None:
-            self._seen.calls.append("destroyed in a capture")
+        self._handle = seen.handle()
 
     def register_generator_state(self, generator: torch.Generator) -> None:
         self._seen.calls.append("register")
@@ -144,6 +143,19 @@ class Seen:
     def __init__(self) -> None:
         self.calls, self.pools = list[str](), list[Any]()
         self.capturing: Graph | None = None
+        self._handles = list[weakref.ref[Any]]()
+
+    def handle(self) -> np.ndarray:
+        """Returns a stand-in for the driver's graph: the collector does not track it, so only its last reference
+        destroys it."""
+
+        def destroyed(_: Any) -> None:
+            if self.capturing is not None:
+                self.calls.append("destroyed in a capture")
+
+        handle = np.empty(0)
+        self._handles.append(weakref.ref(handle, destroyed))
+        return handle
 
     @contextmanager
     def capture(self, graph: Graph, pool: Any, stream: Any, capture_error_mode: str) -> Iterator[None]:

@@ -14,6 +14,8 @@ from step_training import Scaled, Training
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
 from voronerf.nerf import SplitStrategy, batches, loss, replayed, terms
+from voronerf.ops._core import capture
+from voronerf.ops._core.capture import Capture
 from voronerf.ops.keep_heaviest import reference
 from voronerf.router import optimizers
 
@@ -195,7 +197,7 @@ def test_no_other_graph_is_destroyed_in_a_capture(monkeypatch):
         update = step._update
 
         def leaves_garbage(output):
-            old = [torch.cuda.CUDAGraph()]
+            old = [Capture(torch.device("cpu"), step.generator)]
             old.append(old)  # only the garbage collector can destroy it
             del old
             lists = [[] for _ in range(100_000)]  # so many new objects that garbage is collected
@@ -204,6 +206,7 @@ def test_no_other_graph_is_destroyed_in_a_capture(monkeypatch):
         monkeypatch.setattr(step, "_update", leaves_garbage)
         step(32), step(32)
         assert "capture" in seen.calls and "destroyed in a capture" not in seen.calls
+        assert gc.isenabled() and not capture._FREED
 
 
 def test_a_capture_is_freed_without_the_garbage_collector():
@@ -211,12 +214,12 @@ def test_a_capture_is_freed_without_the_garbage_collector():
         step = built().training_step
         step(32), step(32)
         (segment,) = step._step._segments
-        capture = weakref.ref(segment.recording)
+        first = weakref.ref(segment.recording)
         gc.disable()
         try:
-            while segment.recording is capture():
+            while segment.recording is first():
                 step(33)
-            assert capture() is None
+            assert first() is None
         finally:
             gc.enable()
 

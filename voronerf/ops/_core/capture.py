@@ -11,7 +11,6 @@ number of rows is fixed by the captured run.
 
 from __future__ import annotations
 
-import gc
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,6 +22,10 @@ from torch import Tensor
 from voronerf.ops._core.active import active
 
 T = TypeVar("T")
+
+#: The captures that run now, by id, and the graphs of captures that were freed meanwhile: if another graph is destroyed
+#: during a capture, CUDA invalidates the capture.
+_RUNNING, _FREED = set[int](), list[Any]()
 
 
 class Capture:
@@ -82,17 +85,22 @@ class Capture:
 
     def capture(self, function: Callable[[], T]) -> T:
         """Captures the function without running its kernels. Each replay fills the tensors of the returned result."""
-        collects = gc.isenabled()
+        _RUNNING.add(id(self))
         try:
-            gc.disable()  # destroying another graph would invalidate this one
             active.vary = self._take_number
             # Other threads, such as a viewer's, may allocate device memory during the capture.
             with torch.cuda.graph(self._graph, self._pool, self._stream, capture_error_mode="thread_local"):
                 return function()
         finally:
             active.vary = None
-            if collects:
-                gc.enable()
+            _RUNNING.discard(id(self))
+            if not _RUNNING:
+                _FREED.clear()
+
+    def __del__(self) -> None:
+        """Hands the graph on if it must not be destroyed yet; the garbage collector may run at any time."""
+        if _RUNNING:
+            _FREED.append(self._graph)
 
     def count(self, count: Callable[[], int]) -> int:
         """Returns the number of rows of this run; a replay with another number is refused."""
