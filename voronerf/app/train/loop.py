@@ -21,7 +21,7 @@ READ_EVERY = 3 * GROUP
 #: Floaters are dropped after a training with at least `FLOATER_VIEWS` views and `FLOATER_STEPS` steps, by rays through
 #: at most `FLOATER_RAYS` pixels along the longer side of each view. With few views, few cameras see the same surface;
 #: after few steps, there is fog but no floater.
-FLOATER_VIEWS, FLOATER_STEPS, FLOATER_RAYS = 20, 1000, 96
+FLOATER_VIEWS, FLOATER_STEPS, FLOATER_RAYS = 36, 1000, 96
 #: Target duration of a group of steps in seconds, so that a training reacts quickly, for example to Ctrl-C.
 ANSWER = 0.3
 
