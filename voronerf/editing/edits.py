@@ -51,8 +51,18 @@ class RunContents:
 
     @classmethod
     def of(cls, run: Path | str) -> RunContents:
-        """Reads a source from a run directory; an ordinary run becomes one part whose only network is its field."""
-        run = Path(run)
+        """Reads a source from a run directory; an ordinary run becomes one part whose only network is its field.
+
+        A run that was trained with a region is cut to it.
+        """
+        whole = cls._whole(Path(run))
+        if (region := whole.config.region) is None:
+            return whole
+        whole = replace(whole, config=replace(whole.config, region=None))
+        return replace(cut_source(whole, Solid.box(region[:3], region[3:])), cut=False)
+
+    @classmethod
+    def _whole(cls, run: Path) -> RunContents:
         name, record = run.name, run / "scene.json"
         checkpoint = last_checkpoint(run, keep=is_shown)
         if not record.is_file():
@@ -244,28 +254,25 @@ def _settings(sources: Sequence[RunContents], frames: Sequence[Similarity], scen
 
 
 def _join_scenes(sources: Sequence[RunContents], frames: Sequence[Similarity]) -> Scene:
-    """Joins the views and the boxes of all sources; a scene that occurs twice in the same place counts once."""
-    first, box, views = sources[0].scene, sources[0].scene.box, []
-    seen: set[tuple[str, str]] = set()
+    """Joins the views and the boxes of all sources; a view that occurs twice in the same place counts once."""
+    first, box = sources[0].scene, sources[0].scene.box
     if box is not None:
         corners = torch.cat([frame.points(_corners(s.scene.box)) for s, frame in zip(sources, frames, strict=True)])
         boxes = [(s.scene.box, frame) for s, frame in zip(sources, frames, strict=True)]
         same = all(frame.is_identity and other is not None and torch.equal(other, box) for other, frame in boxes)
         box = box if same else torch.stack((corners.amin(0), corners.amax(0)))
-    for source, frame in zip(sources, frames, strict=True):
-        key = (source.config.data, str(frame.to_values()))
-        if key not in seen:
-            seen.add(key)
-            views.append((source.name, source.scene, frame))
-    near = min(scene.near * frame.scale for _, scene, frame in views)
-    far = max(scene.far * frame.scale for _, scene, frame in views)
+    pairs = [*zip(sources, frames, strict=True)]
+    near = min(source.scene.near * frame.scale for source, frame in pairs)
+    far = max(source.scene.far * frame.scale for source, frame in pairs)
+    places = [(source.config.data, str(frame.to_values())) for source, frame in pairs]
     train, test = (
-        _join_views([(name, getattr(scene, part), f) for name, scene, f in views]) for part in ("train", "test")
+        _join_views([(place, getattr(source.scene, part), frame) for place, (source, frame) in zip(places, pairs)])
+        for part in ("train", "test")
     )
     if box is not None:
         distances = (torch.cat((train.cameras.origins, test.cameras.origins))[:, None] - _corners(box)).norm(dim=-1)
         far = max(far, 1.01 * float(distances.max()))
-    moved = None if len(views) > 1 or not frames[0].is_identity else first.transform
+    moved = None if len({*places}) > 1 or not frames[0].is_identity else first.transform
     return replace(first, train=train, test=test, near=near, far=far, box=box, transform=moved)
 
 
@@ -274,19 +281,24 @@ def _corners(box: Tensor | None) -> Tensor:
     return torch.cartesian_prod(*box.float().T)
 
 
-def _join_views(views: Sequence[tuple[str, Split, Similarity]]) -> Split:
-    """Joins the cameras of several splits, without images.
+def _join_views(views: Sequence[tuple[tuple[str, str], Split, Similarity]]) -> Split:
+    """Joins the cameras of several splits, without images; each split comes with the name of its scene and its place.
 
-    If names of images repeat, all names get the number of their split as a prefix.
+    A view counts once if its name repeats in one scene and place. If names repeat otherwise, all names get the number
+    of their scene as a prefix.
     """
-    cameras = [moved_cameras(split.cameras, frame) for _, split, frame in views]
-    names = [name for _, split, _ in views for name in split.names]
-    if len(set(names)) < len(names):
-        names = [f"{i}-{name}" for i, (_, split, _) in enumerate(views) for name in split.names]
+    cameras, names = list[Cameras](), dict[tuple[str, str], list[str]]()
+    for place, split, frame in views:
+        known = names.setdefault(place, [])
+        new = [number for number, name in enumerate(split.names) if name not in known]
+        known += [split.names[number] for number in new]
+        if new:
+            cameras.append(moved_cameras(split.cameras[new], frame))
+    every = [name for known in names.values() for name in known]
+    if len(set(every)) < len(every):
+        every = [f"{i}-{name}" for i, known in enumerate(names.values()) for name in known]
     none = torch.empty(0, 1, 1, 3, dtype=torch.uint8, device="cpu")
-    if len(cameras) == 1:
-        return Split(cameras[0], none, tuple(names))
-    return Split(Cameras.joined(cameras), none, tuple(names))
+    return Split(cameras[0] if len(cameras) == 1 else Cameras.joined(cameras), none, tuple(every))
 
 
 def moved_cameras(cameras: Cameras, frame: Similarity) -> Cameras:

@@ -4,6 +4,7 @@ from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches, RaySource
 from voronerf.nerf.cameras import Cameras, Rays, focus_point, orbit_cameras, turntable_cameras
 from voronerf.nerf.contraction import Contraction, Perspective
+from voronerf.nerf.distributed import Ranks
 from voronerf.nerf.field import DirectionPerSample, Field
 from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.occupancy import OccupancyGrid
@@ -31,6 +32,7 @@ __all__ = [
     "OccupancyGrid",
     "Perspective",
     "PlannedSplit",
+    "Ranks",
     "RayBatches",
     "RayColours",
     "RayLoss",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from voronerf.nerf.cameras import Cameras, Rays
+from voronerf.nerf.distributed import ALONE
 from voronerf.nerf.occupancy import draw_seed
 from voronerf.nerf.replay import replayed
 from voronerf.nerf.volume import Batch
@@ -29,6 +30,7 @@ class RaySource(Protocol):
 
     Attributes:
         device: The device of its rays.
+        ranks: A `Ranks`, set by a `TrainingStep` with several processes: each should draw other rays.
 
     Examples:
         >>> import torch
@@ -70,6 +72,7 @@ class RayBatches:
         near: The distance along a ray at which the scene begins.
         far: The distance along a ray at which the scene ends.
         box: [2, 3], the box of the scene; None for no box.
+        region: [2, 3], a box that the rays must meet, too; None for none. Rays are not cut to it.
         background: [3], the colour behind the scene; None for black.
         random_background: Whether to draw a background colour for each ray, for images with alpha, and for opaque
             images if ``background`` is None. A translucent surface then never has the right colour, so surfaces learn
@@ -104,6 +107,7 @@ class RayBatches:
         near: float,
         far: float,
         box: Tensor | None = None,
+        region: Tensor | None = None,
         background: Tensor | None = None,
         random_background: bool = True,
         masks: Tensor | None = None,
@@ -120,22 +124,23 @@ class RayBatches:
         self.box, self.background = (None if each is None else each.to(self.place) for each in (box, background))
         self.random_background = random_background and (images.shape[-1] == 4 or background is None)
         self.cones, self.backend = cones, backend
+        self.ranks = ALONE
         if fetch is not None:
             self.fetch = fetch  # type: ignore[method-assign, assignment]
         if unseen and box is not None:
             message = "RayBatches: unseen must be 0 with a box, since unseen rays may miss it"
             raise ValueError(f"{message}, got {unseen}")
         self.unseen = unseen
-        self.useful = self._useful_pixels(masks)
+        self.useful = self._useful_pixels(masks, [each for each in (self.box, region) if each is not None])
         self.sparse = None
         if sparse is not None:
             pixels, distances = (tensor.to(self.place) for tensor in sparse)
             self.sparse = (pixels, distances) if len(pixels) else None
 
-    def _useful_pixels(self, masks: Tensor | None) -> PixelRuns | None:
+    def _useful_pixels(self, masks: Tensor | None, boxes: Sequence[Tensor]) -> PixelRuns | None:
         """Returns the pixels to draw from; None for all pixels."""
         cameras = self.cameras
-        if self.box is None and masks is None and cameras.sizes is None:
+        if not boxes and masks is None and cameras.sizes is None:
             return None
         runs = []
         for image in range(len(cameras)):
@@ -143,8 +148,8 @@ class RayBatches:
             chosen = torch.ones(height, width, dtype=torch.bool, device=self.place)
             if masks is not None:
                 chosen &= masks[image, :height, :width].to(self.place)
-            if self.box is not None:
-                bounds: dict[str, Any] = {"near": self.near, "far": self.far, "box": self.box}
+            for box in boxes:
+                bounds: dict[str, Any] = {"near": self.near, "far": self.far, "box": box.to(self.place)}
                 _, first, last = cameras.image_rays_between(image, backend=self.backend, **bounds)
                 chosen &= (last > first).reshape(height, width)
             edges = torch.nn.functional.pad(chosen.to(torch.int8), (1, 1)).diff(dim=1)
@@ -171,7 +176,7 @@ class RayBatches:
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """Draws ``count`` rays with replacement; the first rays go through points of the sparse model."""
-        seed = draw_seed(self.place, generator)
+        seed = self.ranks.seed(draw_seed(self.place, generator))
         known = None
         if self.sparse is not None and (several := following_count(count, lambda rays: int(SPARSE * rays))):
             known = KnownPixels(*self.sparse, several)

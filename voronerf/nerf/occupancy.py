@@ -19,6 +19,7 @@ from torch import Tensor
 
 from voronerf.nerf.cameras import Rays
 from voronerf.nerf.contraction import Contraction, Perspective
+from voronerf.nerf.distributed import Ranks
 from voronerf.nerf.field import Field
 from voronerf.nerf.radiance import radiance_of
 from voronerf.nerf.replay import replayed
@@ -123,6 +124,7 @@ class OccupancyGrid:
         self._numbers = None if contraction is None else contraction.numbers.to(self.box)
         self.density = torch.full(shape, remembered * self.threshold, dtype=torch.float32, device=self.box.device)
         self.occupied = torch.ones(shape, dtype=torch.bool, device=self.box.device)
+        self._merged: Tensor | None = None
 
     @classmethod
     def for_training(
@@ -359,6 +361,22 @@ class OccupancyGrid:
         self.density[floaters] = 0
         self.occupied[floaters] = False
 
+    def merge(self, ranks: Ranks) -> None:
+        """Takes over the changes of all processes: a voxel gets the largest density of the processes that changed it.
+
+        Args:
+            ranks: The processes, whose grids were equal after the last call.
+        """
+        if ranks.size == 1:
+            return
+        if self._merged is None:
+            self._merged = torch.full_like(self.density, -1)
+        changed = torch.where(self.density != self._merged, self.density, -1)
+        ranks.maximum(changed)
+        torch.where(changed < 0, self._merged, changed, out=self.density)
+        torch.ge(self.density, self.threshold, out=self.occupied)
+        self._merged.copy_(self.density)
+
     def drop_specks(self) -> None:
         """Marks isolated groups of one or two occupied voxels as empty; they look like dust in pictures."""
         neighbours = (self._neighbours() * self.occupied)[None]
@@ -408,7 +426,7 @@ class OccupancyGrid:
         """
         other = OccupancyGrid.from_state(state, contraction=self.contraction, device=self.box.device)
         self.box, self.threshold, self.settled = other.box, other.threshold, other.settled
-        self.density, self.occupied = other.density, other.occupied
+        self.density, self.occupied, self._merged = other.density, other.occupied, None
 
     @staticmethod
     def from_state(

@@ -15,6 +15,7 @@ from torch import Tensor
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.diagram.subdivision import Split, split_diagram
+from voronerf.nerf.distributed import ALONE, Ranks
 from voronerf.nerf.replay import replayed
 from voronerf.nerf.volume import RenderOutput
 from voronerf.router import VoronoiRouter
@@ -125,6 +126,7 @@ class Strategy:
         inherit: Whether new cells start as copies of their parent.
         splits: The number of splits made.
         remaining: The number of splits still planned.
+        ranks: The processes of a data-parallel training, set by `TrainingStep`.
 
     Examples:
         >>> from voronerf.nerf import Strategy
@@ -134,6 +136,7 @@ class Strategy:
 
     inherit: bool = True
     splits: int = 0
+    ranks: Ranks = ALONE
 
     @property
     def remaining(self) -> int:
@@ -286,6 +289,7 @@ class SplitStrategy(Strategy):
         if planned.max_cells is not None:
             children = min(children, planned.max_cells - cells + 1)
         points, importance = self.reservoir.samples()
+        points, importance = self.ranks.gather(points), self.ranks.gather(importance)
         if len(points) < children and self.splits == 0:
             raise ValueError(
                 f"SplitStrategy: {children} cells need at least {children} samples, got {len(points)} after {step} "

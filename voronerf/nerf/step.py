@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from voronerf.nerf import schedule
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RaySource
+from voronerf.nerf.distributed import ALONE, Ranks
 from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.replay import Replay, Stage, in_python
 from voronerf.nerf.split import Strategy
@@ -96,6 +97,8 @@ class TrainingStep:
         autocast: The dtype of the networks under autocast; None for float32. With autocast, a step is captured on CUDA,
             and runs eagerly on the CPU.
         scaler: GradScaler for float16, which prevents the capture of a step; None for no scaler.
+        ranks: The processes of a data-parallel training, which average their gradients. With several processes, the
+            attribute ``ranks`` of ``batches`` and ``strategy`` is set, too.
 
     Examples:
         >>> import torch
@@ -126,9 +129,13 @@ class TrainingStep:
         generator: torch.Generator,
         autocast: torch.dtype | None = None,
         scaler: torch.amp.GradScaler | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
         self.batches, self.loss, self.optimizer, self.strategy, self.guard = batches, loss, optimizer, strategy, guard
-        self.generator, self.autocast, self.scaler = generator, autocast, scaler
+        self.generator, self.autocast, self.scaler, self.ranks = generator, autocast, scaler, ranks
+        for part in (batches, strategy):
+            if ranks.size > 1 and part is not None:
+                part.ranks = ranks  # type: ignore[union-attr]
         self.run_within(nullcontext)
         self._start_anew()
 
@@ -217,6 +224,8 @@ class TrainingStep:
         self.optimizer.steps_done = self._done = at
         if at % schedule.GROUP == 0:
             self._after({})
+            if (grid := self.loss.renderer.sampler.grid) is not None:
+                grid.merge(self.ranks)
 
     # Stages -----------------------------------------------------------------------------------------------------------
 
@@ -231,11 +240,14 @@ class TrainingStep:
             stages = [stage._replace(function=self._in_precision()(stage.function)) for stage in stages]
         *evaluate, learn = stages
         clear = Stage("clear", self.optimizer.zero_grad)
-        update = Stage("update", self._update, ("output",), self._uses, restore=_set_gradients)
+        gradients = Stage("backward", self._backward, ("output",), self._uses, restore=_set_gradients)
+        average = Stage("average", self._average, ("output", "gradients"), python=not self._on_gpu())
+        update = Stage("update", self._update, ("output",), self._uses)
         hook = "step_post_backward"
         parts = [part for part in (loss.renderer.sampler, self.strategy) if part is not None]
         post = (Stage.of_hook(part, hook, function=getattr(part, hook), reads=("output",)) for part in parts)
-        return [draw, *evaluate, clear, learn, update, *post]
+        averaging = [average] if self.ranks.size > 1 else []
+        return [draw, *evaluate, clear, learn, gradients, *averaging, update, *post]
 
     def _before_step(self) -> list[Stage]:
         sampler = self.loss.renderer.sampler
@@ -250,7 +262,7 @@ class TrainingStep:
 
     def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
         """Notes the attributes that a recorded step depends on; see `voronerf.nerf.replay.Stage`."""
-        names = "batches", "loss", "optimizer", "strategy", "guard", "generator", "autocast", "scaler"
+        names = "batches", "loss", "optimizer", "strategy", "guard", "generator", "autocast", "scaler", "ranks"
         noted.entries(vars(self), names)
         return ()
 
@@ -261,17 +273,32 @@ class TrainingStep:
         renderer = self.loss.renderer
         renderer.sampler.step_pre_backward(renderer.field, self._done, self.generator)
 
-    def _update(self, output: RenderOutput) -> dict[str, Any]:
-        """Updates the parameters, and returns them with the gradients, which replays write.
+    def _backward(self, output: RenderOutput) -> dict[str, Any]:
+        """Returns the parameters with their gradients, which replays write.
 
         Under autocast, the backward pass runs here, outside the context.
         """
-        loss, guard, scaler = output.loss, self.guard, self._scaler
+        loss = output.loss
         if self.autocast is not None:
-            (loss if scaler is None else scaler.scale(loss)).backward()
+            (loss if self._scaler is None else self._scaler.scale(loss)).backward()
             # If the autograd graph stayed alive, the next step's gradients would use the stream of this step, but a
             # capture may only wait for its own stream.
             loss = loss.detach()
+        gradients = [(p, p.grad) for group in self.optimizer.param_groups for p in group["params"]]
+        if active.recording is not None:
+            for _, gradient in gradients:
+                if gradient is not None:
+                    active.recording.hold(gradient)
+        return {"output": output._replace(loss=loss), "gradients": gradients}
+
+    def _average(self, output: RenderOutput, gradients: list[tuple[Tensor, Tensor | None]]) -> None:
+        """Averages gradients and the loss over the ranks, so that the guard judges equally on all of them."""
+        present = [gradient for _, gradient in gradients if gradient is not None]
+        self.ranks.average([output.loss.detach(), *present])
+
+    def _update(self, output: RenderOutput) -> None:
+        """Updates the parameters."""
+        loss, guard, scaler = output.loss, self.guard, self._scaler
         if scaler is None:
             self.optimizer.update(guard, None if guard is None else loss)
         else:
@@ -280,12 +307,6 @@ class TrainingStep:
             # A flag on the device makes the optimiser skip a step that is not finite, so the host need not wait.
             scaler.step(self.optimizer)
             scaler.update()
-        gradients = [(p, p.grad) for group in self.optimizer.param_groups for p in group["params"]]
-        if active.recording is not None:
-            for _, gradient in gradients:
-                if gradient is not None:
-                    active.recording.hold(gradient)
-        return {"output": output._replace(loss=loss), "gradients": gradients}
 
     @property
     def _scaler(self) -> torch.amp.GradScaler | None:

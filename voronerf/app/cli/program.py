@@ -30,18 +30,20 @@ from voronerf.app.cli.export import export
 from voronerf.app.cli.info import info
 from voronerf.app.cli.parsing import parse
 from voronerf.app.cli.process import process
+from voronerf.app.cli.regions import regions
 from voronerf.app.cli.render import render
 from voronerf.app.cli.suggest import argument_names, check_characters, hyphenated
-from voronerf.app.cli.train import WHAT_TO_TRY, train, with_stored_settings
+from voronerf.app.cli.train import WHAT_TO_TRY, restarted, train, with_stored_settings
 from voronerf.app.cli.view import view
 from voronerf.app.train.config import ConfigError
 from voronerf.app.train.loop import TrainingError
 from voronerf.app.wording import nearest
+from voronerf.nerf.distributed import PeerLost
 from voronerf.ops._core.backends import BackendUnavailable
 
 #: Errors that a user can cause; they are printed as one line. ValueError includes SceneError and CheckpointError.
 EXPECTED = (
-    *(ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError),
+    *(ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError, PeerLost),
     *(MemoryError, torch.OutOfMemoryError),
 )
 
@@ -58,6 +60,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "eval": evaluate_run,
     "render": render,
     "export": export,
+    "regions": regions,
     "join": join,
     "cut": cut,
     "place": place,
@@ -164,6 +167,8 @@ def parse_command(name: str = "--help", *words: str) -> Callable[[], int]:
             hint = "see voronerf --help"
         raise ConfigError(f"there is no command {name}; {hint}")
     command = COMMANDS[name]
+    if name == "train":
+        words = tuple(restarted(list(words)))
     check_characters(name, command, list(words))
     return parse(name, with_stored_settings(command, list(words)) if name == "train" else command, words)
 

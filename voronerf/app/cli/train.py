@@ -42,7 +42,7 @@ from voronerf.app.train.callbacks import (
     TensorBoard,
     tensorboard_writer,
 )
-from voronerf.app.train.checkpoint import checkpoint_paths, last_checkpoint
+from voronerf.app.train.checkpoint import Checkpoint, checkpoint_paths, last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import machine_speed, why_no_occupancy
 from voronerf.app.train.loop import Callback, run
@@ -59,6 +59,7 @@ from voronerf.app.train.run_directory import (
     write_curve,
 )
 from voronerf.app.train.state import HALVES, State
+from voronerf.nerf.distributed import PeerLost, Ranks
 from voronerf.ops._core import backends
 
 #: The maximum length of a picture's name without its suffix, in bytes, on most file systems.
@@ -114,7 +115,17 @@ def train(
         explain: Only print how a training step is computed, and what prevents a faster implementation.
         capture: The settings of COLMAP.
     """
-    present_device(config.device)  # fails before the scene is read
+    ranks = Ranks.join(present_device(config.device))  # fails before the scene is read
+    if ranks.size > 1:
+        if config.out is None:
+            raise ConfigError("--out must be given with several processes, so that a restart finds the run")
+        if config.device.startswith("cuda:"):
+            raise ConfigError(f"--device must be cuda, without a number, with several processes, got {config.device}")
+        if needs_cameras(config.data):
+            rule = "--data must be a scene with several processes; voronerf process makes one"
+            raise ConfigError(f"{rule}, got {config.data}")
+        if ranks.rank:
+            return 0 if explain else follow(config, ranks)
     if panels is not None and panels < 0:
         raise ConfigError(f"--panels must be 0 or more, got {panels}")
     if not checkpoint_every > 0:
@@ -174,6 +185,26 @@ def train(
                 with contextlib.suppress(KeyboardInterrupt):
                     viewer.serve()
     return 0 if summary["complete"] else 130
+
+
+def follow(config: TrainConfig, ranks: Ranks) -> int:
+    """Trains as one of several processes, but not the first, which alone prints, evaluates and writes files.
+
+    Returns:
+        The exit status.
+    """
+    scene = load_scene(config.data, **config.reading)
+    try:
+        none: tuple[float, Checkpoint | None] = (1.0, None)
+        speed, checkpoint = ranks.first(none)
+        state = build(config, scene, speed=speed, ranks=ranks)
+        if checkpoint is not None:
+            load(state, checkpoint)
+        with stopped_by_signals(state.stop):
+            run(state)
+    except PeerLost:  # the first process prints the reason
+        return 1
+    return 130 if state.stopped else 0
 
 
 def with_cameras(config: TrainConfig, settings: CaptureSettings) -> tuple[TrainConfig, int]:
@@ -275,7 +306,8 @@ def run_training(
 ) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 
-    ``watch`` makes the callback that shows the training in a viewer. ``quiet`` prints only the live line.
+    ``watch`` makes the callback that shows the training in a viewer. ``quiet`` prints only the live line. With
+    several processes, this is the first; see `follow` for the others.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the current step: the checkpoint and the summary are written,
     the pictures are not. A second signal ends the process at once.
@@ -294,9 +326,12 @@ def run_training(
             # A resumed run keeps its settings.
             measured = config.budget is not None and not resume and present_device(config.device) == "cpu"
             speed = machine_speed() if measured else 1.0
-            state = build(config, scene, on_event=display.on_event, speed=speed)
-            if resume:
-                load(state, last_checkpoint(out))
+            checkpoint = last_checkpoint(out) if resume else None
+            ranks = Ranks.join(present_device(config.device))
+            ranks.first((speed, checkpoint))
+            state = build(config, scene, on_event=display.on_event, speed=speed, ranks=ranks)
+            if checkpoint is not None:
+                load(state, checkpoint)
             lpips, source = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])
             if lpips is None:
                 display.on_event(source)
@@ -350,6 +385,15 @@ def stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
         yield
     finally:
         restore()
+
+
+def restarted(words: list[str]) -> list[str]:
+    """Returns the arguments of a training, with --resume if ``torchrun`` has restarted a run with a checkpoint."""
+    out = _option_path(words, "--out")
+    is_restart = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
+    if not is_restart or out is None or not checkpoint_paths(out):
+        return words
+    return [*(word for word in words if word != "--resume"), "--resume"]
 
 
 def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callable[..., int]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
+
+import torch
 
 from voronerf.app.scenes.blender import load_blender
 from voronerf.app.scenes.builtin import builtin_scene, city_scene
@@ -18,6 +20,7 @@ from voronerf.app.scenes.folders import CONVERTED, SUFFIXES
 from voronerf.app.scenes.gather import POLYCAM, VIDEOS
 from voronerf.app.scenes.llff import FILE, load_llff
 from voronerf.app.scenes.photographs import Reading
+from voronerf.app.scenes.regions import region_of
 from voronerf.app.scenes.scene import KINDS, Scene, Split
 from voronerf.app.scenes.transforms import load_transforms
 from voronerf.app.wording import similar_path
@@ -109,6 +112,7 @@ def load_scene(
     normalise: bool = True,
     images: str = "auto",
     keep_far: bool = False,
+    region: Sequence[float] | None = None,
 ) -> Scene:
     """Loads a scene.
 
@@ -133,6 +137,8 @@ def load_scene(
             memory.
         keep_far: keep photographs whose cameras lie far from the others. By default they are left out, since one such
             camera would determine the scale of the scene.
+        region: x y z of the lowest and of the highest corner of a box. Only pixels whose rays meet it are used, and the
+            rest of the scene becomes a background. None is the whole scene.
 
     Raises:
         SceneError: the data cannot be used; the message is one line with the file and the fault.
@@ -153,19 +159,29 @@ def load_scene(
     if is_builtin(source):
         if format != "auto" or kind not in ("auto", "object"):
             raise SceneError(f"{source}: format must be auto and kind auto or object, got {format} and {kind}")
-        name, _, part = str(source).partition(":")
-        if name == BUILTIN and part and not (re.fullmatch(r"[1-9]\d{0,3}", part) and int(part) <= MOST_PIXELS):
-            raise SceneError(f"builtin: the size must be 1 to {MOST_PIXELS} pixels, got {part!r:.60}")
-        full, downscale = int(part) if name == BUILTIN and part else BUILTIN_SIZE, downscale or 1
-        if downscale > full:
-            raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {full} x {full}")
-        if name == CITY:
-            return city_of(full // downscale, part or "1x1", images)
-        if images == "disk":
-            raise SceneError(
-                f"{source}: images must be auto or memory for a built-in scene other than a city, got disk"
-            )
-        return _computed(full // downscale)
+        scene = _builtin(str(source), downscale or 1, images)
+    else:
+        reading = Reading(downscale, allow_outside, kind, normalise, images, keep_far)
+        scene = _read(source, format, reading)
+    return scene if region is None else region_of(scene, torch.tensor(region, dtype=torch.float32).view(2, 3))
+
+
+def _builtin(source: str, downscale: int, images: str) -> Scene:
+    name, _, part = source.partition(":")
+    if name == BUILTIN and part and not (re.fullmatch(r"[1-9]\d{0,3}", part) and int(part) <= MOST_PIXELS):
+        raise SceneError(f"builtin: the size must be 1 to {MOST_PIXELS} pixels, got {part!r:.60}")
+    full = int(part) if name == BUILTIN and part else BUILTIN_SIZE
+    if downscale > full:
+        raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {full} x {full}")
+    if name == CITY:
+        return city_of(full // downscale, part or "1x1", images)
+    if images == "disk":
+        raise SceneError(f"{source}: images must be auto or memory for a built-in scene other than a city, got disk")
+    return _computed(full // downscale)
+
+
+def _read(source: str | Path, format: str, reading: Reading) -> Scene:
+    """Reads a folder, or the folder of a file."""
     if re.match("(?i)[a-z][a-z0-9+.-]+://", str(source)):
         raise SceneError(f"{source}: is not a folder; download the scene, unpack it and give its folder")
     folder = Path(source)
@@ -195,6 +211,6 @@ def load_scene(
     if format != "auto" and format not in formats:
         raise SceneError(f"{folder}: format must be one that the folder has, {' or '.join(formats)}, got {format}")
     chosen = formats[0] if format == "auto" else format
-    scene = FORMATS[chosen].load(folder, Reading(downscale, allow_outside, kind, normalise, images, keep_far))
+    scene = FORMATS[chosen].load(folder, reading)
     others = tuple(f"--format {name} would read {FORMATS[name].sign}" for name in formats if name != chosen)
     return replace(scene, notes=(*scene.notes, *others))

@@ -95,8 +95,9 @@ class Scene:
         box: float32 [2, 3], lowest and highest corner of an axis-aligned box around the scene, or None if unknown.
         background: the colour behind transparent pixels, "white"; None for opaque images.
         kind: one of `KINDS`.
-        contraction: the contraction that makes the space of a scene without a box finite; None for the sphere around
-            the origin and all cameras.
+        contraction: the contraction that makes the space of a scene without a box finite, or around a region of a
+            scene; None for the sphere around the box, or around the origin and all cameras.
+        region: float32 [2, 3], the box that the rays of all trained pixels meet; None for the whole scene.
         transform: float64 [4, 4], transform from the files' coordinates to the scene's, or None if it was not moved.
         notes: lines about how the files were read.
 
@@ -116,6 +117,7 @@ class Scene:
     background: str | None = None
     kind: str = "object"
     contraction: Contraction | Perspective | None = None
+    region: Tensor | None = None
     transform: Tensor | None = None
     notes: tuple[str, ...] = ()
 
@@ -133,8 +135,8 @@ class Scene:
 
         Args:
             contraction: "none"; "sphere"; "ndc" for forward-facing cameras; or "auto", which is none for a scene with
-                a box, otherwise ndc or sphere. The sphere is around the scene's box; without a box, it is the sphere of
-                the scene's contraction, or else around the origin and all cameras.
+                a box and without a contraction, otherwise ndc or sphere. The sphere belongs to the scene's contraction,
+                or else goes around the scene's box, or else around the origin and all cameras.
             cones: Whether the field takes cones instead of points.
             device: The device of the contraction's tensors.
 
@@ -143,7 +145,8 @@ class Scene:
         """
         default, chosen = self.contraction, contraction
         if contraction == "auto":
-            chosen = "none" if self.box is not None else "ndc" if isinstance(default, Perspective) else "sphere"
+            is_boxed = self.box is not None and default is None
+            chosen = "none" if is_boxed else "ndc" if isinstance(default, Perspective) else "sphere"
         if chosen == "none":
             return Space(None, self.spacing, cones)
         if chosen == "ndc":
@@ -152,12 +155,12 @@ class Scene:
             return Space(
                 replace(default, centre=default.centre.to(device), axes=default.axes.to(device)), self.spacing, cones
             )
-        if self.box is not None:
-            sphere = Contraction(self.box.mean(0).to(device), float((self.box[1] - self.box[0]).norm()) / 2)
-        elif default is not None:
+        if default is not None:
             sphere = Contraction(
                 default.centre.to(device), default.near if isinstance(default, Perspective) else default.radius
             )
+        elif self.box is not None:
+            sphere = Contraction(self.box.mean(0).to(device), float((self.box[1] - self.box[0]).norm()) / 2)
         else:
             radius = float(self.train.cameras.origins.norm(dim=-1).max())
             if radius == 0:
@@ -186,7 +189,8 @@ class Scene:
     def pixel(self, space: Space) -> float:
         """Returns the width of a training pixel at the scene's middle: distance / focal length, in scene units.
 
-        In normalised device coordinates this width is the same at all distances.
+        The distance is the mean over all cameras, or over the cameras around a region. In normalised device coordinates
+        the width is the same at all distances.
         """
         cameras = self.train.cameras
         focal = float(cameras.intrinsics[:, :2].mean())
@@ -195,6 +199,10 @@ class Scene:
         if self.kind in ("forward", "inside-out"):
             return 2 / (1 / self.near + 1 / self.far) / focal
         centre = cameras.origins.new_zeros(3) if self.contraction is None else self.contraction.centre
-        centre = centre if self.box is None else self.box.mean(0)
-        distance = float((cameras.origins - centre).norm(dim=-1).mean()) or self.near  # 0 for panoramas from one place
-        return distance / focal
+        if self.box is not None and self.region is None:
+            centre = self.box.mean(0)
+        distances = (cameras.origins - centre).norm(dim=-1)
+        if self.region is not None:  # far cameras see little of it
+            reach = max(float((self.region[1] - self.region[0]).norm()) / 2, 1.5 * float(distances.min()))
+            distances = distances[distances <= reach]
+        return (float(distances.mean()) or self.near) / focal  # the distance is 0 for panoramas from one place

@@ -24,6 +24,7 @@ from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.cameras import Rays
 from voronerf.nerf.contraction import Contraction
+from voronerf.nerf.distributed import ALONE, Ranks
 from voronerf.nerf.field import DirectionPerSample, Field
 from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.occupancy import OccupancyGrid
@@ -60,6 +61,7 @@ def build(
     *,
     on_event: Callable[[str], None] | None = None,
     speed: float = 1.0,
+    ranks: Ranks = ALONE,
 ) -> State:
     """Builds the state of a training before its first step.
 
@@ -69,6 +71,7 @@ def build(
         on_event: Called with a line of text for each split, evaluation and checkpoint.
         speed: The machine's speed, for the defaults of a training with a budget: see
             :func:`voronerf.app.train.defaults.machine_speed`.
+        ranks: The processes of a data-parallel training.
 
     Raises:
         ConfigError: For settings that do not fit the scene, or networks that do not fit into memory.
@@ -140,6 +143,7 @@ def build(
         scaler=torch.amp.GradScaler(device.type, enabled=config.precision == "fp16"),
         guard=Guard.on(device),
         rays=int(config.rays or 0),
+        ranks=ranks,
         unseen_share=unseen_share(scene, renderer.sampler.space),
         on_event=on_event,
     )
@@ -155,6 +159,7 @@ def make_batches(config: TrainConfig, scene: Scene, *, unseen: float = 0.0) -> R
         near=scene.near,
         far=scene.far,
         box=scene.box,
+        region=scene.region,
         background=scene.background_colour(),
         masks=train.masks,
         sparse=train.sparse_depth if config.sparse_depth else None,

@@ -61,6 +61,9 @@ class SceneSettings:
     keep_far: bool = False
     """Keep photographs whose cameras lie far from the others. By default they are left out, since one lost camera would
     determine the scale of the scene."""
+    region: tuple[float, float, float, float, float, float] | None = None
+    """Train only a box of the scene, x y z of its lowest and of its highest corner, on the pixels that see it; voronerf
+    regions divides a scene into such boxes, and voronerf join joins them."""
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,8 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
     contraction, sparse_depth, rays, samples = config.contraction, config.sparse_depth, config.rays, config.samples
     if contraction == "auto":
         forward = isinstance(scene.contraction, Perspective)
-        contraction = "none" if kind.scene_options is None or boxed else "ndc" if forward else "sphere"
+        is_plain = kind.scene_options is None or (boxed and scene.contraction is None)
+        contraction = "none" if is_plain else "ndc" if forward else "sphere"
     contracted = contraction != "none"
     space = scene.space(contraction, cones=kind.cones)
     pixel = scene.pixel(space)

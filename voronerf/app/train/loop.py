@@ -82,14 +82,16 @@ def train(
     """
     scene, first_step = state.scene, state.step
     one_thread = backends.torch_on_one_thread if state.thread_deterministic else nullcontext
-    quick_steps = GROUP
+    group = quick_steps = min((callback.group for callback in callbacks), default=GROUP)
     state.training_step.run_within(one_thread)
-    while state.fraction < 1 and state.seconds < until and not state.stopped:
+    while True:
         started = clock()
+        most = state.agree(min(group, quick_steps))
+        if state.fraction >= 1 or state.seconds >= until or state.stopped:
+            break
         with one_thread():
             prepare(state, callbacks)
-        group = min((callback.group for callback in callbacks), default=GROUP)
-        steps = min(state.steps_per_update(), steps_to_judgement(state), group, quick_steps)
+        steps = min(state.steps_per_update(), steps_to_judgement(state), most)
         output = state.training_step(state.rays, steps, at=state.step - state.began)
         count(state, steps, output)
         judge_start(state, output)
@@ -100,10 +102,12 @@ def train(
             callback.after_step(state)
     if state.fraction >= 1 and state.step > first_step:  # only once, in the call that ends the training
         started = clock()
+        if state.sampler.grid is not None:
+            state.sampler.grid.merge(state.ranks)
         with state.averaged():
             state.sampler.finish(state.renderer.field, state.config.seed)
-            has_floaters = len(scene.train) >= FLOATER_VIEWS and state.step >= FLOATER_STEPS
-            if has_floaters and isinstance(state.sampler, Occupancy):
+            has_views = len(scene.train) >= FLOATER_VIEWS and scene.region is None
+            if has_views and state.step >= FLOATER_STEPS and isinstance(state.sampler, Occupancy):
                 rays = view_rays(scene, FLOATER_RAYS, state.device)
                 state.sampler.drop_floaters(state.renderer.field, rays, near=scene.near, far=scene.far)
         state.add_seconds(clock() - started)

@@ -40,7 +40,7 @@ def judge_start(state: State, last: StepOutput) -> None:
     draw = sum(stage.cells == 1 for stage in state.stages)
     if state.router.num_cells > 1 or draw > DRAWS:
         return
-    fault = why_nothing_is_learnt(last.batch, last.output)
+    fault = state.ranks.first(why_nothing_is_learnt(last.batch, last.output))
     if fault is None:
         return
     config = state.config

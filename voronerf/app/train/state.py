@@ -17,6 +17,7 @@ from voronerf.app.train.config import TrainConfig
 from voronerf.nerf import schedule
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
+from voronerf.nerf.distributed import ALONE, Ranks
 from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.replay import in_python
@@ -74,6 +75,7 @@ class State:
         evaluation_seconds: The time in seconds of evaluations that count for the budget.
         reserved_seconds: The seconds of the budget that are reserved for the last evaluation.
         rays: The number of rays of the next step.
+        ranks: The processes of a data-parallel training.
         unseen_share: The fraction of the training in which batches have unseen rays, from positions without a camera.
         rays_done: The number of rays of all finished steps.
         loss: The loss of the last step that the host has read.
@@ -97,6 +99,7 @@ class State:
     scaler: torch.amp.GradScaler
     guard: Guard
     rays: int
+    ranks: Ranks = ALONE
     unseen_share: float = 0.0
     on_event: Callable[[str], None] | None = None
     step: int = 0
@@ -120,6 +123,7 @@ class State:
             generator=self.draws,
             autocast=HALVES.get(self.config.precision),
             scaler=self.scaler,
+            ranks=self.ranks,
         )
 
     @property
@@ -200,6 +204,14 @@ class State:
         """The step of the last start of the coarse stage, see `voronerf.app.train.start`."""
         return max((stage.started_at_step for stage in self.stages if stage.cells == 1), default=0)
 
+    def agree(self, steps: int) -> int:
+        """Takes over what depends on the clock, on samples or on signals from rank 0; returns its number of steps."""
+        names = "seconds", "evaluation_seconds", "reserved_seconds", "rays", "stopped"
+        numbers, steps = self.ranks.first(([getattr(self, name) for name in names], steps))
+        for name, number in zip(names, numbers, strict=True):
+            setattr(self, name, number)
+        return steps
+
     def averaged(self) -> AbstractContextManager[None]:
         """Returns a context in which the networks have their averaged weights, for pictures but not for training."""
         return self.optimizer.averaged()
@@ -236,9 +248,9 @@ class State:
         self.stages.append(TrainingStage(1, self.seconds, self.step, None, None, 0))
 
     def count_steps(self, count: int, rays: int) -> None:
-        """Counts ``count`` steps with ``rays`` rays each."""
+        """Counts ``count`` steps with ``rays`` rays each in every process."""
         self.step += count
-        self.rays_done += count * rays
+        self.rays_done += count * rays * self.ranks.size
 
     def add_seconds(self, seconds: float) -> None:
         """Adds seconds of training time."""

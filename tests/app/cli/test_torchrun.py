@@ -1,0 +1,119 @@
+"""Tests of trainings of several processes that ``torchrun`` starts, and of regions."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+from cli_commands import TINY, words
+from helpers import read_json
+
+from voronerf import editing
+from voronerf.app import open_run
+from voronerf.app.cli import main, train
+from voronerf.app.files import read_json_lines
+from voronerf.app.scenes import load_scene
+from voronerf.app.train.checkpoint import load_checkpoint
+from voronerf.nerf import Ranks
+
+several = pytest.mark.skipif(
+    sys.platform == "win32" or not torch.distributed.is_available(), reason="needs torch.distributed with libuv"
+)
+
+
+def torchrun(*parts, processes=2):
+    command = [sys.executable, *words(f"-m torch.distributed.run --standalone --nproc-per-node {processes}")]
+    return subprocess.Popen(
+        command + words(*parts), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+
+
+def finished(process):
+    try:
+        output = process.communicate(timeout=300)[0]
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    return output
+
+
+def children(process):
+    """Returns the process numbers of the trainings, in the order of their ranks."""
+    listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True)
+    return [int(line) for line in listed.stdout.split()]
+
+
+@several
+def test_another_number_of_processes_continues_a_run(tmp_path):
+    assert main(words("train --data builtin --out", tmp_path, TINY)) == 0
+    process = torchrun("-m voronerf train --resume --steps 40 --out", tmp_path)
+    output = finished(process)
+    assert process.returncode == 0 and output.count("wrote") == 1, output
+    summary = read_json(tmp_path / "summary.json")
+    assert summary["complete"] and summary["steps"] == 40 and summary["cells"] == 3
+    checkpoint = load_checkpoint(tmp_path / "checkpoints" / "last.safetensors")
+    assert checkpoint.values["rays_done"] == (16 + 2 * 24) * 64
+    assert main(words("train --resume --steps 48 --out", tmp_path)) == 0
+    assert read_json(tmp_path / "summary.json")["steps"] == 48
+
+
+@several
+def test_a_killed_process_ends_all_and_a_restart_goes_on(tmp_path):
+    endless = TINY.replace("--steps 16", "--steps 1600 --checkpoint-every 0.2 --panels 0")
+    last = tmp_path / "checkpoints" / "last.safetensors"
+    process = torchrun("--max-restarts 1 -m voronerf train --data builtin --out", tmp_path, endless)
+    deadline = time.monotonic() + 200
+    while not last.exists():
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.05)
+    os.kill(children(process)[1], signal.SIGKILL)
+    output = finished(process)
+    assert process.returncode == 0 and "another process of this training has ended" in output, output
+    summary = read_json(tmp_path / "summary.json")
+    assert summary["complete"] and summary["steps"] == 1600
+    assert [line["step"] for line in read_json_lines(tmp_path / "metrics.jsonl")] == [800, 1600]
+
+
+def test_several_processes_need_out(tmp_path, monkeypatch, fails):
+    monkeypatch.setattr(Ranks, "join", lambda device: Ranks(0, 2))
+    fails("--out must be given with several processes", "train --data builtin")
+    monkeypatch.setattr(train, "present_device", torch.device)
+    fails("--device must be cuda, without a number, with several processes", "train --device cuda:1 --out", tmp_path)
+
+
+def test_regions_are_trained_and_joined(tmp_path, capsys):
+    assert main(words("regions builtin-city:2x1 --count 2 --out", tmp_path)) == 0
+    *jobs, join = (line.split()[1:] for line in capsys.readouterr().out.splitlines())
+    boxes = [[float(word) for word in job[job.index("--region") + 1 :][:6]] for job in jobs]
+    assert boxes[0][3] == boxes[1][0] and boxes[0][:3] == [-1, -0.5, -0.03]
+    whole, region = (load_scene("builtin-city:2x1", downscale=5, region=box) for box in (None, boxes[0]))
+    assert region.pixel(region.space()) < whole.pixel(whole.space())
+    for job in jobs:
+        assert main(words(*job, "--downscale 5 --steps 60 --panels 0")) == 0
+    assert main(join) == 0
+    run = editing.open_run(tmp_path / "joined")
+    part = open_run(tmp_path / "region-0")
+    assert run.scene.test.masks is None and len(part.scene.test) <= len(run.scene.test)
+    assert part.scene.test.masks.float().mean() < 1
+    torch.testing.assert_close(run.scene.box, torch.tensor(boxes[0][:3] + boxes[1][3:]).view(2, 3), atol=0.1, rtol=0)
+    assert torch.isfinite(run.render(0).colour).all()
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (
+            "train --region 0 0 0 -1 1 1",
+            "region must be x y z of a corner and of a larger one, got [[0.0, 0.0, 0.0], [-1",
+        ),
+        ("train --region 90 90 90 91 91 91", "region must be seen by a test view, got [[90.0, 90.0, 90.0], [91"),
+        ("regions builtin-city --count 0", "count must be 1 to 40, the number of points, got 0"),
+        ("regions builtin-city --count 41", "count must be 1 to 40, the number of points, got 41"),
+    ],
+)
+def test_bad_regions_are_one_line(tmp_path, parts, message, fails):
+    scene = "--data builtin-city --downscale 10 --steps 8" if parts.startswith("train") else ""
+    fails(message, parts, scene, "--out", tmp_path / "out")
