@@ -8,17 +8,8 @@ import torch
 from voronerf import HashGridField, OccupancyGrid, VoronoiRouter
 from voronerf.app.evaluate import evaluate, mean_scores
 from voronerf.app.scenes import load_scene
-from voronerf.nerf import (
-    Adam,
-    Occupancy,
-    PlannedSplit,
-    Ranks,
-    RayBatches,
-    RayLoss,
-    Renderer,
-    SplitStrategy,
-    TrainingStep,
-)
+from voronerf.nerf import Adam, Occupancy, PlannedSplit, RayBatches, RayLoss, Renderer, SplitStrategy, TrainingStep
+from voronerf.nerf.distributed import Ranks
 from voronerf.nerf.samplers import usual_samples
 from voronerf.nerf.schedule import GROUP, learning_rate, next_rays
 from voronerf.nerf.terms import SparseDepth

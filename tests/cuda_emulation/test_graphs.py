@@ -257,15 +257,15 @@ def test_no_graph_of_autograd_outlives_a_step():
     with emulated(), graphs() as seen:
         training, alive = Training(cells=2), list[weakref.ref]()
         training.step.autocast = torch.bfloat16
-        update = training.step._update
+        backward = training.step._backward
 
         def marked(output):
             mark = contextlib.ExitStack()  # supports weak references
             alive.append(weakref.ref(mark))
             output.loss.grad_fn.metadata["mark"] = mark
-            return update(output)
+            return backward(output)
 
-        training.step._update = marked
+        training.step._backward = marked
         gc.disable()
         try:
             held = [training.step(64) for _ in range(4)]

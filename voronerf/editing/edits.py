@@ -59,7 +59,8 @@ class RunContents:
         if (region := whole.config.region) is None:
             return whole
         whole = replace(whole, config=replace(whole.config, region=None))
-        return replace(cut_source(whole, Solid.box(region[:3], region[3:])), cut=False)
+        cut = cut_source(whole, Solid.box(region[:3], region[3:]))
+        return replace(cut, cut=whole.scene.box is None)  # regions fill the box of a scene
 
     @classmethod
     def _whole(cls, run: Path) -> RunContents:
@@ -287,11 +288,11 @@ def _join_views(views: Sequence[tuple[tuple[str, str], Split, Similarity]]) -> S
     A view counts once if its name repeats in one scene and place. If names repeat otherwise, all names get the number
     of their scene as a prefix.
     """
-    cameras, names = list[Cameras](), dict[tuple[str, str], list[str]]()
+    cameras, names = list[Cameras](), dict[tuple[str, str], dict[str, None]]()
     for place, split, frame in views:
-        known = names.setdefault(place, [])
+        known = names.setdefault(place, {})
         new = [number for number, name in enumerate(split.names) if name not in known]
-        known += [split.names[number] for number in new]
+        known |= dict.fromkeys(split.names)
         if new:
             cameras.append(moved_cameras(split.cameras[new], frame))
     every = [name for known in names.values() for name in known]

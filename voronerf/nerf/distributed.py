@@ -55,13 +55,20 @@ class Ranks:
 
         Args:
             device: The device of the networks. On GPUs, this process uses the GPU with the number ``LOCAL_RANK``.
+
+        Raises:
+            ValueError: There are fewer GPUs than processes.
+            PeerLost: Another process has ended.
         """
         if int(os.environ.get("WORLD_SIZE", "1")) < 2:
             return cls()
         if not dist.is_initialized():
             on_gpu = torch.device(device).type == "cuda"
             if on_gpu:
-                torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
+                local, count = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
+                if local >= count:
+                    raise ValueError(f"Ranks.join: every process needs a GPU; LOCAL_RANK is {local}, of {count} GPUs")
+                torch.cuda.set_device(local)
             with _peers():
                 store, rank, size = next(dist.rendezvous("env://"))
                 # After a restart, torchrun's store still has the addresses of the processes that have ended.

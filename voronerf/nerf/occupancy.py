@@ -365,7 +365,7 @@ class OccupancyGrid:
         """Takes over the changes of all processes: a voxel gets the largest density of the processes that changed it.
 
         Args:
-            ranks: The processes, whose grids were equal after the last call.
+            ranks: The processes. Their grids must be equal at the first call.
         """
         if ranks.size == 1:
             return

@@ -98,7 +98,8 @@ class TrainingStep:
             and runs eagerly on the CPU.
         scaler: GradScaler for float16, which prevents the capture of a step; None for no scaler.
         ranks: The processes of a data-parallel training, which average their gradients. With several processes, the
-            attribute ``ranks`` of ``batches`` and ``strategy`` is set, too.
+            attribute ``ranks`` of ``batches`` and ``strategy`` is set, too, and calls need ``at``: after each `GROUP`
+            of steps, the grids of the processes are merged.
 
     Examples:
         >>> import torch

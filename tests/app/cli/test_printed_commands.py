@@ -33,7 +33,7 @@ PROGRAMS = ("voronerf", "python", "make", "pip", "ns-train", "tensorboard")
 #: Programs of other projects.
 FOREIGN = ("tensorboard", "ns-train")
 #: Option values that make a command quick.
-SHORT = {"--budget": "0.1", "--frames": "2", "--resolution": "8", "--count": "20"}
+SHORT = {"--budget": "0.1", "--frames": "2", "--resolution": "8", "--count": "5"}
 ADDED = {
     "train": ("--budget",),
     "render": ("--frames",),

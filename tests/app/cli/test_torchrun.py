@@ -16,7 +16,10 @@ from voronerf.app import open_run
 from voronerf.app.cli import main, train
 from voronerf.app.files import read_json_lines
 from voronerf.app.scenes import load_scene
+from voronerf.app.scenes.regions import tiles
+from voronerf.app.train import TrainConfig, build
 from voronerf.app.train.checkpoint import load_checkpoint
+from voronerf.app.train.config import ConfigError
 from voronerf.nerf import Ranks
 
 several = pytest.mark.skipif(
@@ -64,7 +67,7 @@ def test_another_number_of_processes_continues_a_run(tmp_path):
 def test_a_killed_process_ends_all_and_a_restart_goes_on(tmp_path):
     endless = TINY.replace("--steps 16", "--steps 1600 --checkpoint-every 0.2 --panels 0")
     last = tmp_path / "checkpoints" / "last.safetensors"
-    process = torchrun("--max-restarts 1 -m voronerf train --data builtin --out", tmp_path, endless)
+    process = torchrun("--max-restarts 1 -m voronerf train --resume --data builtin --out", tmp_path, endless)
     deadline = time.monotonic() + 200
     while not last.exists():
         assert time.monotonic() < deadline and process.poll() is None
@@ -77,11 +80,22 @@ def test_a_killed_process_ends_all_and_a_restart_goes_on(tmp_path):
     assert [line["step"] for line in read_json_lines(tmp_path / "metrics.jsonl")] == [800, 1600]
 
 
-def test_several_processes_need_out(tmp_path, monkeypatch, fails):
+def test_settings_that_several_processes_refuse(tmp_path, monkeypatch, fails):
     monkeypatch.setattr(Ranks, "join", lambda device: Ranks(0, 2))
     fails("--out must be given with several processes", "train --data builtin")
     monkeypatch.setattr(train, "present_device", torch.device)
     fails("--device must be cuda, without a number, with several processes", "train --device cuda:1 --out", tmp_path)
+    with pytest.raises(ConfigError, match="--assignment must be nearest with several processes, got stochastic"):
+        build(TrainConfig(assignment="stochastic", steps=8), load_scene("builtin", downscale=20), ranks=Ranks(0, 2))
+
+
+@pytest.mark.parametrize("source", ["builtin", "builtin-city:2x2"])
+def test_regions_fill_the_box(source):
+    """The cameras of the first scene are outside of its box."""
+    scene = load_scene(source, downscale=20)
+    sides = torch.stack([box[1] - box[0] for box in tiles(scene, 5)])
+    assert sides.amin() > 0
+    torch.testing.assert_close(sides.prod(1).sum(), (scene.box[1] - scene.box[0]).prod())
 
 
 def test_regions_are_trained_and_joined(tmp_path, capsys):

@@ -169,8 +169,8 @@ def test_plan(settings, expected):
     assert all(p.max_cells == settings.get("max_cells") for p in plan if p.cells == "worst")
 
 
-def test_there_are_at_most_37_settings():
-    assert len(dataclasses.fields(TrainConfig)) <= 37
+def test_there_are_at_most_38_settings():
+    assert len(dataclasses.fields(TrainConfig)) <= 38
 
 
 def test_long_trainings_of_objects_take_more_rays_a_step():

@@ -33,7 +33,7 @@ from voronerf.app.cli.process import process
 from voronerf.app.cli.regions import regions
 from voronerf.app.cli.render import render
 from voronerf.app.cli.suggest import argument_names, check_characters, hyphenated
-from voronerf.app.cli.train import WHAT_TO_TRY, restarted, train, with_stored_settings
+from voronerf.app.cli.train import WHAT_TO_TRY, train, with_stored_settings, without_early_resume
 from voronerf.app.cli.view import view
 from voronerf.app.train.config import ConfigError
 from voronerf.app.train.loop import TrainingError
@@ -168,7 +168,7 @@ def parse_command(name: str = "--help", *words: str) -> Callable[[], int]:
         raise ConfigError(f"there is no command {name}; {hint}")
     command = COMMANDS[name]
     if name == "train":
-        words = tuple(restarted(list(words)))
+        words = tuple(without_early_resume(list(words)))
     check_characters(name, command, list(words))
     return parse(name, with_stored_settings(command, list(words)) if name == "train" else command, words)
 

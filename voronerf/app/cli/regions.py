@@ -15,7 +15,8 @@ def regions(data: str, /, count: int, out: Path = Path("runs")) -> int:
 
     The jobs need no communication, so they can run on one machine one after another, or on many machines. The boxes
     have equally many points of the sparse model or, without a model, equally many cameras. Each printed command takes
-    further options of voronerf train, which should be the same in all of them.
+    further options of voronerf train, which should be the same in all of them and leave the coordinates of the scene as
+    they are.
 
     Args:
         data: The scene, as for voronerf train.

@@ -103,7 +103,8 @@ def train(
 
     Args:
         config: The settings.
-        resume: Continue the run in --out from its last checkpoint.
+        resume: Continue the run in --out from its last checkpoint. With several processes, also start a run, so that a
+            restart by torchrun continues it.
         file: JSON of settings by name, such as the config.json of a run; options on the command line override it.
         checkpoint_every: Seconds of training between checkpoints, which are written in the background.
         panels: Number of test views drawn as panels at the end: truth, render, error, depth, cells. Default 4; with a
@@ -184,7 +185,7 @@ def train(
                 viewer.show(import_viewer().Subject.of(opened), read_curve(chosen.out))
                 with contextlib.suppress(KeyboardInterrupt):
                     viewer.serve()
-    return 0 if summary["complete"] else 130
+    return 0 if summary["complete"] or ranks.size > 1 else 130  # torchrun starts failed processes again
 
 
 def follow(config: TrainConfig, ranks: Ranks) -> int:
@@ -200,11 +201,12 @@ def follow(config: TrainConfig, ranks: Ranks) -> int:
         state = build(config, scene, speed=speed, ranks=ranks)
         if checkpoint is not None:
             load(state, checkpoint)
+            state.strategy.forget()  # these samples belong to the first process
         with stopped_by_signals(state.stop):
             run(state)
-    except PeerLost:  # the first process prints the reason
+    except PeerLost:  # the first process prints the reason, or torchrun if that process has ended
         return 1
-    return 130 if state.stopped else 0
+    return 0
 
 
 def with_cameras(config: TrainConfig, settings: CaptureSettings) -> tuple[TrainConfig, int]:
@@ -387,13 +389,16 @@ def stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
         restore()
 
 
-def restarted(words: list[str]) -> list[str]:
-    """Returns the arguments of a training, with --resume if ``torchrun`` has restarted a run with a checkpoint."""
-    out = _option_path(words, "--out")
-    is_restart = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
-    if not is_restart or out is None or not checkpoint_paths(out):
+def without_early_resume(words: list[str]) -> list[str]:
+    """Returns the arguments of a training, without --resume if several processes have no checkpoint to resume.
+
+    ``torchrun`` repeats the same command after a process has ended, perhaps before the first checkpoint.
+    """
+    out, file = _option_path(words, "--out"), _option_path(words, "--config")
+    is_several = os.environ.get("WORLD_SIZE", "1") != "1"
+    if not is_several or out is None or file is not None or checkpoint_paths(out):
         return words
-    return [*(word for word in words if word != "--resume"), "--resume"]
+    return [word for word in words if word != "--resume"]
 
 
 def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callable[..., int]:

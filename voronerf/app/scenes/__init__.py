@@ -163,7 +163,9 @@ def load_scene(
     else:
         reading = Reading(downscale, allow_outside, kind, normalise, images, keep_far)
         scene = _read(source, format, reading)
-    return scene if region is None else region_of(scene, torch.tensor(region, dtype=torch.float32).view(2, 3))
+    if region is None:
+        return scene
+    return region_of(scene, torch.tensor(region, dtype=torch.float32, device="cpu").view(2, 3))
 
 
 def _builtin(source: str, downscale: int, images: str) -> Scene:

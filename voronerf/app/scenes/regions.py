@@ -19,8 +19,7 @@ from voronerf.nerf.contraction import Contraction
 
 #: The fraction of the points beyond the sides of the outer boxes, along each axis and on each side: strays of a model.
 STRAYS = 0.002
-#: The minimum fraction of the pixels of a test view whose rays meet the region. If no view has twice as many, half of
-#: the largest fraction.
+#: The minimum fraction of the pixels of a test view whose rays meet the region; at most half of the largest fraction.
 SEEN = 0.2
 
 
@@ -48,7 +47,7 @@ def region_of(scene: Scene, box: Tensor) -> Scene:
         _, first, last = test.cameras.image_rays_between(view, **bounds)
         mask = test.mask(view)
         masks[view, :height, :width] = (last > first).view(height, width) & (True if mask is None else mask)
-    shares = masks.flatten(1).float().mean(1)
+    shares = masks.flatten(1).count_nonzero(1) / masks[0].numel()
     if not shares.any():
         raise SceneError(f"{scene.name}: region must be seen by a test view, got {box.tolist()}")
     seeing = (shares >= min(SEEN, float(shares.max()) / 2)).nonzero()[:, 0]
@@ -61,15 +60,15 @@ def region_of(scene: Scene, box: Tensor) -> Scene:
 def tiles(scene: Scene, count: int) -> list[Tensor]:
     """Divides a scene into boxes [2, 3] with equally many points, which fill the box around them without gaps.
 
-    The points belong to the sparse model; without one, they are the positions of the cameras. The longer side of the
-    box is divided first, as in a k-d tree (Bentley 1975).
+    The points belong to the sparse model; without one, they are the positions of the cameras. The longest side of the
+    box is divided first, as in a k-d tree (Bentley 1975); in the middle if that leaves no point on one side.
 
     Args:
         scene: The scene.
         count: The number of boxes, at least 1.
 
     Raises:
-        SceneError: ``count`` is below 1, or there are fewer points.
+        SceneError: The scene has neither a box nor a sparse model, ``count`` is below 1, or there are fewer points.
 
     Examples:
         >>> from voronerf.app.scenes import load_scene
@@ -86,6 +85,8 @@ def tiles(scene: Scene, count: int) -> list[Tensor]:
     if not 1 <= count <= len(points):
         raise SceneError(f"{scene.name}: count must be 1 to {len(points)}, the number of points, got {count}")
     box = scene.box
+    if box is None and depths is None:
+        raise SceneError(f"{scene.name}: the scene must have a box or a sparse model to be divided into regions")
     if box is None:
         ends = torch.tensor([STRAYS, 1 - STRAYS], dtype=points.dtype, device="cpu")
         box = torch.quantile(points[:: max(1, len(points) // 1_000_000)], ends, dim=0)
@@ -98,7 +99,9 @@ def _divided(points: Tensor, box: Tensor, count: int) -> list[Tensor]:
     axis = int((box[1] - box[0]).argmax())
     order, first = points[:, axis].argsort(), count // 2
     place = len(points) * first // count
-    border = points[order[place - 1 : place + 1], axis].mean().clamp(box[0, axis], box[1, axis])
+    border = points[order[place - 1 : place + 1], axis].mean()
+    if not box[0, axis] < border < box[1, axis]:
+        border = box[:, axis].mean()
     low, high = box.clone(), box.clone()
     low[1, axis] = high[0, axis] = border
     return _divided(points[order[:place]], low, first) + _divided(points[order[place:]], high, count - first)

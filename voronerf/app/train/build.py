@@ -87,6 +87,8 @@ def build(
         (3, 4)
     """
     config = resolve(replace(config, device=present_device(config.device)), scene, speed)
+    if config.assignment == "stochastic" and ranks.size > 1:  # draws a number for each sample, and samples differ
+        raise ConfigError("--assignment must be nearest with several processes, got stochastic")
     if config.parameters is not None:
         width = solve_width(config, config.parameters)
         lr = config.field_type.learning_rate({**config.network_options, "width": width})

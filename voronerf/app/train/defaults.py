@@ -104,11 +104,11 @@ def unseen_share(scene: Scene, space: Space) -> float:
     """Returns the fraction of a training in which batches have unseen rays; 0 for no unseen rays.
 
     Unseen rays begin at positions without a camera. Only photographs by cameras around a place, with a sparse model,
-    have them. The fraction is larger if fewer image tiles have points of the sparse model, since surfaces without
-    texture have few points.
+    have them, but not regions. The fraction is larger if fewer image tiles have points of the sparse model, since
+    surfaces without texture have few points.
     """
     points, cameras = scene.train.sparse_depth, scene.train.cameras
-    if scene.background is not None or space.full_gradient is None or points is None:
+    if scene.background is not None or space.full_gradient is None or points is None or scene.region is not None:
         return 0.0
     side = max(1, round(max(cameras.width, cameras.height) / TILES))
     row, column = points.pixels // cameras.width, points.pixels % cameras.width

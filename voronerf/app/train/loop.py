@@ -82,13 +82,17 @@ def train(
     """
     scene, first_step = state.scene, state.step
     one_thread = backends.torch_on_one_thread if state.thread_deterministic else nullcontext
-    group = quick_steps = min((callback.group for callback in callbacks), default=GROUP)
+    quick_steps = GROUP
     state.training_step.run_within(one_thread)
+    if state.sampler.grid is not None:
+        state.sampler.grid.merge(state.ranks)
     while True:
-        started = clock()
-        most = state.agree(min(group, quick_steps))
-        if state.fraction >= 1 or state.seconds >= until or state.stopped:
+        group = min((callback.group for callback in callbacks), default=GROUP)
+        goes_on = state.fraction < 1 and state.seconds < until and not state.stopped
+        most = state.agree(min(group, quick_steps) if goes_on else 0)
+        if not most:
             break
+        started = clock()
         with one_thread():
             prepare(state, callbacks)
         steps = min(state.steps_per_update(), steps_to_judgement(state), most)

@@ -205,8 +205,8 @@ class State:
         return max((stage.started_at_step for stage in self.stages if stage.cells == 1), default=0)
 
     def agree(self, steps: int) -> int:
-        """Takes over what depends on the clock, on samples or on signals from rank 0; returns its number of steps."""
-        names = "seconds", "evaluation_seconds", "reserved_seconds", "rays", "stopped"
+        """Takes over what depends on the clock or on samples from rank 0; returns its number of steps, 0 at the end."""
+        names = "seconds", "evaluation_seconds", "reserved_seconds", "rays"
         numbers, steps = self.ranks.first(([getattr(self, name) for name in names], steps))
         for name, number in zip(names, numbers, strict=True):
             setattr(self, name, number)
