@@ -36,7 +36,6 @@ class Ranks:
     Attributes:
         rank: The number of this process, 0..size - 1.
         size: The number of processes.
-        group: The process group; None for all processes.
 
     Examples:
         >>> from voronerf.nerf import Ranks
@@ -47,7 +46,6 @@ class Ranks:
 
     rank: int = 0
     size: int = 1
-    group: dist.ProcessGroup | None = None
 
     @classmethod
     def join(cls, device: torch.device | str = "cpu") -> Ranks:
@@ -91,7 +89,7 @@ class Ranks:
         small = [each for each in tensors if each.numel() < SMALL or not each.is_contiguous()]
         message = torch.cat([each.reshape(-1) for each in small]) if small else tensors[0].new_empty(0)
         with _peers():
-            works = [dist.all_reduce(each, group=self.group, async_op=True) for each in (message, *large)]
+            works = [dist.all_reduce(each, async_op=True) for each in (message, *large)]
             for work, each in zip(works, (message, *large), strict=True):
                 work.wait()
                 each /= self.size
@@ -102,7 +100,7 @@ class Ranks:
         """Replaces a tensor by the elementwise maximum over the ranks, in place."""
         if self.size > 1:
             with _peers():
-                dist.all_reduce(tensor, dist.ReduceOp.MAX, group=self.group)
+                dist.all_reduce(tensor, dist.ReduceOp.MAX)
 
     def gather(self, rows: Tensor) -> Tensor:
         """Returns the rows of all ranks, in the order of the ranks; their numbers may differ."""
@@ -110,7 +108,7 @@ class Ranks:
             return rows
         parts: list[Any] = [None] * self.size
         with _peers():
-            dist.all_gather_object(parts, rows.cpu(), group=self.group)
+            dist.all_gather_object(parts, rows.cpu())
         return torch.cat(parts).to(rows.device)
 
     def first(self, held: T) -> T:
@@ -118,7 +116,7 @@ class Ranks:
         parts = [held]
         if self.size > 1:
             with _peers():
-                dist.broadcast_object_list(parts, group=self.group, group_src=0)
+                dist.broadcast_object_list(parts, src=0)
         return parts[0]
 
 

@@ -18,6 +18,7 @@ from voronerf.app.files import read_json_lines
 from voronerf.app.scenes import load_scene
 from voronerf.app.scenes.regions import tiles
 from voronerf.app.train import TrainConfig, build
+from voronerf.app.train.build import make_batches
 from voronerf.app.train.checkpoint import load_checkpoint
 from voronerf.app.train.config import ConfigError
 from voronerf.nerf import Ranks
@@ -105,12 +106,17 @@ def test_regions_are_trained_and_joined(tmp_path, capsys):
     assert boxes[0][3] == boxes[1][0] and boxes[0][:3] == [-1, -0.5, -0.03]
     whole, region = (load_scene("builtin-city:2x1", downscale=5, region=box) for box in (None, boxes[0]))
     assert region.pixel(region.space()) < whole.pixel(whole.space())
+    rays = make_batches(TrainConfig(data="builtin-city:2x1"), region).draw(500, torch.Generator().manual_seed(0)).rays
+    ends = (region.region[:, None] - rays.origins) / rays.directions  # where a ray meets the planes of the sides
+    assert (ends.amin(0).amax(1).clamp_min(0) <= ends.amax(0).amin(1) + 1e-4).all()
     for job in jobs:
         assert main(words(*job, "--downscale 5 --steps 60 --panels 0")) == 0
     assert main(join) == 0
     run = editing.open_run(tmp_path / "joined")
     part = open_run(tmp_path / "region-0")
-    assert run.scene.test.masks is None and len(part.scene.test) <= len(run.scene.test)
+    assert run.scene.test.masks is None and len(part.scene.test) < len(run.scene.test)
+    names = list(run.scene.test.names)  # views that both regions see count once
+    assert len(set(names)) == len(names) and set(part.scene.test.names) <= set(names) <= set(whole.test.names)
     assert part.scene.test.masks.float().mean() < 1
     torch.testing.assert_close(run.scene.box, torch.tensor(boxes[0][:3] + boxes[1][3:]).view(2, 3), atol=0.1, rtol=0)
     assert torch.isfinite(run.render(0).colour).all()
