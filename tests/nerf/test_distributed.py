@@ -12,6 +12,7 @@ needs_gloo = pytest.mark.skipif(
 
 #: The collectives, with tensors that differ in each process, checked against the tensors of all processes.
 COLLECTIVES = """
+import sys
 import torch
 from voronerf import OccupancyGrid
 from voronerf.nerf import Ranks
@@ -43,6 +44,9 @@ if ranks.rank == 1:
 grid.merge(ranks)
 assert grid.density.flatten().tolist() == [kept, 0.375, 0.25], grid.density
 assert grid.occupied.flatten().tolist() == [True, False, False]
+sys.setswitchinterval(1000)  # Python ends before another thread can free the last tensors
+for _ in range(20):
+    ranks.maximum(torch.ones(2))
 """
 
 #: A training with a split, updates of the grid and a learning start, which prints a checksum of its networks.

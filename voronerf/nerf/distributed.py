@@ -8,6 +8,7 @@ one kind.
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -73,6 +74,7 @@ class Ranks:
                 store = dist.PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), store)
                 backend = "nccl" if on_gpu else "gloo"
                 dist.init_process_group(backend, store=store, rank=rank, world_size=size)
+            atexit.register(_leave)
         return cls(dist.get_rank(), dist.get_world_size())
 
     def seed(self, seed: Tensor) -> Tensor:
@@ -122,6 +124,12 @@ class Ranks:
 
 #: A process on its own.
 ALONE = Ranks()
+
+
+def _leave() -> None:
+    """Ends the threads of the group before Python ends: one that frees a tensor after that would abort the process."""
+    if dist.is_initialized():
+        dist.destroy_process_group()
 
 
 @contextmanager
