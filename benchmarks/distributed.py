@@ -9,7 +9,7 @@ runs in processes of its own, in turns over the seeds. ``average_us`` is the tim
 wait for the other process; ``alone_us`` is the time of the average alone, after a barrier; ``equal`` says whether both
 processes end with the same bits. The second command kills one of the processes of ``torchrun --max-restarts`` again and
 again, at random moments. The third trains regions one after another and joins them, then trains the whole scene in as
-much time with as many parameters.
+much time: with as many parameters, and with the default tables.
 """
 
 from __future__ import annotations
@@ -185,19 +185,19 @@ def killed(options: Options) -> dict[str, Any]:
 
 
 def in_regions(options: Options) -> list[dict[str, Any]]:
-    """Trains a scene in regions, and as a whole with as many parameters; scores both."""
+    """Trains a scene in regions, and as a whole with as many parameters and with the default tables; scores all."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
         printed = _voronerf("regions", options.data[0], "--count", options.regions, "--out", folder)[0]
         *jobs, join = (shlex.split(line)[1:] for line in printed.splitlines() if line.startswith("voronerf"))
         used = [_trained(options, *job, budget=options.seconds) for job in jobs]
         _voronerf(*join)
-        joined = _scored(options, folder / "joined", used, sorted(folder.glob("region-*")))
-        whole = folder / "whole"
-        words = ["train", "--data", options.data[0], "--cells", 16, options.regions, "--out", whole]
-        words += ["--field-options", f"log2_entries={options.entries}"]
-        used = [_trained(options, *words, budget=options.regions * options.seconds)]
-        return [joined, _scored(options, whole, used, [whole])]
+        results = [_scored(options, folder / "joined", used, sorted(folder.glob("region-*")))]
+        for way, added in (("whole", ["--field-options", f"log2_entries={options.entries}"]), ("default", [])):
+            words = ["train", "--data", options.data[0], "--cells", 16, options.regions, *added, "--out", folder / way]
+            used = [_trained(options, *words, budget=options.regions * options.seconds)]
+            results.append(_scored(options, folder / way, used, [folder / way]))
+        return results
 
 
 def _trained(options: Options, *words: Any, budget: float) -> tuple[float, float]:
