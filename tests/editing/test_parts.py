@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import refuses
 
-from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
+from voronerf import NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
 from voronerf.app.train.config import TrainConfig
 from voronerf.editing.geometry import Similarity, Solid
 from voronerf.editing.network import StoredRouter
@@ -49,8 +49,8 @@ def queries(n: int = 500, width: float = 2.0):
     return points, directions, torch.randint(0, 20, (n,), dtype=torch.int32)
 
 
-def part_of(router: VoronoiRouter, diagram: VoronoiDiagram | None = None, kept=None, **placed) -> Part:
-    return Part(StoredRouter.of(router, TrainConfig()), diagram, kept, **placed)
+def part_of(router: VoronoiRouter, diagram: VoronoiDiagram | None = None, kept=None, voxels=None, **placed) -> Part:
+    return Part(StoredRouter.of(router, TrainConfig(), voxels), diagram, kept, **placed)
 
 
 def close(a: torch.Tensor, b: torch.Tensor) -> bool:
@@ -100,6 +100,21 @@ def test_a_similarity_moves_points_directions_and_densities(torch_seed) -> None:
     colour, density = parts(frame.points(points), frame.directions(directions), index)
     wanted = router(points, directions, index)
     assert close(colour, wanted[0]) and close(density * 2.5, wanted[1])
+
+
+def test_voxels_that_were_empty_in_the_training_are_empty(torch_seed) -> None:
+    router, (points, directions, index) = plain(5), queries()
+    sphere, frame = Contraction(torch.tensor([1.0, 0.5, 0.5]), 0.4), Similarity.of((1, -2, 3), (10, 20, 30), 2.5)
+    grid = OccupancyGrid(sphere.cube, 3, threshold=1.0)
+    grid.occupied[1] = False
+    parts = Parts([part_of(router, voxels=(grid.box, grid.occupied), frame=frame, contraction=sphere)]).eval()
+    density = parts(frame.points(points), frame.directions(directions), index)[1]
+    contracted = sphere.points(points)
+    full = grid.occupied.view(-1)[grid.voxels(contracted).long()]
+    assert 0 < int(full.sum()) < len(full)
+    assert close(density * 2.5, router(contracted, directions, index)[1] * full)
+    kept = parts[0].keep(torch.tensor([0, 2]))  # a cut, stored and read again
+    assert all(map(torch.equal, StoredRouter(kept.network.stored()).voxels, (grid.box, grid.occupied)))
 
 
 def test_similarities(torch_seed) -> None:

@@ -78,7 +78,7 @@ class RunContents:
         if isinstance(contraction, Perspective):
             raise ConfigError(f"{name}: --contraction ndc cannot be joined or cut: it belongs to one camera")
         if config.sampling != "stratified":
-            network = StoredRouter.of(network.router, config)
+            network = StoredRouter.of(network.router, config, network.voxels)
         if contraction is not None:
             return cls(name, config, scene, Parts([Part(network, contraction=contraction)]), None)
         region = []

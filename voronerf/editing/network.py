@@ -1,4 +1,4 @@
-"""The stored networks of cells; a router is made from them on first use."""
+"""The stored networks of cells, and the voxels in which they have learnt; a router is made on first use."""
 
 from __future__ import annotations
 
@@ -17,16 +17,27 @@ from voronerf.router import VoronoiRouter
 
 
 class StoredRouter:
-    """A stored router: the settings and the tensors of its checkpoint."""
+    """A stored router: the settings and the tensors of its checkpoint.
+
+    Attributes:
+        voxels: The box [2, 3] and the occupied voxels, bool [x, y, z], of the training's grid; None without a grid.
+            Networks have learnt nothing in empty voxels.
+    """
 
     def __init__(self, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> None:
         self.checkpoint, self.device, self.backend = checkpoint, device, backend
         self.diagram = VoronoiDiagram.from_state(checkpoint.group("router"), "diagram.")
+        grid = checkpoint.group("occupancy")
+        self.voxels = (grid["box"].to(device), grid["occupied"].to(device)) if grid else None
 
     @classmethod
-    def of(cls, router: VoronoiRouter, config: TrainConfig) -> StoredRouter:
-        """Returns the stored form of a router and its settings."""
+    def of(
+        cls, router: VoronoiRouter, config: TrainConfig, voxels: tuple[Tensor, Tensor] | None = None
+    ) -> StoredRouter:
+        """Returns the stored form of a router, its settings and the voxels in which it has learnt."""
         tensors = {f"router.{name}": tensor for name, tensor in router.state_dict().items()}
+        if voxels is not None:
+            tensors |= {"occupancy.box": voxels[0], "occupancy.occupied": voxels[1]}
         network = cls(Checkpoint(tensors, {"config": replace(config, sampling="stratified").to_values()}))
         network.router = router
         return network
@@ -38,12 +49,13 @@ class StoredRouter:
 
     def part(self, cells: Sequence[int] | Tensor) -> StoredRouter:
         """Returns a StoredRouter with only the given cells."""
-        return StoredRouter.of(self.router.part(cells), config_of(self.checkpoint))
+        return StoredRouter.of(self.router.part(cells), config_of(self.checkpoint), self.voxels)
 
     def stored(self) -> Checkpoint:
         """Returns the checkpoint on the CPU, without the tensors that are needed only in training."""
-        kept = {k: v for k, v in self.checkpoint.tensors.items() if k.startswith("router") or k.endswith(".average")}
-        tensors = {name: tensor.cpu() for name, tensor in kept.items()}
+        starts = "router", "occupancy.box", "occupancy.occupied"
+        shown = (name for name in self.checkpoint.tensors if name.startswith(starts) or name.endswith(".average"))
+        tensors = {name: self.checkpoint.tensors[name].cpu() for name in shown}
         return Checkpoint(tensors, {"config": self.checkpoint.values["config"]})
 
 

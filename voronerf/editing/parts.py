@@ -25,6 +25,7 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.editing.geometry import Similarity, Solid
 from voronerf.editing.network import StoredRouter
 from voronerf.nerf.contraction import Contraction
+from voronerf.ops.formulas import voxels_of
 
 
 class Part(nn.Module):
@@ -111,6 +112,8 @@ class Part(nn.Module):
     def evaluate(self, local: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the colours [m, 3] and the densities [m], per scene unit, of points that the part covers.
 
+        Density is 0 in voxels that were empty in the training.
+
         Args:
             local: [m, 3], the points in the part's frame.
             directions: [r, 3], the rays' directions in the scene.
@@ -119,6 +122,10 @@ class Part(nn.Module):
         points = local if self.contraction is None else self.contraction.points(local)
         directions = self.frame.inverse.directions(directions)
         colour, density = as_field(self.network.router)(points, directions, ray_index)
+        if self.network.voxels is not None:
+            box, occupied = self.network.voxels
+            voxel = voxels_of(points, box, occupied.shape).long()
+            density = torch.where(occupied.view(-1)[voxel], density, 0)
         return colour, density if self.frame.is_identity else density / self.frame.scale
 
 
