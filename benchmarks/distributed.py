@@ -8,8 +8,8 @@ The first command compares two processes with one process of two threads, at equ
 runs in processes of its own, in turns over the seeds. ``average_us`` is the time of the average in a step, with the
 wait for the other process; ``alone_us`` is the time of the average alone, after a barrier; ``equal`` says whether both
 processes end with the same bits. The second command kills one of the processes of ``torchrun --max-restarts`` again and
-again, at random moments. The third trains regions one after another and joins them, then trains the whole scene in as
-much processor time: with as many parameters, and with the default tables.
+again, at random moments. The third trains regions one after another and joins them, then trains the whole scene in 1.2
+times the processor time: with as many parameters, and with the default tables.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Options:
     seconds: float = 60
     """The budget of each region in seconds."""
     whole: float = 1340
-    """The budget of each whole training in seconds; 1340 takes about as much processor time as 16 regions of 60 s."""
+    """The budget of each whole training in seconds; 1340 took 1.2 times the processor time of 16 regions of 60 s."""
     entries: int = 24
     """log2 of the entries of each table of the whole training; with 24, it has as many parameters as 16 regions."""
     folder: Path | None = None

@@ -118,6 +118,7 @@ def test_regions_are_trained_and_joined(tmp_path, capsys):
     names = list(run.scene.test.names)  # views that both regions see count once
     assert len(set(names)) == len(names) and set(part.scene.test.names) <= set(names) <= set(whole.test.names)
     assert part.scene.test.masks.float().mean() < 1
+    assert torch.equal(run.router[0].network.voxels[1], part.renderer.occupancy.occupied)
     torch.testing.assert_close(run.scene.box, torch.tensor(boxes[0][:3] + boxes[1][3:]).view(2, 3), atol=0.1, rtol=0)
     assert torch.isfinite(run.render(0).colour).all()
 
