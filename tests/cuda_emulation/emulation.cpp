@@ -31,9 +31,7 @@ constexpr unsigned kNoOrder = 1;         // a switch between fibers is no synchr
 constexpr unsigned char kPoison = 0xff;  // NaN in float32, bfloat16 and float16, and -1 as an index
 constexpr size_t kStaticShared = 48 * 1024;
 
-bool racing() {
-  return __tsan_create_fiber != nullptr;
-}
+bool racing() { return __tsan_create_fiber != nullptr; }
 void release(void* what) {
   if (racing()) __tsan_release(what);
 }
@@ -133,9 +131,7 @@ void switch_to(Fiber& from, Fiber& to, bool leaving) {
   }
 }
 
-void yield() {
-  switch_to(*launching->current, launching->main, false);
-}
+void yield() { switch_to(*launching->current, launching->main, false); }
 
 void body() {
   Launch& it = *launching;
@@ -188,26 +184,43 @@ void prepare(Fiber& fiber) {
   fiber.state = State::ready;
 }
 
-void run_block(Launch& it, Block& block, std::mt19937_64& random) {
-  std::vector<unsigned> order(block.fibers.size());
-  for (unsigned i = 0; i < order.size(); ++i) order[i] = i;
-  while (block.left < block.fibers.size()) {
-    std::shuffle(order.begin(), order.end(), random);
+// Runs a block in rounds. In a round, every fiber that can go on runs to its next operation of the warp or the block,
+// in shuffled order. `ahead`: a warp runs to its next barrier of the block before the other warps. A lost __syncthreads
+// shows only then, if the code before it ends in an operation of the warp, after which the warps are in step.
+void run_block(Launch& it, Block& block, std::mt19937_64& random, bool ahead) {
+  const auto threads = static_cast<unsigned>(block.fibers.size());
+  std::vector<unsigned> order(threads), warps(threads / 32);
+  for (unsigned i = 0; i < threads; ++i) order[i] = i;
+  for (unsigned i = 0; i < threads / 32; ++i) warps[i] = i;
+  // Runs a round of some fibers. Returns whether any of them could go on.
+  const auto round = [&](unsigned first, unsigned count) {
+    std::shuffle(order.begin() + first, order.begin() + first + count, random);
     bool moved = false;
-    for (const unsigned i : order) {
+    for (unsigned place = first; place < first + count && it.error.empty(); ++place) {
+      const unsigned i = order[place];
       Fiber& fiber = block.fibers[i];
       if (fiber.state != State::ready) continue;
       moved = true;
       it.current = &fiber;
       thread_index = {i % block_size.x, i / block_size.x % block_size.y, i / (block_size.x * block_size.y)};
       switch_to(it.main, fiber, false);
-      if (!it.error.empty()) return;
+    }
+    return moved;
+  };
+  while (block.left < threads && it.error.empty()) {
+    bool moved = false;
+    if (ahead) {
+      std::shuffle(warps.begin(), warps.end(), random);
+      for (const unsigned warp : warps) {
+        while (round(32 * warp, 32)) moved = true;
+      }
+    } else {
+      moved = round(0, threads);
     }
     if (moved) continue;
     const bool barrier = block.waiting > 0;
     it.error = barrier ? "__syncthreads is not reached by every thread of the block"
                        : "an operation of a warp is not reached by all of its lanes";
-    return;
   }
 }
 
@@ -218,13 +231,9 @@ Settings& settings() {
   return kept;
 }
 
-int lane() {
-  return static_cast<int>(launching->current->index % 32);
-}
+int lane() { return static_cast<int>(launching->current->index % 32); }
 
-void fail(const std::string& message) {
-  throw std::runtime_error(message);
-}
+void fail(const std::string& message) { throw std::runtime_error(message); }
 
 void require_all(unsigned mask) {
   if (mask != 0xffffffffu) fail("the emulation has no partial warps");
@@ -283,15 +292,11 @@ void* shared(const void* key, size_t size) {
   return memory;
 }
 
-void* dynamic_shared() {
-  return launching->block->dynamic;
-}
+void* dynamic_shared() { return launching->block->dynamic; }
 
 // The number of launches so far, for tests.
 static int64_t launched = 0;
-int64_t launches() {
-  return launched;
-}
+int64_t launches() { return launched; }
 
 void launch(void (*run)(void*), void* context, dim3 grid, dim3 block_of, size_t dynamic_bytes) {
   const size_t threads = size_t{block_of.x} * block_of.y * block_of.z;
@@ -322,7 +327,7 @@ void launch(void (*run)(void*), void* context, dim3 grid, dim3 block_of, size_t 
     Block& block = *kept.back();
     for (Fiber& fiber : block.fibers) prepare(fiber);
     it.block = &block;
-    run_block(it, block, random);
+    run_block(it, block, random, (number + settings().seed) % 2 == 1);
     if (!it.error.empty()) break;
     // Under ThreadSanitizer a launch reuses no memory, since its blocks are not synchronised.
     if (racing()) continue;

@@ -1,8 +1,8 @@
 // Replaces CUDA for g++: the same .cu sources run on the CPU, block by block, with every thread as a fiber. For tests
 // only: csrc/common/cuda_wrappers.h includes it under VN_EMULATE. Threads of a block run in a shuffled order that
-// depends on a seed. They stop at barriers and at warp operations, which all lanes must reach. Shared memory is
-// poisoned before every block. The emulation checks logic, not speed. It has no partial warps: every mask has all 32
-// lanes.
+// depends on a seed. They stop at barriers and at warp operations, which all lanes must reach. In half of the blocks, a
+// warp runs to its next barrier of the block before the other warps do. Shared memory is poisoned before every block.
+// The emulation checks logic, not speed. It has no partial warps: every mask has all 32 lanes.
 #pragma once
 
 #include <algorithm>

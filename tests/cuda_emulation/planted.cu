@@ -16,6 +16,7 @@ enum Bug {
   kBlocksMeet,         // two blocks write the same element
   kBarrierTooSoon,     // overwrites values that other threads still read
   kShuffleForBarrier,  // a shuffle instead of __syncwarp, which does not order memory
+  kWarpForBlock,       // __syncwarp instead of __syncthreads between a write and another warp's read
 };
 
 // Writes to out[i] three times the sum of the block's values, computed in two rounds through shared memory.
@@ -39,6 +40,14 @@ __global__ void planted_kernel(const float* values, float* out, int* counter, in
     __syncwarp();
   }
   const float neighbour = staged[i / 32 * 32 + (i + 1) % 32];
+  // Reads the value of the next warp.
+  if (bug == kWarpForBlock) {
+    __syncwarp();
+  } else {
+    __syncthreads();
+  }
+  const int other = (i + 32) % threads;
+  const float difference = staged[other] - values[blockIdx.x * threads + other];
   float shuffled = neighbour;
   if (!(bug == kDivergentShuffle && i == 5))
     shuffled = __shfl_sync(0xffffffffu, values[blockIdx.x * threads + i], i + 1);
@@ -46,7 +55,7 @@ __global__ void planted_kernel(const float* values, float* out, int* counter, in
     *counter = *counter + 1;
   }
   if (bug == kBlocksMeet && i == 0) *counter = static_cast<int>(blockIdx.x);
-  out[blockIdx.x * threads + i] = sum + neighbour - shuffled;
+  out[blockIdx.x * threads + i] = sum + neighbour - shuffled + difference;
   if (bug == kPastTheOutput && blockIdx.x == gridDim.x - 1 && i == threads - 1) out[(blockIdx.x + 1) * threads] = 1.0f;
 }
 

@@ -23,6 +23,7 @@ BUGS = [
     ("4", "none", "an operation of a warp is not reached by all of its lanes"),
     ("7", "none", "wrong"),
     ("10", "none", "wrong"),
+    ("12", "none", "wrong"),
     ("0", "address", "right"),
     ("5", "address", "heap-buffer-overflow"),
     ("6", "address", "heap-buffer-overflow"),
@@ -32,6 +33,7 @@ BUGS = [
     ("8", "thread", "data race"),
     ("9", "thread", "data race"),
     ("10", "thread", "data race"),
+    ("12", "thread", "data race"),
 ]
 """The number of a bug in planted.cu, the sanitizer, and the expected verdict."""
 
