@@ -18,11 +18,11 @@ VN_NAMES(ProgramPackKind, "matrix", "transposed", "vector", "few", "few_transpos
 VN_NAMES(ProgramSumKind, "none", "inputs_outputs", "outputs_inputs", "vector");
 VN_NAMES(ProgramLayout, "floats", "pairs", "tiles", "parts");
 VN_NAMES(ProgramPrecision, "float32", "tf32", "bfloat16", "float16");
-VN_STRUCT(ProgramPack, kind, parameter, o, i, start, width, at);
+VN_STRUCT(ProgramPack, kind, parameter, o, i, start, width, waves, at);
 VN_STRUCT(ProgramOperand, parameter, spread, slot, stride, memory, input, pairs, start, width, place);
 VN_STRUCT(ProgramStep, op, function, binary, encoding, finish, to_registers, order, width, slot, stride, memory, number,
           depth, sources, parameter, pairs, floats, from_registers, points, in_place, a, b, first, operand_count);
-VN_STRUCT(ProgramSum, sum, kind, adds, partial, o, i, start, width, stride, size);
+VN_STRUCT(ProgramSum, sum, kind, adds, partial, o, i, start, width, stride, size, waves);
 VN_STRUCT(ProgramInput, width, ray);
 VN_STRUCT(ProgramOutput, width, ray, memory);
 VN_STRUCT(ProgramLookup, input, parameter, grid, memory);

@@ -18,6 +18,33 @@ VN_HD constexpr MapPlace accumulator_place(unsigned lane, int i) {
   return {static_cast<int>(lane / 4) + 8 * (i / 2), static_cast<int>(2 * (lane % 4)) + i % 2};
 }
 
+// The order of the columns of an encoding by octaves as 16-bit numbers. In a program, the columns are the features if
+// `raw`, and for each octave the sines of all features and then their cosines. Here the features come last, and a sine
+// and its cosine are one word. Four octaves (at the end two, then one) of a feature are neighbours, so that a thread
+// stores them at once.
+struct WaveOrder {
+  int octaves, features, raw;
+};
+// Returns the number of octaves that are stored together with an octave: 4, 2 or 1.
+VN_HD constexpr int wave_group(const WaveOrder& order, int octave) {
+  return octave < order.octaves / 4 * 4 ? 4 : octave < order.octaves / 2 * 2 ? 2 : 1;
+}
+// `wave_place` returns the place of a program's column, `wave_column` the column at a place.
+VN_HD constexpr int wave_place(const WaveOrder& order, int column) {
+  const int wave = column - order.raw * order.features, feature = wave % order.features;
+  if (wave < 0) return 2 * order.octaves * order.features + column;
+  const int row = wave / order.features, octave = row / 2, group = wave_group(order, octave),
+            first = octave / group * group;
+  return 2 * (first * order.features + group * feature + octave - first) + row % 2;
+}
+VN_HD constexpr int wave_column(const WaveOrder& order, int place) {
+  const int raw = place - 2 * order.octaves * order.features;
+  if (raw >= 0) return raw;
+  const int word = place / 2, octave = word / order.features, group = wave_group(order, octave),
+            first = octave / group * group, within = word - first * order.features;
+  return (order.raw + 2 * (first + within % group) + place % 2) * order.features + within / group;
+}
+
 // The range in which a warp searches non-decreasing values for the last value that is at most a bound. `probed` returns
 // the index that a lane probes, `narrowed` the range that remains if `votes` probes are at most the bound. The first
 // value must be at most the bound.

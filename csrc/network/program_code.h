@@ -1,5 +1,5 @@
 // A program as the kernels of both devices read it. The structs are plain data: files compiled per instruction set
-// include them, and CUDA copies them to the device unchanged. voronerf/ops/grouped_program/lowering.py fills the
+// include them, and CUDA copies them to the device unchanged. voronerf/ops/network/lowering.py fills the
 // records by the names of their members.
 //
 // A tile is a range of rows of one cell. Each value of a tile has a slot, which begins `slot` columns after the start
@@ -37,10 +37,11 @@ enum class ProgramFunction : int { VN_FUNCTIONS(VN_NUMBER) };
 //   few, few_transposed  like matrix and transposed, for up to four outputs: [1 or 4][inputs] (few_outputs_tile.h)
 //   waves       the table [3][width] of an encoding (frequency_encode_tile.h) with `o` octaves of `i` features,
 //               preceded by the features if start is 1; it has no parameter
+// waves: on CUDA, the pack of kind `waves` in whose order (WaveOrder) a matrix has its columns, or -1.
 enum class ProgramPackKind : int { matrix, transposed, vector, few, few_transposed, waves };
 struct ProgramPack {
   ProgramPackKind kind;
-  int32_t parameter, o, i, start, width, at;
+  int32_t parameter, o, i, start, width, waves, at;
 };
 
 // Columns [start, start + width) of a value or of a parameter vector.
@@ -83,13 +84,14 @@ struct ProgramStep {
   int32_t first, operand_count;  // index of the first operand, and number of operands
 };
 
-// Part of a sum over the rows of a cell, read from its place in the partial. `kind` none: the sum stays 0.
+// Part of a sum over the rows of a cell, read from its place in the partial. `kind` none: the sum stays 0. waves: the
+// order of the partial's inputs, as in ProgramPack.
 enum class ProgramSumKind : int { none, inputs_outputs, outputs_inputs, vector };
 struct ProgramSum {
   int32_t sum;
   ProgramSumKind kind;
   bool adds;  // adds to a sum that starts at 0; else the parts of the sum do not overlap and overwrite it
-  int32_t partial, o, i, start, width, stride, size;
+  int32_t partial, o, i, start, width, stride, size, waves;
 };
 
 // Pointers to all records of a program, in the memory of one device (CPU or CUDA).

@@ -25,7 +25,7 @@ struct is_array<Array<T>> : std::true_type {};
 template <typename... T>
 void read(T&... values);
 
-void members(voronerf::ProgramPack& p) { read(p.kind, p.parameter, p.o, p.i, p.start, p.width, p.at); }
+void members(voronerf::ProgramPack& p) { read(p.kind, p.parameter, p.o, p.i, p.start, p.width, p.waves, p.at); }
 void members(voronerf::ProgramOperand& o) {
   read(o.parameter, o.spread, o.slot, o.stride, o.memory, o.input, o.pairs, o.start, o.width, o.place);
 }
@@ -35,7 +35,7 @@ void members(voronerf::ProgramStep& s) {
   read(s.first, s.operand_count);
 }
 void members(voronerf::ProgramSum& s) {
-  read(s.sum, s.kind, s.adds, s.partial, s.o, s.i, s.start, s.width, s.stride, s.size);
+  read(s.sum, s.kind, s.adds, s.partial, s.o, s.i, s.start, s.width, s.stride, s.size, s.waves);
 }
 void members(voronerf::ProgramInput& i) { read(i.width, i.ray); }
 void members(voronerf::ProgramOutput& o) { read(o.width, o.ray, o.memory); }

@@ -20,6 +20,12 @@ std::tuple<int, int> of(voronerf::MapPlace place) {
 void bind_index_maps(py::module_& module) {
   using namespace voronerf;
   module.def("accumulator_place", [](int lane, int i) { return of(accumulator_place(lane, i)); });
+  module.def("wave_place", [](int octaves, int features, int raw, int i) {
+    return wave_place({octaves, features, raw}, i);
+  });
+  module.def("wave_column", [](int octaves, int features, int raw, int i) {
+    return wave_column({octaves, features, raw}, i);
+  });
   module.def("last_not_above", [](const std::vector<int32_t>& values, int64_t count, int64_t value) {
     MapSpan span{0, count};
     while (span.last - span.first > 1) {

@@ -17,6 +17,21 @@ def test_a_lanes_sums_are_those_of_the_tile():
             assert place(lane, i + 1) == (row, column + 1) and column % 2 == 0
 
 
+def test_an_encoding_has_each_column_at_one_place_and_its_waves_in_pairs():
+    place, column = module().wave_place, module().wave_column
+    for order in itertools.product(range(17), range(1, 8), (0, 1)):
+        octaves, features, raw = order
+        places = [place(*order, i) for i in range((2 * octaves + raw) * features)]
+        assert sorted(places) == list(range(len(places)))
+        assert [column(*order, at) for at in places] == list(range(len(places)))
+        for octave, feature in itertools.product(range(octaves), range(features)):
+            sine = (raw + 2 * octave) * features + feature
+            assert places[sine] % 2 == 0 and places[sine + features] == places[sine] + 1
+            if octave % 4 == 0 and octave + 4 <= octaves:  # stored at once by a thread
+                assert places[sine] % 8 == 0
+                assert [places[sine + 2 * i * features] - places[sine] for i in range(4)] == [0, 2, 4, 6]
+
+
 def test_a_tile_is_of_the_cell_that_counts_it():
     """Finds the cell of each tile: for all sets of up to four cells with up to three tiles each, and for many cells."""
     for cells in range(1, 5):

@@ -344,6 +344,13 @@ __device__ __forceinline__ uint32_t any_packed_word(const PackedMatrix& matrix, 
   }
 }
 
+// Returns the order of an encoding's 16-bit columns; without octaves for `waves` -1, the order of the program.
+__device__ __forceinline__ WaveOrder wave_order(const ProgramCode& code, int waves) {
+  if (waves < 0) return {0, 0, 0};
+  const ProgramPack& pack = code.packs[waves];
+  return {pack.o, pack.i, pack.start};
+}
+
 // Packs the matrices and biases of each cell. A block packs one part of a matrix or bias at a time.
 __device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision) {
   const bool halves = precision == ProgramPrecision::bfloat16 || precision == ProgramPrecision::float16;
@@ -360,6 +367,7 @@ __device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision
     PackedMatrix matrix{from, transposed ? pack.i : 1, transposed ? 1 : pack.i, transposed ? pack.o : pack.width,
                         transposed ? pack.width : pack.o};
     if (vector) matrix = {from, 0, 1, 1, pack.width};
+    matrix.waves = wave_order(call.code, pack.waves);
     const int outputs = padded(matrix.outputs, kProgramOutputs);
     // For tensor cores, the two bias columns of a lane are stored twice, because a lane has them in two rows.
     const int words = vector ? (tensors ? 2 : 1) * outputs : padded(matrix.depth, deep) * outputs / (halves ? 2 : 1);
@@ -416,8 +424,10 @@ __global__ void __launch_bounds__(kThreads)
         const ProgramSum& sum = code.sums[r];
         if (sum.kind == ProgramSumKind::none) continue;
         const bool vector = sum.kind == ProgramSumKind::vector, transposed = sum.kind == ProgramSumKind::inputs_outputs;
-        const int o = vector ? 0 : i / sum.i, column = i - o * sum.i * !vector - sum.start;
+        const int o = vector ? 0 : i / sum.i;
+        int column = i - o * sum.i * !vector - sum.start;
         if (column < 0 || column >= sum.width) continue;
+        if (sum.waves >= 0) column = wave_place(wave_order(code, sum.waves), column);
         const int at = sum.partial + (transposed ? column * sum.stride + o : o * sum.stride + column);
         const float* from = call.partials + at;
         int64_t task = first;

@@ -221,46 +221,64 @@ __device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int
     to.put(row, column + features, sine_of_octave(angle, 0.5f) * blur);
   });
 }
-// Computes the octaves as 16-bit numbers, and also as floats if kFloats. A thread computes all octaves of a column of a
-// row: every fourth by the hardware functions, and the next three by double-angle formulas, each of which doubles the
-// error.
+// Computes the octaves as 16-bit numbers in the order of WaveOrder, and also as floats if kFloats. A thread computes
+// all octaves of a feature of a row: every fourth by the hardware functions, and the next three by double-angle
+// formulas, each of which doubles the error.
 template <bool kBlurred, bool kFloats, typename Tile>
 __device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int features, const Operand& x,
                                              const Target<Tile::kBfloat16>& to) {
-  constexpr int kDoubled = 4;
+  const WaveOrder order{octaves, features, !kBlurred};
   const int rows = tile.rows();
   const float largest = kLargestDeviceAngle / octave_scale(octaves > 0 ? octaves - 1 : 0);
   for (int i = Tile::worker(); i < Tile::kRows * features; i += Tile::kWorkers) {
-    const int feature = i / Tile::kRows, row = i % Tile::kRows, column = (kBlurred ? 0 : features) + feature;
+    const int feature = i / Tile::kRows, row = i % Tile::kRows;
     if (row >= rows) continue;
     const float value = x.at(row, feature), variance = kBlurred ? x.at(row, features + feature) : 0.0f;
-    if (!kBlurred) to.put(row, feature, value);
-    uint16_t* half = to.halves + row * to.halves_stride + column;
-    float* wide = to.floats + row * to.stride + column;
-    const auto put = [&](int octave, float2 pair) {
-      const float blur = kBlurred ? octave_blur(octave_scale(octave), variance) : 1.0f;
-      const uint32_t word = pack_halves<Tile::kBfloat16>(pair.x * blur, pair.y * blur);
-      half[0] = static_cast<uint16_t>(word), half[features] = static_cast<uint16_t>(word >> 16);
-      half += 2 * features;
+    auto* words = reinterpret_cast<uint32_t*>(to.halves + row * to.halves_stride);
+    float* wide = to.floats + row * to.stride + (kBlurred ? 0 : features) + feature;
+    if (!kBlurred) {
+      to.put_half(row, wave_place(order, feature), value);
+      if (kFloats) to.floats[row * to.stride + feature] = value;
+    }
+    const auto damping = [&](int octave) { return kBlurred ? octave_blur(octave_scale(octave), variance) : 1.0f; };
+    const auto word = [&](float2 pair, float blur) {
       if (kFloats) {
         wide[0] = pair.x * blur, wide[features] = pair.y * blur;
         wide += 2 * features;
       }
+      return pack_halves<Tile::kBfloat16>(pair.x * blur, pair.y * blur);
     };
     if (!(fabsf(value) <= largest)) {  // too large, or NaN
 #pragma unroll 1
-      for (int octave = 0; octave < octaves; ++octave) put(octave, exact_sine_and_cosine(value, octave));
+      for (int octave = 0; octave < octaves; ++octave) {
+        const int column = (2 * octave + order.raw) * features + feature;
+        words[wave_place(order, column) / 2] = word(exact_sine_and_cosine(value, octave), damping(octave));
+      }
       continue;
     }
-    for (int first = 0; first < octaves; first += kDoubled) {
+    for (int first = 0; first < octaves; first += 4, words += 4 * features) {
       float2 pair = fast_sine_and_cosine(value * octave_scale(first));
-#pragma unroll
-      for (int octave = first; octave < first + kDoubled; ++octave) {
-        if (octave >= octaves) break;
-        put(octave, pair);
+      float blur = damping(first);
+      const auto next = [&] {
+        const uint32_t result = word(pair, blur);
         const float twice = pair.x + pair.x;
         pair = make_float2(twice * pair.y, fmaf(-twice, pair.x, 1.0f));
+        if (kBlurred) blur *= blur * (blur * blur);  // the angle doubles, so the exponent is four times larger
+        return result;
+      };
+      const int left = octaves - first;
+      uint32_t* at = words;
+      if (left >= 2) {
+        const uint32_t one = next(), two = next();
+        if (left >= 4) {
+          const uint32_t three = next(), four = next();
+          *reinterpret_cast<uint4*>(words + 4 * feature) = uint4{one, two, three, four};
+          continue;
+        }
+        *reinterpret_cast<uint2*>(words + 2 * feature) = uint2{one, two};
+        at += 2 * features;
       }
+      if (left % 2 == 1) at[feature] = next();
     }
   }
 }
@@ -268,7 +286,7 @@ template <bool kBlurred, typename Tile>
 __device__ __noinline__ void octaves(Tile tile, const ProgramStep& step, const ProgramOperand* operands, int features) {
   const Operand x = tile.value(operands[0]);
   const auto to = tile.target(step);
-  if constexpr (Tile::kHalves) {
+  if constexpr (Tile::kHalves) {  // 16-bit numbers have their own order
     if (to.has_halves && to.has_floats) return fast_octaves<kBlurred, true>(tile, step.depth, features, x, to);
     if (to.has_halves) return fast_octaves<kBlurred, false>(tile, step.depth, features, x, to);
   }

@@ -18,12 +18,15 @@ namespace voronerf {
 
 // Packed weights --------------------------------------------------------------------------------------------------
 
-// A matrix of weights: at(depth, output) returns an element, or 0 outside.
+// A matrix of weights: at(depth, output) returns an element, or 0 outside. With `waves.octaves` > 0, the depth is in
+// the order of an encoding's 16-bit numbers.
 struct PackedMatrix {
   const float* data;
   int by_depth, by_output, depth, outputs;
+  WaveOrder waves{};
   __device__ __forceinline__ float at(int k, int n) const {
-    return k < depth && n < outputs ? data[k * by_depth + n * by_output] : 0.0f;
+    if (k >= depth || n >= outputs) return 0.0f;
+    return data[(waves.octaves > 0 ? wave_column(waves, k) : k) * by_depth + n * by_output];
   }
 };
 

@@ -42,6 +42,9 @@ _NARROW = 4  # layers of at most this width use the kernel for few outputs (few_
 _NONE = -1
 
 
+_SumPart = tuple[int, str, int, int, int, int, int, int, int, int]  # the members of a ProgramSum except `adds`
+
+
 class Lookup(NamedTuple):
     """A lookup in a hash grid: the indices of the input (the points), the parameter (the table) and the grid."""
 
@@ -132,6 +135,7 @@ class _Value:
     input: int = _NONE  # the input that steps may read in place
     pairs: int = _NONE
     floats: bool = True  # whether any step reads the floats; if not, only the pairs are written
+    waves: int = _NONE  # on CUDA, the pack in whose order an encoding has its pairs (WaveOrder in index_maps.h)
 
 
 class _Lowering:
@@ -147,7 +151,7 @@ class _Lowering:
         self.at, self.in_registers = 0, _NONE  # the number of the current step; the value in registers (CUDA)
         self.steps: list[Any] = []
         self.operands: list[Any] = []
-        self.sums: list[tuple[int, str, int, int, int, int, int, int, int]] = []
+        self.sums: list[_SumPart] = []
         self.memories: list[int] = []
         self.lookups: list[tuple[Lookup, int]] = []
         self.scatters: list[tuple[Lookup, int, int]] = []
@@ -230,9 +234,11 @@ class _Lowering:
 
     # Records ----------------------------------------------------------------------------------------------------------
 
-    def pack(self, kind: str, parameter: int, start: int, width: int, floats: int, shape: tuple[int, int]) -> int:
+    def pack(
+        self, kind: str, parameter: int, start: int, width: int, floats: int, shape: tuple[int, int], waves: int = _NONE
+    ) -> int:
         """Returns the index of the pack for a part of a parameter, ``floats`` in size; adds the pack if it is new."""
-        key = (kind, parameter, *shape, start, width)
+        key = (kind, parameter, *shape, start, width, waves)
         if key not in self.packs:
             self.packs[key] = len(self.packs), self.packed
             self.packed += _padded(floats)
@@ -243,7 +249,7 @@ class _Lowering:
         shape = self.program.parameters[parameter]
         return (shape[0], shape[1]) if len(shape) == 2 else (1, shape[0])
 
-    def operand(self, c: Columns, place: int = 0, *, product: bool = False) -> Any:
+    def operand(self, c: Columns, place: int = 0, *, product: bool = False, waves: bool = False) -> Any:
         """Returns the record of an operand.
 
         Args:
@@ -251,6 +257,7 @@ class _Lowering:
             place: the first target column of the operand of a move; 0 for other steps.
             product: whether the record also refers to the pairs of the value, if it has them. Kernels read the x of a
                 linear step as pairs. With tile registers they also read pairs for ``relu_slope`` and for sums.
+            waves: whether the pairs may be in the order of `_Value.waves`.
         """
         fields: dict[str, Any] = dict.fromkeys(("memory", "input", "pairs"), _NONE)
         fields |= {"start": c.start, "width": c.width, "place": place, "spread": c.spread}
@@ -261,9 +268,15 @@ class _Lowering:
             return self.compiled.ProgramOperand(parameter=True, slot=number, stride=0, **(fields | {"start": 0}))
         value = self.values[c.index]
         fields |= {"memory": value.memory, "input": value.input}
-        if product:
-            fields["pairs"] = value.pairs if _all_of(c, value.width) else _NONE
+        if product and _all_of(c, value.width) and (waves or value.waves == _NONE):
+            fields["pairs"] = value.pairs
         return self.compiled.ProgramOperand(parameter=False, slot=max(value.slot, 0), stride=value.stride, **fields)
+
+    def waves(self, step: Step, place: int) -> int:
+        """Returns the pack in whose order a step reads the columns of an operand, or -1 for the program's order."""
+        c = step.operands[place]
+        value = self.values[c.index] if c.of == VALUE and _in_any_order(step, place) else None
+        return value.waves if value is not None and _all_of(c, value.width) else _NONE
 
     def emit(self, op: str, operands: Iterable[Any] = (), value: _Value | None = None, **members: Any) -> None:
         """Appends the record of a step."""
@@ -442,9 +455,13 @@ class _Lowering:
         kind = f"few{'_transposed' * transposed}" if few else kind
         deep = self.pairs_of(depth) if self.tiles else -(-depth // 2) if self.half else depth
         deep = _padded(depth) if self.cuda and not self.half else deep
-        number = self.pack(kind, matrix, start, width, deep * (order or self.padded_outputs(step.width)), (o, i))
+        deep *= order or self.padded_outputs(step.width)
+        number = self.pack(kind, matrix, start, width, deep, (o, i), self.waves(step, 0))
         slope = len(step.operands) - 1 if relu_slope and self.tiles else _NONE
-        records = [self.operand(c, product=at < count or at == slope) for at, c in enumerate(step.operands)]
+        records = [
+            self.operand(c, product=at < count or at == slope, waves=_in_any_order(step, at))
+            for at, c in enumerate(step.operands)
+        ]
         entrywise = [c for c in step.operands[count:] if all(c[:2] != x[:2] for x in sources)]
         value = self.make(step, dying, entrywise)
         as_pairs = self._as_pairs(step)
@@ -469,6 +486,8 @@ class _Lowering:
 
         def takes(reader: Step, place: int) -> bool:
             if not _all_of(reader.operands[place], step.width):
+                return False
+            if self._reorders(step) and not _in_any_order(reader, place):
                 return False
             if reader.op == "linear":
                 slope = reader.name == "relu_slope" and place == len(reader.operands) - 1
@@ -509,10 +528,16 @@ class _Lowering:
             raw = step.operands[0].width
             width = _padded(encoded_columns(step.name, raw, size))
             members["number"] = self.pack("waves", 0, int(octaves == 1), width, 3 * width, (size, raw // octaves))
+            if self._reorders(step) and value.pairs != _NONE:
+                value.waves = members["number"]
         if self.tiles and not self.cuda and not order and octaves == 1 and any(as_pairs := self._as_pairs(step)):
             value.pairs = self.slots.take(self.pairs_of(step.width))
             value.floats = value.memory != _NONE or not all(as_pairs)
         self.emit("encode", records, value, **members)
+
+    def _reorders(self, step: Step) -> bool:
+        """Returns whether a step writes pairs in the order of `_Value.waves`."""
+        return self.cuda and step.op == "encode" and _by_octaves(step) > 0 and not int(step.numbers[2])
 
     def _input_of(self, x: Columns) -> int:
         (number,) = [int(step.numbers[0]) for step in self.work if step.op == "input" and step.out == x.index]
@@ -539,16 +564,20 @@ class _Lowering:
         stride = _padded(i if by_outputs else o)
         self.partial += stride * (o if by_outputs else i)
         kind = "outputs_inputs" if by_outputs else "inputs_outputs"
-        self.sums.append((step.out, kind, at, o, shape[1], start, i, stride, shape[0] * shape[1]))
+        size = shape[0] * shape[1]
+        self.sums.append((step.out, kind, at, o, shape[1], start, i, stride, size, self.waves(step, 1)))
         broadcast = 0 if by_outputs else 1
-        records = [self.operand(c, product=self.tiles or place == broadcast) for place, c in enumerate(step.operands)]
+        records = [
+            self.operand(c, product=self.tiles or place == broadcast, waves=_in_any_order(step, place))
+            for place, c in enumerate(step.operands)
+        ]
         self.emit("outer", records, number=at, stride=stride, order=int(by_outputs))
 
     def _columns(self, step: Step, dying: set[int]) -> None:
         shape, start, at = self.program.sums[step.out], int(step.numbers[0]), self.partial
         size, stride = shape[0] * (shape[1] if len(shape) > 1 else 1), _padded(step.width)
         self.partial += stride
-        self.sums.append((step.out, "vector", at, 1, size, start, step.width, stride, size))
+        self.sums.append((step.out, "vector", at, 1, size, start, step.width, stride, size, _NONE))
         records = [self.operand(step.operands[0], product=self.tiles and not self.parts)]
         self.emit("columns", records, number=at, stride=stride, width=step.width)
 
@@ -559,7 +588,7 @@ class _Lowering:
         for i, shape in enumerate(program.sums):
             if i not in scattered and not any(record[0] == i for record in self.sums):
                 size = shape[0] * (shape[1] if len(shape) > 1 else 1)
-                self.sums.append((i, "none", 0, 0, 0, 0, 0, 0, size))
+                self.sums.append((i, "none", 0, 0, 0, 0, 0, 0, size, _NONE))
         self.sums.sort()
         outputs = []
         for number, c in enumerate(program.outputs):
@@ -620,13 +649,13 @@ class _Lowering:
         )
 
 
-def _sum_records(parts: list[tuple[int, str, int, int, int, int, int, int, int]]) -> list[Any]:
+def _sum_records(parts: list[_SumPart]) -> list[Any]:
     """Returns the records of the parts of sums, in order.
 
     If the parts of a sum cover it without overlap, they overwrite its memory. Otherwise they are added to it.
     """
     spans: dict[int, list[tuple[int, int]]] = {}
-    for out, _, _, _, _, start, width, _, _ in parts:
+    for out, _, _, _, _, start, width, _, _, _ in parts:
         spans.setdefault(out, []).append((start, start + width))
     records = []
     for part in parts:
@@ -649,6 +678,11 @@ def _sums(step: Step) -> bool:
 def _by_octaves(step: Step) -> int:
     """Returns `Encoding.octaves` of a step: the columns of x for one angle; 0 if it encodes no sines and cosines."""
     return ENCODINGS[step.name].octaves if step.name in ENCODINGS else 0
+
+
+def _in_any_order(step: Step, place: int) -> bool:
+    """Returns whether a step can read an operand in another order of columns: as inputs of a layer's weights."""
+    return (step.op == "linear" and place == 0 and not int(step.numbers[2])) or (step.op == "outer" and place == 1)
 
 
 def _sources(step: Step) -> int:
