@@ -204,6 +204,23 @@ __device__ __forceinline__ void load_matrices(uint32_t (&words)[4], const uint32
   }
 }
 
+// Stores what load_matrices loads.
+template <bool kShared>
+__device__ __forceinline__ void store_matrices(uint32_t* to, const uint32_t (&words)[4], int stride, int lane) {
+#if !defined(VN_EMULATE) && __CUDA_ARCH__ >= 900
+  if constexpr (kShared) {
+    const auto at = static_cast<uint32_t>(__cvta_generic_to_shared(to + lane % 16 * stride + lane / 16 * 4));
+    asm volatile("stmatrix.sync.aligned.m8n8.x4.shared.b16 [%0], {%1, %2, %3, %4};" ::"r"(at), "r"(words[0]),
+                 "r"(words[1]), "r"(words[2]), "r"(words[3])
+                 : "memory");
+  } else
+#endif
+  {
+#pragma unroll
+    for (int j = 0; j < 4; ++j) to[(lane / 4 + 8 * (j % 2)) * stride + 4 * (j / 2) + lane % 4] = words[j];
+  }
+}
+
 // Loads a block of 16 rows by 16 columns, transposed so that the rows are the inner dimension of the product. kLeft: as
 // the fragments of one left operand [columns][rows]; otherwise as the fragments of two right operands.
 template <bool kShared, bool kLeft>

@@ -174,18 +174,19 @@ __device__ __forceinline__ int cell_of_task(const CudaRows& rows, int task) {
   return static_cast<int>(cells.first);
 }
 
-// Runs the steps from `i` up to the next sum over rows; a team computes these steps independently. Returns the index of
-// the sum.
+// Runs the steps from `i` up to the next sum over rows; a team computes these steps independently. Sets i to the index
+// of the sum. Returns false if the program ends.
 template <typename Steps, typename Tile>
-__device__ __forceinline__ int own_steps(const CudaProgram& call, const Tile& tile, int i) {
-  for (; i < call.code.step_count; ++i) {
+__device__ __forceinline__ bool own_steps(const CudaProgram& call, const Tile& tile, int& i) {
+  for (;; ++i) {
     CudaStep step = load_step(call.steps + i);
-    if (step.sums()) break;
-    if (Tile::kHalves && step.pairs >= 0 && (step.op == CudaOp::plain || step.op == CudaOp::input)) {
-      clear_rest(tile, step);
-    }
+    if (step.sums()) return true;
+    if (step.op == CudaOp::end) return false;
+    if (Tile::kHalves && step.is(kClears) && (step.is(kPads) || tile.rows() < Tile::kRows)) clear_rest(tile, step);
     if (step.op == CudaOp::plain) {
-      plain_step(tile, call.code.steps[i]);
+      plain_step(tile, call.code.steps[step.number]);
+    } else if (step.op == CudaOp::waves) {
+      waves_step(tile, i);
     } else if (step.op == CudaOp::input) {
       input_step(tile, step);
     } else if (step.op == CudaOp::output) {
@@ -198,27 +199,28 @@ __device__ __forceinline__ int own_steps(const CudaProgram& call, const Tile& ti
         } else {
           Steps::linear(tile, step, i, held);
         }
-        if (!step.holds) break;
+        if (!step.is(kHolds)) break;
         Tile::sync();
         step = load_step(call.steps + ++i);
       }
     }
     Tile::sync();
-    if (step.keeps) {
-      keep(tile, call.code.steps[i]);
+    if (step.is(kKeeps)) {
+      keep(tile, call.code.steps[step.number]);
       Tile::sync();
     }
   }
-  return i;
 }
-// Returns the index of the next sum over rows, for a warp without rows.
-__device__ __forceinline__ int next_sum(const CudaProgram& call, int i) {
-  while (i < call.code.step_count && !load_step(call.steps + i).sums()) ++i;
-  return i;
+// The same for a warp without rows, which runs no steps.
+__device__ __forceinline__ bool next_sum(const CudaProgram& call, int& i) {
+  for (;; ++i) {
+    const CudaStep step = load_step(call.steps + i);
+    if (step.sums() || step.op == CudaOp::end) return step.sums();
+  }
 }
 template <typename Steps, typename Tile>
 __device__ __forceinline__ int sums(const CudaProgram& call, const Tile& tile, int i) {
-  for (; i < call.code.step_count; ++i) {
+  for (;; ++i) {
     const CudaStep step = load_step(call.steps + i);
     if (step.op == CudaOp::outer) {
       Steps::outer(tile, step);
@@ -285,9 +287,8 @@ __global__ void __launch_bounds__(32 * program_warps(Steps::Tile::kRows), progra
   for (int task = blockIdx.x; task < rows.first_task[rows.k]; task += gridDim.x) {
     begin_task<Tile>(call, task, partial);
     do {
-      for (int i = 0;;) {
-        i = Tile::kTeam == 1 && tile.rows() == 0 ? next_sum(call, i) : own_steps<Steps>(call, tile, i);
-        if (i == call.code.step_count) break;
+      int i = 0;
+      while (Tile::kTeam == 1 && tile.rows() == 0 ? next_sum(call, i) : own_steps<Steps>(call, tile, i)) {
         __syncthreads();
         i = sums<Steps>(call, tile, i);
         __syncthreads();
@@ -390,7 +391,9 @@ __device__ void clear_strays(const CudaProgram& call) {
     const int width = call.output_widths[o];
     for (int64_t i = begin; i < strays * width; i += step) {
       const int64_t stray = i / width, row = source_row(rows, stray < low ? stray : stray + high - low);
-      store_number(call.outputs[o], call.output_types[o], row * width + i - stray * width, 0.0f);
+      with_type(call.output_types[o], [&](auto type) {
+        store_number<decltype(type)::value>(call.outputs[o], row * width + i - stray * width, 0.0f);
+      });
     }
   }
   for (int l = 0; l < call.lookup_count; ++l) {
@@ -524,7 +527,7 @@ CodePlaces code_places(const ProgramTable& table) {
   at.scatters = after(at.sums, table.sums);
   at.grids = after(at.scatters, table.scatters);
   at.own_steps = at.grids + aligned(static_cast<int64_t>(table.grids.size() * sizeof(HashEncoding)));
-  at.bytes = at.own_steps + aligned(static_cast<int64_t>(table.steps.size() * sizeof(CudaStep)));
+  at.bytes = at.own_steps + aligned(static_cast<int64_t>((table.steps.size() + 1) * sizeof(CudaStep)));
   return at;
 }
 
@@ -540,52 +543,60 @@ int32_t largest_pack(const ProgramTable& table) {
 
 // Returns a step as the interpreter reads it. `step` and `operands` must already have the positions of the slots on the
 // device (class Slots). goes_on: the step adds to the sums of the previous step.
-CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, const std::vector<ProgramPack>& packs,
-                   bool goes_on) {
+CudaStep cuda_step(const ProgramStep& step, int32_t index, const ProgramOperand* operands,
+                   const std::vector<ProgramPack>& packs, bool goes_on) {
   CudaStep result{};
   const auto value = [](const ProgramOperand& o) -> CudaValue {
     if (o.pairs >= 0) return {o.pairs, 0, pair_stride(o.width), o.width};
     return {o.slot, o.start, o.stride, o.width};
   };
-  result.keeps = step.memory != kNoMemory;
+  result.set(kKeeps, step.memory != kNoMemory);
   result.slot = step.floats ? step.slot : -1, result.stride = step.stride, result.pairs = step.pairs;
   result.width = step.width, result.depth = step.depth;
   result.bias = result.added = -1;
-  result.number = step.number;
+  const bool numbered = step.op == ProgramOp::input || step.op == ProgramOp::output || step.op == ProgramOp::outer ||
+                        step.op == ProgramOp::columns;
+  result.number = numbered ? step.number : index;
   const ProgramOperand *x = operands, *y = operands;
   if (step.op == ProgramOp::linear) {
     const ProgramPack& pack = packs[static_cast<size_t>(step.number)];
     result.weights = pack.at;
-    result.transposed = pack.kind == ProgramPackKind::transposed;
-    result.relu = step.finish == ProgramFinish::relu;
-    result.sloped = step.finish == ProgramFinish::relu_slope;
-    result.x_held = step.from_registers;
-    result.holds = step.to_registers == ProgramToRegisters::words;
-    result.carries = step.to_registers == ProgramToRegisters::sums;
-    if (result.sloped) y = operands + step.operand_count - 1;
-    if (step.operand_count > 1 + static_cast<int>(result.sloped) && !goes_on) {
+    result.set(kTransposed, pack.kind == ProgramPackKind::transposed);
+    result.set(kRelu, step.finish == ProgramFinish::relu);
+    result.set(kSloped, step.finish == ProgramFinish::relu_slope);
+    result.set(kXHeld, step.from_registers);
+    result.set(kHolds, step.to_registers == ProgramToRegisters::words);
+    result.set(kCarries, step.to_registers == ProgramToRegisters::sums);
+    if (result.is(kSloped)) y = operands + step.operand_count - 1;
+    if (step.operand_count > 1 + static_cast<int>(result.is(kSloped)) && !goes_on) {
       const ProgramOperand& added = operands[1];
       const bool bias = added.parameter && !added.spread;
       if (bias) result.bias = packs[static_cast<size_t>(added.slot)].at;
       if (!bias) result.added = step.first + 1;
     }
-    const bool words = (result.x_held || x->pairs >= 0) && (!result.sloped || y->pairs >= 0) && !step.floats;
-    result.op = words && result.added < 0 && !result.carries ? CudaOp::chain : CudaOp::linear;
+    const bool words = (result.is(kXHeld) || x->pairs >= 0) && (!result.is(kSloped) || y->pairs >= 0) && !step.floats;
+    result.op = words && result.added < 0 && !result.is(kCarries) ? CudaOp::chain : CudaOp::linear;
   } else if (step.op == ProgramOp::outer) {
     result.op = CudaOp::outer;
-    result.swapped = step.order != 1;
-    (result.swapped ? x : y) = operands + 1;
+    result.set(kSwapped, step.order != 1);
+    (result.is(kSwapped) ? x : y) = operands + 1;
   } else if (step.op == ProgramOp::columns) {
     result.op = CudaOp::columns;
+  } else if (step.op == ProgramOp::output) {
+    result.op = CudaOp::output;
+    if (x->parameter || x->spread) result.added = step.first;
   } else {
-    result.op = step.op == ProgramOp::input    ? CudaOp::input
-                : step.op == ProgramOp::output ? CudaOp::output
-                                               : CudaOp::plain;
-    result.added = step.first;
-    return result;
+    const bool waves = step.op == ProgramOp::encode && step.order == 0 &&
+                       (step.encoding == ProgramEncoding::frequency || step.encoding == ProgramEncoding::integrated);
+    result.op = waves ? CudaOp::waves : step.op == ProgramOp::input ? CudaOp::input : CudaOp::plain;
+    result.set(kDamped, step.encoding == ProgramEncoding::integrated);
+    result.set(kClears, step.pairs >= 0 && (result.op != CudaOp::input || step.width > kFewColumns));
+    const int32_t written = waves ? padded(step.width, 2) : step.width;  // waves are whole words
+    result.set(kPads, written < 2 * pair_words(step.width));
+    if (!waves) return result;
   }
-  result.x = value(*x), result.x_words = x->pairs >= 0;
-  result.y = value(*y), result.y_words = y->pairs >= 0;
+  result.x = value(*x), result.set(kXWords, x->pairs >= 0);
+  result.y = value(*y), result.set(kYWords, y->pairs >= 0);
   return result;
 }
 
@@ -593,15 +604,18 @@ CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, cons
 // from the same words.
 void join_columns(std::vector<CudaStep>& steps) {
   for (size_t i = 0; i < steps.size(); ++i) {
-    CudaStep& sum = steps[i];
+    const CudaStep sum = steps[i];
+    if (sum.op != CudaOp::columns || !sum.is(kXWords)) continue;
     for (const size_t j : {i - 1, i + 1}) {
-      if (sum.op != CudaOp::columns || sum.width == 0 || !sum.x_words || j >= steps.size()) continue;
+      if (j >= steps.size()) continue;
       CudaStep& outer = steps[j];
       const bool same = std::memcmp(&outer.y, &sum.x, sizeof(CudaValue)) == 0;
-      if (outer.op != CudaOp::outer || outer.bias >= 0 || !outer.swapped || !outer.x_words || !outer.y_words || !same)
+      if (outer.op != CudaOp::outer || outer.bias >= 0 || !outer.is(kSwapped) || !outer.is(kXWords) ||
+          !outer.is(kYWords) || !same)
         continue;
       outer.bias = sum.number;
-      sum.width = 0;
+      steps.erase(steps.begin() + static_cast<std::ptrdiff_t>(i--));
+      break;
     }
   }
 }
@@ -753,11 +767,13 @@ void program_code_cuda(const Program& program, unsigned char* code) {
     operand.stride += kProgramSkew;
   }
   std::vector<CudaStep> own_steps;
-  for (const ProgramStep& step : steps) {
-    const bool goes_on = !own_steps.empty() && own_steps.back().carries;
-    own_steps.push_back(cuda_step(step, operands.data() + step.first, table.packs, goes_on));
+  for (size_t i = 0; i < steps.size(); ++i) {
+    const bool goes_on = !own_steps.empty() && own_steps.back().is(kCarries);
+    const ProgramOperand* first = operands.data() + steps[i].first;
+    own_steps.push_back(cuda_step(steps[i], static_cast<int32_t>(i), first, table.packs, goes_on));
   }
   join_columns(own_steps);
+  own_steps.emplace_back().op = CudaOp::end;
   std::vector<HashEncoding> grids;
   for (const HashGrid& grid : table.grids) grids.push_back(hash_encoding(HashInputs{}, grid));
   const auto write = [code](int64_t place, const auto& records) {

@@ -32,16 +32,7 @@ __device__ __forceinline__ void hash_with_features(int features, const Run& run)
 // Calls run(features of a level, type of the table) with compile-time constants.
 template <typename Run>
 __device__ __forceinline__ void hash_with_table(int features, int type, const Run& run) {
-  hash_with_features(features, [&](auto count) {
-    switch (static_cast<TableType>(type)) {
-      case TableType::float32:
-        return run(count, std::integral_constant<TableType, TableType::float32>());
-      case TableType::bfloat16:
-        return run(count, std::integral_constant<TableType, TableType::bfloat16>());
-      default:
-        return run(count, std::integral_constant<TableType, TableType::float16>());
-    }
-  });
+  hash_with_features(features, [&](auto count) { with_type(type, [&](auto type) { run(count, type); }); });
 }
 
 struct HashAxes {
@@ -221,76 +212,96 @@ __device__ __forceinline__ void exact_octaves(const Tile& tile, int octaves, int
     to.put(row, column + features, sine_of_octave(angle, 0.5f) * blur);
   });
 }
-// Computes the octaves as 16-bit numbers in the order of WaveOrder, and also as floats if kFloats. A thread computes
-// all octaves of a feature of a row: every fourth by the hardware functions, and the next three by double-angle
-// formulas, each of which doubles the error.
+// Computes kCount octaves of a value from `first` on as words of 16-bit numbers: the first octave by the hardware
+// functions, and the next ones by double-angle formulas, each of which doubles the error. Calls put(octave, sine,
+// cosine) for each.
+template <int kCount, bool kBfloat16, bool kBlurred, typename Put>
+__device__ __forceinline__ void fast_words(uint32_t (&words)[kCount], float value, float variance, int first,
+                                           const Put& put) {
+  float2 pair = fast_sine_and_cosine(value * octave_scale(first));
+  float blur = kBlurred ? octave_blur(octave_scale(first), variance) : 1.0f;
+#pragma unroll
+  for (int i = 0; i < kCount; ++i) {
+    const float sine = pair.x * blur, cosine = pair.y * blur, twice = pair.x + pair.x;
+    words[i] = pack_halves<kBfloat16>(sine, cosine);
+    put(first + i, sine, cosine);
+    pair = make_float2(twice * pair.y, fmaf(-twice, pair.x, 1.0f));
+    if (kBlurred) blur *= blur * (blur * blur);  // the scale doubles, and the exponent has its square
+  }
+}
+// Computes the octaves as 16-bit numbers in the order of WaveOrder, and as floats if kFloats. A thread computes all
+// octaves of a feature of a row.
 template <bool kBlurred, bool kFloats, typename Tile>
 __device__ __forceinline__ void fast_octaves(const Tile& tile, int octaves, int features, const Operand& x,
                                              const Target<Tile::kBfloat16>& to) {
   const WaveOrder order{octaves, features, !kBlurred};
-  const int rows = tile.rows();
-  const float largest = kLargestDeviceAngle / octave_scale(octaves > 0 ? octaves - 1 : 0);
-  for (int i = Tile::worker(); i < Tile::kRows * features; i += Tile::kWorkers) {
-    const int feature = i / Tile::kRows, row = i % Tile::kRows;
-    if (row >= rows) continue;
+  const float largest = kLargestDeviceAngle * octave_scale(1 - octaves);
+  const int row = Tile::worker() % Tile::kRows, last = octaves / 4 * 4;
+  if (row >= tile.rows()) return;
+  auto* const words = reinterpret_cast<uint32_t*>(to.halves + row * to.halves_stride);
+  float* const floats = to.floats + row * to.stride;
+#pragma unroll 1
+  for (int feature = Tile::worker() / Tile::kRows; feature < features; feature += Tile::kWorkers / Tile::kRows) {
     const float value = x.at(row, feature), variance = kBlurred ? x.at(row, features + feature) : 0.0f;
-    auto* words = reinterpret_cast<uint32_t*>(to.halves + row * to.halves_stride);
-    float* wide = to.floats + row * to.stride + (kBlurred ? 0 : features) + feature;
-    if (!kBlurred) {
-      to.put_half(row, wave_place(order, feature), value);
-      if (kFloats) to.floats[row * to.stride + feature] = value;
-    }
-    const auto damping = [&](int octave) { return kBlurred ? octave_blur(octave_scale(octave), variance) : 1.0f; };
-    const auto word = [&](float2 pair, float blur) {
-      if (kFloats) {
-        wide[0] = pair.x * blur, wide[features] = pair.y * blur;
-        wide += 2 * features;
-      }
-      return pack_halves<Tile::kBfloat16>(pair.x * blur, pair.y * blur);
+    const auto put = [&](int octave, float sine, float cosine) {
+      float* const at = floats + (2 * octave + order.raw) * features + feature;
+      if (kFloats) at[0] = sine, at[features] = cosine;
     };
+    if (!kBlurred) {
+      const int place = wave_place(order, feature);
+      to.put_half(row, place, value);
+      if (feature == features - 1 && place % 2 == 0) to.put_half(row, place + 1, 0.0f);
+      if (kFloats) floats[feature] = value;
+    }
     if (!(fabsf(value) <= largest)) {  // too large, or NaN
 #pragma unroll 1
       for (int octave = 0; octave < octaves; ++octave) {
-        const int column = (2 * octave + order.raw) * features + feature;
-        words[wave_place(order, column) / 2] = word(exact_sine_and_cosine(value, octave), damping(octave));
+        const float2 pair = exact_sine_and_cosine(value, octave);
+        const float blur = kBlurred ? octave_blur(octave_scale(octave), variance) : 1.0f;
+        const int place = wave_place(order, (2 * octave + order.raw) * features + feature);
+        words[place / 2] = pack_halves<Tile::kBfloat16>(pair.x * blur, pair.y * blur);
+        put(octave, pair.x * blur, pair.y * blur);
       }
       continue;
     }
-    for (int first = 0; first < octaves; first += 4, words += 4 * features) {
-      float2 pair = fast_sine_and_cosine(value * octave_scale(first));
-      float blur = damping(first);
-      const auto next = [&] {
-        const uint32_t result = word(pair, blur);
-        const float twice = pair.x + pair.x;
-        pair = make_float2(twice * pair.y, fmaf(-twice, pair.x, 1.0f));
-        if (kBlurred) blur *= blur * (blur * blur);  // the angle doubles, so the exponent is four times larger
-        return result;
-      };
-      const int left = octaves - first;
-      uint32_t* at = words;
-      if (left >= 2) {
-        const uint32_t one = next(), two = next();
-        if (left >= 4) {
-          const uint32_t three = next(), four = next();
-          *reinterpret_cast<uint4*>(words + 4 * feature) = uint4{one, two, three, four};
-          continue;
-        }
-        *reinterpret_cast<uint2*>(words + 2 * feature) = uint2{one, two};
-        at += 2 * features;
-      }
-      if (left % 2 == 1) at[feature] = next();
+    uint32_t* at = words + 4 * feature;
+#pragma unroll 2
+    for (int first = 0; first < last; first += 4, at += 4 * features) {
+      uint32_t four[4];
+      fast_words<4, Tile::kBfloat16, kBlurred>(four, value, variance, first, put);
+      *reinterpret_cast<uint4*>(at) = uint4{four[0], four[1], four[2], four[3]};
+    }
+    at -= 2 * feature;
+    if (octaves % 4 >= 2) {
+      uint32_t two[2];
+      fast_words<2, Tile::kBfloat16, kBlurred>(two, value, variance, last, put);
+      *reinterpret_cast<uint2*>(at) = uint2{two[0], two[1]};
+      at += 2 * features;
+    }
+    if (octaves % 2 == 1) {
+      uint32_t one[1];
+      fast_words<1, Tile::kBfloat16, kBlurred>(one, value, variance, octaves - 1, put);
+      at[-feature] = one[0];
     }
   }
 }
-template <bool kBlurred, typename Tile>
-__device__ __noinline__ void octaves(Tile tile, const ProgramStep& step, const ProgramOperand* operands, int features) {
-  const Operand x = tile.value(operands[0]);
+// Runs an encoding by octaves.
+template <typename Tile>
+__device__ __noinline__ void waves_step(Tile tile, int number) {
+  const CudaStep step = load_step(tile.call.steps + number);
+  const Operand x{tile.slot(step.x.slot) + step.x.start, step.x.stride, false};
   const auto to = tile.target(step);
+  const int octaves = step.depth;
   if constexpr (Tile::kHalves) {  // 16-bit numbers have their own order
-    if (to.has_halves && to.has_floats) return fast_octaves<kBlurred, true>(tile, step.depth, features, x, to);
-    if (to.has_halves) return fast_octaves<kBlurred, false>(tile, step.depth, features, x, to);
+    if (to.has_halves) {
+      if (step.is(kDamped) && to.has_floats) return fast_octaves<true, true>(tile, octaves, step.x.columns / 2, x, to);
+      if (step.is(kDamped)) return fast_octaves<true, false>(tile, octaves, step.x.columns / 2, x, to);
+      if (to.has_floats) return fast_octaves<false, true>(tile, octaves, step.x.columns, x, to);
+      return fast_octaves<false, false>(tile, octaves, step.x.columns, x, to);
+    }
   }
-  exact_octaves<kBlurred>(tile, step.depth, features, x, to);
+  if (step.is(kDamped)) return exact_octaves<true>(tile, octaves, step.x.columns / 2, x, to);
+  exact_octaves<false>(tile, octaves, step.x.columns, x, to);
 }
 
 // Computes the gradient with respect to the encoded columns of x, from the encoding and from the gradient g with
@@ -321,9 +332,7 @@ struct Octaves {
   template <typename Tile>
   static __device__ __forceinline__ void run(const Tile& tile, const ProgramStep& step,
                                              const ProgramOperand* operands) {
-    const int features = operands[0].width / (kBlurred ? 2 : 1);
-    if (step.order == 0) return octaves<kBlurred>(tile, step, operands, features);
-    octaves_gradient(tile, step, operands, features, kBlurred);
+    octaves_gradient(tile, step, operands, operands[0].width / (kBlurred ? 2 : 1), kBlurred);  // waves_step has values
   }
 };
 

@@ -252,7 +252,7 @@ struct TensorSteps {
   // Runs any linear step. If the next steps add to its sums, it runs them too and advances `number` to the last of
   // them. In a team each warp has 16 of 64 columns, except for values in registers, which only the first warp computes.
   static __device__ __forceinline__ void linear(const Tile& tile, CudaStep& step, int& number, Held& held) {
-    const bool words = Numbers::kHalves && (step.pairs >= 0 || step.holds || step.carries);
+    const bool words = Numbers::kHalves && (step.pairs >= 0 || step.is(kHolds) || step.is(kCarries));
     const int wide = words ? 2 * pair_words(step.width) : step.width;
     if (kTeam > 1 && !in_registers(step)) {
 #pragma unroll 1
@@ -260,7 +260,7 @@ struct TensorSteps {
       return;
     }
     if (kTeam > 1 && Tile::warp() > 0) {
-      while (step.carries) step = load_step(tile.call.steps + ++number);
+      while (step.is(kCarries)) step = load_step(tile.call.steps + ++number);
       return;
     }
     if (wide <= 8) return part<1>(tile, step, number, 0, held);
@@ -287,11 +287,11 @@ struct TensorSteps {
         return;
       }
       if (kTeam > 1 && Tile::warp() > 0) return;
-      if (step.x_held && width > half) {
+      if (step.is(kXHeld) && width > half) {
         if (step.depth > half) return chained_part<8, 2>(tile, step, 0, held);
         return chained_part<8, 1>(tile, step, 0, held);
       }
-      if (step.x_held) {
+      if (step.is(kXHeld)) {
         if (step.depth > half) return chained_part<4, 2>(tile, step, 0, held);
         return chained_part<4, 1>(tile, step, 0, held);
       }
@@ -309,56 +309,21 @@ struct TensorSteps {
   // Computes partial[i][j] += sum over rows of a[row][i] b[row][j]. A warp computes 16 by 32 entries at a time. If
   // step.bias >= 0, warps with a's first 16 columns also add up the columns of b.
   static __device__ __forceinline__ void outer(const Tile& tile, const CudaStep& step) {
-    const bool swapped = step.swapped != 0;
-    const ProductValue a = product_value<true>(tile, step.x, step.x_words);
-    const ProductValue b = product_value<true>(tile, step.y, step.y_words);
-    const int warp = static_cast<int>(thread_again() / 32), lane = lane_again();
-    const bool words = Numbers::kHalves && a.has_words && b.has_words, full = tile.all() % Tile::kRows == 0,
-               fill = tile.fill();
+    const ProductValue a = product_value<true>(tile, step.x, step.is(kXWords));
+    const ProductValue b = product_value<true>(tile, step.y, step.is(kYWords));
+    const bool words = Numbers::kHalves && a.has_words && b.has_words;
+    const int lane = lane_again(), down = padded(a.columns, 16);
     float* const partial = tile.partial() + step.number;
-    // Blocks of entries are counted without a division.
-    const int down = 16 * ceil_div(a.columns, 16);
-    int i0 = 16 * warp, j0 = 0;
+    int i0 = 16 * static_cast<int>(thread_again() / 32), j0 = 0;
 #pragma unroll 1
     for (;; i0 += static_cast<int>(threads_again() / 2)) {
-      for (; i0 >= down; j0 += 32) i0 -= down;
+      for (; i0 >= down; j0 += 32) i0 -= down;  // a division takes longer
       if (j0 >= b.columns) break;
-      float sums[4][4] = {};
-      float2 previous[8];  // loaded while the products run
-      const bool pairs = j0 + 32 <= b.columns && i0 + 16 <= a.columns && !fill;
       float* const corner = partial + (i0 + lane / 4) * step.stride + j0 + 2 * (lane % 4);
-#pragma unroll
-      for (int t = 0; t < 8; ++t) {
-        previous[t] = pairs ? *reinterpret_cast<const float2*>(corner + t % 2 * 8 * step.stride + t / 2 * 8)
-                            : make_float2(0.0f, 0.0f);
-      }
-      // The padding after the columns of a row only affects sums that are not stored.
-      const bool floats = !Numbers::kHalves && full && step.x.start + i0 + 16 <= step.x.stride &&
-                          step.y.start + j0 + 32 <= step.y.stride;
-      if (words && step.bias >= 0 && i0 == 0) {
-        float columns[4][4] = {};
-        multiply_transposed<true, true>(sums, columns, tile, a, b, i0, j0, swapped, lane);
-        add_columns(columns, tile.partial() + step.bias, j0, b.columns, fill, lane);
-      } else if (words || floats) {
-        multiply_transposed<true, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
+      if (words) {
+        outer_words(tile, step, a, b, corner, i0, j0);
       } else {
-        multiply_transposed<false, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
-      }
-      if (j0 + 32 <= b.columns && i0 + 16 <= a.columns) {
-#pragma unroll
-        for (int t = 0; t < 8; ++t) {
-          const float x = sums[t / 2][t % 2 * 2] + previous[t].x, y = sums[t / 2][t % 2 * 2 + 1] + previous[t].y;
-          *reinterpret_cast<float2*>(corner + t % 2 * 8 * step.stride + t / 2 * 8) = make_float2(x, y);
-        }
-        continue;
-      }
-#pragma unroll
-      for (int i = 0; i < 16; ++i) {
-        const MapPlace at = accumulator_place(static_cast<unsigned>(lane), i % 4);
-        const int from = i0 + at.row, to = j0 + i / 4 * 8 + at.column;
-        if (from >= a.columns || to >= b.columns) continue;
-        float& entry = partial[from * step.stride + to];
-        entry = (fill ? 0.0f : entry) + sums[i / 4][i % 4];
+        outer_floats(tile, step, a, b, partial, i0, j0);
       }
     }
   }
@@ -366,7 +331,7 @@ struct TensorSteps {
   // Computes partial[j] += sum over rows of b[row][j]; for words, by a product with ones.
   static __device__ __forceinline__ void columns(const Tile& tile, const CudaStep& step) {
     if constexpr (Numbers::kHalves) {
-      if (step.x_words) return sum_words(tile, step);
+      if (step.is(kXWords)) return sum_words(tile, step);
     }
     sum_columns(tile, step);
   }
@@ -375,8 +340,54 @@ struct TensorSteps {
   template <int kTiles>
   using Sums = float[kTall][kTiles][4];
 
+  // Computes 16 by 32 entries of an outer product of words. Their padding is 0, and the partial has space for it.
+  static __device__ __forceinline__ void outer_words(const Tile& tile, const CudaStep& step, const ProductValue& a,
+                                                     const ProductValue& b, float* corner, int i0, int j0) {
+    const int lane = lane_again();
+    const bool fill = tile.fill(), swapped = step.is(kSwapped);
+    const auto entries = [&](int t) { return reinterpret_cast<float2*>(corner + t % 2 * 8 * step.stride + t / 2 * 8); };
+    float2 previous[8];  // loaded while the products run
+#pragma unroll
+    for (int t = 0; t < 8; ++t) previous[t] = fill ? make_float2(0.0f, 0.0f) : *entries(t);
+    float sums[4][4] = {};
+    if (step.bias >= 0 && i0 == 0) {
+      float columns[4][4] = {};
+      multiply_transposed<true, true>(sums, columns, tile, a, b, i0, j0, swapped, lane);
+      add_columns(columns, tile.partial() + step.bias + j0, fill, lane);
+    } else {
+      multiply_transposed<true, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
+    }
+#pragma unroll
+    for (int t = 0; t < 8; ++t) {
+      const float x = sums[t / 2][t % 2 * 2] + previous[t].x, y = sums[t / 2][t % 2 * 2 + 1] + previous[t].y;
+      *entries(t) = make_float2(x, y);
+    }
+  }
+  // The same if an operand has no words.
+  static __device__ __forceinline__ void outer_floats(const Tile& tile, const CudaStep& step, const ProductValue& a,
+                                                      const ProductValue& b, float* partial, int i0, int j0) {
+    const int lane = lane_again();
+    const bool fill = tile.fill(), swapped = step.is(kSwapped);
+    float sums[4][4] = {};
+    // The padding after the columns of a row only affects sums that are not stored.
+    if (!Numbers::kHalves && tile.all() % Tile::kRows == 0 && step.x.start + i0 + 16 <= step.x.stride &&
+        step.y.start + j0 + 32 <= step.y.stride) {
+      multiply_transposed<true, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
+    } else {
+      multiply_transposed<false, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
+    }
+#pragma unroll
+    for (int i = 0; i < 16; ++i) {
+      const MapPlace at = accumulator_place(static_cast<unsigned>(lane), i % 4);
+      const int from = i0 + at.row, to = j0 + i / 4 * 8 + at.column;
+      if (from >= a.columns || to >= b.columns) continue;
+      float& entry = partial[from * step.stride + to];
+      entry = (fill ? 0.0f : entry) + sums[i / 4][i % 4];
+    }
+  }
+
   static __device__ __forceinline__ bool in_registers(const CudaStep& step) {
-    return step.x_held || step.holds || step.carries;
+    return step.is(kXHeld) || step.is(kHolds) || step.is(kCarries);
   }
 
   // Computes 8 kTiles columns from `first` on. kHeld: the number of chunks of an operand in registers, or 0 if the
@@ -392,8 +403,10 @@ struct TensorSteps {
       for (int c = 0; c < kHeld; ++c) product.chunk(sums, c, [&](int r) { return product.held(held, r, c); });
     } else {
       const int chunks = ceil_div(step.depth, Numbers::kChunk);
+      // The first chunk is apart: its products read the bias of both rows from the same registers.
+      product.chunk(sums, 0, [&](int r) { return product.template left<true>(r, 0); });
 #pragma unroll 1
-      for (int c = 0; c < chunks; ++c) product.chunk(sums, c, [&](int r) { return product.template left<true>(r, c); });
+      for (int c = 1; c < chunks; ++c) product.chunk(sums, c, [&](int r) { return product.template left<true>(r, c); });
     }
     put_words<kTiles>(held, sums, tile, step, first);
   }
@@ -407,14 +420,14 @@ struct TensorSteps {
     for (;;) {
       multiply<kTiles>(sums, tile, step, first, held, lane);
       if (step.added >= 0) add<kTiles>(sums, step, tile, first);
-      if (!Numbers::kHalves || kTiles == 1 || !step.carries) break;
+      if (!Numbers::kHalves || kTiles == 1 || !step.is(kCarries)) break;
       step = load_step(tile.call.steps + ++number);
     }
-    const bool floats = step.slot >= 0, by_words = Numbers::kHalves && step.y_words;
-    if (step.relu && floats) {
+    const bool floats = step.slot >= 0, by_words = Numbers::kHalves && step.is(kYWords);
+    if (step.is(kRelu) && floats) {
       for_each_sum<kTiles>([&](int r, int t, int i) { sums[r][t][i] = sums[r][t][i] < 0.0f ? 0.0f : sums[r][t][i]; });
     }
-    if (step.sloped && (floats || !by_words)) cut_slopes<kTiles>(sums, tile, step, first);
+    if (step.is(kSloped) && (floats || !by_words)) cut_slopes<kTiles>(sums, tile, step, first);
     if (floats && tile.rows() == Tile::kRows && first + 8 * kTiles <= step.width) {
       store<kTiles, true>(sums, tile, step, first);
     } else if (floats) {
@@ -436,6 +449,13 @@ struct TensorSteps {
 #pragma unroll
     for (int i = 0; i < 2 * kTall * kTiles; ++i) visit(i / (2 * kTiles), i / 2 % kTiles, i % 2);
   }
+  // Calls visit(r, t) for each block of 16 rows by 16 columns: tiles t and t + 1.
+  template <int kTiles, typename Visit>
+  static __device__ __forceinline__ void for_each_block(const Visit& visit) {
+    static_assert(kTiles % 2 == 0);
+#pragma unroll
+    for (int i = 0; i < kTall * kTiles / 2; ++i) visit(2 * i / kTiles, 2 * i % kTiles);
+  }
   // Returns the row and column of a sum, relative to the rows of its warp and the columns of its part.
   static __device__ __forceinline__ MapPlace place(int r, int t, int i, int lane) {
     const MapPlace offset = accumulator_place(static_cast<unsigned>(lane), i);
@@ -450,13 +470,13 @@ struct TensorSteps {
     int across, lane;
     bool cut;
     __device__ __forceinline__ Product(const Tile& tile, const CudaStep& step, int first, int lane)
-        : x(product_value<false>(tile, step.x, step.x_words)),
+        : x(product_value<false>(tile, step.x, step.is(kXWords))),
           weights(reinterpret_cast<const uint4*>(tile.packed(step.weights)) + first / 8 * 32 + lane),
           bias(reinterpret_cast<const float4*>(step.bias < 0 ? kNoBias : tile.packed(step.bias) + 2 * first) +
                lane % 4),
           across(4 * padded(step.width, kProgramOutputs)),
           lane(lane),
-          cut(!step.transposed) {}
+          cut(!step.is(kTransposed)) {}
     // Sets the sums to the bias.
     template <int kTiles>
     __device__ __forceinline__ void start(float (&sums)[kTall][kTiles][4]) const {
@@ -500,12 +520,12 @@ struct TensorSteps {
                                                   const Held& held, int lane) {
     const Product product{tile, step, first, lane};
     const int chunks = ceil_div(step.depth, Numbers::kChunk);
-    if (Numbers::kHalves && step.x_held) {
+    if (Numbers::kHalves && step.is(kXHeld)) {
       product.chunk(sums, 0, [&](int r) { return product.held(held, r, 0); });
       if (chunks > 1) product.chunk(sums, 1, [&](int r) { return product.held(held, r, 1); });
       return;
     }
-    const bool words = Numbers::kHalves && step.x_words;
+    const bool words = Numbers::kHalves && step.is(kXWords);
 #pragma unroll 1
     for (int c = 0; c < chunks; ++c) {
       product.chunk(sums, c, [&](int r) {
@@ -572,7 +592,7 @@ struct TensorSteps {
         add_ones(sums[0], right[0]);
         add_ones(sums[1], right[1]);
       });
-      add_columns(sums, tile.partial() + step.number, j0, step.width, fill, lane);
+      add_columns(sums, tile.partial() + step.number + j0, fill, lane);
     }
   }
   // Adds sums of columns over the rows, by a product with ones.
@@ -580,14 +600,18 @@ struct TensorSteps {
     const uint32_t one = Numbers::pair(1.0f, 1.0f), ones[4] = {one, one, one, one};
     Numbers::multiply_transposed(sums, ones, right);
   }
-  // Adds sums of columns to partial[j], for columns from j0 on: kTiles tiles of eight.
+  // Adds sums of columns to the partial, which has space for all columns of the tiles of eight.
   template <int kTiles>
-  static __device__ __forceinline__ void add_columns(const float (&sums)[kTiles][4], float* partial, int j0,
-                                                     int columns, bool fill, int lane) {
+  static __device__ __forceinline__ void add_columns(const float (&sums)[kTiles][4], float* partial, bool fill,
+                                                     int lane) {
+    if (lane >= 4) return;
+    float2* const entries = reinterpret_cast<float2*>(partial) + lane;
+    float2 previous[kTiles];
 #pragma unroll
-    for (int i = 0; i < 2 * kTiles; ++i) {
-      const int j = j0 + 8 * (i / 2) + 2 * lane + i % 2;
-      if (lane < 4 && j < columns) partial[j] = (fill ? 0.0f : partial[j]) + sums[i / 2][i % 2];
+    for (int t = 0; t < kTiles; ++t) previous[t] = fill ? make_float2(0.0f, 0.0f) : entries[4 * t];
+#pragma unroll
+    for (int t = 0; t < kTiles; ++t) {
+      entries[4 * t] = make_float2(previous[t].x + sums[t][0], previous[t].y + sums[t][1]);
     }
   }
 
@@ -608,7 +632,7 @@ struct TensorSteps {
   static __device__ __forceinline__ void cut_slopes(Sums<kTiles>& sums, const Tile& tile, const CudaStep& step,
                                                     int first) {
     const int lane = lane_again();
-    const ProductValue slope = product_value<false>(tile, step.y, step.y_words);
+    const ProductValue slope = product_value<false>(tile, step.y, step.is(kYWords));
     if (Numbers::kHalves && slope.has_words) {
       const uint32_t* corner = slope.words + lane / 4 * slope.stride + first / 2 + lane % 4;
       for_each_sum<kTiles>([&](int r, int t, int i) {
@@ -629,7 +653,7 @@ struct TensorSteps {
   static __device__ __forceinline__ void put_words(Held& held, const Sums<kTiles>& sums, const Tile& tile,
                                                    const CudaStep& step, int first) {
     const int lane = lane_again();
-    if (step.relu) {
+    if (step.is(kRelu)) {
       for_each_word<kTiles>([&](int r, int t, int h) {
         held.words[r][t][h] = Numbers::relu_pair(sums[r][t][2 * h], sums[r][t][2 * h + 1]);
       });
@@ -637,11 +661,13 @@ struct TensorSteps {
       for_each_word<kTiles>(
           [&](int r, int t, int h) { held.words[r][t][h] = Numbers::pair(sums[r][t][2 * h], sums[r][t][2 * h + 1]); });
     }
-    if (step.sloped && step.y_words) {
-      const uint32_t* const corner =
-          product_value<false>(tile, step.y, true).words + lane / 4 * step.y.stride + first / 2 + lane % 4;
-      for_each_word<kTiles>([&](int r, int t, int h) {
-        held.words[r][t][h] &= Numbers::above_zero(corner[(16 * r + 8 * h) * step.y.stride + 4 * t]);
+    if (step.is(kSloped) && step.is(kYWords)) {
+      const uint32_t* const corner = product_value<false>(tile, step.y, true).words + first / 2;
+      for_each_block<kTiles>([&](int r, int t) {
+        uint32_t slopes[4];
+        load_matrices<kShared>(slopes, corner + 16 * r * step.y.stride + 4 * t, step.y.stride, lane);
+#pragma unroll
+        for (int i = 0; i < 4; ++i) held.words[r][t + i / 2][i % 2] &= Numbers::above_zero(slopes[i]);
       });
     }
     if (tile.rows() < Tile::kRows || first + 8 * kTiles > step.width) {
@@ -649,8 +675,12 @@ struct TensorSteps {
     }
     if (step.pairs < 0) return;
     const int stride = pair_stride(step.width);
-    uint32_t* const to = reinterpret_cast<uint32_t*>(tile.slot(step.pairs)) + lane / 4 * stride + first / 2 + lane % 4;
-    for_each_word<kTiles>([&](int r, int t, int h) { to[(16 * r + 8 * h) * stride + 4 * t] = held.words[r][t][h]; });
+    uint32_t* const to = reinterpret_cast<uint32_t*>(tile.slot(step.pairs)) + first / 2;
+    for_each_block<kTiles>([&](int r, int t) {
+      const auto& words = held.words[r];
+      const uint32_t four[4] = {words[t][0], words[t][1], words[t + 1][0], words[t + 1][1]};
+      store_matrices<kShared>(to + 16 * r * stride + 4 * t, four, stride, lane);
+    });
   }
   // Clears the numbers in rows without a sample and in columns after the last one, since products read multiples of 16
   // rows and columns.
@@ -820,8 +850,8 @@ struct FloatSteps {
       float four[4] = {sums[r].x, sums[r].y, sums[r].z, sums[r].w};
 #pragma unroll
       for (int i = 0; i < 4; ++i) {  // comparisons keep NaN
-        if (step.relu) four[i] = four[i] < 0.0f ? 0.0f : four[i];
-        if (step.sloped) four[i] = slope.at(at, first + i) <= 0.0f ? 0.0f : four[i];
+        if (step.is(kRelu)) four[i] = four[i] < 0.0f ? 0.0f : four[i];
+        if (step.is(kSloped)) four[i] = slope.at(at, first + i) <= 0.0f ? 0.0f : four[i];
       }
       if (first + 4 <= step.width) {
         *reinterpret_cast<float4*>(to + at * step.stride) = make_float4(four[0], four[1], four[2], four[3]);

@@ -4,6 +4,8 @@
 // not validated offsets, order and ray_index, so each use clamps them to valid indices.
 #pragma once
 
+#include <type_traits>
+
 #include "common/cuda_wrappers.h"
 #include "common/index_maps.h"
 #include "encoding/hash_encode_math.h"
@@ -32,28 +34,42 @@ struct CudaRows {
 struct CudaValue {
   int32_t slot, start, stride, columns;
 };
-// The kinds of steps. chain: a linear step that reads and writes only words (pairs of 16-bit numbers).
-enum class CudaOp : int32_t { plain, input, output, linear, chain, outer, columns };
+// The kinds of steps. chain: a linear step that reads and writes only words (pairs of 16-bit numbers). waves: an
+// encoding by octaves. The last step is `end`.
+enum class CudaOp : int32_t { plain, input, output, linear, chain, waves, outer, columns, end };
+// Properties of a step.
+enum CudaFlag : uint32_t {
+  kKeeps = 1,  // the result is also stored for the caller, or added to the gradient of a table
+  kRelu = 2,
+  kSloped = 4,
+  kTransposed = 8,
+  kXWords = 16,
+  kYWords = 32,
+  kSwapped = 64,   // outer: y, not x, is the gradient
+  kXHeld = 128,    // x is in registers
+  kHolds = 256,    // the result stays in registers
+  kCarries = 512,  // the next step adds to the sums
+  kDamped = 1024,  // waves: damped by variances
+  kClears = 2048,  // clear_rest clears rows of words without a sample
+  kPads = 4096,    // clear_rest also clears columns, for steps that do not write the padding of a row
+};
 // A step as the interpreter reads it, in five loads: the fields of the step, its operands and packs. Plain steps use
-// only `op` and `keeps`.
+// only `op`, `number`, `flags` and the fields of the result.
 struct alignas(16) CudaStep {
   CudaValue x;
   // Offsets in the packed parameters; -1: none. For outer, bias is the offset of the sums of y's columns in the
   // partial, or -1.
   int32_t weights, bias;
-  int32_t depth, width;  // output: `depth` is the first destination column
+  int32_t depth, width;  // output: `depth` is the first destination column. waves: `depth` is the number of octaves
   CudaValue y;           // linear: the value of the ReLU whose slope is applied. outer: right operand
   int32_t slot, stride;  // of the result as floats (slot -1: none); outer: `stride` is the row of the sum
   int32_t pairs;         // slot of the result as 16-bit words, or -1
-  int32_t added;         // index of an added operand, or -1; output: the written operand
-  int32_t number;        // input, output: its index. outer, columns: offset in the partial
+  int32_t added;         // index of an added operand, or -1; output: of an operand that is not in a slot, or -1
+  int32_t number;        // input, output: its index. outer, columns: offset in the partial. else: index of the step
   CudaOp op;
-  uint32_t keeps : 1;  // the result is also stored for the caller, or added to the gradient of a table
-  uint32_t relu : 1, sloped : 1, transposed : 1;
-  uint32_t x_words : 1, y_words : 1;
-  uint32_t swapped : 1;            // outer: y, not x, is the gradient
-  uint32_t x_held : 1, holds : 1;  // x is in registers; the result stays in registers
-  uint32_t carries : 1;            // the next step adds to the sums
+  uint32_t flags;
+  __host__ __device__ __forceinline__ bool is(CudaFlag flag) const { return (flags & flag) != 0; }
+  void set(CudaFlag flag, bool value) { flags |= value ? flag : 0u; }
   __device__ __forceinline__ bool sums() const { return op == CudaOp::outer || op == CudaOp::columns; }
 };
 static_assert(sizeof(CudaStep) == 80, "five loads");
@@ -108,27 +124,32 @@ __device__ __forceinline__ int64_t cell_rows(const CudaRows& rows, int64_t cell)
   return count < 0 ? 0 : count;
 }
 
-// Loads and stores of numbers by their type in memory.
-__device__ __forceinline__ float load_number(const void* from, int type, int64_t at) {
+// Calls run(type) with the type of numbers in memory as a compile-time constant, and returns its result.
+template <typename Run>
+__device__ __forceinline__ auto with_type(int type, const Run& run) {
   switch (static_cast<TableType>(type)) {
     case TableType::float32:
-      return static_cast<const float*>(from)[at];
+      return run(std::integral_constant<TableType, TableType::float32>());
     case TableType::bfloat16:
-      return unpack_half<true>(static_cast<const uint16_t*>(from)[at]);
+      return run(std::integral_constant<TableType, TableType::bfloat16>());
     default:
-      return unpack_half<false>(static_cast<const uint16_t*>(from)[at]);
+      return run(std::integral_constant<TableType, TableType::float16>());
   }
 }
-__device__ __forceinline__ void store_number(void* to, int type, int64_t at, float x) {
-  switch (static_cast<TableType>(type)) {
-    case TableType::float32:
-      static_cast<float*>(to)[at] = x;
-      return;
-    case TableType::bfloat16:
-      static_cast<uint16_t*>(to)[at] = static_cast<uint16_t>(pack_halves<true>(x, 0.0f));
-      return;
-    default:
-      static_cast<uint16_t*>(to)[at] = static_cast<uint16_t>(pack_halves<false>(x, 0.0f));
+template <TableType kType>
+using InMemory = std::conditional_t<kType == TableType::float32, float, uint16_t>;
+// Loads and stores of numbers of a type.
+template <TableType kType>
+__device__ __forceinline__ float load_number(const void* from, int64_t at) {
+  if constexpr (kType == TableType::float32) return static_cast<const float*>(from)[at];
+  return unpack_half<kType == TableType::bfloat16>(static_cast<const uint16_t*>(from)[at]);
+}
+template <TableType kType>
+__device__ __forceinline__ void store_number(void* to, int64_t at, float x) {
+  if constexpr (kType == TableType::float32) {
+    static_cast<float*>(to)[at] = x;
+  } else {
+    static_cast<uint16_t*>(to)[at] = static_cast<uint16_t>(pack_halves<kType == TableType::bfloat16>(x, 0.0f));
   }
 }
 
@@ -137,8 +158,12 @@ struct InputRow {
   const void* data;
   int64_t at, apart;  // offset of the first column, and stride of columns
   int type;
+  template <TableType kType>
   __device__ __forceinline__ float column(int i) const {
-    return data == nullptr ? 0.0f : load_number(data, type, at + i * apart);
+    return data == nullptr ? 0.0f : load_number<kType>(data, at + i * apart);
+  }
+  __device__ __forceinline__ float column(int i) const {
+    return with_type(type, [&](auto type) { return column<decltype(type)::value>(i); });
   }
 };
 __device__ __forceinline__ InputRow input_row(const CudaProgram& call, int input, int width, int64_t source) {
@@ -329,23 +354,70 @@ __device__ __forceinline__ void clear_rest(const Tile& tile, const CudaStep& ste
   }
 }
 
-// Inputs and outputs with at most this many columns have one thread per row, which resolves the row's index once.
+// Inputs and outputs with at most this many columns have one thread per row, which resolves the row's index once, and
+// requests all numbers before it waits for the first.
 constexpr int kFewColumns = 8;
+
+// Calls visit(i) for the first `width` of kFewColumns.
+template <typename Visit>
+__device__ __forceinline__ void for_few(int width, const Visit& visit) {
+#pragma unroll
+  for (int i = 0; i < kFewColumns / 2; ++i) {
+    if (i < width) visit(i);
+  }
+  if (width <= kFewColumns / 2) return;
+#pragma unroll
+  for (int i = kFewColumns / 2; i < kFewColumns; ++i) {
+    if (i < width) visit(i);
+  }
+}
+__device__ __forceinline__ void load_few(float (&values)[kFewColumns], const InputRow& from, int width) {
+  if (from.data == nullptr) return;
+  if (from.apart != 1) {  // float32
+    const float* at = static_cast<const float*>(from.data) + from.at;
+    return for_few(width, [&](int i) {
+      values[i] = *at;
+      at += from.apart;
+    });
+  }
+  with_type(from.type, [&](auto type) {
+    constexpr TableType kType = decltype(type)::value;
+    const auto* const at = static_cast<const InMemory<kType>*>(from.data) + from.at;
+    for_few(width, [&](int i) { values[i] = load_number<kType>(at, i); });
+  });
+}
 
 template <typename Tile>
 __device__ __forceinline__ void input_step(const Tile& tile, const CudaStep& step) {
   const CudaProgram& call = tile.call;
   const int width = step.width, input = step.number, begin = tile.begin();
   const auto to = tile.target(step);
+  const int row = Tile::worker();
   if (width > kFewColumns && !call.transposed[input]) {  // neighbouring lanes read neighbouring columns
     return for_each_entry<Tile>(tile.rows(), width, [&](int row, int column) {
       to.put(row, column, input_row(call, input, width, source_row(call.rows, begin + row)).column(column));
     });
   }
-  const int row = Tile::worker();
-  if (row >= tile.rows()) return;
-  const InputRow from = input_row(call, input, width, source_row(call.rows, begin + row));
-  for (int column = 0; column < width; ++column) to.put(row, column, from.column(column));
+  if (width > kFewColumns) {
+    if (row >= tile.rows()) return;
+    const InputRow from = input_row(call, input, width, source_row(call.rows, begin + row));
+    for (int column = 0; column < width; ++column) to.put(row, column, from.column(column));
+    return;
+  }
+  float values[kFewColumns] = {};
+  if (row < tile.rows()) {
+    load_few(values, input_row(call, input, width, source_row(call.rows, begin + row)), width);
+    float* const floats = to.floats + row * to.stride;
+    if (to.has_floats) for_few(width, [&](int i) { floats[i] = values[i]; });
+  }
+  if (!to.has_halves || row >= Tile::kRows) return;
+  // The whole padded row, and rows without a sample, which are 0.
+  static_assert(kFewColumns == 8, "one store of 16 bytes");
+  auto* const words = reinterpret_cast<uint4*>(to.halves + row * to.halves_stride);
+  const auto word = [&](int i) { return pack_halves<Tile::kBfloat16>(values[i], values[i + 1]); };
+  words[0] = uint4{word(0), word(2), word(4), word(6)};
+#pragma unroll
+  for (int i = 1; i < pair_words(kFewColumns) / 4; ++i) words[i] = uint4{0, 0, 0, 0};
 }
 
 template <typename Tile>
@@ -353,18 +425,28 @@ __device__ __forceinline__ void output_step(const Tile& tile, const CudaStep& st
   const CudaProgram& call = tile.call;
   const int output = step.number, width = step.width, type = call.output_types[output], begin = tile.begin();
   const int64_t wide = call.output_widths[output];
-  const Operand x = tile.operand(call.code.operands[step.added]);
-  const auto put = [&](int64_t source, int row, int column) {
-    store_number(call.outputs[output], type, source * wide + step.depth + column, x.at(row, column));
-  };
-  if (width > kFewColumns) {
-    return for_each_entry<Tile>(tile.rows(), width,
-                                [&](int row, int column) { put(source_row(call.rows, begin + row), row, column); });
+  void* const to = call.outputs[output];
+  if (width > kFewColumns || step.added >= 0) {
+    const Operand x = step.added < 0 ? Operand{tile.slot(step.x.slot) + step.x.start, step.x.stride, false}
+                                     : tile.operand(call.code.operands[step.added]);
+    return with_type(type, [&](auto type) {
+      for_each_entry<Tile>(tile.rows(), width, [&](int row, int column) {
+        const int64_t source = source_row(call.rows, begin + row);
+        store_number<decltype(type)::value>(to, source * wide + step.depth + column, x.at(row, column));
+      });
+    });
   }
   const int row = Tile::worker();
   if (row >= tile.rows()) return;
-  const int64_t source = source_row(call.rows, begin + row);
-  for (int column = 0; column < width; ++column) put(source, row, column);
+  const int64_t first = source_row(call.rows, begin + row) * wide + step.depth;
+  const float* const x = tile.slot(step.x.slot) + step.x.start + row * step.x.stride;
+  float values[kFewColumns] = {};
+  for_few(width, [&](int i) { values[i] = x[i]; });
+  with_type(type, [&](auto type) {
+    constexpr TableType kType = decltype(type)::value;
+    auto* const at = static_cast<InMemory<kType>*>(to) + first;
+    for_few(width, [&](int i) { store_number<kType>(at, i, values[i]); });
+  });
 }
 
 }  // namespace voronerf

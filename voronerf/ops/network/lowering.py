@@ -229,7 +229,7 @@ class _Lowering:
         return _padded(width, 2 * _GRANULE) // 2 * (2 if self.parts else 1)
 
     def padded_outputs(self, width: int) -> int:
-        """Returns the number of floats, with padding, in a row of packed weights that has one float per output."""
+        """Returns the number of floats, with padding, in a row of packed weights or of a partial sum."""
         return _padded(width, 2 * _GRANULE if self.cuda else _GRANULE)
 
     # Records ----------------------------------------------------------------------------------------------------------
@@ -561,8 +561,9 @@ class _Lowering:
         shape, start, at = self.program.sums[step.out], int(step.numbers[0]), self.partial
         by_outputs = self._by_outputs(step)
         o, i = step.operands[0].width, step.operands[1].width
-        stride = _padded(i if by_outputs else o)
-        self.partial += stride * (o if by_outputs else i)
+        stride = self.padded_outputs(i if by_outputs else o)
+        rows = o if by_outputs else i
+        self.partial += stride * (_padded(rows) if self.cuda else rows)
         kind = "outputs_inputs" if by_outputs else "inputs_outputs"
         size = shape[0] * shape[1]
         self.sums.append((step.out, kind, at, o, shape[1], start, i, stride, size, self.waves(step, 1)))
@@ -575,7 +576,7 @@ class _Lowering:
 
     def _columns(self, step: Step, dying: set[int]) -> None:
         shape, start, at = self.program.sums[step.out], int(step.numbers[0]), self.partial
-        size, stride = shape[0] * (shape[1] if len(shape) > 1 else 1), _padded(step.width)
+        size, stride = shape[0] * (shape[1] if len(shape) > 1 else 1), self.padded_outputs(step.width)
         self.partial += stride
         self.sums.append((step.out, "vector", at, 1, size, start, step.width, stride, size, _NONE))
         records = [self.operand(step.operands[0], product=self.tiles and not self.parts)]
