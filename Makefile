@@ -55,7 +55,7 @@ check: $(VENV)/.built
 docs: $(VENV)/.built $(VENV)/.docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-cuda-check: $(VENV)/.installed
+cuda-check: $(VENV)/.built
 	@$(BIN)/python .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
 
 # The Warp kernels as machine code for the same GPUs, by Warp alone: registers, stack and shared memory. HALF=--half: for 16-bit weights.

@@ -6,11 +6,11 @@ architecture is compiled to PTX as well.
 For every kernel it prints registers, spills, shared memory and the warps that fit a multiprocessor's registers, and
 compares them with the table .ci/cuda_resources.json. More spilled bytes than in the table are a failure, and so is any
 spill of a kernel that is not in the table. If nvcc has the version recorded in the table, more registers, more shared
-memory and fewer warps are failures too. If cuobjdump and nvdisasm are installed as well, it is a failure if a network
-layer has more instructions than in the table, or if machine_code.py does not find a layer that the table has. The check
-also fails if a kernel's resources are not reported for every architecture, or if there is no kernel. Kernels of the
-toolkit (CUB) are only counted: their names change with the toolkit's version. In the output, sm_80 is an A100, sm_89 an
-RTX 4090, sm_90 an H200.
+memory and fewer warps are failures too. With this nvcc, sm_90 and the programs cuobjdump and nvdisasm, passes.py runs
+the machine code of whole passes of networks. It is a failure if their results are wrong, or if a pass has over 1 % more
+instructions than in the table. The check also fails if a kernel's resources are not reported for every architecture, or
+if there is no kernel. Kernels of the toolkit (CUB) are only counted: their names change with the toolkit's version. In
+the output, sm_80 is an A100, sm_89 an RTX 4090, sm_90 an H200.
 
 ``--update`` writes the named architectures to the table and removes kernels that no longer exist. The last line of the
 output is one sentence: what was compiled, and whether it passed.
@@ -26,10 +26,11 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = runpy.run_path(str(ROOT / "setup.py"), run_name="voronerf_setup")
-CODE = runpy.run_path(str(Path(__file__).with_name("machine_code.py")))
+TOOLS = runpy.run_path(str(Path(__file__).with_name("machine_run.py")))["tools"]
 OUT: Path = BUILD["build_folder"]()
 TABLE = ROOT / ".ci" / "cuda_resources.json"
 REGISTERS = 65536
@@ -37,7 +38,9 @@ REGISTERS = 65536
 MOST_WARPS = {"sm_75": 32, "sm_86": 48, "sm_89": 48, "sm_120": 48}
 """The maximum number of warps on a multiprocessor; 64 for other architectures."""
 NETWORKS = "network/cuda/program_cuda.cu.o"
-"""The object file whose kernels contain network layers."""
+"""The object file with the kernels of networks."""
+ALLOWED = 1.01
+"""The instructions that a pass may have, relative to the table."""
 FLAGS = "-Werror all-warnings -Xcompiler -Wall,-Wextra,-Werror -Xptxas -v"
 OBJECT = re.compile(r"^\[\d+/\d+\] (?=\S+\.cu\.o$)", re.MULTILINE)
 """The line that ninja prints before the output of a compilation."""
@@ -84,22 +87,19 @@ def main(architectures: list[str]) -> int:
                 "shared_bytes": int(shared[1]) if shared else 0,
                 "warps": warps(int(match["registers"]), match["arch"]),
             }
-    path, counted = CODE["tools"](), (OUT / NETWORKS).is_file() and NETWORKS not in failed
-    if path is None:
-        print("cuda-check: no layer instructions were counted: cuobjdump or nvdisasm is missing.")
-    for architecture in architectures if path is not None and counted else ():
-        for name, found in CODE["layers"](OUT / NETWORKS, architecture, path).items():
-            kernel = f"{Path(NETWORKS).stem}: {demangled(name)}"
-            row = kernels.get(kernel, {}).get(f"sm_{architecture}")
-            if row is None or "program_kernel" not in kernel:
-                continue
-            row["layer"] = sum(found.values())
-            said = ", ".join(f"{count} {kind}" for kind, count in found.most_common(6))
-            print(f"{kernel} (sm_{architecture}): {row['layer']} instructions a layer, {said}")
-    for kernel, by_architecture in sorted(kernels.items()):
-        columns = {key: [row[key] for row in by_architecture.values() if key in row] for key in COLUMNS}
-        print(f"{kernel}: " + ", ".join(f"{key} {span(values)}" for key, values in columns.items() if values))
     version = nvcc_version(nvcc)
+    passes: dict[str, int] = {}
+    wrong = ""
+    compiled_networks = "90" in architectures and NETWORKS not in failed and (OUT / NETWORKS).is_file()
+    if TOOLS() is None:
+        print("cuda-check: no passes were run: cuobjdump or nvdisasm is missing.")
+    elif compiled_networks and (update or table()["nvcc"] == version):
+        passes, wrong = passes_of(OUT / NETWORKS)
+    for name, count in passes.items():
+        print(f"{name} (sm_90): {count} instructions for 32 rows")
+    for kernel, by_architecture in sorted(kernels.items()):
+        columns = {key: [row[key] for row in by_architecture.values()] for key in COLUMNS}
+        print(f"{kernel}: " + ", ".join(f"{key} {span(values)}" for key, values in columns.items()))
     spilling = sum(row["spilled_bytes"] > 0 for rows in kernels.values() for row in rows.values())
     targets = f"{', '.join(f'sm_{arch}' for arch in architectures)} and PTX of {architectures[-1]}"
     # Kernels of files that failed to compile are skipped, because the failure itself is reported.
@@ -111,7 +111,7 @@ def main(architectures: list[str]) -> int:
         for arch in architectures
         if f"sm_{arch}" not in found
     ]
-    worse = [] if update else regressions(version, kernels)
+    worse = [] if update else regressions(version, kernels, passes)
     for line in worse:
         print(line)
     if failed:
@@ -120,55 +120,75 @@ def main(architectures: list[str]) -> int:
         outcome = f"failed: no resources were reported of {', '.join(lacking)}"
     elif not kernels:
         outcome = "failed: no kernel was reported"
+    elif wrong:
+        outcome = f"failed: {wrong}"
     elif worse:
         outcome = f"failed: {len(worse)} regressions against {TABLE.relative_to(ROOT)}, listed above"
     else:
         outcome = f"held without a warning, {spilling} spilling"
         if update:
-            TABLE.write_text(as_text(version, merged(version, kernels)))
+            TABLE.write_text(as_text(version, *merged(version, kernels, passes)))
     toolkit = f" and {len(borrowed)} of the toolkit's" if borrowed else ""
     print(f"cuda-check: {len(objects)} files, {len(kernels)} kernels{toolkit} compiled for {targets} {outcome}.")
-    return 1 if failed or lacking or worse or not kernels else 0
+    return 1 if failed or lacking or wrong or worse or not kernels else 0
+
+
+def passes_of(compiled: Path) -> tuple[dict[str, int], str]:
+    """Returns the instructions of each pass that passes.py counts, or why there are none."""
+    command = [sys.executable, str(Path(__file__).with_name("passes.py")), "--json", str(compiled)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode == 0:
+        return json.loads(done.stdout), ""
+    return {}, f"passes.py ended with {done.returncode}, {(done.stderr.strip() or 'silently').splitlines()[-1]}"
 
 
 Kernels = dict[str, dict[str, dict[str, int]]]
 
 
-def regressions(version: str, kernels: Kernels) -> list[str]:
+def regressions(version: str, kernels: Kernels, passes: dict[str, int]) -> list[str]:
     """Returns a line for each value that is worse than in the table.
 
     A kernel or architecture that is not in the table gets a line only if it spills.
     """
-    kept = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": "", "kernels": {}}
-    compared = ("spilled_bytes", *(("registers", "shared_bytes", "layer") if kept["nvcc"] == version else ()))
-    counted = any("layer" in row for rows in kernels.values() for row in rows.values())
-    worse = []
+    kept = table()
+    same = kept["nvcc"] == version
+    compared = ("spilled_bytes", *(("registers", "shared_bytes") if same else ()))
+    worse = [
+        f"{name}: {count} instructions, above {kept['passes'][name]}"
+        for name, count in passes.items()
+        if same and count > ALLOWED * kept["passes"].get(name, count)
+    ]
     for kernel, by_architecture in sorted(kernels.items()):
         for architecture, row in by_architecture.items():
             known = unpack(kept["kernels"].get(kernel, {})).get(architecture, {"spilled_bytes": 0})
             for key in compared:
-                if key in row and row[key] > known.get(key, row[key]):
+                if row[key] > known.get(key, row[key]):
                     worse.append(f"{kernel} ({architecture}): {key} {row[key]}, above {known[key]}")
-            if counted and "layer" in compared and "layer" in known and "layer" not in row:
-                worse.append(
-                    f"{kernel} ({architecture}): no layer was found (the table has {known['layer']} instructions)"
-                )
             if "registers" in compared and row["warps"] < known.get("warps", 0):
                 worse.append(f"{kernel} ({architecture}): warps {row['warps']}, below {known['warps']}")
     return worse
 
 
-def merged(version: str, kernels: Kernels) -> Kernels:
-    """Returns the table with the new rows.
+def merged(version: str, kernels: Kernels, passes: dict[str, int]) -> tuple[Kernels, dict[str, int]]:
+    """Returns the table's kernels and passes with the new values.
 
-    If the table records the same version of nvcc, the compiled kernels keep their rows of other architectures.
+    If the table records the same version of nvcc, the compiled kernels keep their rows of other architectures, and the
+    passes are kept if none were run.
     """
-    table = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": ""}
-    kept = table["kernels"] if table["nvcc"] == version else {}
-    return {
-        kernel: dict(sorted((unpack(kept.get(kernel, {})) | found).items(), key=lambda row: number(row[0])))
+    kept = table()
+    if kept["nvcc"] != version:
+        kept |= {"kernels": {}, "passes": {}}
+    rows = {
+        kernel: dict(sorted((unpack(kept["kernels"].get(kernel, {})) | found).items(), key=lambda row: number(row[0])))
         for kernel, found in kernels.items()
     }
+    return rows, passes or kept["passes"]
+
+
+def table() -> dict[str, Any]:
+    """Returns the recorded table: the version of nvcc, kernels and passes."""
+    empty = {"nvcc": "", "kernels": {}, "passes": {}}
+    return empty | (json.loads(TABLE.read_text()) if TABLE.exists() else {})
 
 
 def number(architecture: str) -> int:
@@ -176,19 +196,19 @@ def number(architecture: str) -> int:
     return int(architecture.removeprefix("sm_"))
 
 
-COLUMNS = ("registers", "spilled_bytes", "shared_bytes", "warps", "layer")
+COLUMNS = ("registers", "spilled_bytes", "shared_bytes", "warps")
 
 
-def as_text(version: str, kernels: Kernels) -> str:
+def as_text(version: str, kernels: Kernels, passes: dict[str, int]) -> str:
     """Returns the table as JSON, one line for each kernel."""
     rows = {
-        kernel: {
-            architecture: [row[key] for key in COLUMNS if key in row] for architecture, row in by_architecture.items()
-        }
+        kernel: {architecture: [row[key] for key in COLUMNS] for architecture, row in by_architecture.items()}
         for kernel, by_architecture in sorted(kernels.items())
     }
     lines = ",\n".join(f"  {json.dumps(kernel)}: {json.dumps(row)}" for kernel, row in rows.items())
-    return f'{{\n "nvcc": "{version}",\n "columns": {json.dumps(COLUMNS)},\n "kernels": {{\n{lines}\n }}\n}}\n'
+    counts = ",\n".join(f"  {json.dumps(name)}: {count}" for name, count in passes.items())
+    head = f' "nvcc": "{version}",\n "passes": {{\n{counts}\n }},\n "columns": {json.dumps(COLUMNS)},\n'
+    return f'{{\n{head} "kernels": {{\n{lines}\n }}\n}}\n'
 
 
 def unpack(rows: dict[str, list[int]]) -> dict[str, dict[str, int]]:

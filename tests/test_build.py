@@ -3,7 +3,9 @@
 import importlib.metadata
 import importlib.util
 import os
+import re
 import runpy
+import struct
 import subprocess
 import sys
 import sysconfig
@@ -239,17 +241,17 @@ def test_cuda_check_compares_with_the_table(check, monkeypatch, tmp_path):
     row = {"registers": 40, "spilled_bytes": 8, "shared_bytes": 0, "warps": 48}
     monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
     # The table is absent; a kernel that is not in the table must have no spills.
-    assert len(check.regressions("V13", {"kernel": {"sm_80": row}})) == 1
-    check.TABLE.write_text(check.as_text("V13", {"kernel": {"sm_80": row}}))
-    assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []
+    assert len(check.regressions("V13", {"kernel": {"sm_80": row}}, {})) == 1
+    check.TABLE.write_text(check.as_text("V13", {"kernel": {"sm_80": row}}, {}))
+    assert check.regressions("V13", {"kernel": {"sm_80": row}}, {}) == []
     more = {"kernel": {"sm_80": {**row, "registers": 41, "spilled_bytes": 12}}}
-    assert check.regressions("V13", more) == [
+    assert check.regressions("V13", more, {}) == [
         "kernel (sm_80): spilled_bytes 12, above 8",
         "kernel (sm_80): registers 41, above 40",
     ]
     fewer = {"kernel": {"sm_80": {**row, "warps": 47}}}
-    assert check.regressions("V13", fewer) == ["kernel (sm_80): warps 47, below 48"]
-    assert check.regressions("V14", more) == ["kernel (sm_80): spilled_bytes 12, above 8"]
+    assert check.regressions("V13", fewer, {}) == ["kernel (sm_80): warps 47, below 48"]
+    assert check.regressions("V14", more, {}) == ["kernel (sm_80): spilled_bytes 12, above 8"]
     assert [check.warps(registers, "sm_90") for registers in (8, 32, 33, 255)] == [64, 64, 51, 8]
     assert [check.warps(8, architecture) for architecture in ("sm_75", "sm_89")] == [32, 48]
 
@@ -260,10 +262,10 @@ def test_cuda_check_notes_the_architectures_it_was_asked_for(check, monkeypatch,
     _, said = reporting(REPORT.format("90"), "90")
     kernel = next(line for line in said.splitlines() if "kernel" in line).split(": registers")[0]
     kernels = {kernel: {"sm_100": old, "sm_90": old}, "gone": {"sm_100": old}}
-    check.TABLE.write_text(check.as_text("V12", kernels))
+    check.TABLE.write_text(check.as_text("V12", kernels, {}))
     reporting(REPORT.format("90"), "90", "--update")
     assert list(check.json.loads(check.TABLE.read_text())["kernels"][kernel]) == ["sm_90"]  # drops rows of another nvcc
-    check.TABLE.write_text(check.as_text("", kernels))
+    check.TABLE.write_text(check.as_text("", kernels, {}))
     reporting(REPORT.format("90"), "90", "--update")
     kept = check.json.loads(check.TABLE.read_text())["kernels"]
     assert list(kept[kernel]) == ["sm_90", "sm_100"] and "gone" not in kept
@@ -324,55 +326,80 @@ def test_the_wheel_does_the_main_job_in_a_new_environment(installed):
     installed("python", "-c", "import voronerf.app.viewer, sys; assert '.venv' not in voronerf.__file__")
 
 
-SASS = """\
-\t\tFunction : kernel
-        /*0000*/                   MOV R1, c[0x0][0x28] ;    /* 0x00000a0000017a02 */
-        /*0010*/              @!P0 BRA 0x70 ;
-        /*0020*/                   LDG.E.128 R4, desc[UR4][R2.64] ;
-{products}
-        /*0030*/              @!P1 BRA P0, 0x60 ;
-        /*0040*/                   STS [R3], R4 ;
-        /*0050*/                   F2FP.RELU.BF16.F32.PACK_AB R4, R5, R4 ;
-        /*0060*/               @P2 BRA 0x10 ;
-        /*0070*/                   EXIT ;
-        /*0080*/                   HMMA.16816.F32.BF16 R8, R4, R6, R8 ;
-        /*0090*/                   BRA 0x90 ;
-"""
-
-
 @pytest.fixture
-def code():
-    path = ROOT / ".ci" / "machine_code.py"
+def machine():
+    path = ROOT / ".ci" / "machine_run.py"
     if not path.is_file():
-        pytest.skip(".ci/machine_code.py is missing: the tests need the source tree")
-    return runpy.run_path(str(path))
+        pytest.skip(".ci/machine_run.py is missing: the tests need the source tree")
+    return SimpleNamespace(**runpy.run_path(str(path)))
 
 
-def test_instructions_of_a_layer_are_those_of_the_shortest_way_around(code, tmp_path):
-    products = "\n".join(f"        /*2{i:02x}1*/ HMMA.16816.F32.BF16 R8, R4, R6, R8 ;" for i in range(32))
-    (tmp_path / "sass").write_text(SASS.format(products=products))
-    program(tmp_path / "cuobjdump", f'test "$1 $2" = "-arch sm_90" && cat "{tmp_path}/sass"')
-    layers = code["layers"](tmp_path / "program.o", "90", f"{tmp_path}:/bin:/usr/bin")
-    # Skipped instructions and instructions after the layer's end do not count.
-    assert layers == {"kernel": {"BRA": 3, "LDG": 1, "HMMA": 32}}
+def launched(machine, instructions, *words):
+    """Runs instructions in one warp with 64-bit arguments; returns the launch."""
+    kernel = machine.Kernel([line.strip() for line in instructions.strip().splitlines()])
+    launch = machine.Launch(kernel, 1, 32, 0, struct.pack(f"<{len(words)}Q", *words), range(0), 0)
+    launch.run(0)
+    return launch
 
 
-def test_a_block_that_is_a_loop_is_counted_once(code):
-    loop = [(16 * i, "FFMA R0, R1, R2, R0") for i in range(130)] + [(4000, "@P0 BRA 0x0")]
-    assert code["layer"]([*loop, (4016, "EXIT")]) == {"FFMA": 130, "BRA": 1}
-    assert code["layer"]([*loop, (4016, "@P0 BRA 0x0"), (4032, "EXIT")]) == {"FFMA": 130, "BRA": 2}
-    assert not code["layer"]([(0, "FFMA R0, R1, R2, R0"), (16, "EXIT")])
+def test_machine_code_counts_each_group_of_lanes_that_issues_an_instruction(machine):
+    text = """
+        S2R R0, SR_TID.X
+        LDC.64 R2, c[0x0][0x210]
+        IMAD.WIDE.U32 R2, R0, 0x4, R2
+        ISETP.GE.AND P0, PT, R0, 0x8, PT
+        BSSY B0, 0x80
+        @P0 BRA 0x70
+        IMAD.SHL.U32 R0, R0, 0x2, RZ
+        BSYNC B0
+        @!P0 VIADD R0, R0, 0xffffffff
+        @!PT BRA 0x0
+        STG.E desc[UR4][R2.64], R0
+        EXIT
+    """
+    launch = launched(machine, text, 1 << 20)
+    assert launch.counts == [1] * 7 + [2] + [1] * 4
+    values = [2 * lane - 1 if lane < 8 else lane for lane in range(32)]
+    place = (1 << 20) - machine.PROCESS.base
+    assert launch.stored[4] == {place + 4 * lane: value % 2**32 for lane, value in enumerate(values)}
 
 
-def test_cuda_check_tells_of_more_instructions_of_a_layer(check, monkeypatch, tmp_path):
+@pytest.mark.parametrize("a", [0, 5, 2**32 - 1, 2**32, 2**63 - 1, 2**64 - 1, 2**64 - 2**32])
+@pytest.mark.parametrize("b", [0, 1, 2**32, 2**33 - 1, 2**63])
+def test_machine_code_computes_with_64_bits(machine, a, b):
+    text = """
+        LDC.64 R4, c[0x0][0x210]
+        LDC.64 R6, c[0x0][0x218]
+        LDC.64 R2, c[0x0][0x220]
+        IADD3 R8, P0, R4, -R6, RZ
+        IADD3.X R9, R5, ~R7, RZ, P0, !PT
+        LEA R10, P1, R4, R6, 0x3
+        LEA.HI.X R11, R4, R7, R5, 0x3, P1
+        ISETP.GE.U32.AND P2, PT, R4, R6, PT
+        ISETP.GE.AND.EX P2, PT, R5, R7, PT, P2
+        SEL R12, RZ, 0x1, !P2
+        STG.E.128 desc[UR4][R2.64], R8
+        STG.E desc[UR4][R2.64+0x10], R12
+        EXIT
+    """
+    words = [*launched(machine, text, a, b, 1 << 20).stored[4].values()]
+    assert words[0] + (words[1] << 32) == (a - b) % 2**64
+    assert words[2] + (words[3] << 32) == (8 * a + b) % 2**64
+    signed = [number - 2**64 if number >> 63 else number for number in (a, b)]
+    assert words[4] == (signed[0] >= signed[1])
+
+
+@pytest.mark.parametrize("text", ["FROB R0, R1", "MOV.FROB R0, R1", "SHFL.BFLY PT, R0, R1, 0x1, R2", "MOV R0, B1"])
+def test_machine_code_names_an_unknown_instruction(machine, text):
+    with pytest.raises(NotImplementedError, match=re.escape(f"{text} at 0x10")):
+        launched(machine, f"NOP\n{text}\nEXIT")
+
+
+def test_cuda_check_tells_of_more_instructions_of_a_pass(check, monkeypatch, tmp_path):
     monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
-    row = {"registers": 40, "spilled_bytes": 0, "shared_bytes": 0, "warps": 48}
-    kept = {"kernel": {"sm_80": {**row, "layer": 200}}, "other": {"sm_80": row}}
-    check.TABLE.write_text(check.as_text("V13", kept))
-    assert check.regressions("V13", {"kernel": {"sm_80": row}}) == []  # without cuobjdump nothing is counted
-    kernels = {"kernel": {"sm_80": row}, "other": {"sm_80": {**row, "layer": 9}}}
-    assert check.regressions("V13", kernels) == ["kernel (sm_80): no layer was found (the table has 200 instructions)"]
-    assert check.regressions("V14", kernels) == []
-    assert check.regressions("V13", {"kernel": {"sm_80": {**row, "layer": 201}}}) == [
-        "kernel (sm_80): layer 201, above 200"
-    ]
+    check.TABLE.write_text(check.as_text("V13", {}, {"net forward": 1000}))
+    assert check.regressions("V13", {}, {"net forward": 1010, "other forward": 5}) == []
+    assert check.regressions("V14", {}, {"net forward": 1011}) == []
+    assert check.regressions("V13", {}, {"net forward": 1011}) == ["net forward: 1011 instructions, above 1000"]
+    assert check.merged("V13", {}, {}) == ({}, {"net forward": 1000})  # none were run
+    assert check.merged("V14", {}, {}) == ({}, {})

@@ -31,7 +31,9 @@ constexpr unsigned kNoOrder = 1;         // a switch between fibers is no synchr
 constexpr unsigned char kPoison = 0xff;  // NaN in float32, bfloat16 and float16, and -1 as an index
 constexpr size_t kStaticShared = 48 * 1024;
 
-bool racing() { return __tsan_create_fiber != nullptr; }
+bool racing() {
+  return __tsan_create_fiber != nullptr;
+}
 void release(void* what) {
   if (racing()) __tsan_release(what);
 }
@@ -131,7 +133,9 @@ void switch_to(Fiber& from, Fiber& to, bool leaving) {
   }
 }
 
-void yield() { switch_to(*launching->current, launching->main, false); }
+void yield() {
+  switch_to(*launching->current, launching->main, false);
+}
 
 void body() {
   Launch& it = *launching;
@@ -231,9 +235,18 @@ Settings& settings() {
   return kept;
 }
 
-int lane() { return static_cast<int>(launching->current->index % 32); }
+Watcher& watcher() {
+  static Watcher kept;
+  return kept;
+}
 
-void fail(const std::string& message) { throw std::runtime_error(message); }
+int lane() {
+  return static_cast<int>(launching->current->index % 32);
+}
+
+void fail(const std::string& message) {
+  throw std::runtime_error(message);
+}
 
 void require_all(unsigned mask) {
   if (mask != 0xffffffffu) fail("the emulation has no partial warps");
@@ -292,11 +305,15 @@ void* shared(const void* key, size_t size) {
   return memory;
 }
 
-void* dynamic_shared() { return launching->block->dynamic; }
+void* dynamic_shared() {
+  return launching->block->dynamic;
+}
 
 // The number of launches so far, for tests.
 static int64_t launched = 0;
-int64_t launches() { return launched; }
+int64_t launches() {
+  return launched;
+}
 
 void launch(void (*run)(void*), void* context, dim3 grid, dim3 block_of, size_t dynamic_bytes) {
   const size_t threads = size_t{block_of.x} * block_of.y * block_of.z;

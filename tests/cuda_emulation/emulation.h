@@ -10,6 +10,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <functional>
 #include <limits>
 #include <string>
 #include <type_traits>
@@ -116,6 +117,24 @@ void launch_of(const Launch& run, dim3 grid, dim3 block, size_t dynamic_bytes) {
          dynamic_bytes);
 }
 
+// Called after each launch, if set: with the kernel's name in the source, the sizes, and the bytes of the arguments as in
+// CUDA's parameter buffer.
+using Watcher = std::function<void(const char* name, dim3 grid, dim3 block, size_t dynamic_bytes, const std::string&)>;
+Watcher& watcher();
+
+template <typename... Parameters, typename... Arguments>
+void tell_watcher(const char* name, void (*)(Parameters...), dim3 grid, dim3 block, size_t dynamic_bytes,
+                  const Arguments&... arguments) {
+  if (!watcher()) return;
+  std::string packed;
+  const auto pack = [&packed](const auto& parameter) {
+    while (packed.size() % alignof(decltype(parameter)) != 0) packed.push_back('\0');
+    packed.append(reinterpret_cast<const char*>(&parameter), sizeof parameter);
+  };
+  (pack(static_cast<const Parameters&>(arguments)), ...);
+  watcher()(name, grid, block, dynamic_bytes, packed);
+}
+
 template <typename T>
 T from_lane(const unsigned char* slots, int lane) {
   T value;
@@ -168,8 +187,9 @@ cudaError_t cudaFuncSetAttribute(Kernel, cudaFuncAttribute, int value) {
 #define blockDim vn_emulation::block_size
 #define gridDim vn_emulation::grid_size
 
-#define VN_LAUNCH(kernel, grid, block, bytes, stream, ...) \
-  ((void)(stream), vn_emulation::launch_of([&] { kernel(__VA_ARGS__); }, grid, block, bytes))
+#define VN_LAUNCH(kernel, grid, block, bytes, stream, ...)                                    \
+  ((void)(stream), vn_emulation::launch_of([&] { kernel(__VA_ARGS__); }, grid, block, bytes), \
+   vn_emulation::tell_watcher(#kernel, kernel, grid, block, bytes, __VA_ARGS__))
 #define VN_SHARED(name, ...)        \
   using name##_type = __VA_ARGS__;  \
   static const char name##_key = 0; \

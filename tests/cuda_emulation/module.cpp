@@ -38,6 +38,15 @@ PYBIND11_MODULE(voronerf_emulation, module) {
     return plan;
   });
   module.def("launches", &vn_emulation::launches);
+  // Calls call(name, grid, block, shared bytes, bytes of the arguments) after each launch, until the next `watch`.
+  module.def("watch", [](const py::object& call) {
+    vn_emulation::watcher() = nullptr;
+    if (call.is_none()) return;
+    vn_emulation::watcher() = [call](const char* name, dim3 grid, dim3 block, size_t shared, const std::string& bytes) {
+      const py::gil_scoped_acquire held;
+      call(name, grid.x, block.x, shared, py::bytes(bytes));
+    };
+  });
   module.def("seed", [](uint64_t seed) { vn_emulation::settings().seed = seed; });
   module.def("device", [](int capability, int compiled, int shared_bytes) {
     ++vn_emulation::settings().device;

@@ -2,10 +2,12 @@
 
 import os
 import pickle
+import struct
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from bugs import verdict
 from emulated import module
@@ -66,6 +68,16 @@ def test_finds(bug, sanitizer, expected):
         assert expected in found
     else:
         assert found.splitlines()[-1].startswith(expected), found
+
+
+def test_a_watcher_gets_the_arguments_of_a_launch():
+    seen, memory = [], np.zeros(256, np.float32)
+    module().watch(lambda *launch: seen.append(launch))
+    module().planted(memory.ctypes.data, memory[64:].ctypes.data, memory[192:].ctypes.data, 2, 64, 0)
+    module().watch(None)
+    module().planted(memory.ctypes.data, memory[64:].ctypes.data, memory[192:].ctypes.data, 2, 64, 0)
+    arguments = struct.pack("<QQQi", *(memory[at:].ctypes.data for at in (0, 64, 192)), 0)
+    assert seen == [("planted_kernel", 2, 64, 256, arguments)]
 
 
 @pytest.fixture(scope="module")
