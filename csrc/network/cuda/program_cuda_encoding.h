@@ -14,46 +14,68 @@
 
 namespace voronerf {
 
-// Calls run(features of a level) with a compile-time constant.
+// The features of an entry that are loaded at once. Calls run(count) with a compile-time constant; entries of eight
+// features are two pieces.
 template <typename Run>
-__device__ __forceinline__ void hash_with_features(int features, const Run& run) {
+__device__ __forceinline__ void hash_with_piece(int features, const Run& run) {
   switch (features) {
     case 1:
       return run(std::integral_constant<int, 1>());
     case 2:
       return run(std::integral_constant<int, 2>());
-    case 4:
-      return run(std::integral_constant<int, 4>());
     default:
-      return run(std::integral_constant<int, 8>());
+      return run(std::integral_constant<int, 4>());
   }
 }
 
-// Calls run(features of a level, type of the table) with compile-time constants.
-template <typename Run>
-__device__ __forceinline__ void hash_with_table(int features, int type, const Run& run) {
-  hash_with_features(features, [&](auto count) { with_type(type, [&](auto type) { run(count, type); }); });
-}
-
-struct HashAxes {
-  HashAxis axes[3];
+// A point in the box of a grid, and its corners on a level.
+struct HashPoint {
+  float places[3];
 };
-// Returns the corners and weights of a point on each axis of a level. point(axis) returns a coordinate.
+struct HashCell {
+  HashAxis axes[3];
+  uint32_t entries[8];  // of the corners, in the order of hash_corners
+};
+// point(axis) returns a coordinate.
 template <typename Point>
-__device__ __forceinline__ HashAxes hash_axes(const HashEncoding& grid, const GridLevel& level, const Point& point) {
-  HashAxes result;
+__device__ __forceinline__ HashPoint hash_point(const HashEncoding& grid, const Point& point) {
+  HashPoint result;
 #pragma unroll
   for (int axis = 0; axis < 3; ++axis) {
-    result.axes[axis] = hash_axis(hash_place(point(axis), grid.low[axis], grid.inverse[axis]).place, level);
+    result.places[axis] = hash_place(point(axis), grid.low[axis], grid.inverse[axis]).place;
   }
   return result;
 }
+__device__ __forceinline__ HashCell hash_cell(const HashPoint& point, const GridLevel& level) {
+  HashCell result;
+#pragma unroll
+  for (int axis = 0; axis < 3; ++axis) result.axes[axis] = hash_axis(point.places[axis], level);
+  hash_corners<1>(result.axes, level, 0, [&](int64_t entry, int x, int y, int z) {
+    result.entries[x + 2 * y + 4 * z] = static_cast<uint32_t>(entry);
+  });
+  return result;
+}
+// Calls visit(corner, x, y, z) for each corner.
+template <typename Visit>
+__device__ __forceinline__ void for_each_corner(const Visit& visit) {
+#pragma unroll
+  for (int corner = 0; corner < 8; ++corner) visit(corner, corner & 1, corner >> 1 & 1, corner >> 2);
+}
 
-// Returns the table of the tile's cell.
-template <TableType kType, typename Tile>
-__device__ __forceinline__ const typename HashElement<kType>::Type* hash_table(const Tile& tile, int parameter) {
-  return static_cast<const typename HashElement<kType>::Type*>(tile.call.parameters[parameter]) +
-         tile.cell() * tile.call.strides[parameter];
+// Loads the features from `first` on of a cell's corners, from the table of the tile's cell. The code is separate for
+// each type of table only here.
+template <int kPiece, typename Tile>
+__device__ __forceinline__ void hash_values(float (&values)[8][kPiece], const Tile& tile, int parameter,
+                                            const HashCell& cell, const GridLevel& level, int features, int first) {
+  const CudaProgram& call = tile.call;
+  with_type(call.parameter_types[parameter], [&](auto type) {
+    constexpr TableType kType = decltype(type)::value;
+    const auto* const from = static_cast<const InMemory<kType>*>(call.parameters[parameter]) +
+                             tile.cell() * call.strides[parameter] + level.offset * features + first;
+    for_each_corner([&](int corner, int, int, int) {
+      hash_load<kType>(from + cell.entries[corner] * static_cast<uint32_t>(features), values[corner]);
+    });
+  });
 }
 
 template <typename Tile>
@@ -61,27 +83,27 @@ __device__ __noinline__ void look_up(Tile tile, const ProgramStep& step, const P
   const Operand x = tile.value(operands[0]);
   const auto to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
-  const int rows = tile.rows();
-  hash_with_table(grid.features, tile.call.parameter_types[step.parameter], [&](auto features, auto type) {
-    constexpr int kFeatures = decltype(features)::value;
-    constexpr TableType kType = decltype(type)::value;
-    const auto* table = hash_table<kType>(tile, step.parameter);
+  const int row = Tile::worker() % Tile::kRows, features = grid.features, parameter = step.parameter;
+  if (row >= tile.rows()) return;
+  const HashPoint point = hash_point(grid, [&](int axis) { return x.at(row, axis); });
+  hash_with_piece(features, [&](auto piece) {
+    constexpr int kPiece = decltype(piece)::value;
 #pragma unroll 1
-    for (int i = Tile::worker(); i < Tile::kRows * grid.count; i += Tile::kWorkers) {
-      const int number = i / Tile::kRows, row = i % Tile::kRows;
-      if (row >= rows) continue;
+    for (int number = Tile::worker() / Tile::kRows; number < grid.count; number += Tile::kWorkers / Tile::kRows) {
       const GridLevel& level = grid.levels[number];
-      const HashAxes at = hash_axes(grid, level, [&](int axis) { return x.at(row, axis); });
-      float sums[kFeatures] = {};
-      hash_corners<kFeatures>(at.axes, level, level.offset * kFeatures, [&](int64_t entry, int a, int b, int c) {
-        const float weight = hash_weight(at.axes, false, nullptr, a, b, c);
-        float values[kFeatures];
-        hash_load<kType>(table + entry, values);
+      const HashCell cell = hash_cell(point, level);
+#pragma unroll 1
+      for (int first = 0; first < features; first += kPiece) {
+        float values[8][kPiece], sums[kPiece] = {};
+        hash_values(values, tile, parameter, cell, level, features, first);
+        for_each_corner([&](int corner, int a, int b, int c) {
+          const float weight = hash_weight(cell.axes, false, nullptr, a, b, c);
 #pragma unroll
-        for (int f = 0; f < kFeatures; ++f) sums[f] += weight * values[f];
-      });
+          for (int f = 0; f < kPiece; ++f) sums[f] += weight * values[corner][f];
+        });
 #pragma unroll
-      for (int f = 0; f < kFeatures; ++f) to.put(row, number * kFeatures + f, sums[f]);
+        for (int f = 0; f < kPiece; ++f) to.put(row, number * features + first + f, sums[f]);
+      }
     }
   });
 }
@@ -91,26 +113,30 @@ template <typename Tile>
 __device__ __noinline__ void scatter_rows(Tile tile, const ProgramStep& step, const ProgramScatter& scatter) {
   const CudaProgram& call = tile.call;
   const HashEncoding& grid = call.grids[scatter.grid];
-  const int rows = tile.rows(), begin = tile.begin();
+  const int row = Tile::worker() % Tile::kRows, features = grid.features;
+  if (row >= tile.rows()) return;
+  const InputRow from = input_row(call, scatter.input, 3, source_row(call.rows, tile.begin() + row));
+  const HashPoint point = hash_point(grid, [&](int axis) { return from.column(axis); });
   float* const to = call.sums[scatter.sum] + tile.cell() * call.strides[scatter.parameter];
-  hash_with_features(grid.features, [&](auto features) {
-    constexpr int kFeatures = decltype(features)::value;
+  const float* const gradients = tile.slot(step.slot) + row * step.stride;
+  hash_with_piece(features, [&](auto piece) {
+    constexpr int kPiece = decltype(piece)::value;
 #pragma unroll 1
-    for (int i = Tile::worker(); i < Tile::kRows * grid.count; i += Tile::kWorkers) {
-      const int number = i / Tile::kRows, row = i % Tile::kRows;
-      if (row >= rows) continue;
-      const int64_t source = source_row(call.rows, begin + row);
+    for (int number = Tile::worker() / Tile::kRows; number < grid.count; number += Tile::kWorkers / Tile::kRows) {
       const GridLevel& level = grid.levels[number];
-      const InputRow from = input_row(call, scatter.input, 3, source);
-      const HashAxes at = hash_axes(grid, level, [&](int axis) { return from.column(axis); });
-      const float* gradient = tile.slot(step.slot) + row * step.stride + number * kFeatures;
-      hash_corners<kFeatures>(at.axes, level, level.offset * kFeatures, [&](int64_t entry, int x, int y, int z) {
-        const float weight = hash_weight(at.axes, false, nullptr, x, y, z);
-        float added[kFeatures];
+      const HashCell cell = hash_cell(point, level);
+#pragma unroll 1
+      for (int first = 0; first < features; first += kPiece) {
+        const float* const gradient = gradients + number * features + first;
+        float* const entries = to + level.offset * features + first;
+        for_each_corner([&](int corner, int a, int b, int c) {
+          const float weight = hash_weight(cell.axes, false, nullptr, a, b, c);
+          float added[kPiece];
 #pragma unroll
-        for (int f = 0; f < kFeatures; ++f) added[f] = weight * gradient[f];
-        hash_add(to + entry, added);
-      });
+          for (int f = 0; f < kPiece; ++f) added[f] = weight * gradient[f];
+          hash_add(entries + cell.entries[corner] * static_cast<uint32_t>(features), added);
+        });
+      }
     }
   });
 }
@@ -121,28 +147,33 @@ __device__ __noinline__ void look_up_gradient(Tile tile, const ProgramStep& step
   const Operand x = tile.value(operands[0]), g = tile.value(operands[1]);
   const auto to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
-  const int worker = Tile::worker(), part = worker % 8, rows = tile.rows();
-  hash_with_table(grid.features, tile.call.parameter_types[step.parameter], [&](auto features, auto type) {
-    constexpr int kFeatures = decltype(features)::value;
-    constexpr TableType kType = decltype(type)::value;
-    const auto* table = hash_table<kType>(tile, step.parameter);
+  const int worker = Tile::worker(), part = worker % 8, rows = tile.rows(), features = grid.features;
+  hash_with_piece(features, [&](auto piece) {
+    constexpr int kPiece = decltype(piece)::value;
 #pragma unroll 1
-    for (int first = 0; first < rows; first += Tile::kWorkers / 8) {
-      const int row = first + worker / 8;
+    for (int top = 0; top < rows; top += Tile::kWorkers / 8) {
+      const int row = top + worker / 8;
       float sums[3] = {};
 #pragma unroll 1
       for (int number = part; row < rows && number < grid.count; number += 8) {
         const GridLevel& level = grid.levels[number];
-        const HashAxes at = hash_axes(grid, level, [&](int axis) { return x.at(row, axis); });
-        hash_corners<kFeatures>(at.axes, level, level.offset * kFeatures, [&](int64_t entry, int a, int b, int c) {
-          float product = 0.0f, values[kFeatures];
-          hash_load<kType>(table + entry, values);
+        const HashCell cell = hash_cell(hash_point(grid, [&](int axis) { return x.at(row, axis); }), level);
+        float products[8] = {};
+#pragma unroll 1
+        for (int first = 0; first < features; first += kPiece) {
+          float values[8][kPiece];
+          hash_values(values, tile, step.parameter, cell, level, features, first);
 #pragma unroll
-          for (int f = 0; f < kFeatures; ++f) product += g.at(row, number * kFeatures + f) * values[f];
-          const int corner[3] = {a, b, c};
+          for (int f = 0; f < kPiece; ++f) {
+            const float by = g.at(row, number * features + first + f);
+            for_each_corner([&](int corner, int, int, int) { products[corner] += by * values[corner][f]; });
+          }
+        }
+        for_each_corner([&](int corner, int a, int b, int c) {
+          const int at[3] = {a, b, c};
 #pragma unroll
           for (int axis = 0; axis < 3; ++axis) {
-            sums[axis] += product * hash_weight_slope(at.axes, false, nullptr, axis, corner);
+            sums[axis] += products[corner] * hash_weight_slope(cell.axes, false, nullptr, axis, at);
           }
         });
       }
