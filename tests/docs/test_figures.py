@@ -92,6 +92,14 @@ def test_tables_of_operations_are_those_of_the_program(page: str, arguments: str
     assert 4 < len(rows) <= 14 and not set(rows) - set(printed)
 
 
+def test_counted_instructions_are_those_of_the_check() -> None:
+    passes = json.loads((ROOT / ".ci" / "cuda_resources.json").read_text())["passes"]
+    section = (ROOT / "docs" / "cuda.md").read_text().split("## Speed, counted")[1].split("\n## ")[0]
+    counts = re.findall(r"^\| (\w+)[^|]*\| ([\d,]+)(?: \|[^|]*){2} \| ([\d,]+) ", section, re.MULTILINE)
+    shown = {f"{name} {way}": count for name, *both in counts for way, count in zip(("forward", "gradients"), both)}
+    assert shown == {name: f"{count:,}" for name, count in passes.items()}
+
+
 def test_the_claims_of_the_first_page() -> None:
     text = " ".join((ROOT / "README.md").read_text().split())
 
