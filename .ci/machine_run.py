@@ -285,6 +285,13 @@ def widened(words: np.ndarray) -> np.ndarray:
     return (words.view(np.uint16).astype(u32) << 16).view(f32)
 
 
+def whole(mask: np.ndarray) -> bool:
+    """Returns whether all lanes run an instruction of the warp, for which some of them alone are an error."""
+    if mask.any() and not mask.all():
+        raise RuntimeError("only some lanes run an instruction of the whole warp")
+    return bool(mask.all())
+
+
 def multiply(w: Warp, to: int, a: int, b: int, c: int) -> None:
     """HMMA.16816: adds the product of [16, 16] and [16, 8] bfloat16 numbers to c."""
     left = widened(w.registers[a : a + 4]).reshape(2, 2, 8, 4, 2).transpose(1, 2, 0, 3, 4).reshape(16, 16)
@@ -441,12 +448,12 @@ FORMS = {
     "F2FP.BF16.F32.PACK_AB": "r0 = bfloat16(f1) << 16 | bfloat16(f2)",
     "F2FP.RELU.BF16.F32.PACK_AB": "r0 = bfloat16(np.maximum(f1, 0)) << 16 | bfloat16(np.maximum(f2, 0))",
     "HSET2.BF16_V2.GTU.AND": "r0 = (~(widened(r1) <= 0) * np.uint16(0xFFFF)).view(u32); z2; z3",
-    "HMMA.16816.F32.BF16": "if m.any(): multiply(w, i0, i1, i2, i3)",
+    "HMMA.16816.F32.BF16": "if whole(m): multiply(w, i0, i1, i2, i3)",
     "CS2R": "q0 = np.zeros(1, i64); z1",
     "S2R S2UR": "r0 = w.special[t1]",
     "R2UR": "if m.any(): w.UR[i0][0] = r1[m.argmax()]",
     "VOTE.ANY": "r0 = bits_of(w.mask & p2); z1",
-    "SHFL.BFLY": "x, y = shuffled(r2, LANES ^ s3); r1 = x; p0 = y; z4",
+    "SHFL.BFLY": "whole(m); x, y = shuffled(r2, LANES ^ s3); r1 = x; p0 = y; z4",
     "BSSY": "w.barriers[b0] = lanes",
     "BSYNC": "w.wait(lanes, b0)",
     "BREAK": "w.leave(lanes, [b0])",
@@ -462,9 +469,9 @@ FORMS = {
     "LDC": "load(w, m, rows, i0, c1, a1, size)",
     **{f"LD{space}": f"load(w, m, rows, i0, '{space}', a1, size)" for space in ("", "G", "S", "L")},
     **{f"ST{space}": f"store(w, m, '{space}', a0, i1, size)" for space in ("", "G", "S", "L")},
-    "LDSM.16.M88.4": "if m.any(): load_matrices(w, a1, i0, False)",
-    "LDSM.16.MT88.4": "if m.any(): load_matrices(w, a1, i0, True)",
-    "STSM.16.M88.4": "if m.any(): store_matrices(w, a0, i1)",
+    "LDSM.16.M88.4": "if whole(m): load_matrices(w, a1, i0, False)",
+    "LDSM.16.MT88.4": "if whole(m): load_matrices(w, a1, i0, True)",
+    "STSM.16.M88.4": "if whole(m): store_matrices(w, a0, i1)",
     **{f"REDG.ADD.F32{x}.RN": f"add(w, m, a0, i1, {x[1:] or 1})" for x in ("", "x2", "x4")},
 }
 FORMS = {name: does for names, does in FORMS.items() for name in names.split()}

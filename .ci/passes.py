@@ -41,8 +41,8 @@ N = 16384
 """The number of rows of a call. Most are in no cell: only for large calls does the plan give a task several tiles."""
 STATES = 512
 """The bytes of a block's shared memory before its values, kProgramStates."""
-ALLOWED = 2e-2
-"""The largest relative difference (Frobenius norm) from the emulation. Where rounding switches a ReLU it is 7e-3."""
+ALLOWED = 3e-3
+"""The largest relative difference (Frobenius norm) from the emulation. Orders of summation differ by 7e-4."""
 CUDA_STEP = 80
 """The bytes of a CudaStep."""
 OPERATIONS = ("plain", "input", "output", "linear", "chain", "waves", "outer", "columns", "end")
@@ -165,7 +165,7 @@ def _compared(launch: Launch) -> tuple[float, int]:
         places, inverse = np.unique(at, return_inverse=True)
         pairs.append([np.bincount(inverse, values), PROCESS.numbers[4][places // 4].view(np.float32)])
     errors = [float(np.linalg.norm(found - known) / np.linalg.norm(known)) for found, known in pairs if len(found)]
-    return max(errors), sum(len(found) for found, _ in pairs)
+    return float(np.max(errors)), sum(len(found) for found, _ in pairs)
 
 
 def main() -> None:

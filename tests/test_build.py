@@ -389,6 +389,14 @@ def test_machine_code_computes_with_64_bits(machine, a, b):
     assert words[4] == (signed[0] >= signed[1])
 
 
+def test_machine_code_of_a_warp_needs_all_lanes(machine):
+    divide = "S2R R0, SR_TID.X\nISETP.GE.AND P0, PT, R0, 0x8, PT\n@P0 EXIT"
+    product = "HMMA.16816.F32.BF16 R8, R4, R6, R8\nEXIT"
+    assert launched(machine, product).counts == [1, 1]
+    with pytest.raises(RuntimeError, match="only some lanes"):
+        launched(machine, f"{divide}\n{product}")
+
+
 @pytest.mark.parametrize("text", ["FROB R0, R1", "MOV.FROB R0, R1", "SHFL.BFLY PT, R0, R1, 0x1, R2", "MOV R0, B1"])
 def test_machine_code_names_an_unknown_instruction(machine, text):
     with pytest.raises(NotImplementedError, match=re.escape(f"{text} at 0x10")):

@@ -25,24 +25,25 @@ VN_HD constexpr MapPlace accumulator_place(unsigned lane, int i) {
 struct WaveOrder {
   int octaves, features, raw;
 };
-// Returns the number of octaves that are stored together with an octave: 4, 2 or 1.
+// Returns the number of octaves that are stored together with an octave: 4, 2 or 1, which is a shift by 2, 1 or 0. A
+// division takes 20 instructions.
 VN_HD constexpr int wave_group(const WaveOrder& order, int octave) {
-  return octave < order.octaves / 4 * 4 ? 4 : octave < order.octaves / 2 * 2 ? 2 : 1;
+  return octave < (order.octaves & ~3) ? 4 : octave < (order.octaves & ~1) ? 2 : 1;
 }
 // `wave_place` returns the place of a program's column, `wave_column` the column at a place.
 VN_HD constexpr int wave_place(const WaveOrder& order, int column) {
   const int wave = column - order.raw * order.features, feature = wave % order.features;
   if (wave < 0) return 2 * order.octaves * order.features + column;
   const int row = wave / order.features, octave = row / 2, group = wave_group(order, octave),
-            first = octave / group * group;
+            first = octave & ~(group - 1);
   return 2 * (first * order.features + group * feature + octave - first) + row % 2;
 }
 VN_HD constexpr int wave_column(const WaveOrder& order, int place) {
   const int raw = place - 2 * order.octaves * order.features;
   if (raw >= 0) return raw;
   const int word = place / 2, octave = word / order.features, group = wave_group(order, octave),
-            first = octave / group * group, within = word - first * order.features;
-  return (order.raw + 2 * (first + within % group) + place % 2) * order.features + within / group;
+            first = octave & ~(group - 1), within = word - first * order.features;
+  return (order.raw + 2 * (first + (within & (group - 1))) + place % 2) * order.features + (within >> group / 2);
 }
 
 // The range in which a warp searches non-decreasing values for the last value that is at most a bound. `probed` returns

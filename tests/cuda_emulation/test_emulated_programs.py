@@ -15,7 +15,7 @@ from torch import Tensor
 
 from voronerf import HashGrid
 from voronerf.ops import grouped_program
-from voronerf.ops._core.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
+from voronerf.ops._core.program import FUNCTIONS, PARAMETER, VALUE, Builder, Columns, Program, Step, gradient
 from voronerf.ops.network import native as plans
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "ops"))
@@ -414,3 +414,16 @@ def test_derivatives_again_on_the_device() -> None:
             assert all(map(torch.equal, found, derivatives(program, *given, "native")))
         finally:
             torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+def test_a_sum_of_no_columns_is_zero(products: str) -> None:
+    """Writes of a value without columns would be outside of its slot, and loops over its columns would not end."""
+    x, nothing = Columns(VALUE, 0, 0, 16), Columns(VALUE, 1, 0, 0)
+    sums = (Step("columns", 0, 0, (nothing,), (0,)), Step("outer", 1, 0, (x, nothing), (0,)))
+    steps = (Step("input", 0, 16, (), (0,)), Step("input", 1, 0, (), (1,)), *sums)
+    program = Program((16, 0), (), steps, (x,), ((3,), (16, 4)))
+    tensors = tensors_of(program, [600])
+    with emulated():
+        found = plans.Run(tensors, [], offsets_of([600]), None, None, (), program.text, products=products).results()
+    assert torch.equal(found[0], tensors[0]) and not any(total.any() for total in found[1:])

@@ -344,7 +344,7 @@ __device__ __forceinline__ void clear_rest(const Tile& tile, const CudaStep& ste
   const int width = step.width, stride = to.halves_stride / 2, first_padding = (width + 1) / 2,
             last = pair_words(width);
   const int row = Tile::worker(), rows = tile.rows();
-  if (width % 2 != 0 && row < rows) to.put_half(row, width, 0.0f);
+  if (width % 2 != 0 && step.op != CudaOp::waves && row < rows) to.put_half(row, width, 0.0f);
   if (first_padding < last) {
     for_each_entry<Tile>(tile.rows(), last - first_padding,
                          [&](int row, int word) { words[row * stride + first_padding + word] = 0; });

@@ -180,6 +180,8 @@ class _Lowering:
         program, fresh = self.program, 1 + max((s.out for s in self.program.steps if not _sums(s)), default=0)
         steps, uses = list[Step](), dict[int, int]()
         for step in program.steps:
+            if _sums(step) and not all(c.width for c in step.operands):
+                continue  # the sum stays 0
             if step.op == "scatter" and not self._whole(step.operands[1]):
                 g = step.operands[1]
                 steps.append(Step("function", fresh, g.width, (g,), (0, 0.0, 0.0), "copy"))
@@ -229,8 +231,12 @@ class _Lowering:
         return _padded(width, 2 * _GRANULE) // 2 * (2 if self.parts else 1)
 
     def padded_outputs(self, width: int) -> int:
-        """Returns the number of floats, with padding, in a row of packed weights or of a partial sum."""
+        """Returns the number of floats, with padding, in a row of packed weights that has one float per output."""
         return _padded(width, 2 * _GRANULE if self.cuda else _GRANULE)
+
+    def padded_sums(self, width: int) -> int:
+        """Returns the number of floats in a row of a partial sum; CUDA adds sums of pairs in blocks of 16 by 32."""
+        return _padded(width, 2 * _GRANULE if self.cuda and self.half else _GRANULE)
 
     # Records ----------------------------------------------------------------------------------------------------------
 
@@ -553,7 +559,7 @@ class _Lowering:
         self.emit("output", [self.operand(step.operands[0])], width=step.width, number=number, depth=first)
 
     def _by_outputs(self, step: Step) -> bool:
-        """Returns whether an outer step stores its partial sum as [outputs, inputs]: the order with less padding."""
+        """Returns whether an outer step stores its partial sum as [outputs, inputs]: with shorter padded rows."""
         o, i = step.operands[0].width, step.operands[1].width
         return o * _padded(i) < i * _padded(o)
 
@@ -561,9 +567,9 @@ class _Lowering:
         shape, start, at = self.program.sums[step.out], int(step.numbers[0]), self.partial
         by_outputs = self._by_outputs(step)
         o, i = step.operands[0].width, step.operands[1].width
-        stride = self.padded_outputs(i if by_outputs else o)
+        stride = self.padded_sums(i if by_outputs else o)
         rows = o if by_outputs else i
-        self.partial += stride * (_padded(rows) if self.cuda else rows)
+        self.partial += stride * (_padded(rows) if self.cuda and self.half else rows)
         kind = "outputs_inputs" if by_outputs else "inputs_outputs"
         size = shape[0] * shape[1]
         self.sums.append((step.out, kind, at, o, shape[1], start, i, stride, size, self.waves(step, 1)))
@@ -576,7 +582,7 @@ class _Lowering:
 
     def _columns(self, step: Step, dying: set[int]) -> None:
         shape, start, at = self.program.sums[step.out], int(step.numbers[0]), self.partial
-        size, stride = shape[0] * (shape[1] if len(shape) > 1 else 1), self.padded_outputs(step.width)
+        size, stride = shape[0] * (shape[1] if len(shape) > 1 else 1), self.padded_sums(step.width)
         self.partial += stride
         self.sums.append((step.out, "vector", at, 1, size, start, step.width, stride, size, _NONE))
         records = [self.operand(step.operands[0], product=self.tiles and not self.parts)]
